@@ -1,0 +1,44 @@
+# Everything a target needs it sets up by itself, inside this folder. Only `make test` installs Debian packages, and
+# only those that are missing.
+
+VENV := .venv/bin/python
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check footprint clean
+
+help:
+	@echo "make demo             two simulated robots, one on Zenoh and one on MQTT, driven through a broker; Ctrl-C ends it"
+	@echo "make demo SECONDS=20  the same, ending by itself; succeeds only if both robots moved and stopped as commanded"
+	@echo "make test             all checks and tests"
+	@echo "make check            lint, types and imports only"
+	@echo "make footprint        what a robot costs and how fast it is: memory, CPU, start, latency; mqtt beside zenoh"
+	@echo "make clean            remove what the other targets made"
+
+demo: .venv/.ready-demo
+	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS))
+
+test: check
+	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs
+	@echo "pebble: tests"
+	@$(VENV) -m pytest --numprocesses 2 --dist loadscope --ignore tests/robot
+	@echo "pebble: whole robots, one at a time because their deadlines are checked"
+	@$(VENV) -m pytest tests/robot
+
+footprint: .venv/.ready-dev
+	@$(VENV) -m tests.robot.footprint
+
+check: .venv/.ready-dev
+	@echo "pebble: lint"
+	@$(VENV) -m ruff check
+	@$(VENV) -m ruff format --check
+	@echo "pebble: types"
+	@$(VENV) -m mypy
+	@echo "pebble: imports"
+	@.venv/bin/lint-imports --no-logo
+
+clean:
+	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/.ready-%: pyproject.toml tools/setup.sh
+	@sh tools/setup.sh $*

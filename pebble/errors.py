@@ -1,0 +1,31 @@
+"""Every exception Pebble raises on purpose."""
+
+
+class PebbleError(Exception):
+    """Base of them all. Only the CLI and a process's outermost line catch it; its text is the message a user reads."""
+
+
+class ConfigError(PebbleError):
+    """A config file is wrong. ``problems`` holds one line per mistake, each with its JSON path.
+
+    Example: ``services.mqtt_bridge.heartbeet: unknown key, did you mean "heartbeat"?``
+    """
+
+    def __init__(self, problems: list[str] | str) -> None:
+        self.problems = [problems] if isinstance(problems, str) else list(problems)
+        super().__init__("\n".join(self.problems))
+
+
+class TransportError(PebbleError):
+    """A topic, filter or payload no transport may carry, or a transport that cannot be set up at all.
+
+    A lost connection is *not* an error: transports reconnect by themselves and say so through their state.
+    """
+
+
+class PayloadError(PebbleError):
+    """A payload does not follow its channel's contract. Example: ``drive-values: x is NaN``."""
+
+
+class LinkError(PebbleError):
+    """A serial line, camera or other device could not be opened or stopped answering."""

@@ -1,0 +1,1 @@
+"""The programs a robot is made of: one process each, owning one thing each."""

@@ -1,0 +1,160 @@
+"""What many tests need: waiting for a condition, free ports, a real broker, programs that surely end."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+_libc = ctypes.CDLL(None)
+
+#: The checkout: tests that start programs of ours start them here.
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.005) -> bool:
+    """Wait until ``condition()`` is true; False when ``timeout`` seconds went by without it."""
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(step)
+    return bool(condition())
+
+
+def free_port() -> int:
+    """A TCP port of the loopback address that nobody listens on just now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def die_with_parent() -> None:
+    """For a child, before it runs its program: a killed pytest leaves nobody behind (Linux)."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def listening(port: int) -> bool:
+    """Does somebody take connections on this loopback port?"""
+    try:
+        socket.create_connection(("127.0.0.1", port), 0.2).close()
+    except OSError:
+        return False
+    return True
+
+
+def mosquitto_path() -> str:
+    """Debian puts the broker where users' PATH does not look."""
+    found = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
+    assert found, "mosquitto is not installed: `make test` installs it"
+    return found
+
+
+class Broker:
+    """A real mosquitto on a free loopback port. ``stop``/``kill`` then ``start`` keep port and persistence."""
+
+    def __init__(self, folder: Path, *options: str, port: int | None = None, persistence: bool = False) -> None:
+        self.port = port or free_port()
+        lines = [f"listener {self.port} 127.0.0.1", "allow_anonymous true", *options]
+        if os.geteuid() == 0:
+            lines.append("user root")  # it would become a user who may not enter our folders
+        self._store = folder / f"store-{self.port}"
+        if persistence:
+            self._store.mkdir(parents=True, exist_ok=True)
+            self._store.chmod(0o777)
+            lines += [
+                "persistence true",
+                f"persistence_location {self._store}/",
+                "autosave_on_changes true",
+                "autosave_interval 1",
+            ]
+        self._config = folder / f"mosquitto-{self.port}.conf"
+        self._config.write_text("\n".join(lines) + "\n")
+        self._process: subprocess.Popen[bytes] | None = None
+        self.start()
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None
+
+    def start(self) -> None:
+        self._process = subprocess.Popen(
+            [mosquitto_path(), "-c", str(self._config)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            preexec_fn=die_with_parent,
+        )
+        assert until(self._answers, 10), f"mosquitto did not start with {self._config.read_text()}"
+
+    def stop(self) -> None:
+        """A polite end (SIGTERM): persistence is written."""
+        self._end(lambda process: process.terminate())
+
+    def kill(self) -> None:
+        """SIGKILL: what was not saved is lost."""
+        self._end(lambda process: process.kill())
+
+    def save(self) -> None:
+        """Make it write its persistence now, and wait until it has."""
+        file = self._store / "mosquitto.db"
+        before = file.stat().st_mtime_ns if file.exists() else 0
+        os.kill(self.pid, signal.SIGUSR1)
+        assert until(lambda: file.exists() and file.stat().st_mtime_ns != before), "mosquitto did not save"
+
+    def forget(self) -> None:
+        """Wipe what a stopped broker saved."""
+        for file in self._store.glob("*"):
+            file.unlink()
+
+    def freeze(self) -> None:
+        """It keeps its connections, and answers nothing."""
+        os.kill(self.pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        os.kill(self.pid, signal.SIGCONT)
+
+    def _end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
+        if self._process is not None:
+            how(self._process)
+            self._process.wait(10)
+            self._process = None
+
+    def _answers(self) -> bool:
+        assert self._process is not None
+        assert self._process.poll() is None, "mosquitto exited at once"
+        return listening(self.port)
+
+
+class AmqttBroker:
+    """amqtt in a process of its own: no bridge mode, no MQTT 5."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self._process: subprocess.Popen[bytes] | None = None
+        self.start()
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "tests.amqtt_broker", str(self.port)]
+        self._process = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, preexec_fn=die_with_parent
+        )
+        assert until(lambda: listening(self.port), 20), "amqtt did not start"
+
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait(10)
+            self._process = None

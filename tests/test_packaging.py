@@ -1,0 +1,89 @@
+"""What an installed Pebble consists of, and that the folders' two names are the same thing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.support import ROOT
+
+LINKED = ("configs", "firmware", "services", "transports")
+NOT_SOURCES = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "tests", "docs")
+
+
+def sources() -> dict[str, Path]:
+    """Every file that belongs into the package, by its path inside the wheel."""
+    found = {}
+    for folder, inside in ((ROOT / "pebble", "pebble"), *((ROOT / name, f"pebble/{name}") for name in LINKED)):
+        for path in folder.rglob("*"):  # does not follow the symlinks
+            if path.is_file() and "__pycache__" not in path.parts:
+                found[f"{inside}/{path.relative_to(folder)}"] = path
+    return found
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """Built from a copy: what a build leaves in the checkout would go into the next one."""
+    folder = tmp_path_factory.mktemp("wheel")
+    shutil.copytree(ROOT, folder / "source", symlinks=True, ignore=NOT_SOURCES)
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), "source"]
+    built = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (path,) = folder.glob("*.whl")
+    return zipfile.ZipFile(path)
+
+
+def test_pyproject_lists_every_package() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    tree = {path.rpartition("/")[0].replace("/", ".") for path in sources() if path.endswith("/__init__.py")}
+    assert sorted(listed) == sorted(tree)
+
+
+@pytest.mark.parametrize("name", LINKED)
+def test_the_top_level_folders_are_inside_the_package_too(name: str) -> None:
+    assert os.readlink(ROOT / "pebble" / name) == f"../{name}"  # noqa: PTH115 - the text of the link
+
+
+def test_the_wheel_holds_every_source_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+    packed = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert packed == set(sources())
+
+
+def test_every_module_of_the_wheel_imports_without_the_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    wheel.extractall(tmp_path)
+    names = [name.removesuffix(".py").removesuffix("/__init__") for name in wheel.namelist() if name.endswith(".py")]
+    modules = [name.replace("/", ".") for name in names if not name.endswith("__main__")]
+    code = "import importlib, sys\nfor name in sys.argv[1:]: print(importlib.import_module(name).__file__)"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    imported = subprocess.run(
+        [sys.executable, "-c", code, *modules],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert imported.returncode == 0, imported.stderr
+    assert all(line.startswith(str(tmp_path)) for line in imported.stdout.splitlines())
+    assert len(imported.stdout.splitlines()) == len(modules)
+
+
+@pytest.mark.parametrize("name", ["transports", "services"])
+def test_the_linter_refuses_the_bare_folder_names(name: str) -> None:
+    checked = subprocess.run(
+        [sys.executable, "-m", "ruff", "check", "--no-cache", "--stdin-filename", "pebble/example.py", "-"],
+        input=f'"""Example."""\n\nimport {name}\n',
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "TID251" in checked.stdout
+    assert f"import pebble.{name}: the bare name is nobody's to claim" in checked.stdout

@@ -1,0 +1,60 @@
+#!/bin/sh
+# Makes .venv and installs this checkout into it, with the extra named by the argument (demo or dev).
+# Needs no root and no compiler. make calls it whenever pyproject.toml is newer than what it left behind.
+set -eu
+cd "$(dirname "$0")/.."
+extra=$1
+
+say() { printf 'pebble: %s\n' "$*"; }
+fail() {
+    printf 'pebble: %s\n' "$@" >&2
+    exit 1
+}
+
+# The first Python that can run us and has every module named. The system's comes first: every user may run it, which is
+# not so with one in somebody's home. $PYTHON overrides the search.
+find_python() {
+    for name in ${PYTHON:-/usr/bin/python3 python3.11 python3.12 python3.13 python3.14 python3}; do
+        if "$name" -c "import sys, $1; sys.exit(sys.version_info < (3, 11))" 2>/dev/null; then
+            echo "$name"
+            return
+        fi
+    done
+    return 1
+}
+
+# Debian leaves ensurepip out of its python3; pip's wheel from the index can install itself.
+fetch_pip() {
+    wheel=$(.venv/bin/python tools/fetch_pip.py .venv) && .venv/bin/python "$wheel/pip" install --quiet "$wheel" && rm "$wheel"
+}
+
+make_venv() {
+    [ -w . ] || fail "$PWD is not writable by $(id -un): clone the project as this user"
+    rm -rf .venv
+    if python=$(find_python "venv, ensurepip"); then
+        say "making .venv with $("$python" --version)"
+        "$python" -m venv .venv
+    elif python=$(find_python venv); then
+        say "making .venv with $("$python" --version), and fetching pip because ensurepip is missing"
+        "$python" -m venv --without-pip .venv
+        fetch_pip || {
+            rm -rf .venv
+            sh tools/debian-packages.sh "=python3-venv"
+            "$python" -m venv .venv
+        }
+    else
+        fail "Python 3.11 or newer is needed, and none was found. On Debian: apt install python3 python3-venv" \
+            "A Python elsewhere: make demo PYTHON=/path/to/python3.12"
+    fi
+}
+
+# A user without a home (nobody, a service account) has no place for pip's cache.
+[ -w "${HOME:-/nonexistent}" ] || export PIP_NO_CACHE_DIR=1
+.venv/bin/python -m pip --version >/dev/null 2>&1 || make_venv
+say "installing Pebble and what it needs for '$extra' into .venv; the first time takes a minute"
+.venv/bin/python -m pip install --disable-pip-version-check --editable ".[$extra]" >.venv/pip.log 2>&1 || {
+    cat .venv/pip.log >&2
+    fail "pip could not install what Pebble needs, see above"
+}
+touch ".venv/.ready-$extra"
+[ "$extra" != dev ] || touch .venv/.ready-demo # the one includes the other
