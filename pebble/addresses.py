@@ -1,0 +1,58 @@
+"""Under which topic, QoS and retain each channel of one robot really travels (paper Table A.6)."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any, NamedTuple
+
+from pebble.config import Config
+from pebble.contract import CHANNELS, Channel, Override, channel_of
+
+
+class Address(NamedTuple):
+    """A channel's effective place on the wire."""
+
+    topic: str  # of a pattern channel: a filter
+    qos: int
+    retain: bool
+
+
+class Addresses:
+    """Looks a channel's address up, and a topic's channel."""
+
+    def __init__(self, config: Config) -> None:
+        self.base = config.base
+        self._of = {channel: _address(channel, config) for channel in CHANNELS}
+        self._channels = {address.topic: channel for channel, address in self._of.items() if not channel.is_pattern}
+
+    def __getitem__(self, channel: Channel) -> Address:
+        return self._of[channel]
+
+    def channel(self, topic: str) -> Channel | None:
+        """The channel that travels under ``topic``, renamed or not; None for topics the contract does not know."""
+        renamed = self._channels.get(topic)
+        if renamed is not None or not topic.startswith(self.base + "/"):
+            return renamed
+        known = channel_of(topic[len(self.base) + 1 :])
+        return known if known is not None and known.is_pattern else None
+
+
+def _address(channel: Channel, config: Config) -> Address:
+    default = Address(channel.filter(config.base), channel.default_qos, channel.default_retain)
+    return default if channel.override is None else _overridden(default, channel.override, config)
+
+
+def _overridden(default: Address, override: Override, config: Config) -> Address:
+    topic, qos, retain = (
+        _at(config, path) if path else None for path in (override.topic, override.qos, override.retain)
+    )
+    return Address(
+        default.topic if topic is None else topic,
+        default.qos if qos is None else qos,
+        default.retain if retain is None else retain,
+    )
+
+
+def _at(config: Config, path: str) -> Any:
+    """The value at a dotted path of the config tree; None where the key was not set."""
+    return reduce(getattr, path.split("."), config)

@@ -1,0 +1,154 @@
+"""What must hold between the keys of a section, and what only the machine can tell: files and passwords."""
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path as FilePath
+from typing import Any
+
+from msgspec.structs import replace
+
+from pebble.config.links import Mqtt, Tls
+from pebble.config.problems import Path
+from pebble.config.reader import Check, Reader
+from pebble.config.tree import SERIAL_PROTOCOLS, MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
+from pebble.config.types import Secret
+
+_LATER = ("av_daemon", "ros1_bridge", "soundboard_handler", "autonomy_manager", "web_handler")
+_INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
+
+
+def _root(reader: Reader, root: Root, _path: Path) -> Root:
+    kind, platform = root.transport.kind, root.robot.platform
+    if root.transport.mqtt_mirror is not None and kind != "zenoh":
+        reader.notes.doubt(
+            ("transport", "mqtt_mirror"), f'only a Zenoh robot has a mirror and kind is "{kind}": leave it out'
+        )
+    if platform != "linux" and kind != "mqtt":
+        reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
+    return root
+
+
+def _services(reader: Reader, services: Services, path: Path) -> Services:
+    for name in _LATER:
+        if getattr(services, name).enabled:
+            reader.notes.warning((*path, name), "is enabled, but arrives in a later release; skipped")
+    return services
+
+
+def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
+    notes, remote = reader.notes, bridge.remote
+    if remote is not None and remote.kind != "mqtt":
+        if bridge.remote_mqtt.host:
+            notes.warning((*path, "remote_mqtt"), f'not used: remote says "{remote.kind}"')
+        if remote.kind == "zenoh" and not remote.connect:
+            notes.doubt((*path, "remote", "connect"), "is missing, name the endpoint of the operators' hub")
+        if remote.kind == "zenoh" and remote.listen:
+            notes.problem((*path, "remote", "listen"), "an uplink only connects: leave it out")
+    elif bridge.enabled and not bridge.remote_mqtt.host:
+        notes.doubt((*path, "remote_mqtt", "host"), "is missing, write the name of the broker where operators are")
+    return bridge
+
+
+def _serial(reader: Reader, serial: SerialBridges, path: Path) -> SerialBridges:
+    lines = {(*path, "instances", name): line for name, line in serial.instances.items()}
+    if serial.serial.port is not None or not any(line.enabled for line in lines.values()):
+        lines = {path: serial, **lines}
+    ports: dict[str, str] = {}
+    for place, line in lines.items():
+        if line.enabled:
+            _serial_line(reader, line, place, ports)
+    for name in serial.instances:
+        if not _INSTANCE_NAME(name):
+            reader.notes.problem((*path, "instances", name), "must be named with 1 to 32 of A-Z a-z 0-9 _ . -")
+    return serial
+
+
+def _serial_line(reader: Reader, line: SerialBridge, path: Path, ports: dict[str, str]) -> None:
+    name, port = str(path[-1]), line.serial.port
+    if port is None:
+        reader.notes.doubt((*path, "serial", "port"), "is missing, write the device, for example /dev/ttyACM0")
+    elif port in ports:
+        reader.notes.problem(path, f"shares {port} with {ports[port]}, write another serial.port")
+    else:
+        ports[port] = name
+    if line.protocol not in SERIAL_PROTOCOLS:
+        reader.notes.warning(path, f"protocol {line.protocol} arrives in a later release; skipped")
+
+
+def _safety(reader: Reader, safety: SerialSafety, path: Path) -> SerialSafety:
+    """Two keys of the original that nobody can switch off here: the motors stop, and old news moves nothing."""
+    if not safety.ignore_retained_drive:
+        reader.notes.warning((*path, "ignore_retained_drive"), "false has no effect: a kept drive command never moves")
+    if not safety.stop_on_shutdown:
+        reader.notes.warning((*path, "stop_on_shutdown"), "false has no effect: a stop is always the last line")
+    return safety
+
+
+def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
+    files = {key: getattr(tls, key) for key in ("ca_cert", "client_cert", "client_key")}
+    named = {key: file for key, file in files.items() if file is not None}
+    if not tls.enabled:
+        if named:
+            reader.notes.warning((*path, "enabled"), f"is false: the link is not encrypted, {', '.join(named)} unused")
+        return tls
+    for key, file in named.items():
+        _contents(reader, file, (*path, key))
+    for key, other in (("client_cert", "client_key"), ("client_key", "client_cert")):
+        if key in named and other not in named:
+            reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")
+    return tls
+
+
+def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
+    given = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
+    if len(given) > 1:
+        reader.notes.problem((*path, given[1]), f"is a second password beside {given[0]}, leave one of them")
+        return mqtt
+    if given and mqtt.username is None:
+        reader.notes.warning((*path, given[0]), "is not sent: there is no username")
+    if mqtt.password_env is not None:
+        return _with_password(mqtt, _variable(reader, mqtt.password_env, (*path, "password_env")))
+    if mqtt.password_file is not None:
+        return _with_password(mqtt, _contents(reader, mqtt.password_file, (*path, "password_file")))
+    return mqtt
+
+
+def _with_password(mqtt: Mqtt, password: str | None) -> Mqtt:
+    return mqtt if password is None else replace(mqtt, password=Secret(password))
+
+
+def _variable(reader: Reader, name: str, path: Path) -> str | None:
+    if name not in reader.env:
+        reader.notes.problem(path, f"the environment variable {name} is not set, set it before the start")
+        return None
+    return reader.env[name]
+
+
+def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
+    """The file's text without its final newline; noted and None when it cannot be read."""
+    try:
+        return file.read_text().rstrip("\r\n")
+    except FileNotFoundError:
+        reader.notes.problem(path, f"there is no file {file}")
+    except ValueError:  # UnicodeDecodeError, or a zero byte in the path
+        reader.notes.problem(path, f"{str(file)!r} does not hold text")
+    except OSError as error:
+        reader.notes.problem(path, f"{file} cannot be read: {os.strerror(error.errno or 0)}")
+    return None
+
+
+def _table(*rows: tuple[type[Any], Callable[[Reader, Any, Path], Any]]) -> Mapping[type[Any], Check]:
+    return dict(rows)
+
+
+#: By the class of a section, subclasses included.
+CHECKS = _table(
+    (Root, _root),
+    (Services, _services),
+    (MqttBridge, _bridge),
+    (SerialBridges, _serial),
+    (SerialSafety, _safety),
+    (Tls, _tls),
+    (Mqtt, _mqtt),
+)

@@ -1,0 +1,86 @@
+"""What is wrong or worth knowing about a config file: collected while it is read, told all at once."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+Path = tuple[str | int, ...]
+
+
+class Note(NamedTuple):
+    """One remark about one place of the file."""
+
+    path: Path
+    text: str
+
+    def __str__(self) -> str:
+        return f"{show_path(self.path)}: {self.text}"
+
+
+class Notes:
+    """Problems, which refuse the file, and warnings, which do not."""
+
+    def __init__(self) -> None:
+        self.problems: list[Note] = []
+        self.warnings: list[Note] = []
+        self.retired: list[Note] = []  # text: what replaces the key
+
+    def problem(self, path: Path, text: str) -> None:
+        self.problems.append(Note(path, text))
+
+    def doubt(self, path: Path, text: str) -> None:
+        """A problem that may only follow from another: not told where one is known, at this place or around it."""
+        if not any(known.path == path[: len(known.path)] for known in self.problems):
+            self.problem(path, text)
+
+    def warning(self, path: Path, text: str) -> None:
+        self.warnings.append(Note(path, text))
+
+    def forget_inherited(self, own: Any, merged: Any) -> None:
+        """Leave out what concerns values that ``merged`` holds but ``own`` does not: they are told where they stand."""
+        for notes in (self.problems, self.warnings, self.retired):
+            notes[:] = [note for note in notes if holds(own, note.path) or not holds(merged, note.path)]
+
+    def warning_lines(self) -> tuple[str, ...]:
+        """One line per warning; keys that are replaced by the same thing share a line."""
+        return (*_told_together(self.retired), *map(str, self.warnings))
+
+
+def _told_together(retired: list[Note]) -> Iterator[str]:
+    """Example: ``video.{socket_path, shm_size}: no longer used, …``."""
+    for text in dict.fromkeys(note.text for note in retired):
+        groups: dict[Path, list[str]] = {}
+        for note in retired:
+            if note.text == text:
+                groups.setdefault(note.path[:-1], []).append(str(note.path[-1]))
+        places = (
+            show_path((*parent, keys[0] if len(keys) == 1 else f"{{{', '.join(keys)}}}"))
+            for parent, keys in groups.items()
+        )
+        yield f"{', '.join(places)}: no longer used, {text}"
+
+
+def show_path(path: Path) -> str:
+    """Example: ``web_interface.robots[0].id``."""
+    text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
+    return text.removeprefix(".") or "(the whole file)"
+
+
+def holds(raw: Any, path: Path) -> bool:
+    """Is there something at ``path``?"""
+    for step in path:
+        known = range(len(raw)) if isinstance(raw, list) else raw if isinstance(raw, Mapping) else ()
+        if step not in known:
+            return False
+        raw = raw[step]
+    return True
+
+
+def nearest(key: str, known: Iterable[str]) -> str:
+    """What to say after "unknown key": the known key that looks most like it, and all of them where none does."""
+    from difflib import get_close_matches  # only a file with a mistake pays for this import
+
+    names = sorted(known)
+    if close := get_close_matches(key, names, n=1):
+        return f'did you mean "{close[0]}"?'
+    best = get_close_matches(key, names, n=1, cutoff=0.0)
+    return f'the nearest is "{best[0]}" of {", ".join(names)}'

@@ -1,0 +1,181 @@
+"""Turns plain data into config sections; goes on after a mistake, so that all of them are told at once."""
+
+import types
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import msgspec
+from msgspec import Meta
+from msgspec.structs import FieldInfo, fields
+
+from pebble.config import problems
+from pebble.config.types import Secret, Section
+
+S = TypeVar("S", bound=Section)
+#: Looks at a finished section of its class; returns it, completed where it needs to be.
+Check = Callable[["Reader", Any, problems.Path], Any]
+
+_WRONG = object()  # what a value that was refused reads as: the key's default takes its place
+
+
+class Reader:
+    """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets."""
+
+    def __init__(self, folder: Path, env: Mapping[str, str], checks: Mapping[type[Section], Check]) -> None:
+        self.folder, self.env, self.notes = folder, env, problems.Notes()
+        self._checks = checks
+
+    def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:
+        """A section of ``kind``. Refused values are noted and replaced by their defaults (missing ones by None)."""
+        if not isinstance(raw, dict):
+            self.notes.problem(path, f"must be an object {{…}}, not {_shown(raw)}")
+            raw = {}
+        known = {field.encode_name: field for field in fields(kind)}
+        values: dict[str, Any] = {}
+        for key, value in raw.items():
+            self._note_key(kind, known, key, (*path, key))
+            if key in known and value not in ("", None):
+                read = self._value(known[key].type, value, (*path, key))
+                if read is not _WRONG:
+                    values[known[key].name] = read
+        for field in known.values():
+            if field.required and field.name not in values:
+                values[field.name] = self._missing(field, (*path, field.encode_name))
+        return self._checked(kind(**values), path)
+
+    def _checked(self, section: S, path: problems.Path) -> S:
+        for kind, check in self._checks.items():
+            if isinstance(section, kind):
+                section = check(self, section, path)
+        return section
+
+    def _note_key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> None:
+        for name, replacement in kind.retired.items():
+            if key == name or (name.endswith("*") and key.startswith(name[:-1])):
+                self.notes.retired.append(problems.Note(path, replacement))
+                return
+        if key not in known:
+            self.notes.problem(path, f"unknown key, {problems.nearest(key, known)}")
+
+    def _missing(self, field: FieldInfo, path: problems.Path) -> Any:
+        kind, metas = unwrap(field.type)
+        if _is_section(kind):
+            return self.section(kind, {}, path)
+        self.notes.doubt(path, f"is missing, write {expected(kind, metas)}")
+        return None
+
+    def _value(self, annotation: Any, raw: Any, path: problems.Path) -> Any:
+        kind, metas = unwrap(annotation)
+        if _is_section(kind):
+            return self.section(kind, raw, path)
+        if get_origin(kind) is tuple:
+            return self._list(get_args(kind)[0], raw, path)
+        if get_origin(kind) is dict:
+            return self._map(get_args(kind)[1], raw, path)
+        if kind is Path:
+            return self._path(raw, path) if isinstance(raw, str) else self._refuse(kind, metas, raw, path)
+        if get_origin(kind) is Literal and isinstance(raw, str):
+            raw = next((choice for choice in get_args(kind) if str(choice).lower() == raw.lower()), raw)
+        try:
+            value = msgspec.convert(raw, annotation)
+        except msgspec.ValidationError:
+            return self._refuse(kind, metas, raw, path)
+        return Secret(value) if _extra(metas, "secret") else value
+
+    def _path(self, text: str, path: problems.Path) -> Any:
+        try:
+            return self.folder / Path(text).expanduser()
+        except RuntimeError:  # ~somebody, or ~ without a home
+            self.notes.problem(path, f"{_shown(text)} names a home folder that is not known, write the whole path")
+            return _WRONG
+
+    def _list(self, item: Any, raw: Any, path: problems.Path) -> Any:
+        if isinstance(raw, str) and unwrap(item)[0] is str:
+            raw = self._words(raw, path)
+        if not isinstance(raw, list):
+            self.notes.problem(path, f"must be a list […], not {_shown(raw)}")
+            return _WRONG
+        items = [self._value(item, value, (*path, index)) for index, value in enumerate(raw)]
+        return tuple(value for value in items if value is not _WRONG)
+
+    def _words(self, line: str, path: problems.Path) -> list[str]:
+        import shlex  # few files write a list as one line
+
+        try:
+            return shlex.split(line)
+        except ValueError as error:
+            self.notes.problem(path, f"cannot be split into words: {error}; write a list of words")
+            return []
+
+    def _map(self, item: Any, raw: Any, path: problems.Path) -> Any:
+        if not isinstance(raw, dict):
+            self.notes.problem(path, f"must be an object {{…}}, not {_shown(raw)}")
+            return _WRONG
+        items = {key: self._value(item, value, (*path, key)) for key, value in raw.items()}
+        return {key: value for key, value in items.items() if value is not _WRONG}
+
+    def _refuse(self, kind: Any, metas: list[Meta], raw: Any, path: problems.Path) -> Any:
+        shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
+        if kind in (bool, int, float) and isinstance(raw, str):
+            shown = f"the text {shown}"  # 1883 and "1883" look alike to a person
+        self.notes.problem(path, f"must be {expected(kind, metas)}, not {shown}")
+        return _WRONG
+
+
+def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
+    """The bare type behind ``Annotated`` and ``| None``, and all that was said about it on the way."""
+    metas: list[Meta] = []
+    while True:
+        if get_origin(annotation) is Annotated:
+            annotation, *said = get_args(annotation)
+            metas += said
+        elif get_origin(annotation) in (Union, types.UnionType) and types.NoneType in get_args(annotation):
+            others = tuple(kind for kind in get_args(annotation) if kind is not types.NoneType)
+            annotation = Union[others]  # noqa: UP007 - of a tuple made at run time
+        else:
+            return annotation, metas
+
+
+def expected(kind: Any, metas: list[Meta]) -> str:
+    """What would be right, in words, to follow "must be"."""
+    if said := _extra(metas, "expected"):
+        return str(said)
+    if get_origin(kind) is Literal:
+        *most, last = map(_shown, get_args(kind))
+        return f"{', '.join(most)} or {last}" if most else last
+    if get_origin(kind) in (Union, types.UnionType):
+        return " or ".join(expected(member, []) for member in get_args(kind))
+    name = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}[kind]
+    return " ".join((name, *_limits(metas)))
+
+
+def _limits(metas: list[Meta]) -> Iterator[str]:
+    bound: dict[str, float] = {}
+    for meta in metas:
+        bound |= {name: limit for name in ("ge", "gt", "le") if (limit := getattr(meta, name)) is not None}
+    if "ge" in bound and "le" in bound:
+        yield f"from {bound['ge']} to {bound['le']}"
+    elif "gt" in bound:
+        yield f"above {bound['gt']}"
+        if "le" in bound:
+            yield f"and at most {bound['le']}"
+    elif "ge" in bound:
+        yield f"of at least {bound['ge']}"
+
+
+def _extra(metas: list[Meta], name: str) -> Any:
+    return next((meta.extra[name] for meta in metas if meta.extra and name in meta.extra), None)
+
+
+def _is_section(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Section)
+
+
+def _shown(raw: Any) -> str:
+    if isinstance(raw, dict):
+        return "an object"
+    if isinstance(raw, list):
+        return "a list"
+    text = msgspec.json.encode(raw).decode()
+    return text if len(text) <= 60 else f"{text[:57]}…"

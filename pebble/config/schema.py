@@ -1,0 +1,143 @@
+"""Writes configs/schema.json for editors and the tables of docs/configuration.md.
+
+Run ``python -m pebble.config.schema`` after every change of a section.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+import msgspec
+from msgspec import NODEFAULT
+from msgspec.structs import FieldInfo, fields
+
+from pebble.config.reader import expected, unwrap
+from pebble.config.tree import Root
+from pebble.config.types import Section
+
+SCHEMA_FILE = Path("configs", "schema.json")
+DOCS_FILE = Path("docs", "configuration.md")
+_BEGIN, _END = "<!-- generated: keys -->\n", "<!-- end of generated: keys -->\n"
+
+
+def schema_text() -> str:
+    """The JSON Schema of a config file. Stricter than the reader in one thing: an empty string is not "not set"."""
+    _, definitions = msgspec.json.schema_components(
+        [Root], schema_hook=lambda _kind: {"type": "string"}, ref_template="#/$defs/{name}"
+    )
+    for kind in _subclasses(Section):
+        if kind.__name__ in definitions:
+            _complete(definitions[kind.__name__], kind)
+    whole = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Config of a Pebble robot",
+        "$ref": f"#/$defs/{Root.__name__}",
+        "$defs": dict(sorted(definitions.items())),
+    }
+    return json.dumps(whole, indent=1) + "\n"
+
+
+def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
+    """Comments and keys of the original are allowed; a section's default is what its own keys default to."""
+    properties = definition["properties"]
+    for value in properties.values():
+        if "$ref" in value or value.get("default", 0) is None:
+            value.pop("default", None)
+        if value.get("items") == {"type": "string"}:
+            value["type"] = ["array", "string"]  # words, or one line of them
+    patterns: dict[str, Any] = {"^//": {"description": "A comment."}}
+    for key, replacement in kind.retired.items():
+        told = {"deprecated": True, "description": f"No longer used: {replacement}."}
+        if key.endswith("*"):
+            patterns[f"^{key[:-1]}"] = told
+        else:
+            properties[key] = properties.get(key, {}) | told
+    definition["patternProperties"] = patterns
+
+
+def _subclasses(kind: type[Section]) -> Iterator[type[Section]]:
+    for child in kind.__subclasses__():
+        yield child
+        yield from _subclasses(child)
+
+
+def docs_text(current: str) -> str:
+    """``current`` with its generated part written anew."""
+    before, _, rest = current.partition(_BEGIN)
+    _, _, after = rest.partition(_END)
+    return f"{before}{_BEGIN}\n{''.join(_chapters(Root, '', {}))}{_END}{after}"
+
+
+def _chapters(kind: type[Section], path: str, told: dict[type[Section], str]) -> Iterator[str]:
+    """One table per section, depth first; a kind of section that stands in several places is told at the first."""
+    told[kind] = path
+    inner: list[tuple[type[Section], str]] = []
+    rows = []
+    for field in sorted(fields(kind), key=lambda field: not field.required):
+        section, place = _section_of(field), f"{path}.{field.encode_name}".removeprefix(".")
+        if section is None:
+            rows.append(_row(field))
+            continue
+        place += {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
+        like = f"keys as in `{told[section]}`" if section in told else "keys below"
+        rows.append(f"| `{field.encode_name}` | | {_meaning(field)} ({like}) |\n")
+        if section not in told:
+            told[section] = place
+            inner.append((section, place))
+    yield f"### {f'`{path}`' if path else 'The whole file'}\n\n"
+    yield f"{kind.__doc__}\n\n| key | default | meaning |\n|---|---|---|\n{''.join(rows)}\n"
+    for text in dict.fromkeys(kind.retired.values()):
+        keys = ", ".join(f"`{key}`" for key, replacement in kind.retired.items() if replacement == text)
+        yield f"No longer used: {keys}; {text}.\n\n"
+    for section, place in inner:
+        yield from _chapters(section, place, told)
+
+
+def _section_of(field: FieldInfo) -> type[Section] | None:
+    kind, _ = unwrap(field.type)
+    inner = get_args(kind)[-1] if get_origin(kind) is dict else get_args(kind)[0] if get_origin(kind) is tuple else kind
+    return inner if isinstance(inner, type) and issubclass(inner, Section) else None
+
+
+def _row(field: FieldInfo) -> str:
+    return f"| `{field.encode_name}` | {_default(field)} | {_meaning(field)}{_allowed(field)} |\n"
+
+
+def _meaning(field: FieldInfo) -> str:
+    _, metas = unwrap(field.type)
+    return next(meta.description for meta in metas if meta.description)
+
+
+def _allowed(field: FieldInfo) -> str:
+    """The kind of value, in words, where the meaning alone does not tell."""
+    kind, metas = unwrap(field.type)
+    if get_origin(kind) is tuple:
+        return " A list."
+    if get_origin(kind) is dict:
+        return " An object."
+    if kind in (bool, str) and not any(meta.extra for meta in metas):
+        return ""
+    text = expected(kind, metas).partition(":")[0]  # the rules of topics are told once, in the text
+    return f" {text[:1].upper()}{text[1:]}."
+
+
+def _default(field: FieldInfo) -> str:
+    if field.required:
+        return "**required**"
+    if field.default_factory is not NODEFAULT:
+        return "`{}`"
+    if field.default is None:
+        return "not set"
+    return f"`{msgspec.json.encode(field.default).decode()}`"
+
+
+def write(root: Path) -> None:
+    """Write both files below ``root``, the project's folder."""
+    (root / SCHEMA_FILE).write_text(schema_text())
+    docs = root / DOCS_FILE
+    docs.write_text(docs_text(docs.read_text()))
+
+
+if __name__ == "__main__":
+    write(Path(__file__).resolve().parent.parent)

@@ -1,0 +1,300 @@
+"""The tree of a robot's config file: every key of what runs today, with its default, its limits and its meaning."""
+
+from typing import Annotated, ClassVar, Literal
+
+from msgspec import Meta, field
+
+from pebble.config.later import (
+    AutonomyManager,
+    AvDaemon,
+    Media,
+    Ros1Bridge,
+    SoundboardHandler,
+    WebHandler,
+    WebInterface,
+)
+from pebble.config.links import Mqtt, RemoteLink, RemoteMqtt, TransportSection
+from pebble.config.types import (
+    EMPTY,
+    Command,
+    File,
+    Interval,
+    Level,
+    LogLevel,
+    Qos,
+    Seconds,
+    Section,
+    Service,
+    Topic,
+    doc,
+)
+
+
+class Robot(Section, frozen=True, kw_only=True):
+    """Who the robot is: its topics begin with `{system}/{type}/{id}`."""
+
+    id: Annotated[Level, doc("The robot's own name.")]
+    system: Annotated[Level, doc("First level of all topics.")] = "pebble"
+    type: Annotated[Level, doc("Second level of all topics: the kind of component.")] = "robots"
+    platform: Annotated[
+        Literal["linux", "esp32", "esp8266"],
+        doc("What it runs on. The MCU platforms run their own firmware: `pebble up` does not start them."),
+    ] = "linux"
+
+
+class Defaults(Section, frozen=True, kw_only=True):
+    """What several services share."""
+
+    retained_publish_interval_seconds: Annotated[Interval, doc("How often kept state is published again.")] = 3600.0
+
+
+class CapabilitiesSection(Section, frozen=True, kw_only=True):
+    """The message that says what the robot can do."""
+
+    enabled: Annotated[bool, doc("Publish it.")] = True
+    topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/capabilities`.")] = None
+    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
+    retain: Annotated[bool | None, doc("Instead of the contract's rule whether it is kept.")] = None
+    publish_interval_seconds: Annotated[
+        Interval, doc("How often it is published again; services.defaults' unless set.")
+    ] = 3600.0
+
+
+class LogsSection(Section, frozen=True, kw_only=True):
+    """Log lines of all services as messages."""
+
+    enabled: Annotated[bool, doc("Publish them.")] = True
+    topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/logs`.")] = None
+    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
+    retain: Annotated[bool | None, doc("Instead of the contract's rule whether they are kept.")] = None
+    min_level: Annotated[LogLevel, doc("Lines below this level stay on the robot.")] = "INFO"
+    max_message_chars: Annotated[
+        int, Meta(ge=64, le=65536, description="Longer lines are cut and end in three dots.")
+    ] = 2048
+
+
+class Launcher(Service, frozen=True, kw_only=True):
+    """Starts, watches and stops the other services."""
+
+    enabled: Annotated[bool, doc("Publish capabilities and logs.")] = True
+    restart_delay_seconds: Annotated[
+        Seconds,
+        doc("Scales the waits between restarts: none, then a quarter of this, doubling up to 5 times it."),
+    ] = 2.0
+    shutdown_timeout_seconds: Annotated[
+        Seconds, doc("How long the whole robot may take to stop before what is left is killed.")
+    ] = 8.0
+    capabilities: Annotated[CapabilitiesSection, doc("What the robot can do.")] = CapabilitiesSection()
+    logs: Annotated[LogsSection, doc("Log lines as messages.")] = LogsSection()
+
+
+class BridgeTopics(Section, frozen=True, kw_only=True):
+    """Other names for what the bridge listens to; unset: `{base}/incoming/…`."""
+
+    remote_mirror: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/remote-mirror`.")] = None
+    mqtt_audio: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/mqtt-audio`.")] = None
+    mqtt_video: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/mqtt-video`.")] = None
+    reboot: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/reboot`.")] = None
+    service_restart: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/service-restart`.")] = None
+    git_pull: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/git-pull`.")] = None
+    audio_control: Annotated[Topic | None, doc("Instead of `{base}/incoming/audio`.")] = None
+    video_control: Annotated[Topic | None, doc("Instead of `{base}/incoming/front-camera`.")] = None
+
+
+class Heartbeat(Section, frozen=True, kw_only=True):
+    """The robot's sign of life towards operators."""
+
+    enabled: Annotated[bool, doc("Send it.")] = True
+    topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/online`.")] = None
+    interval_seconds: Annotated[float, Meta(ge=0.05, le=3600, description="Seconds between two of them.")] = 0.25
+    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
+    retain: Annotated[bool | None, doc("Instead of the contract's rule whether it is kept.")] = None
+
+
+class SystemControl(Section, frozen=True, kw_only=True):
+    """A command of the operating system that one flag runs, without a shell."""
+
+    command: Annotated[Command, doc("The program and its arguments; unset: the flag does nothing.")] = ()
+    cwd: Annotated[File | None, doc("Folder to run it in; unset: the service's own.")] = None
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 0.0
+    ignore_retained: Annotated[bool, doc("Refuse a kept request: it is old news.")] = True
+
+
+class RebootControl(SystemControl, frozen=True, kw_only=True):
+    """What `flags/reboot` runs, for example `sudo -n /sbin/reboot`."""
+
+    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 30.0
+
+
+class ServiceRestartControl(SystemControl, frozen=True, kw_only=True):
+    """What `flags/service-restart` runs, for example `sudo -n systemctl restart pebble.service`."""
+
+    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 10.0
+
+
+class GitPullControl(SystemControl, frozen=True, kw_only=True):
+    """What `flags/git-pull` runs, for example `git -C /opt/pebble pull --ff-only`."""
+
+    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 60.0
+
+
+_MEDIA_PROGRAMS = "the media services know what to start by themselves, services.mqtt_bridge.media says how"
+
+
+class MediaControl(Section, frozen=True, kw_only=True):
+    """How the media programs are run on request."""
+
+    retired: ClassVar = {
+        key: _MEDIA_PROGRAMS
+        for prefix in ("", "publisher_", "receiver_")
+        for key in (f"{prefix}command", f"{prefix}cwd")
+    }
+
+    stop_timeout: Annotated[Seconds, doc("How long a media program may take to stop before it is killed.")] = 10.0
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    publisher_env: Annotated[dict[str, str], doc("Environment variables to add for the audio publisher.")] = field(
+        default_factory=dict
+    )
+    receiver_env: Annotated[dict[str, str], doc("Environment variables to add for the audio receiver.")] = field(
+        default_factory=dict
+    )
+
+
+class MqttBridge(Service, frozen=True, kw_only=True):
+    """The robot's link to its operators: heartbeat, mirroring, flags and system commands."""
+
+    remote_mqtt: Annotated[RemoteMqtt, doc("The broker where operators are.")] = RemoteMqtt()
+    remote: Annotated[RemoteLink | None, doc("Used instead of remote_mqtt when set.")] = None
+    topics: Annotated[BridgeTopics, doc("Other names for topics.")] = BridgeTopics()
+    heartbeat: Annotated[Heartbeat, doc("Sign of life.")] = Heartbeat()
+    media: Annotated[Media, doc("Pictures and sound towards operators.")] = Media()
+    video_control: Annotated[MediaControl, doc("Running the camera publisher.")] = MediaControl()
+    audio_control: Annotated[MediaControl, doc("Running the audio programs.")] = MediaControl()
+    reboot_control: Annotated[RebootControl, doc("What `flags/reboot` runs.")] = RebootControl()
+    service_restart_control: Annotated[ServiceRestartControl, doc("What `flags/service-restart` runs.")] = (
+        ServiceRestartControl()
+    )
+    git_pull_control: Annotated[GitPullControl, doc("What `flags/git-pull` runs.")] = GitPullControl()
+
+
+class SerialPort(Section, frozen=True, kw_only=True):
+    """The line to the MCU."""
+
+    port: Annotated[str | None, doc("Device, for example `/dev/ttyACM0`; required where the bridge is enabled.")] = None
+    baud: Annotated[int, Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's.")] = 115200
+    timeout_seconds: Annotated[Interval, doc("How long one read waits.")] = 0.1
+
+
+class SerialTelemetry(Section, frozen=True, kw_only=True):
+    """Which of the MCU's reports are published."""
+
+    publish_touch_sensors: Annotated[bool, doc("Publish every touch report, up to 50 per second.")] = False
+
+
+class OdometryRing(Section, frozen=True, kw_only=True):
+    """The original's ring of raw hall-sensor samples; still checked, no longer used."""
+
+    enabled: Annotated[bool, doc("No longer used.")] = True
+    name: Annotated[str | None, doc("No longer used.")] = None
+    slots: Annotated[int, Meta(ge=64, le=1_000_000, description="No longer used.")] = 2048
+
+
+class SerialSafety(Section, frozen=True, kw_only=True):
+    """When the wheels are told to stop."""
+
+    drive_timeout_seconds: Annotated[
+        float, Meta(gt=0, le=5, description="No drive command for this long: stop. 5 s is the MCU's own limit.")
+    ] = 0.75
+    ignore_retained_drive: Annotated[bool, doc("A kept drive command is always refused: it is old news.")] = True
+    stop_on_shutdown: Annotated[bool, doc("A stop is always sent as the last line.")] = True
+
+
+class SerialTopics(Section, frozen=True, kw_only=True):
+    """Other names for what the MCU says and is told; unset: the contract's."""
+
+    drive_values: Annotated[Topic | None, doc("Instead of `{base}/incoming/drive-values`.")] = None
+    lights_solid: Annotated[Topic | None, doc("Instead of `{base}/incoming/lights-solid`.")] = None
+    lights_flash: Annotated[Topic | None, doc("Instead of `{base}/incoming/lights-flash`.")] = None
+    touch_sensors: Annotated[Topic | None, doc("Instead of `{base}/outgoing/touch-sensors`.")] = None
+    charging_status: Annotated[Topic | None, doc("Instead of `{base}/outgoing/charging-status`.")] = None
+    charging_level: Annotated[Topic | None, doc("Instead of `{base}/outgoing/charging-level`.")] = None
+    high_rate: Annotated[Topic | None, doc("Instead of `{base}/outgoing/sensors/imu-fast`.")] = None
+    low_rate: Annotated[Topic | None, doc("Instead of `{base}/outgoing/sensors/imu`.")] = None
+
+
+class ImuPublish(Section, frozen=True, kw_only=True):
+    """How IMU samples are published."""
+
+    high_rate_qos: Annotated[Qos | None, doc("Instead of the contract's QoS of `sensors/imu-fast`.")] = None
+    low_rate_qos: Annotated[Qos | None, doc("Instead of the contract's QoS of `sensors/imu`.")] = None
+    high_rate_retain: Annotated[bool | None, doc("Instead of the contract's rule for `sensors/imu-fast`.")] = None
+    low_rate_retain: Annotated[bool | None, doc("Instead of the contract's rule for `sensors/imu`.")] = None
+
+
+class SerialHealth(Section, frozen=True, kw_only=True):
+    """When the process gives up and is started again."""
+
+    imu_sample_timeout_seconds: Annotated[
+        Seconds | None, doc("No IMU sample for this long: exit; 0: never. Unset: 5 for an IMU, else 0.")
+    ] = None
+    exit_on_serial_error: Annotated[bool | None, doc("Exit when the port fails. Unset: only for an IMU.")] = None
+
+
+#: The protocols that this release speaks; a line with another one is checked and skipped.
+SERIAL_PROTOCOLS = ("goob_base_v1",)
+
+
+class SerialBridge(Service, frozen=True, kw_only=True):
+    """One serial line to an MCU; one process each."""
+
+    retired: ClassVar = {"odometry_shm": "raw hall samples travel through the robot's own transport"}
+
+    protocol: Annotated[
+        Literal["goob_base_v1", "imu_mpu6050_v1", "pebble_serial_v1"], doc("Which lines the MCU speaks.")
+    ] = "goob_base_v1"
+    serial: Annotated[SerialPort, doc("The line.")] = SerialPort()
+    telemetry: Annotated[SerialTelemetry, doc("What is published.")] = SerialTelemetry()
+    odometry_shm: Annotated[OdometryRing, doc("No longer used.")] = OdometryRing()
+    safety: Annotated[SerialSafety, doc("When to stop.")] = SerialSafety()
+    topics: Annotated[SerialTopics, doc("Other names for topics.")] = SerialTopics()
+    publish: Annotated[ImuPublish, doc("IMU samples.")] = ImuPublish()
+    health: Annotated[SerialHealth, doc("When to give up.")] = SerialHealth()
+
+
+class SerialBridges(SerialBridge, frozen=True, kw_only=True):
+    """The serial line to the motor MCU, and further lines as instances of it."""
+
+    instances: Annotated[
+        dict[str, SerialBridge], doc("Further lines by name, each with the keys that differ from this section.")
+    ] = EMPTY
+
+
+class Services(Section, frozen=True, kw_only=True):
+    """One section per service."""
+
+    defaults: Annotated[Defaults, doc("What several services share.")] = Defaults()
+    launcher: Annotated[Launcher, doc("Starts the others.")] = Launcher()
+    av_daemon: Annotated[AvDaemon, doc("Camera and microphone.")] = AvDaemon()
+    mqtt_bridge: Annotated[MqttBridge, doc("Link to operators.")] = MqttBridge()
+    ros1_bridge: Annotated[Ros1Bridge, doc("Link to ROS 1.")] = Ros1Bridge()
+    serial_mcu_bridge: Annotated[SerialBridges, doc("Serial line to the motor MCU.")] = SerialBridges()
+    soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()
+    autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()
+    web_handler: Annotated[WebHandler, doc("Runs the web page.")] = WebHandler()
+
+
+class Root(Section, frozen=True, kw_only=True):
+    """What stands at the top of the file."""
+
+    schema_: Annotated[str | None, doc("Where editors find the JSON Schema; nothing else reads it.")] = field(
+        name="$schema", default=None
+    )
+    log_level: Annotated[LogLevel, doc("How much is logged.")] = "INFO"
+    robot: Annotated[Robot, doc("Who the robot is.")]
+    local_mqtt: Annotated[Mqtt, doc("The broker inside the robot; used where transport.kind is mqtt.")] = Mqtt()
+    transport: Annotated[TransportSection, doc("How messages move inside the robot; absent: MQTT.")] = TransportSection(
+        kind="mqtt"
+    )
+    services: Annotated[Services, doc("One section per service.")] = Services()
+    web_interface: Annotated[WebInterface, doc("The operators' web page.")] = WebInterface()

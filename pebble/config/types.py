@@ -1,0 +1,74 @@
+"""The kinds of value a config key may have, and what every section of a config has in common."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from msgspec import Meta, Struct, field
+
+from pebble.identity import LEVEL, LEVEL_RULE
+
+# As pebble.transports.topics checks it: brokers close the connection on what is refused here.
+_BAD = r"+#\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
+_TOPIC = rf"^(?!\$)(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
+
+# ``expected`` is how a problem says what would be right, in "must be …, not …".
+Level = Annotated[str, Meta(pattern=LEVEL, extra={"expected": LEVEL_RULE})]
+Topic = Annotated[
+    str, Meta(pattern=_TOPIC, extra={"expected": "a topic: 1 to 250 characters, no + or #, no $ at the start"})
+]
+Endpoint = Annotated[
+    str, Meta(pattern=r"^[a-z0-9-]+/.+", extra={"expected": 'a Zenoh endpoint such as "tls/192.168.1.7:7447"'})
+]
+LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
+Port = Annotated[int, Meta(ge=1, le=65535)]
+Qos = Annotated[int, Meta(ge=0, le=1, extra={"expected": "0 or 1"})]
+Count = Annotated[int, Meta(ge=1, le=1_000_000_000)]
+# A wait beyond 100 days is a typing mistake, and some clocks and locks of the system refuse it.
+Seconds = Annotated[float, Meta(ge=0, le=10_000_000)]
+Interval = Annotated[float, Meta(gt=0, le=10_000_000)]
+Pixels = Annotated[int, Meta(ge=1, le=16384)]
+FramesPerSecond = Annotated[float, Meta(gt=0, le=1000)]
+Rotation = Literal[0, 90, 180, 270]
+SampleRate = Annotated[int, Meta(ge=4000, le=384_000)]
+AudioChannels = Annotated[int, Meta(ge=1, le=8)]
+#: A list of words, or one line that is split as a shell would; it is never run by a shell.
+Command = tuple[str, ...]
+#: Relative to the config file; ``~`` is the user's home.
+File = Annotated[Path, Meta(extra={"expected": "a path"})]
+Password = Annotated[str, Meta(extra={"secret": True})]
+
+
+#: The default of a key that holds an object of any keys.
+EMPTY: Any = field(default_factory=dict)
+
+
+def doc(text: str) -> Meta:
+    """What a key means, for docs/configuration.md and for editors."""
+    return Meta(description=text)
+
+
+class Secret(str):
+    """Text that shows itself to nobody by accident: ``repr()`` hides it, ``str()`` does not."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return "'***'"
+
+
+class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One object of a config file. Subclasses are data: keys, defaults, limits and what they mean."""
+
+    #: Keys of the original that lost their meaning, with what replaces them; a final ``*`` stands for any ending.
+    retired: ClassVar[Mapping[str, str]] = {}
+
+
+class Service(Section, frozen=True, kw_only=True):
+    """What every service's section has."""
+
+    enabled: Annotated[bool, doc("Start this service.")] = False
+    log_level: Annotated[LogLevel, doc("How much this service logs; the root's log_level unless set.")] = "INFO"
+    retained_publish_interval_seconds: Annotated[
+        Interval, doc("How often kept state is published again; services.defaults' unless set.")
+    ] = 3600.0

@@ -1,0 +1,644 @@
+"""Config files: what they mean, and every way in which they can be wrong."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from pebble.config import Config, load, parse, resolved
+from pebble.errors import ConfigError
+from pebble.transports.topics import check_topic
+
+ROOT = Path(__file__).resolve().parents[2]
+ORIGINAL = ROOT / "tests" / "data" / "original-shaped-config.json"
+OURS = ("goob", "fred", "minilamp", "benjr", "pitcam", "minimal")
+FOLDER = Path("/nowhere")
+
+
+def at(path: str, value: Any) -> dict[str, Any]:
+    """A config with one key set, besides the robot's id."""
+    raw: Any = value
+    for key in reversed(path.split(".")):
+        raw = {key: raw}
+    return raw if path.startswith("robot.") else {"robot": {"id": "goob"}, **raw}
+
+
+def read(raw: dict[str, Any], env: Mapping[str, str] | None = None, folder: Path = FOLDER) -> Config:
+    return parse(raw, folder=folder, env={} if env is None else env)
+
+
+def problems(raw: dict[str, Any], env: Mapping[str, str] | None = None, folder: Path = FOLDER) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        read(raw, env, folder)
+    return caught.value.problems
+
+
+def only_problem(raw: dict[str, Any], env: Mapping[str, str] | None = None, folder: Path = FOLDER) -> str:
+    told = problems(raw, env, folder)
+    assert len(told) == 1, told
+    return told[0]
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "robot.json"
+    path.write_text(text)
+    return path
+
+
+def file_problem(path: Path) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    assert len(caught.value.problems) == 1
+    return caught.value.problems[0]
+
+
+class TestMeaning:
+    def test_an_id_is_enough(self) -> None:
+        config = read({"robot": {"id": "goob"}})
+        assert config.base == "pebble/robots/goob"
+        assert (config.identity.system, config.identity.type, config.identity.id) == ("pebble", "robots", "goob")
+        assert config.transport.kind == "mqtt"
+        assert (config.local_mqtt.host, config.local_mqtt.port) == ("127.0.0.1", 1883)
+        assert config.robot.platform == "linux"
+        assert config.warnings == ()
+
+    def test_services_run_only_when_asked_except_the_launcher(self) -> None:
+        services = read({"robot": {"id": "goob"}}).services
+        enabled = {name for name in services.__struct_fields__ if getattr(getattr(services, name), "enabled", False)}
+        assert enabled == {"launcher"}
+
+    @pytest.mark.parametrize("name", OURS)
+    def test_our_own_files_load_without_a_remark(self, name: str) -> None:
+        config = load(ROOT / "configs" / f"{name}.json", env={})
+        assert config.warnings == ()
+        assert config.path == ROOT / "configs" / f"{name}.json"
+
+    def test_our_robots_are_what_they_are(self) -> None:
+        goob, fred, minilamp, benjr, pitcam = (load(ROOT / "configs" / f"{name}.json", env={}) for name in OURS[:5])
+        assert (goob.transport.kind, goob.services.serial_mcu_bridge.serial.baud) == ("zenoh", 460800)
+        assert (fred.transport.kind, fred.services.serial_mcu_bridge.serial.baud) == ("mqtt", 115200)
+        assert (minilamp.robot.platform, benjr.robot.platform) == ("esp32", "esp8266")
+        assert pitcam.services.mqtt_bridge.heartbeat.enabled
+        assert pitcam.serial_instances() == {}
+
+    def test_zero_and_false_are_values(self) -> None:
+        bridge = {"heartbeat": {"enabled": False, "qos": 0, "retain": False}, "reboot_control": {"cooldown_seconds": 0}}
+        config = read(at("services.mqtt_bridge", bridge) | {"local_mqtt": {"keepalive": 0}})
+        heartbeat = config.services.mqtt_bridge.heartbeat
+        assert (heartbeat.enabled, heartbeat.qos, heartbeat.retain) == (False, 0, False)
+        assert config.services.mqtt_bridge.reboot_control.cooldown_seconds == 0
+        assert config.local_mqtt.keepalive == 0
+
+    @pytest.mark.parametrize("nothing", ["", None])
+    def test_an_empty_string_and_null_mean_not_set(self, nothing: str | None) -> None:
+        raw = {"host": nothing, "port": nothing, "username": nothing, "tls": nothing}
+        assert read(at("local_mqtt", raw)).local_mqtt == read({"robot": {"id": "goob"}}).local_mqtt
+
+    def test_an_empty_environment_variable_stays_one(self) -> None:
+        assert read(at("services.av_daemon.env", {"DISPLAY": ""})).services.av_daemon.env == {"DISPLAY": ""}
+
+    def test_comments_may_stand_anywhere(self) -> None:
+        raw = {"//": "x", "robot": {"id": "a", "// id": 3}, "transport": {"kind": "x", "settings": {"// a": 1, "b": 2}}}
+        assert read(raw).transport.settings == {"b": 2}
+
+    @pytest.mark.parametrize(
+        ("line", "words"),
+        [("sudo -n reboot 'now now'", ("sudo", "-n", "reboot", "now now")), (["a", ""], ("a", "")), ([], ())],
+    )
+    def test_commands_are_words(self, line: Any, words: tuple[str, ...]) -> None:
+        config = read(at("services.mqtt_bridge.git_pull_control.command", line))
+        assert config.services.mqtt_bridge.git_pull_control.command == words
+
+    def test_words_to_choose_from_may_be_in_any_case(self) -> None:
+        assert read(at("log_level", "debug")).log_level == "DEBUG"
+
+    def test_each_system_command_has_its_own_cooldown_and_none_has_a_command(self) -> None:
+        bridge = read(at("services.mqtt_bridge", {"reboot_control": {}})).services.mqtt_bridge
+        controls = (bridge.reboot_control, bridge.service_restart_control, bridge.git_pull_control)
+        assert [control.cooldown_seconds for control in controls] == [30, 10, 60]
+        assert [control.command for control in controls] == [(), (), ()]
+
+    def test_paths_are_relative_to_the_file(self, tmp_path: Path) -> None:
+        path = written(tmp_path, json.dumps(at("transport", {"kind": "zenoh", "journal": "kept", "run_dir": "/r"})))
+        transport = load(path, env={}).transport
+        assert (transport.journal, transport.run_dir) == (tmp_path / "kept", Path("/r"))
+
+    def test_a_config_cannot_be_changed(self) -> None:
+        with pytest.raises(AttributeError):
+            read({"robot": {"id": "goob"}}).log_level = "DEBUG"  # type: ignore[misc]
+
+    def test_a_third_partys_transport_keeps_its_settings(self) -> None:
+        transport = read(at("transport", {"kind": "carrier-pigeon", "settings": {"loft": [1, {"x": ""}]}})).transport
+        assert (transport.kind, transport.settings) == ("carrier-pigeon", {"loft": [1, {"x": ""}]})
+
+    def test_a_mirror_exists_only_where_it_is_written(self) -> None:
+        assert read(at("transport", {"kind": "zenoh"})).transport.mqtt_mirror is None
+        mirror = read(at("transport", {"kind": "zenoh", "mqtt_mirror": {"port": 1884}})).transport.mqtt_mirror
+        assert mirror is not None
+        assert (mirror.host, mirror.port) == ("127.0.0.1", 1884)
+
+
+class TestOriginal:
+    def test_it_loads_unchanged_and_is_an_mqtt_robot(self) -> None:
+        config = load(ORIGINAL, env={})
+        assert config.transport.kind == "mqtt"
+        assert config.base == "pebble/robots/rover-7"
+        assert config.services.mqtt_bridge.remote_mqtt.host == "broker.example"
+        assert config.services.mqtt_bridge.remote_mqtt.password == "change-me"
+        assert config.services.mqtt_bridge.reboot_control.command == ("sudo", "-n", "/sbin/reboot")
+        assert config.services.serial_mcu_bridge.topics.drive_values == "pebble/robots/rover-7/incoming/drive-values"
+        assert list(config.serial_instances()) == [""]
+
+    def test_every_key_whose_meaning_is_gone_is_told_once_with_what_replaces_it(self) -> None:
+        gone = [line for line in load(ORIGINAL, env={}).warnings if "no longer used" in line]
+        assert len(gone) == 3
+        shared_memory, programs, odometry = gone
+        assert "services.av_daemon.video.{socket_path, shm_size, wait_for_connection}" in shared_memory
+        assert "services.mqtt_bridge.media.audio_publisher.{input_shm, input_retry_seconds}" in shared_memory
+        assert "services.mqtt_bridge.video_control.{command, cwd}" in programs
+        assert odometry.startswith("services.serial_mcu_bridge.odometry_shm: no longer used, ")
+        assert all(line.partition("no longer used, ")[2] for line in gone)
+
+    def test_services_of_later_releases_are_skipped_with_a_warning_each(self) -> None:
+        later = [line for line in load(ORIGINAL, env={}).warnings if "later release" in line]
+        assert [line.partition(":")[0] for line in later] == [
+            f"services.{name}" for name in ("av_daemon", "soundboard_handler", "autonomy_manager", "web_handler")
+        ]
+
+    def test_keys_of_any_ending_can_be_retired(self) -> None:
+        config = read(at("services.mqtt_bridge.media.video_publisher", {"source_width": 640, "source_format": "BGR"}))
+        (warning,) = config.warnings
+        assert "{source_width, source_format}" in warning
+
+
+class TestOverridePoints:
+    PATHS = (
+        "launcher.capabilities.topic",
+        "launcher.logs.topic",
+        *(
+            f"mqtt_bridge.topics.{key}"
+            for key in (
+                "remote_mirror", "mqtt_audio", "mqtt_video", "reboot", "service_restart", "git_pull", "audio_control",
+                "video_control",
+            )
+        ),
+        "mqtt_bridge.heartbeat.topic",
+        *(
+            f"mqtt_bridge.media.{key}"
+            for key in (
+                "video_publisher.topic", "video_publisher.overlays_topic", "audio_publisher.topic",
+                "audio_receiver.topic",
+            )
+        ),
+        *(
+            f"serial_mcu_bridge.topics.{key}"
+            for key in (
+                "drive_values", "lights_solid", "lights_flash", "touch_sensors", "charging_status", "charging_level",
+                "high_rate", "low_rate",
+            )
+        ),
+        *(f"{name}.topics.{key}" for name in ("soundboard_handler", "autonomy_manager")
+          for key in ("command", "files", "status")),
+    )  # fmt: skip
+
+    @pytest.mark.parametrize("path", PATHS)
+    def test_each_is_a_key_that_is_not_set_by_itself_and_takes_a_topic(self, path: str) -> None:
+        def value(config: Config) -> Any:
+            found: Any = config.services
+            for key in path.split("."):
+                found = getattr(found, key)
+            return found
+
+        assert value(read({"robot": {"id": "goob"}})) is None
+        assert value(read(at(f"services.{path}", "other/topic"))) == "other/topic"
+        assert only_problem(at(f"services.{path}", "other/#")).startswith(f"services.{path}: must be a topic")
+
+    @given(st.text(st.characters(codec="utf-8"), min_size=1, max_size=260) | st.text("a/", min_size=190, max_size=260))
+    def test_what_is_accepted_every_transport_carries(self, topic: str) -> None:
+        try:
+            config = read(at("services.launcher.logs.topic", topic))
+        except ConfigError:
+            return
+        assert check_topic(str(config.services.launcher.logs.topic)) == topic
+
+
+class TestInheritance:
+    def test_the_roots_log_level_is_every_services_unless_it_has_its_own(self) -> None:
+        raw = at("log_level", "WARNING") | {"services": {"mqtt_bridge": {"log_level": "DEBUG"}}}
+        config = read(raw)
+        assert config.log_level_of("mqtt_bridge") == config.services.mqtt_bridge.log_level == "DEBUG"
+        assert config.log_level_of("launcher") == config.services.launcher.log_level == "WARNING"
+        assert config.log_level_of("zenoh_hub") == "WARNING"
+        assert config.web_interface.log_level == "WARNING"
+
+    def test_an_instance_has_its_own_log_level(self) -> None:
+        imu = {"log_level": "ERROR", "serial": {"port": "/dev/imu"}}
+        config = read(at("services.serial_mcu_bridge", {"log_level": "DEBUG", "instances": {"imu": imu}}))
+        assert config.log_level_of("serial_mcu_bridge:imu") == "ERROR"
+        assert config.log_level_of("serial_mcu_bridge") == "DEBUG"
+
+    def test_the_common_interval_is_every_services_unless_it_has_its_own(self) -> None:
+        common = {"retained_publish_interval_seconds": 60}
+        own = {"retained_publish_interval_seconds": 5}
+        services = read(at("services", {"defaults": common, "serial_mcu_bridge": own})).services
+        assert services.serial_mcu_bridge.retained_publish_interval_seconds == 5
+        assert services.soundboard_handler.retained_publish_interval_seconds == 60
+        assert services.launcher.capabilities.publish_interval_seconds == 60
+
+    def test_a_mistake_in_a_shared_value_is_told_where_it_stands(self) -> None:
+        assert only_problem(at("log_level", "LOUD")).startswith("log_level: must be ")
+        serial = {"safety": {"drive_timeout_seconds": 0}, "typo": 1, "instances": {"a": {}, "b": {}}}
+        told = problems(at("services.serial_mcu_bridge", serial))
+        assert [line.partition(":")[0] for line in told] == [
+            "services.serial_mcu_bridge.safety.drive_timeout_seconds",
+            "services.serial_mcu_bridge.typo",
+        ]
+
+    def test_a_warning_about_a_shared_value_is_told_where_it_stands(self) -> None:
+        serial: dict[str, Any] = {"odometry_shm": {}, "instances": {"a": {}}}
+        (warning,) = read(at("services.serial_mcu_bridge", serial)).warnings
+        assert warning.startswith("services.serial_mcu_bridge.odometry_shm: ")
+
+
+class TestSerialInstances:
+    ROOT_LINE: ClassVar[dict[str, Any]] = {
+        "enabled": True,
+        "serial": {"port": "/dev/a", "baud": 9600},
+        "safety": {"drive_timeout_seconds": 0.4, "stop_on_shutdown": False},
+        "topics": {"drive_values": "x/drive"},
+    }
+
+    def with_(self, **instances: Any) -> Config:
+        return read(at("services.serial_mcu_bridge", {**self.ROOT_LINE, "instances": instances}))
+
+    def test_an_instance_is_laid_over_the_root_entry_object_by_object(self) -> None:
+        config = self.with_(rear={"serial": {"port": "/dev/b"}, "safety": {"drive_timeout_seconds": 0.2}})
+        lines = config.serial_instances()
+        assert list(lines) == ["", "rear"]
+        rear = lines["rear"]
+        assert (rear.serial.port, rear.serial.baud) == ("/dev/b", 9600)
+        assert (rear.safety.drive_timeout_seconds, rear.safety.stop_on_shutdown) == (0.2, False)
+        assert rear.topics.drive_values == "x/drive"
+        assert lines[""].safety.drive_timeout_seconds == 0.4
+
+    def test_zero_and_false_cover_and_an_empty_string_does_not(self) -> None:
+        rear = {"serial": {"port": "/dev/b"}, "topics": {"drive_values": ""}, "telemetry": {}, "enabled": False}
+        line = self.with_(rear=rear).services.serial_mcu_bridge.instances["rear"]
+        assert (line.enabled, line.topics.drive_values) == (False, "x/drive")
+
+    def test_disabled_lines_are_left_out(self) -> None:
+        assert list(self.with_(rear={"enabled": False}).serial_instances()) == [""]
+
+    def test_the_root_entry_is_a_line_only_with_a_port(self) -> None:
+        raw = {"enabled": True, "instances": {"rear": {"serial": {"port": "/dev/b"}}}}
+        assert list(read(at("services.serial_mcu_bridge", raw)).serial_instances()) == ["rear"]
+
+    def test_a_line_of_a_later_protocol_is_checked_and_skipped(self) -> None:
+        config = self.with_(imu={"protocol": "imu_mpu6050_v1", "serial": {"port": "/dev/i"}})
+        assert list(config.serial_instances()) == [""]
+        assert (
+            "services.serial_mcu_bridge.instances.imu: protocol imu_mpu6050_v1 arrives in a later release; skipped"
+            in config.warnings
+        )
+
+    @pytest.mark.parametrize(
+        ("instances", "expected"),
+        [
+            ({"rear": {}}, "instances.rear: shares /dev/a with serial_mcu_bridge"),
+            (
+                {"b": {"serial": {"port": "/dev/b"}}, "c": {"serial": {"port": "/dev/b"}}},
+                "instances.c: shares /dev/b with b",
+            ),
+            ({"no name": {"serial": {"port": "/dev/b"}}}, "instances.no name: must be named with"),
+            ({"": {"serial": {"port": "/dev/b"}}}, "instances.: must be named with"),
+            ({"rear": 5}, "instances.rear: must be an object {…}, not 5"),
+            ({"rear": {"instances": {}, "serial": {"port": "/dev/b"}}}, "instances.rear.instances: unknown key"),
+        ],
+    )
+    def test_mistakes(self, instances: dict[str, Any], expected: str) -> None:
+        raw = at("services.serial_mcu_bridge", {**self.ROOT_LINE, "instances": instances})
+        assert only_problem(raw).startswith(f"services.serial_mcu_bridge.{expected}")
+
+    def test_an_enabled_line_needs_a_port(self) -> None:
+        told = only_problem(at("services.serial_mcu_bridge.enabled", True))
+        assert told.startswith("services.serial_mcu_bridge.serial.port: is missing")
+        told = only_problem(at("services.serial_mcu_bridge", {"enabled": True, "instances": {"rear": {}}}))
+        assert told.startswith("services.serial_mcu_bridge.instances.rear.serial.port: is missing")
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("path", "value", "expected"),
+        [
+            ("robot.system", "a/b", "must be a topic level"),
+            ("robot", [], "must be an object {…}, not a list"),
+            ("log_level", "LOUD", 'must be "DEBUG", "INFO", "WARNING", "ERROR" or "CRITICAL", not "LOUD"'),
+            ("local_mqtt.port", 0, "must be a whole number from 1 to 65535, not 0"),
+            ("local_mqtt.port", 65536, "must be a whole number from 1 to 65535"),
+            ("local_mqtt.port", "1883", 'must be a whole number from 1 to 65535, not the text "1883"'),
+            ("local_mqtt.port", 1883.5, "must be a whole number"),
+            ("local_mqtt.port", True, "must be a whole number"),
+            ("local_mqtt.keepalive", -1, "must be a whole number from 0 to 65535"),
+            ("local_mqtt.protocol", "4", 'must be "3.1.1" or "5"'),
+            ("local_mqtt.silence_seconds", 0, "must be a number above 0"),
+            ("local_mqtt.host", 5, "must be text, not 5"),
+            ("local_mqtt.tls.ca_cert", 5, "must be a path, not 5"),
+            ("local_mqtt.password_file", "~nobody-at-all/x", '"~nobody-at-all/x" names a home folder that'),
+            ("local_mqtt.password_file", "a\x00b", "'/nowhere/a\\x00b' does not hold text"),
+            ("transport.kind", 5, "must be text, not 5"),
+            ("services.defaults.retained_publish_interval_seconds", 0, "must be a number above 0"),
+            ("services.defaults.retained_publish_interval_seconds", float("nan"), "must be a number, not nan"),
+            ("services.launcher.restart_delay_seconds", float("-inf"), "must be a number, not -inf"),
+            ("services.launcher.restart_delay_seconds", 10**400, "must be a number from 0"),
+            ("services.launcher.logs.max_message_chars", 63, "must be a whole number from 64 to 65536"),
+            ("services.mqtt_bridge.heartbeat.interval_seconds", 0.049, "must be a number from 0.05 to 3600, not 0.049"),
+            ("services.mqtt_bridge.heartbeat.qos", 2, "must be 0 or 1, not 2"),
+            ("services.mqtt_bridge.heartbeat.retain", 1, "must be true or false, not 1"),
+            ("services.mqtt_bridge.heartbeat.enabled", "true", 'must be true or false, not the text "true"'),
+            ("services.mqtt_bridge.heartbeat.topic", "$SYS/x", "must be a topic"),
+            ("services.mqtt_bridge.heartbeat.topic", "half \ud800", "holds half a character"),
+            ("services.mqtt_bridge.reboot_control.command", "sudo 'oops", "cannot be split into words: No closing quo"),
+            ("services.mqtt_bridge.reboot_control.command", {"a": 1}, "must be a list […], not an object"),
+            ("services.mqtt_bridge.reboot_control.env", [], "must be an object {…}, not a list"),
+            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 0, "must be a number above 0 and at most 5"),
+            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 5.1, "must be a number above 0 and at most 5"),
+            ("services.serial_mcu_bridge.odometry_shm.slots", 63, "must be a whole number from 64"),
+            ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1" or'),
+            ("services.av_daemon.video.rotate_degrees", 45, "must be 0, 90, 180 or 270, not 45"),
+            ("services.av_daemon.video.io_mode", [], "must be text or a whole number, not a list"),
+        ],
+    )
+    def test_one_wrong_value(self, path: str, value: Any, expected: str) -> None:
+        raw = at(path, value)
+        raw["robot"] = {"id": "goob"} | raw["robot"] if isinstance(raw["robot"], dict) else raw["robot"]
+        told = problems(raw)
+        assert told[0].startswith(f"{path}: {expected}"), told
+
+    def test_items_of_lists_are_told_by_number(self) -> None:
+        told = problems(at("transport", {"kind": "zenoh", "listen": ["tcp/0.0.0.0:7447", "7447"]}))
+        assert told == ['transport.listen[1]: must be a Zenoh endpoint such as "tls/192.168.1.7:7447", not "7447"']
+        script = {"args": [{"key": "a", "type": "intt"}, {"label": "b"}]}
+        assert [
+            line.partition(":")[0] for line in problems(at("services.autonomy_manager.scripts", {"s": script}))
+        ] == [
+            "services.autonomy_manager.scripts.s.args[0].type",
+            "services.autonomy_manager.scripts.s.args[1].key",
+        ]
+
+    @pytest.mark.parametrize(
+        ("path", "nearest"),
+        [
+            ("services.mqtt_bridge.heartbeet", 'did you mean "heartbeat"?'),
+            ("services.mqtt_bridge.remote_mqtt.hots", 'did you mean "host"?'),
+            ("services.serial_mcu_bridge.serial.baudrate", 'did you mean "baud"?'),
+            ("transports", 'did you mean "transport"?'),
+            ("services.web", 'the nearest is "web_handler" of autonomy_manager, '),
+        ],
+    )
+    def test_an_unknown_key_names_the_nearest_one(self, path: str, nearest: str) -> None:
+        assert only_problem(at(path, {})).startswith(f"{path}: unknown key, {nearest}")
+
+    @pytest.mark.parametrize(
+        ("raw", "expected"),
+        [
+            ({}, "robot.id: is missing, write a topic level"),
+            ({"robot": {"id": ""}}, "robot.id: is missing"),
+            (at("transport", {"run_dir": "x"}), "transport.kind: is missing"),
+            (at("services.mqtt_bridge.enabled", True), "services.mqtt_bridge.remote_mqtt.host: is missing"),
+            (at("transport.kind", "mqtt") | at("transport", {"kind": "mqtt", "mqtt_mirror": {}}),
+             "transport.mqtt_mirror: only a Zenoh robot has a mirror"),
+            (at("transport.kind", "zenoh") | {"robot": {"id": "a", "platform": "esp32"}},
+             'transport.kind: must be "mqtt" where robot.platform is "esp32"'),
+            (at("services.mqtt_bridge", {"enabled": True, "remote": {"kind": "zenoh"}}),
+             "services.mqtt_bridge.remote.connect: is missing"),
+        ],
+    )  # fmt: skip
+    def test_what_is_missing_or_does_not_fit_together(self, raw: dict[str, Any], expected: str) -> None:
+        assert only_problem(raw).startswith(expected)
+
+    def test_a_zenoh_uplink_needs_no_remote_broker(self) -> None:
+        remote = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}
+        bridge = read(at("services.mqtt_bridge", {"enabled": True, "remote": remote})).services.mqtt_bridge
+        assert bridge.remote is not None
+        assert bridge.remote.connect == ("tls/base.example:7447",)
+
+    def test_a_remote_broker_beside_another_uplink_is_not_used(self) -> None:
+        remote = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}
+        config = read(at("services.mqtt_bridge", {"remote": remote, "remote_mqtt": {"host": "broker.example"}}))
+        assert config.warnings == ('services.mqtt_bridge.remote_mqtt: not used: remote says "zenoh"',)
+
+    def test_a_zenoh_uplink_only_connects(self) -> None:
+        told = problems(at("services.mqtt_bridge.remote", {"kind": "zenoh", "listen": ["tls/0.0.0.0:7447"]}))
+        assert [line.split(":")[0] for line in told] == [
+            "services.mqtt_bridge.remote.connect",
+            "services.mqtt_bridge.remote.listen",
+        ]
+
+    def test_ten_mistakes_are_told_in_one_run(self, tmp_path: Path) -> None:
+        raw = json.loads(ORIGINAL.read_text())
+        services = raw["services"]
+        del raw["robot"]["id"]
+        raw["log_level"] = "LOUD"
+        raw["local_mqtt"]["port"] = "1883"
+        services["launcher"]["logs"]["max_message_chars"] = 10
+        services["mqtt_bridge"]["heartbeet"] = services["mqtt_bridge"].pop("heartbeat")
+        services["mqtt_bridge"]["remote_mqtt"]["host"] = ""
+        services["mqtt_bridge"]["topics"]["reboot"] = "pebble/+/reboot"
+        services["serial_mcu_bridge"]["safety"]["drive_timeout_seconds"] = 0
+        services["serial_mcu_bridge"]["serial"]["port"] = ""
+        services["av_daemon"]["video"]["rotate_degrees"] = 45
+        with pytest.raises(ConfigError) as caught:
+            load(written(tmp_path, json.dumps(raw)), env={})
+        assert sorted(line.partition(":")[0] for line in caught.value.problems) == [
+            "local_mqtt.port",
+            "log_level",
+            "robot.id",
+            "services.av_daemon.video.rotate_degrees",
+            "services.launcher.logs.max_message_chars",
+            "services.mqtt_bridge.heartbeet",
+            "services.mqtt_bridge.remote_mqtt.host",
+            "services.mqtt_bridge.topics.reboot",
+            "services.serial_mcu_bridge.safety.drive_timeout_seconds",
+            "services.serial_mcu_bridge.serial.port",
+        ]
+
+
+class TestFiles:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ('{\n "robot": {"id": "a",}\n}', "robot.json: line 2, column 22: not JSON: "),
+            ('{"a": 1,\n // no\n "b": 2}', "a comment is a key that starts with //"),
+            ("", "robot.json: line 1, column 1: not JSON"),
+            ("[" * 100_000, "robot.json: nested too deeply"),
+            ('{"a": ' + "9" * 5000 + "}", "robot.json: not JSON: Exceeds the limit"),
+            ("[]", "(the whole file): must be an object {…}, not a list"),
+            ('{"robot": {"id": "a", "id": "b"}}', "robot.id: occurs twice in one object"),
+            ('{"robot": {"id": "a"}, "log_level": NaN}', "log_level: must be a number, not nan"),
+            ('{"robot": {"id": "a"}, "local_mqtt": {"port": 1e999}}', "local_mqtt.port: must be a number, not inf"),
+        ],
+    )
+    def test_text_that_is_not_a_config(self, tmp_path: Path, text: str, expected: str) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load(written(tmp_path, text))
+        assert expected in caught.value.problems[0]
+
+    def test_a_trailing_comma_is_recognised(self, tmp_path: Path) -> None:
+        text = '{"robot": {"id": "a"},\n}'
+        assert file_problem(written(tmp_path, text)).endswith("leave out the comma before it")
+
+    def test_repeated_comments_are_welcome(self, tmp_path: Path) -> None:
+        assert load(written(tmp_path, '{"//": 1, "//": 2, "robot": {"id": "a"}}')).base == "pebble/robots/a"
+
+    def test_a_byte_order_mark_is_not_a_mistake(self, tmp_path: Path) -> None:
+        assert load(written(tmp_path, '\ufeff{"robot": {"id": "a"}}')).base == "pebble/robots/a"
+
+    def test_no_file_a_folder_and_no_text(self, tmp_path: Path) -> None:
+        assert file_problem(tmp_path / "none.json").endswith("none.json: there is no such file")
+        assert "is a folder" in file_problem(tmp_path)
+        (tmp_path / "binary").write_bytes(b"{\xff")
+        assert "is not UTF-8 text, see its byte 1" in file_problem(tmp_path / "binary")
+
+    def test_a_file_that_cannot_be_read(self, tmp_path: Path) -> None:
+        loop = tmp_path / "loop.json"
+        loop.symlink_to(loop)
+        assert "cannot be read" in file_problem(loop)
+
+
+class TestPasswords:
+    SECRET = "correct horse"
+
+    def remote(self, **keys: Any) -> dict[str, Any]:
+        return at("services.mqtt_bridge.remote_mqtt", {"username": "goob", **keys})
+
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        (tmp_path / "password").write_text(f"{self.SECRET}\n")
+        return tmp_path
+
+    @pytest.mark.parametrize(
+        "keys", [{"password": SECRET}, {"password_file": "password"}, {"password_env": "PEBBLE_PASSWORD"}]
+    )
+    def test_it_comes_from_three_places_and_is_never_shown(self, folder: Path, keys: dict[str, str]) -> None:
+        config = read(self.remote(**keys), {"PEBBLE_PASSWORD": self.SECRET}, folder)
+        assert config.services.mqtt_bridge.remote_mqtt.password == self.SECRET
+        assert self.SECRET not in repr(config)
+        assert self.SECRET not in json.dumps(resolved(config))
+
+    @pytest.mark.parametrize(
+        ("keys", "expected"),
+        [
+            ({"password_file": "none"}, "password_file: there is no file "),
+            ({"password_file": "."}, "password_file: "),
+            ({"password_env": "NOT_SET"}, "password_env: the environment variable NOT_SET is not set"),
+            ({"password": SECRET, "password_env": "X"}, "password_env: is a second password beside password"),
+            ({"password": 4711}, "password: must be text, not a value of another kind"),
+        ],
+    )
+    def test_mistakes_are_told_without_the_password(self, folder: Path, keys: dict[str, Any], expected: str) -> None:
+        told = only_problem(self.remote(**keys), {}, folder)
+        assert told.startswith(f"services.mqtt_bridge.remote_mqtt.{expected}")
+        assert self.SECRET not in told
+        assert "4711" not in told
+
+    def test_a_password_without_a_name_is_not_sent(self) -> None:
+        (warning,) = read(at("local_mqtt.password", "x")).warnings
+        assert warning == "local_mqtt.password: is not sent: there is no username"
+
+    def test_passwords_in_addresses_and_settings_are_hidden_too(self) -> None:
+        raw = at("web_interface.mqtt_history.uri", f"mongodb://me:{self.SECRET.split()[0]}@db.example/x")
+        raw["transport"] = {"kind": "other", "settings": {"api_token": "t0k3n", "list": [{"secret": "s3cret"}]}}
+        shown = json.dumps(resolved(read(raw)))
+        assert "mongodb://***@db.example/x" in shown
+        assert all(secret not in shown for secret in ("correct", "t0k3n", "s3cret"))
+
+
+class TestTls:
+    def test_files_are_relative_to_the_config(self, tmp_path: Path) -> None:
+        for name in ("ca.pem", "me.pem", "me.key"):
+            (tmp_path / name).write_text("x")
+        tls = {"enabled": True, "ca_cert": "ca.pem", "client_cert": "me.pem", "client_key": str(tmp_path / "me.key")}
+        config = load(written(tmp_path, json.dumps(at("local_mqtt.tls", tls))), env={})
+        assert config.local_mqtt.tls.ca_cert == tmp_path / "ca.pem"
+        assert config.local_mqtt.tls.client_key == tmp_path / "me.key"
+
+    def test_missing_files_and_half_a_pair_are_problems(self, tmp_path: Path) -> None:
+        told = problems(
+            at("transport", {"kind": "zenoh", "tls": {"enabled": True, "client_key": "no.key"}}), {}, tmp_path
+        )
+        assert told == [
+            f"transport.tls.client_key: there is no file {tmp_path / 'no.key'}",
+            "transport.tls.client_cert: is missing, it belongs to client_key",
+        ]
+
+    def test_certificates_of_a_link_that_is_not_encrypted_are_pointed_out(self) -> None:
+        (warning,) = read(at("local_mqtt.tls.ca_cert", "ca.pem")).warnings
+        assert warning == "local_mqtt.tls.enabled: is false: the link is not encrypted, ca_cert unused"
+
+
+class TestRunDirectory:
+    @pytest.mark.parametrize(
+        ("env", "parent"),
+        [
+            ({"XDG_RUNTIME_DIR": "/run/user/7", "TMPDIR": "/t"}, "/run/user/7/pebble"),
+            ({"TMPDIR": "/t"}, "/t/pebble-"),
+            ({}, "/tmp/pebble-"),
+        ],
+    )
+    def test_each_robot_has_its_own(self, env: dict[str, str], parent: str) -> None:
+        goob, fred = (read({"robot": {"id": name}}, env).run_dir() for name in ("goob", "fred"))
+        assert str(goob).startswith(parent)
+        assert goob != fred
+        assert len(goob.name) == 8
+        assert int(goob.name, 16) >= 0
+
+    def test_systemds_comes_before_the_logins(self) -> None:
+        env = {"RUNTIME_DIRECTORY": "/run/pebble:/run/more", "XDG_RUNTIME_DIR": "/run/user/7"}
+        assert read({"robot": {"id": "goob"}}, env).run_dir() == Path("/run/pebble")
+
+    def test_the_configs_own_comes_before_all(self, tmp_path: Path) -> None:
+        raw = at("transport", {"kind": "zenoh", "run_dir": "run"})
+        assert read(raw, {"RUNTIME_DIRECTORY": "/run/pebble"}, tmp_path).run_dir() == tmp_path / "run"
+
+
+class TestResolved:
+    def test_replacing_a_section_keeps_what_was_derived(self) -> None:
+        config = load(ROOT / "configs" / "goob.json", env={})
+        line = config.serial_instances()[""]
+        view = replace(config, services=replace(config.services, serial_mcu_bridge=line))
+        assert (view.base, view.run_dir(), view.path) == (config.base, config.run_dir(), config.path)
+
+    def test_it_is_a_config_again_and_says_the_same(self) -> None:
+        config = load(ROOT / "configs" / "goob.json", env={})
+        shown = resolved(config)
+        derived = shown.pop("derived")
+        again = read(json.loads(json.dumps(shown)))
+        assert resolved(again)["services"] == shown["services"]
+        assert derived["base"] == config.base
+        assert derived["run_dir"] == str(config.run_dir())
+        assert derived["serial_instances"] == [""]
+
+
+def test_reading_a_config_imports_no_client_library_and_no_cli() -> None:
+    program = "import sys, pebble.config; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    loaded = set(done.stdout.split())
+    assert "pebble.config" in loaded
+    heavy = {"paho", "zenoh", "numpy", "typer", "rich", "jsonschema", "dataclasses", "difflib", "shlex", "asyncio"}
+    assert loaded & heavy == set()
+
+
+def test_what_cannot_be_switched_off_says_so() -> None:
+    safety = {"ignore_retained_drive": False, "stop_on_shutdown": False}
+    serial = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}, "safety": safety}
+    config = parse({"robot": {"id": "x"}, "services": {"serial_mcu_bridge": serial}}, folder=Path(), env={})
+    assert [warning.split(": ")[0].rsplit(".", 1)[-1] for warning in config.warnings] == list(safety)
