@@ -1,0 +1,65 @@
+"""The `net` fixture: every test of the shared suite runs once per kind of transport.
+
+To plug a kind in: write a `Net` (tests/transports/net.py), and add its factory to `NETS`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.transports.net import Net
+
+
+def _memory(_folder: Path) -> Net:
+    from tests.transports.memory_net import MemoryNet
+
+    return MemoryNet()
+
+
+def _mqtt311(folder: Path) -> Net:
+    from tests.transports.mqtt_net import MqttNet
+
+    return MqttNet(folder, "3.1.1")
+
+
+def _mqtt5(folder: Path) -> Net:
+    from tests.transports.mqtt_net import MqttNet
+
+    return MqttNet(folder, "5")
+
+
+def _zenoh(folder: Path) -> Net:
+    from tests.transports.zenoh_net import ZenohNet
+
+    return ZenohNet(folder)
+
+
+NETS: dict[str, Callable[[Path], Net]] = {"memory": _memory, "mqtt311": _mqtt311, "mqtt5": _mqtt5, "zenoh": _zenoh}
+_numbers = itertools.count(1)
+
+
+@pytest.fixture(scope="module", params=list(NETS))
+def fabric(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
+    """One per module and kind; its broker or hub is started."""
+    net = NETS[request.param](tmp_path_factory.mktemp("net"))
+    net.start_fabric()
+    yield net
+    net.stop()
+
+
+@pytest.fixture
+def net(fabric: Net) -> Iterator[Net]:
+    """The fabric, without anybody else's clients."""
+    yield fabric
+    fabric.heal()
+    fabric.close_clients()
+
+
+@pytest.fixture
+def base() -> str:
+    """A topic prefix no other test uses."""
+    return f"pebble/test/n{next(_numbers)}"

@@ -1,0 +1,53 @@
+"""A real mosquitto on a free port, for the shared suite."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pebble.transports import MqttSettings
+from tests.support import Broker
+from tests.transports.net import Net
+
+
+class MqttNet(Net):
+    kind = "mqtt"
+
+    def __init__(self, folder: Path, protocol: str) -> None:
+        super().__init__()
+        self._protocol = protocol
+        self._broker = Broker(folder, persistence=True)
+
+    def settings(self, **changes: Any) -> Any:
+        settings = {"host": "127.0.0.1", "port": self._broker.port, "protocol": self._protocol, **changes}
+        return MqttSettings(**settings)
+
+    def echoless_settings(self) -> Any:
+        return self.settings(as_published=True)
+
+    def start_fabric(self) -> None:
+        if not self._broker.running:
+            self._broker.start()
+
+    def stop_fabric(self, *, forget: bool = False) -> None:
+        if self._broker.running:
+            self._broker.save()
+            self._broker.kill()
+        if forget:
+            self._broker.forget()
+
+    def freeze_fabric(self) -> None:
+        self._broker.freeze()
+
+    def thaw_fabric(self) -> None:
+        self._broker.thaw()
+
+    def heal(self) -> None:
+        if self._broker.running:
+            self._broker.thaw()
+        else:
+            self._broker.start()
+
+    def stop(self) -> None:
+        self.close_clients()
+        self._broker.kill()

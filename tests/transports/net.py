@@ -1,0 +1,161 @@
+"""A fabric and its clients, as the shared transport suite sees them: one `Net` per kind of transport.
+
+A `Net` owns what the clients meet at (a broker, a hub, a Python object) and every client a test makes. The fabric
+lives as long as a module's tests of one kind; `close_clients` ends what one test made. Tests keep apart by topic.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import pickle
+import subprocess
+import sys
+from abc import ABC, abstractmethod
+from typing import Any, Protocol
+
+from pebble.transports import Message, QoS, State, Transport, create
+from tests.support import ROOT, die_with_parent
+
+
+class Peer(Protocol):
+    """A client that can die: in a process of its own where the fabric is real."""
+
+    def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool: ...
+
+    def kill(self) -> None:
+        """SIGKILL, and wait until the process is gone."""
+
+    def close(self) -> None:
+        """A polite close, then the end of the process."""
+
+
+class Net(ABC):
+    """What the suite needs from a kind of transport. A subclass supplies `kind`, `settings` and the fabric."""
+
+    #: What `pebble.transports.create` calls it.
+    kind: str
+
+    def __init__(self) -> None:
+        self._clients: list[Transport] = []
+        self._peers: list[Peer] = []
+
+    # -- to supply
+
+    @abstractmethod
+    def settings(self, **changes: Any) -> Any:
+        """Settings of a client, changed by keyword (the settings class's field names)."""
+
+    @abstractmethod
+    def start_fabric(self) -> None:
+        """Start the broker or hub (again): same address, what it had saved is there again."""
+
+    @abstractmethod
+    def stop_fabric(self, *, forget: bool = False) -> None:
+        """SIGKILL the broker or hub, after what it saves has surely been saved; `forget` then wipes what it saved."""
+
+    @abstractmethod
+    def freeze_fabric(self) -> None:
+        """It stops answering without closing a connection (SIGSTOP)."""
+
+    @abstractmethod
+    def thaw_fabric(self) -> None: ...
+
+    def echoless_settings(self) -> Any:
+        """Settings of a client whose `echo=False` is exact (T16)."""
+        return self.settings()
+
+    @abstractmethod
+    def heal(self) -> None:
+        """After a test that failed half-way: the fabric runs again. Does nothing if it does."""
+
+    def portable_settings(self) -> Any:
+        """Settings a program of its own can use; they must pickle."""
+        return self.settings()
+
+    # -- what tests call
+
+    def client(self, name: str, *, will: Message | None = None, opened: bool = True, **changes: Any) -> Transport:
+        """A client in this process; `opened` waits for the connection and fails the test without one."""
+        return self._client(name, self.settings(**changes), will, opened)
+
+    def echoless_client(self, name: str) -> Transport:
+        return self._client(name, self.echoless_settings(), None, True)
+
+    def peer(self, name: str, *, will: Message | None = None) -> Peer:
+        """A connected client in its own process."""
+        peer = ProcessPeer(self.kind, name, self.portable_settings(), will)
+        self._peers.append(peer)
+        return peer
+
+    def restart_fabric(self, *, forget: bool = False) -> None:
+        self.stop_fabric(forget=forget)
+        self.start_fabric()
+
+    def close_clients(self) -> None:
+        """End every client and peer made so far."""
+        for peer in self._peers:
+            peer.kill()
+        self._peers.clear()
+        for client in self._clients:
+            client.close()
+        self._clients.clear()
+
+    def stop(self) -> None:
+        """End everything, the fabric included."""
+        self.close_clients()
+        self.stop_fabric()
+
+    def _client(self, name: str, settings: Any, will: Message | None, opened: bool) -> Transport:
+        client = create(self.kind, name, settings, will=will)
+        self._clients.append(client)
+        if opened:
+            client.open(10)
+            assert client.state is State.CONNECTED, client.problem
+        return client
+
+
+class ProcessPeer:
+    """Runs tests/transports/peer.py and talks to it in lines of JSON."""
+
+    def __init__(self, kind: str, name: str, settings: Any, will: Message | None) -> None:
+        recipe = base64.b64encode(pickle.dumps((kind, name, settings, will))).decode()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.transports.peer", recipe],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=die_with_parent,
+        )
+        assert self._answer() is True, "the peer did not connect"
+
+    def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
+        return bool(self._ask({"topic": topic, "payload": payload.hex(), "qos": int(qos), "retain": retain}))
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(10)
+        self._release()
+
+    def close(self) -> None:
+        self._ask({"close": True})
+        self._process.wait(10)
+        self._release()
+
+    def _ask(self, request: dict[str, Any]) -> Any:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        assert line, f"the peer died with exit code {self._process.wait(10)}"
+        return json.loads(line)
+
+    def _release(self) -> None:
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            pipe.close()

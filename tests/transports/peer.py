@@ -1,0 +1,33 @@
+"""The program behind `ProcessPeer`: one client that does what lines of JSON on stdin tell it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import pickle
+import sys
+
+from pebble.transports import QoS, State, create
+
+
+def main(recipe: str) -> None:
+    kind, name, settings, will = pickle.loads(base64.b64decode(recipe))
+    client = create(kind, name, settings, will=will).open(10)
+    say(client.state is State.CONNECTED)
+    for line in sys.stdin:
+        request = json.loads(line)
+        if "close" in request:
+            client.close()
+            say(True)
+            return
+        payload = bytes.fromhex(request["payload"])
+        say(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
+
+
+def say(answer: bool) -> None:
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,556 @@
+"""What only the MQTT transport has: bridge mode, TLS, logins, silent links, full sockets, brokers that lack things."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as paho
+import pytest
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pebble.errors import TransportError
+from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, create
+from pebble.transports.mqtt_connection import UNACKED_LIMIT
+from tests.link import Link
+from tests.support import ROOT, AmqttBroker, Broker, free_port, until
+from tests.transports.heard import Heard
+
+DELIVERED = QoS.DELIVERED
+CERTS = ROOT / "tests" / "data" / "tls"
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("broker"))
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture(scope="module")
+def amqtt() -> Iterator[AmqttBroker]:
+    broker = AmqttBroker()
+    yield broker
+    broker.stop()
+
+
+class Clients:
+    """Makes clients, and closes them."""
+
+    def __init__(self) -> None:
+        self._made: list[Transport] = []
+
+    def __call__(
+        self, port: int, name: str = "", *, opened: bool = True, will: Message | None = None, **changes: Any
+    ) -> Transport:
+        settings = MqttSettings(**{"host": "127.0.0.1", "port": port, **changes})
+        client = create("mqtt", name or f"client{len(self._made)}", settings, will=will)
+        self._made.append(client)
+        if opened:
+            client.open(10)
+            assert client.state is State.CONNECTED, client.problem
+        return client
+
+    def close(self) -> None:
+        for client in self._made:
+            client.close()
+
+
+@pytest.fixture
+def clients() -> Iterator[Clients]:
+    clients = Clients()
+    yield clients
+    clients.close()
+
+
+@pytest.fixture
+def link(broker: Broker) -> Iterator[Link]:
+    with Link(broker.port) as link:
+        yield link
+
+
+@pytest.fixture
+def topic(request: pytest.FixtureRequest) -> str:
+    return "mqtt/" + request.node.name.replace("[", "/").rstrip("]")
+
+
+both_protocols = pytest.mark.parametrize("protocol", ["3.1.1", "5"])
+
+
+def reconnected(client: Transport, times: int = 2) -> bool:
+    return until(lambda: client.counters["connected"] >= times and client.state is State.CONNECTED)
+
+
+# -- as published
+
+
+@both_protocols
+def test_as_published_shows_what_was_to_be_kept(broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
+    bridge, other, heard = (
+        clients(broker.port, "bridge", as_published=True, protocol=protocol),
+        clients(broker.port),
+        Heard(),
+    )
+    assert bridge.as_published
+    assert bridge.exact_echo
+    bridge.subscribe(topic, heard, echo=False)
+    other.publish(topic, b"fleeting", qos=DELIVERED)
+    other.publish(topic, b"kept", qos=DELIVERED, retain=True)
+    assert heard.until(b"fleeting", b"kept")
+    assert [(message.retain, message.keep) for message in heard.messages] == [(False, False), (True, True)]
+
+
+@both_protocols
+def test_as_published_drops_own_kept_copies_but_not_other_peoples(
+    broker: Broker, clients: Clients, topic: str, protocol: str
+) -> None:
+    bridge, other, heard = (
+        clients(broker.port, "bridge", as_published=True, protocol=protocol),
+        clients(broker.port),
+        Heard(),
+    )
+    other.publish(f"{topic}/theirs", b"theirs", qos=DELIVERED, retain=True)
+    bridge.publish(f"{topic}/flag", b"true", qos=DELIVERED, retain=True)
+    assert until(lambda: bridge.counters["sent"] == 1)
+    bridge.subscribe(f"{topic}/#", heard, echo=False)
+    assert heard.until(b"theirs")
+    for value in (b"false", b"true", b"false"):  # "true" is what we said ourselves, but not what was said last
+        other.publish(f"{topic}/flag", value, qos=DELIVERED, retain=True)
+    assert heard.until(b"theirs", b"false", b"true", b"false")
+
+
+@both_protocols
+def test_as_published_gives_kept_copies_once_to_each_subscription(
+    broker: Broker, clients: Clients, topic: str, protocol: str
+) -> None:
+    bridge, other = clients(broker.port, "bridge", as_published=True, protocol=protocol), clients(broker.port)
+    first, second = Heard(), Heard()
+    other.publish(f"{topic}/a", b"A", qos=DELIVERED, retain=True)
+    bridge.subscribe(f"{topic}/#", first, echo=False)
+    assert first.until(b"A")
+    bridge.subscribe(f"{topic}/a", second, echo=False)
+    assert second.until(b"A")
+    for _ in range(2):  # equal, but not repeats
+        other.publish(f"{topic}/a", b"A", qos=DELIVERED, retain=True)
+    other.publish(f"{topic}/a", b"B", qos=DELIVERED, retain=True)
+    assert first.until(b"A", b"A", b"A", b"B")
+    assert second.until(b"A", b"A", b"A", b"B")
+
+
+def test_as_published_refuses_to_promise_an_echo(broker: Broker, clients: Clients, topic: str) -> None:
+    with pytest.raises(TransportError, match="echo=False"):
+        clients(broker.port, as_published=True).subscribe(topic, Heard())
+
+
+def test_a_broker_without_bridge_mode_gets_a_plain_connection(
+    amqtt: AmqttBroker, clients: Clients, topic: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    bridge, heard = clients(amqtt.port, "bridge", as_published=True), Heard()
+    assert not bridge.as_published
+    assert not bridge.exact_echo
+    assert "no bridge mode" in caplog.text
+    bridge.subscribe(topic, heard, echo=False)
+    clients(amqtt.port, "other").publish(topic, b"x", qos=DELIVERED)
+    assert heard.until(b"x")
+
+
+def test_a_broker_that_restarts_is_not_taken_for_one_without_bridge_mode(broker: Broker, clients: Clients) -> None:
+    with Link(broker.port) as link:
+        bridge = clients(link.port, "bridge", as_published=True)
+        link.cut()
+        assert until(lambda: bridge.state is State.CONNECTING)
+        link.mend()
+        assert reconnected(bridge)
+        assert bridge.as_published
+        assert bridge.exact_echo
+
+
+def test_a_broker_without_mqtt_5_is_a_problem_in_words(amqtt: AmqttBroker, clients: Clients) -> None:
+    client = clients(amqtt.port, protocol="5", opened=False)
+    client.open(0.2)
+    assert until(lambda: f"broker 127.0.0.1:{amqtt.port} refused us: unsupported protocol version" in client.problem)
+
+
+def test_mixed_echo_on_mqtt_5_is_said_to_be_inexact(broker: Broker, clients: Clients, topic: str) -> None:
+    client, quiet, loud = clients(broker.port, protocol="5"), Heard(), Heard()
+    assert client.exact_echo
+    client.subscribe(f"{topic}/a", quiet, echo=False)
+    client.subscribe(f"{topic}/b", loud)
+    client.publish(f"{topic}/a", b"a", qos=DELIVERED)
+    client.publish(f"{topic}/b", b"b", qos=DELIVERED)
+    assert loud.until(b"b")
+    assert quiet.payloads == []
+    assert client.exact_echo
+    client.subscribe(f"{topic}/#", loud)
+    assert not client.exact_echo
+
+
+def test_urgent_messages_expire_on_mqtt_5(broker: Broker, clients: Clients, topic: str) -> None:
+    """A command that waits in the broker for a slow robot is stale after a while; a flag to be kept never is."""
+    expiries = []
+    listener = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+    listener.on_connect = lambda client, *_: client.subscribe(f"{topic}/#", 1)
+    listener.on_message = lambda _client, _data, raw: expiries.append(
+        getattr(raw.properties, "MessageExpiryInterval", None)
+    )
+    subscribed = threading.Event()
+    listener.on_subscribe = lambda *_: subscribed.set()
+    listener.connect("127.0.0.1", broker.port)
+    listener.loop_start()
+    try:
+        assert subscribed.wait(10)
+        client = clients(broker.port, protocol="5", silence_s=2.5)
+        client.publish(topic, b"command", qos=DELIVERED, urgent=True)
+        client.publish(f"{topic}/flag", b"true", qos=DELIVERED, retain=True, urgent=True)
+        client.publish(topic, b"event", qos=DELIVERED)
+        assert until(lambda: len(expiries) == 3)
+        assert expiries == [3, None, None]
+    finally:
+        listener.disconnect()
+        listener.loop_stop()
+
+
+def test_a_protocol_that_does_not_exist_is_refused(broker: Broker, clients: Clients) -> None:
+    with pytest.raises(TransportError, match="4"):
+        clients(broker.port, protocol="4")
+
+
+# -- T19: links that go silent
+
+
+@both_protocols
+def test_what_was_typed_into_a_silent_link_never_arrives(
+    broker: Broker, clients: Clients, link: Link, topic: str, protocol: str
+) -> None:
+    operator, robot, heard = (
+        clients(link.port, "operator", protocol=protocol, silence_s=0.7),
+        clients(broker.port),
+        Heard(),
+    )
+    robot.subscribe(topic, heard)
+    operator.publish(topic, b"before", qos=DELIVERED)
+    assert heard.until(b"before")
+    link.hole()
+    for _ in range(20):
+        operator.publish(topic, b"into the hole", qos=DELIVERED)
+        operator.publish(f"{topic}/latest", b"into the hole")
+    assert until(lambda: operator.state is State.CONNECTING, 5)
+    assert "has not answered" in operator.problem
+    assert operator.publish(topic, b"without a connection", qos=DELIVERED) is False
+    link.resume()
+    assert reconnected(operator)
+    assert operator.publish(topic, b"after", qos=DELIVERED)
+    assert heard.until(b"before", b"after")
+    assert operator.counters["silences"] == 1
+
+
+@both_protocols
+def test_what_a_silent_link_held_back_for_us_never_arrives(
+    broker: Broker, clients: Clients, link: Link, topic: str, protocol: str
+) -> None:
+    robot, operator, heard = (
+        clients(link.port, "robot", protocol=protocol, silence_s=0.7),
+        clients(broker.port),
+        Heard(),
+    )
+    robot.subscribe(topic, heard)
+    link.hole()
+    for _ in range(20):
+        operator.publish(topic, b"into the hole", qos=DELIVERED)
+    assert until(lambda: robot.state is State.CONNECTING, 5)
+    link.resume()
+    assert reconnected(robot)
+    operator.publish(topic, b"after", qos=DELIVERED)
+    assert heard.until(b"after")
+
+
+def test_what_a_frozen_broker_found_when_it_woke_up_never_arrives(tmp_path: Path, clients: Clients, topic: str) -> None:
+    broker = Broker(tmp_path)
+    robot, heard = clients(broker.port, "robot", silence_s=0.7, reconnect_max_s=0.1), Heard()
+    robot.subscribe(topic, heard)
+    operator = paho.Client(CallbackAPIVersion.VERSION2)
+    operator.connect("127.0.0.1", broker.port)
+    operator.loop_start()
+    assert until(operator.is_connected)
+    broker.freeze()
+    for _ in range(20_000):
+        operator.publish(topic, b"typed while it slept")
+    assert until(lambda: robot.state is State.CONNECTING, 5)
+    broker.thaw()
+    assert reconnected(robot)
+    operator.publish(topic, b"after", qos=1).wait_for_publish(10)
+    assert heard.until(b"after")
+    operator.disconnect()
+    operator.loop_stop()
+    broker.stop()
+
+
+def test_a_short_hole_is_no_silence(broker: Broker, clients: Clients, link: Link, topic: str) -> None:
+    client, heard = clients(link.port, silence_s=30), Heard()
+    client.subscribe(topic, heard)
+    link.hole()
+    assert client.publish(topic, b"held", qos=DELIVERED)
+    link.resume()
+    assert heard.until(b"held")
+    assert client.counters["connected"] == 1
+
+
+def test_a_slow_link_is_not_a_silent_one(broker: Broker, clients: Clients, topic: str) -> None:
+    """Four measured round trips are always granted."""
+    with Link(broker.port, delay_s=0.15) as far:
+        client, heard = clients(far.port, silence_s=0.2), Heard()
+        client.subscribe(topic, heard)
+        for number in range(6):
+            assert client.publish(topic, b"%d" % number, qos=DELIVERED)
+            assert until(lambda: len(heard.messages) == number + 1)  # noqa: B023
+        assert client.counters["connected"] == 1
+
+
+def test_a_long_message_on_a_slow_link_is_not_a_silence(broker: Broker, clients: Clients, topic: str) -> None:
+    with Link(broker.port, delay_s=0.02) as slow:
+        client, heard = clients(slow.port, silence_s=0.8), Heard()
+        client.subscribe(topic, heard)
+        payload = bytes(3_000_000)  # some 50 pieces of 64 KB, 20 ms each, in either direction
+        assert client.publish(topic, payload, qos=DELIVERED)
+        assert heard.until(payload, timeout=30)
+        assert client.counters["silences"] == 0
+
+
+@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
+def test_a_kept_message_lost_in_a_hole_is_sent_again(
+    broker: Broker, clients: Clients, link: Link, topic: str, qos: QoS
+) -> None:
+    client, late, heard = clients(link.port, "client", silence_s=0.7), clients(broker.port), Heard()
+    client.publish(topic, b"old", qos=qos, retain=True)
+    client.publish(f"{topic}/gone", b"old", qos=qos, retain=True)
+    late.subscribe(f"{topic}/#", heard)
+    assert heard.until(b"old", b"old")
+    link.hole()
+    assert client.publish(topic, b"new", qos=qos, retain=True)
+    assert client.publish(f"{topic}/gone", b"", qos=qos, retain=True)
+    assert until(lambda: client.state is State.CONNECTING, 5)
+    link.resume()
+    assert heard.until(b"old", b"old", b"new", b""), heard.messages
+
+
+def test_a_hole_at_the_start_is_a_problem_in_words(clients: Clients, link: Link, topic: str) -> None:
+    link.hole()
+    client = clients(link.port, opened=False)
+    client.open(0.1)
+    assert client.state is State.CONNECTING
+    client.subscribe(topic, Heard())
+    assert client.publish(topic, b"x", qos=DELIVERED) is False
+    assert until(lambda: "does not speak MQTT" in client.problem)
+
+
+def test_close_does_not_wait_for_a_silent_broker(clients: Clients, link: Link) -> None:
+    link.hole()
+    client = clients(link.port, opened=False)
+    client.open(0.1)
+    before = {thread for thread in threading.enumerate() if thread.name.startswith("pebble-mqtt")}
+    assert before
+    began = time.monotonic()
+    client.close()
+    assert time.monotonic() - began < 1.0
+    assert until(lambda: not before & set(threading.enumerate()))
+
+
+def test_two_clients_with_one_name_do_not_fight_at_full_speed(broker: Broker, clients: Clients) -> None:
+    """Each throws the other out; without a pause that would be thousands of times a second."""
+    first = clients(broker.port, "twin", reconnect_max_s=0.5)
+    clients(broker.port, "twin", opened=False, reconnect_max_s=0.5).open(0.0)  # it may be thrown out again at once
+    assert until(lambda: first.counters["connected"] >= 3)
+    began, before = time.monotonic(), first.counters["connected"]
+    assert until(lambda: first.counters["connected"] >= before + 3)
+    assert time.monotonic() - began > 0.2
+
+
+# -- full sockets
+
+
+def test_a_stream_into_a_full_socket_is_bounded_and_the_newest_wins(
+    broker: Broker, clients: Clients, link: Link, topic: str
+) -> None:
+    client, receiver, heard = clients(link.port, "client", silence_s=60, keepalive_s=60), clients(broker.port), Heard()
+    receiver.subscribe(topic, heard, limit=100_000)
+    link.hole()
+    filler = bytes(20_000)
+    for number in range(1000):  # 20 MB: more than the kernel and the link hold
+        began = time.monotonic()
+        assert client.publish(topic, b"%d " % number + filler)
+        assert time.monotonic() - began < 1.0
+    assert client.counters["dropped"] > 500
+    link.resume()
+    assert until(lambda: heard.payloads and heard.payloads[-1].startswith(b"999 "), 30)
+    numbers = [int(payload.split()[0]) for payload in heard.payloads if payload]
+    assert numbers == sorted(numbers)
+    assert len(numbers) == 1000 - client.counters["dropped"]
+
+
+def test_unacknowledged_messages_are_bounded(broker: Broker, clients: Clients, link: Link, topic: str) -> None:
+    client, receiver, heard = clients(link.port, "client", silence_s=60, keepalive_s=60), clients(broker.port), Heard()
+    receiver.subscribe(f"{topic}/#", heard, limit=100_000)
+    link.hole()
+    accepted = [client.publish(topic, b"%d" % number, qos=DELIVERED) for number in range(UNACKED_LIMIT + 100)]
+    assert accepted == [True] * UNACKED_LIMIT + [False] * 100
+    assert client.publish(f"{topic}/kept", b"parked", qos=DELIVERED, retain=True)
+    link.resume()
+    assert until(lambda: len(heard.messages) == UNACKED_LIMIT + 1, 30)
+    assert heard.payloads == [*(b"%d" % number for number in range(UNACKED_LIMIT)), b"parked"]
+
+
+# -- brokers that lack things
+
+
+def test_living_clients_bring_state_back_to_a_broker_without_persistence(tmp_path: Path, clients: Clients) -> None:
+    broker = Broker(tmp_path)
+    try:
+        keeper, heard = clients(broker.port, "keeper"), Heard()
+        keeper.publish("state", b"value", qos=DELIVERED, retain=True)
+        broker.kill()
+        broker.start()
+        assert reconnected(keeper)
+        clients(broker.port, "late").subscribe("state", heard)
+        assert heard.until(b"value", timeout=2)
+    finally:
+        broker.stop()
+
+
+def test_nothing_is_announced_again_to_a_broker_that_still_has_it(
+    broker: Broker, clients: Clients, link: Link, topic: str
+) -> None:
+    keeper, watcher, heard, echo = clients(link.port, "keeper"), clients(broker.port), Heard(), Heard()
+    watcher.subscribe(f"{topic}/#", heard)
+    for number in range(30):
+        keeper.publish(f"{topic}/{number}", b"%d" % number, qos=DELIVERED, retain=True)
+    assert until(lambda: len(heard.messages) == 30)
+    keeper.subscribe(f"{topic}/echo", echo)  # its answer comes after all acknowledgements
+    link.drop()
+    assert reconnected(keeper)
+    keeper.publish(topic, b"last", qos=DELIVERED)
+    assert until(lambda: heard.payloads[-1] == b"last")
+    assert len([message for message in heard.messages if message.topic != topic]) == 30
+
+
+def test_no_broker_is_a_problem_in_words(clients: Clients, caplog: pytest.LogCaptureFixture) -> None:
+    port = free_port()
+    client = clients(port, opened=False)
+    client.open(0.3)
+    assert client.state is State.CONNECTING
+    assert f"broker 127.0.0.1:{port} cannot be reached" in client.problem
+    assert len([record for record in caplog.records if record.levelno == logging.WARNING]) == 1
+
+
+# -- logins and TLS
+
+
+@pytest.fixture(scope="module")
+def strict_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Wants a user name and password."""
+    folder = tmp_path_factory.mktemp("strict")
+    passwords = folder / "passwords"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "goob", "s3cret-word"], check=True)
+    broker = Broker(folder, "allow_anonymous false", f"password_file {passwords}")
+    yield broker
+    broker.stop()
+
+
+@both_protocols
+def test_the_right_password_opens(strict_broker: Broker, clients: Clients, protocol: str) -> None:
+    clients(strict_broker.port, username="goob", password="s3cret-word", protocol=protocol)
+
+
+@both_protocols
+def test_a_wrong_password_is_a_problem_in_words_without_the_password(
+    strict_broker: Broker, clients: Clients, protocol: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    client = clients(strict_broker.port, username="goob", password="s3cret-wrong", protocol=protocol, opened=False)
+    client.open(0.3)
+    assert until(lambda: f"broker 127.0.0.1:{strict_broker.port} refused us" in client.problem)
+    assert "bad user name or password" in client.problem
+    assert "s3cret" not in client.problem + caplog.text + repr(client.settings)  # type: ignore[attr-defined]
+    assert client.state is State.CONNECTING
+
+
+def test_no_password_is_refused(strict_broker: Broker, clients: Clients) -> None:
+    client = clients(strict_broker.port, opened=False)
+    client.open(0.3)
+    assert until(lambda: "refused us" in client.problem)
+
+
+@pytest.fixture(scope="module")
+def tls_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Has a certificate for localhost (and not for 127.0.0.1), and wants one of its clients."""
+    files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
+    broker = Broker(tmp_path_factory.mktemp("tls"), *files, "require_certificate true")
+    yield broker
+    broker.stop()
+
+
+def tls(**changes: Any) -> TlsSettings:
+    files = {"ca_cert": "ca.crt", "client_cert": "client.crt", "client_key": "client.key", **changes}
+    return TlsSettings(**{name: CERTS / value if isinstance(value, str) else value for name, value in files.items()})
+
+
+@both_protocols
+def test_tls_with_client_certificates(tls_broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
+    client, heard = clients(tls_broker.port, host="localhost", tls=tls(), protocol=protocol), Heard()
+    client.subscribe(topic, heard)
+    payload = bytes(range(256)) * 4000
+    client.publish(topic, b"small", qos=DELIVERED)
+    client.publish(topic, payload, qos=DELIVERED)
+    assert heard.until(b"small", payload)
+
+
+def test_tls_checks_the_host_name_unless_told_not_to(tls_broker: Broker, clients: Clients) -> None:
+    client = clients(tls_broker.port, tls=tls(), opened=False)
+    client.open(0.3)
+    assert until(lambda: "certificate verify failed" in client.problem)
+    clients(tls_broker.port, "careless", tls=tls(insecure=True))
+
+
+def test_tls_checks_the_authority_always(tls_broker: Broker, clients: Clients) -> None:
+    settings = tls(ca_cert="other-ca.crt", insecure=True)
+    client = clients(tls_broker.port, host="localhost", tls=settings, opened=False)
+    client.open(0.3)
+    assert until(lambda: "certificate verify failed" in client.problem)
+
+
+def test_tls_without_the_certificate_a_broker_wants_is_a_problem(tls_broker: Broker, clients: Clients) -> None:
+    settings = tls(client_cert=None, client_key=None)
+    client = clients(tls_broker.port, host="localhost", tls=settings, opened=False)
+    client.open(0.3)
+    assert until(lambda: client.problem)
+    assert client.state is State.CONNECTING
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"ca_cert": "nowhere.crt"}, "tls.ca_cert: there is no file .*nowhere.crt"),
+        ({"client_cert": "nowhere.crt"}, "tls.client_cert: there is no file .*nowhere.crt"),
+        ({"client_key": "nowhere.key"}, "tls.client_key: there is no file .*nowhere.key"),
+        ({"client_cert": None}, "tls.client_key is set without tls.client_cert"),
+        ({"ca_cert": "make.sh"}, "tls.ca_cert: .*make.sh cannot be used"),
+        ({"client_key": "server.key"}, "tls.client_cert: .*client.crt cannot be used"),
+        ({"ciphers": None, "client_cert": "make.sh"}, "tls.client_cert: .*make.sh cannot be used"),
+    ],
+)
+def test_tls_mistakes_are_one_clear_error(clients: Clients, wrong: dict[str, Any], words: str) -> None:
+    client = clients(free_port(), tls=tls(**wrong), opened=False)
+    with pytest.raises(TransportError, match=words):
+        client.open(1)
+    assert client.state is State.CLOSED
+    client.close()
+
+
+def test_tls_ciphers_that_do_not_exist_are_an_error(clients: Clients) -> None:
+    settings = TlsSettings(ca_cert=CERTS / "ca.crt", ciphers="NO-SUCH-CIPHER")
+    with pytest.raises(TransportError, match="NO-SUCH-CIPHER cannot be used"):
+        clients(free_port(), tls=settings, opened=False).open(1)

@@ -1,0 +1,79 @@
+"""Topics and filters, compared with paho's matcher (T1)."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from paho.mqtt.client import topic_matches_sub
+
+from pebble.errors import TransportError
+from pebble.transports.topics import check_filter, check_topic, is_pattern, matches
+
+LEVELS = ["a", "b", "aa", "", "$", "$SYS", "é", "a b", "*"]
+
+
+def random_filter(chosen: random.Random) -> str:
+    levels = [chosen.choice([*LEVELS, "+", "+"]) for _ in range(chosen.randint(1, 5))]
+    return "/".join([*levels, "#"] if chosen.random() < 0.3 else levels)
+
+
+def random_topic(chosen: random.Random) -> str:
+    return "/".join(chosen.choice(LEVELS) for _ in range(chosen.randint(1, 5)))
+
+
+def test_matches_agrees_with_paho_on_random_pairs() -> None:
+    chosen, hits = random.Random(20), 0
+    for _ in range(50_000):
+        filter_, topic = random_filter(chosen), random_topic(chosen)
+        wanted = topic_matches_sub(filter_, topic)
+        assert matches(filter_, topic) is wanted, (filter_, topic)
+        hits += wanted
+    assert 500 < hits < 49_500  # the pairs are neither all misses nor all hits
+
+
+@pytest.mark.parametrize(
+    ("filter_", "topic", "wanted"),
+    [
+        ("a/#", "a", True),
+        ("a/#", "a/", True),
+        ("a/#", "ab", False),
+        ("#", "a/b", True),
+        ("#", "$SYS/a", False),
+        ("+/a", "$SYS/a", False),
+        ("$SYS/#", "$SYS/a", True),
+        ("$SYS/+", "$SYS/a", True),
+        ("+", "a/b", False),
+        ("+/+", "/a", True),
+        ("/+", "/a", True),
+        ("+", "/a", False),
+        ("a/+", "a", False),
+        ("a/+/b", "a//b", True),
+        ("a", "A", False),
+    ],
+)
+def test_matches_follows_the_standards_examples(filter_: str, topic: str, wanted: bool) -> None:
+    assert matches(filter_, topic) is wanted
+
+
+def test_errors_name_what_is_wrong() -> None:
+    with pytest.raises(TransportError, match="wildcard"):
+        check_topic("a/+/b")
+    with pytest.raises(TransportError, match="last level"):
+        check_filter("a/#/b")
+    with pytest.raises(TransportError, match="1024"):
+        check_topic("x" * 1025)
+    with pytest.raises(TransportError, match="200 levels"):
+        check_topic("/" * 200)
+
+
+def test_limits_are_inclusive() -> None:
+    assert check_topic("x" * 1024)
+    assert check_topic("/" * 199)
+    assert check_filter("/" * 199)
+
+
+def test_is_pattern() -> None:
+    assert is_pattern("a/+")
+    assert is_pattern("#")
+    assert not is_pattern("a/b")

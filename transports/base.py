@@ -1,0 +1,383 @@
+"""The one pub/sub interface, and everything about it that does not depend on how bytes move.
+
+docs/transports.md numbers the promises (T1 to T19) that every backend keeps; the tests carry the same numbers.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+from types import TracebackType
+from typing import Self
+
+from pebble.errors import TransportError
+from pebble.transports.counters import Counters
+from pebble.transports.topics import check_filter, check_topic, matches
+
+log = logging.getLogger(__name__)
+
+QUEUE_LIMIT = 1000  # messages waiting for one slow handler before the oldest is dropped
+_OWN_LIMIT = 10_000  # kept topics a transport can say again; strangers may invent as many as they like
+_SETTLED_LIMIT = 65_536  # topics one subscription remembers having delivered, per connection
+_HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
+_QUIET_S = 5.0  # between two log lines about the same overflowing subscription
+
+
+class QoS(IntEnum):
+    """The two delivery qualities (T3); the numbers are MQTT's."""
+
+    LATEST = 0  # freshness first, may be dropped
+    DELIVERED = 1  # arrives at least once while connected
+
+
+class State(Enum):
+    CLOSED = "closed"
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """What travels. ``retain`` and ``keep`` differ: a *kept copy* is old news, a message *to be kept* is fresh.
+
+    Published: ``retain`` asks for a kept copy. Received: ``retain`` marks the kept copy itself; on a connection opened
+    ``as_published`` it means "kept, or published to be kept". ``keep`` tells whether the publisher of a live message
+    asked for a kept copy; None where the broker hides it (T5, T7).
+    """
+
+    topic: str
+    payload: bytes
+    qos: QoS = QoS.LATEST
+    retain: bool = False
+    keep: bool | None = None
+
+
+Handler = Callable[[Message], None]
+Watcher = Callable[[State], None]
+
+
+class Subscription:
+    """A filter, its handler and the bounded queue between them. Made by :meth:`Transport.subscribe`."""
+
+    def __init__(
+        self, transport: Transport, filter_: str, handler: Handler, *, qos: QoS, echo: bool, direct: bool, limit: int
+    ) -> None:
+        self.filter, self.qos, self.echo, self.direct = filter_, qos, echo, direct
+        self.dropped = 0  # messages lost because the handler was slower than its queue is long
+        self._transport, self._handler, self._limit = transport, handler, limit
+        self._lock = threading.RLock()
+        self._arrived = threading.Condition(self._lock)
+        self._queue: deque[Message] = deque()
+        self._settled: dict[str, None] = {}
+        self._closed = False
+        self._said_at = float("-inf")
+        self._thread: threading.Thread | None = None
+        if not direct:
+            self._thread = threading.Thread(target=self._run, name=f"pebble-sub {filter_}", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Stop delivery: once this returns no handler call starts any more. Safe from inside the handler."""
+        self._stop()
+        self._transport._forget(self)
+        self._join(_HANDLER_END_S)  # a handler that is running, or just about to, ends before we return if it is quick
+
+    # -- for transports
+
+    def offer(self, message: Message, *, repeat: bool = False) -> None:
+        """Queue ``message``, unless it is a kept copy of something this connection has already delivered (T5, T8).
+
+        As-published connections cannot tell kept from fresh; their backend says when a copy is surely a ``repeat``.
+        """
+        with self._lock:
+            if self._closed:
+                return
+            kept = repeat if self._transport.as_published else message.retain
+            if kept and message.topic in self._settled:
+                self._transport.counters.add("stale")
+                return
+            self._settle(message.topic)
+            if self.direct:
+                self._call(message)
+                return
+            if len(self._queue) >= self._limit:
+                self._overflow(self._queue.popleft())
+            self._queue.append(message)
+            self._arrived.notify()
+
+    def renew(self) -> None:
+        """A new connection began: kept copies are due again."""
+        with self._lock:
+            self._settled.clear()
+
+    def _settle(self, topic: str) -> None:
+        if topic in self._settled:
+            return
+        if len(self._settled) >= _SETTLED_LIMIT:
+            self._settled.pop(next(iter(self._settled)))
+        self._settled[topic] = None
+
+    def _overflow(self, lost: Message) -> None:
+        self.dropped += 1
+        self._transport.counters.add("dropped")
+        now = time.monotonic()
+        if lost.qos is QoS.DELIVERED and now - self._said_at >= _QUIET_S:
+            self._said_at = now
+            log.warning("handler of %s is too slow: %d messages dropped, oldest first", self.filter, self.dropped)
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                while not self._queue and not self._closed:
+                    self._arrived.wait()
+                if self._closed:
+                    return
+                message = self._queue.popleft()
+            self._call(message)
+
+    def _call(self, message: Message) -> None:
+        self._transport.counters.add("delivered")
+        try:
+            self._handler(message)
+        except Exception:  # a handler must not take the receiving thread down (T13)
+            self._transport.counters.add("handler_errors")
+            log.exception("handler of %s failed on a message of %s", self.filter, message.topic)
+
+    def _stop(self) -> None:
+        with self._lock:
+            self._closed = True
+            self._queue.clear()
+            self._arrived.notify_all()
+
+    def _join(self, timeout: float) -> None:
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout)
+
+
+class Transport(ABC):
+    """One client of a fabric of topics. Shared semantics live here; a backend supplies the primitives at the end.
+
+    All methods may be called from any thread, and from inside handlers.
+    """
+
+    #: ``subscribe(echo=False)`` is kept exactly (T16). A backend that cannot promise it sets False when it knows.
+    exact_echo: bool = True
+    #: Received ``retain`` means "kept, or published to be kept"; own publishes never come back (T7).
+    as_published: bool = False
+
+    def __init__(self, client_id: str, *, will: Message | None = None) -> None:
+        if will is not None:
+            check_topic(will.topic)
+        self.client_id, self.will = client_id, will
+        self.counters = Counters()
+        #: One line that says why there is no connection; empty while there is one.
+        self.problem = ""
+        self._state = State.CLOSED
+        self._state_lock = threading.RLock()
+        self._connected = threading.Event()
+        self._watchers: list[Watcher] = []
+        self._subscriptions: list[Subscription] = []
+        self._lock = threading.RLock()  # guards the list of subscriptions
+        self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order on the wire
+        self._own: dict[str, Message] = {}  # our newest message to be kept, by topic; empty payloads included
+        self._parked: dict[str, None] = {}  # topics in _own that the other side has not been told yet, oldest first
+        self._announcing = False  # guarded by _publishing
+
+    # -- what services call
+
+    @property
+    def state(self) -> State:
+        return self._state
+
+    def on_state(self, watcher: Watcher) -> None:
+        """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""
+        self._watchers.append(watcher)
+
+    def open(self, timeout: float = 5.0) -> Self:
+        """Start connecting and wait up to ``timeout`` seconds for success.
+
+        Returns in any case: a robot lives without its broker. Look at ``state`` and ``problem`` to know.
+        Raises TransportError only for settings that can never work.
+        """
+        if self._state is not State.CLOSED:
+            raise TransportError(f"transport {self.client_id} is already open")
+        self._set_state(State.CONNECTING)
+        try:
+            self._open(timeout)
+        except TransportError:
+            self._set_state(State.CLOSED)
+            raise
+        self._connected.wait(timeout)
+        return self
+
+    def close(self) -> None:
+        """Say goodbye (the will is spoken here too, so that others hear one story), and leave nothing behind."""
+        with self._state_lock:
+            if self._state is State.CLOSED:
+                return
+            connected = self._state is State.CONNECTED
+            self._set_state(State.CLOSED)
+        with self._lock:
+            subscriptions, self._subscriptions = self._subscriptions, []
+        for subscription in subscriptions:
+            subscription._stop()
+        self._close(self.will if connected else None)
+        deadline = time.monotonic() + _HANDLER_END_S
+        for subscription in subscriptions:
+            subscription._join(max(0.0, deadline - time.monotonic()))
+
+    def publish(
+        self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False, urgent: bool = False
+    ) -> bool:
+        """Hand over one message; returns whether it was accepted.
+
+        A message that is not kept is refused while there is no connection and never delivered late. A kept one is
+        always accepted: its newest value goes out when the connection is back (T4). ``urgent`` puts commands and
+        flags in front where the backend can. Raises TransportError for a topic that no transport may carry.
+        """
+        check_topic(topic)
+        if not isinstance(payload, bytes):
+            raise TransportError(f"payload of {topic} must be bytes, not {type(payload).__name__}")
+        message = Message(topic, payload, QoS(qos), retain)
+        with self._publishing:
+            if self._state is State.CLOSED:
+                self.counters.add("refused")
+                return False
+            accepted = self._send(message, urgent)
+            if retain:
+                self._remember(message, told=accepted and self._state is State.CONNECTED)
+            self.counters.add("sent" if accepted else "parked" if retain else "refused")
+            return accepted or retain
+
+    def subscribe(
+        self,
+        filter_: str,
+        handler: Handler,
+        *,
+        qos: QoS = QoS.DELIVERED,
+        echo: bool = True,
+        direct: bool = False,
+        limit: int = QUEUE_LIMIT,
+    ) -> Subscription:
+        """Deliver kept copies and live messages that match ``filter_`` to ``handler``, until closed.
+
+        Survives reconnects. ``echo=False`` leaves out what this transport itself publishes (T16). Each subscription
+        has a thread and a queue of ``limit`` messages of its own (T13, T14); ``direct=True`` saves both for a handler
+        that only ever hands the message on: it then runs on the receiving thread and must neither block nor subscribe.
+        Messages published after this returned are received (T3), if there is a connection.
+        """
+        check_filter(filter_)
+        if self.as_published and echo:
+            raise TransportError(f"an as-published connection never echoes: subscribe {filter_} with echo=False")
+        subscription = Subscription(self, filter_, handler, qos=QoS(qos), echo=echo, direct=direct, limit=limit)
+        with self._lock:
+            if self._state is State.CLOSED:
+                subscription._stop()
+                raise TransportError(f"transport {self.client_id} is closed")
+            self._subscriptions.append(subscription)
+        self._declare(subscription)
+        return subscription
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    # -- for backends
+
+    def _matching(self, topic: str) -> list[Subscription]:
+        with self._lock:
+            return [subscription for subscription in self._subscriptions if matches(subscription.filter, topic)]
+
+    def _set_state(self, state: State) -> None:
+        """Tell everybody, once per change. A closed transport stays closed unless it is opened again."""
+        with self._state_lock:
+            if state is self._state or (self._state is State.CLOSED and state is State.CONNECTED):
+                return
+            if state is State.CONNECTED:
+                self.problem = ""
+                self.counters.add("connected")
+            self._state = state
+            if state is State.CONNECTED:
+                self._connected.set()
+            else:
+                self._connected.clear()
+            for watcher in list(self._watchers):
+                try:
+                    watcher(state)
+                except Exception:  # somebody else's code on our thread
+                    log.exception("a state watcher of %s failed", self.client_id)
+
+    def _renew(self) -> None:
+        """Backends call this when a new connection begins, before its first message is offered."""
+        with self._lock:
+            subscriptions = list(self._subscriptions)
+        for subscription in subscriptions:
+            subscription.renew()
+
+    def _remember(self, message: Message, *, told: bool) -> None:
+        if message.topic not in self._own and len(self._own) >= _OWN_LIMIT:
+            self.counters.add("forgotten")
+            return
+        self._own[message.topic] = message
+        self._parked.pop(message.topic, None)
+        if not told:
+            self._parked[message.topic] = None
+        elif not message.payload:
+            del self._own[message.topic]
+
+    def _announce(self, known: Collection[str]) -> None:
+        """Send the kept messages a new connection owes: those changed while away, then those ``known`` lacks (T9)."""
+        with self._publishing:
+            changed = [self._own[topic] for topic in self._parked]
+            missing = [m for topic, m in self._own.items() if topic not in self._parked and topic not in known]
+            self._announcing = True
+            try:
+                for message in changed + missing:
+                    self._remember(message, told=self._send(message, False))
+            finally:
+                self._announcing = False
+
+    def _settle_in(self, known: Collection[str]) -> None:
+        """A new connection has its subscriptions: send the kept messages it owes, and be connected.
+
+        Before that a backend's ``_send`` goes only while ``_announcing``: what is published meanwhile is parked, and
+        sent last.
+        """
+        self._announce(known)
+        self._set_state(State.CONNECTED)
+        self._announce(self._own.keys())
+
+    def _forget(self, subscription: Subscription) -> None:
+        with self._lock:
+            if subscription not in self._subscriptions:
+                return
+            self._subscriptions.remove(subscription)
+        self._undeclare(subscription)
+
+    @abstractmethod
+    def _open(self, timeout: float) -> None:
+        """Start connecting; call ``_set_state(CONNECTED)`` once subscriptions are in place and kept state is sent."""
+
+    @abstractmethod
+    def _close(self, will: Message | None) -> None:
+        """Send ``will`` if given, leave politely, and release every thread, socket and file."""
+
+    @abstractmethod
+    def _send(self, message: Message, urgent: bool) -> bool:
+        """Hand one message over without blocking longer than a bounded time; False if it cannot go now."""
+
+    @abstractmethod
+    def _declare(self, subscription: Subscription) -> None:
+        """Make ``subscription`` (already listed) live; wait, bounded, until it surely is."""
+
+    @abstractmethod
+    def _undeclare(self, subscription: Subscription) -> None:
+        """Stop receiving for ``subscription`` (no longer listed)."""

@@ -1,0 +1,52 @@
+"""Topics and filters as Zenoh key expressions and back: bijective, with MQTT's matching rules (T1, T2).
+
+Zenoh forbids empty chunks and the characters ``* $ ? #`` and treats a chunk that starts with ``@`` as verbatim: no
+wildcard ever matches it. So forbidden characters are percent-escaped, an empty level is written ``%``, a level that
+starts with ``@`` is escaped, and a first level that starts with ``$`` *becomes* verbatim, because MQTT's wildcards
+skip it. Ordinary topics map to themselves.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+
+_FORBIDDEN = re.compile(r"[%*$?#]")  # what Zenoh forbids in a chunk, and the escape character itself
+_ESCAPE = re.compile(r"%([0-9A-F]{2})")
+_EMPTY = "%"  # no escaped level looks like this
+
+
+@lru_cache(maxsize=16384)
+def topic_to_key(topic: str) -> str:
+    """The key of a checked topic (see topics.check_topic)."""
+    return _join([_level(level) for level in topic.split("/")])
+
+
+@lru_cache(maxsize=4096)
+def filter_to_key(filter_: str) -> str:
+    """The key expression of a checked filter (see topics.check_filter)."""
+    wildcards = {"+": "*", "#": "**"}
+    return _join([wildcards[level] if level in wildcards else _level(level) for level in filter_.split("/")])
+
+
+@lru_cache(maxsize=16384)
+def key_to_topic(key: str) -> str:
+    """The topic that ``topic_to_key`` made ``key`` from."""
+    return "/".join("" if chunk == _EMPTY else _unescape(chunk) for chunk in key.removeprefix("@").split("/"))
+
+
+def _join(levels: list[str]) -> str:
+    if levels[0].startswith("%24"):
+        levels[0] = "@" + levels[0]
+    return "/".join(levels)
+
+
+def _level(level: str) -> str:
+    if not level:
+        return _EMPTY
+    escaped = _FORBIDDEN.sub(lambda found: f"%{ord(found.group()):02X}", level)
+    return "%40" + escaped[1:] if escaped.startswith("@") else escaped
+
+
+def _unescape(chunk: str) -> str:
+    return _ESCAPE.sub(lambda found: chr(int(found.group(1), 16)), chunk)

@@ -1,0 +1,214 @@
+"""A fabric inside one process: the reference for what the promises mean, and a fast stand-in for tests.
+
+`MemoryHub` plays the broker. It can be stopped and started, forget what it kept, and let a client crash.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+
+from pebble.transports.base import Message, State, Subscription, Transport
+
+INBOX_LIMIT = 10_000  # messages on their way to one client
+
+
+class MemoryHub:
+    """Where `MemoryTransport`s meet; pass it as their settings. Starts out running."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.kept: dict[str, Message] = {}
+        self.authors: dict[str, MemoryTransport] = {}  # who said the kept message of a topic
+        self.era: int | None = 1  # counts its runs; None while it is stopped
+        self._eras = itertools.count(2)
+        self._clients: list[MemoryTransport] = []  # all that are open, connected or not
+        self._here: list[MemoryTransport] = []  # those that are connected
+
+    def __reduce__(self) -> tuple[type[MemoryHub], tuple[()]]:
+        return MemoryHub, ()  # in another process it is another hub
+
+    def start(self) -> None:
+        with self.lock:
+            self.era = next(self._eras)
+            self._wake_all()
+
+    def stop(self, *, forget: bool = False) -> None:
+        """Every client loses its connection; kept messages stay unless they are to be forgotten."""
+        with self.lock:
+            self.era = None
+            if forget:
+                self.kept.clear()
+                self.authors.clear()
+            self._wake_all()
+
+    def crash(self, client: MemoryTransport) -> None:
+        """``client`` is gone from one moment to the next, and the hub says its will."""
+        with self.lock:
+            self.leave(client)
+            client.vanish()
+            if client.will is not None:
+                self.spread(client.will, client)
+
+    def enter(self, client: MemoryTransport) -> None:
+        with self.lock:
+            self._clients.append(client)
+
+    def attach(self, client: MemoryTransport) -> None:
+        with self.lock:
+            self._here.append(client)
+
+    def detach(self, client: MemoryTransport) -> None:
+        with self.lock:
+            self._here = [other for other in self._here if other is not client]
+
+    def leave(self, client: MemoryTransport) -> None:
+        with self.lock:
+            self.detach(client)
+            self._clients = [other for other in self._clients if other is not client]
+
+    def spread(self, message: Message, author: MemoryTransport) -> None:
+        """Keep ``message`` if it asks for that, and hand it to everybody who is connected."""
+        with self.lock:
+            if message.retain and message.payload:
+                self.kept[message.topic], self.authors[message.topic] = message, author
+            elif message.retain:
+                self.kept.pop(message.topic, None)
+            live = replace(message, retain=False, keep=message.retain)
+            for client in self._here:
+                client.receive(_Delivery(live, author))
+
+    def _wake_all(self) -> None:
+        for client in self._clients:
+            client.wake()
+
+
+@dataclass(frozen=True, slots=True)
+class _Delivery:
+    message: Message
+    author: MemoryTransport
+    only: Subscription | None = None  # kept copies go to the subscription that asked
+
+
+class MemoryTransport(Transport):
+    """One client of a `MemoryHub`, with a receiving thread of its own, as a real one has."""
+
+    def __init__(self, client_id: str, settings: MemoryHub, *, will: Message | None = None) -> None:
+        super().__init__(client_id, will=will)
+        self._hub = settings
+        self._inbox: deque[_Delivery] = deque()
+        self._changed = threading.Condition(settings.lock)
+        self._attached: int | None = None  # the era of the hub we are connected in
+        self._stopping = False
+        self._thread: threading.Thread | None = None
+
+    # -- what the hub calls, with its lock held
+
+    def receive(self, delivery: _Delivery) -> None:
+        if len(self._inbox) >= INBOX_LIMIT:
+            self._inbox.popleft()
+            self.counters.add("dropped")
+        self._inbox.append(delivery)
+        self._changed.notify_all()
+
+    def wake(self) -> None:
+        self._changed.notify_all()
+
+    def vanish(self) -> None:
+        """Die without a word: for the tests of others, not for use."""
+        self._stopping, self._attached = True, None
+        self._inbox.clear()
+        self._changed.notify_all()
+
+    # -- the interface to base
+
+    def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
+        self._stopping = False
+        self.problem = "the hub is away"  # until it is seen
+        self._hub.enter(self)
+        self._thread = threading.Thread(target=self._run, name=f"pebble-memory {self.client_id}", daemon=True)
+        self._thread.start()
+
+    def _close(self, will: Message | None) -> None:
+        with self._hub.lock:
+            if will is not None and self._present:
+                self._hub.spread(will, self)
+            self._hub.leave(self)
+            self.vanish()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(1.0)
+
+    def _send(self, message: Message, urgent: bool) -> bool:  # noqa: ARG002  (nothing to overtake)
+        with self._hub.lock:
+            if not (self._present and (self._state is State.CONNECTED or self._announcing)):
+                return False
+            self._hub.spread(message, self)
+            return True
+
+    def _declare(self, subscription: Subscription) -> None:
+        with self._hub.lock:
+            if self._present:
+                self._ask_for_kept(subscription)
+
+    def _undeclare(self, subscription: Subscription) -> None:
+        """The hub knows no filters: nothing to undo."""
+
+    @property
+    def _present(self) -> bool:
+        return self._attached is not None and self._attached == self._hub.era
+
+    def _ask_for_kept(self, subscription: Subscription) -> None:
+        for topic, message in list(self._hub.kept.items()):
+            copy = replace(message, retain=True, keep=True)
+            if subscription in self._matching(topic):
+                self.receive(_Delivery(copy, self._hub.authors[topic], subscription))
+
+    # -- the receiving thread
+
+    def _run(self) -> None:
+        while True:
+            with self._hub.lock:
+                while not (self._stopping or self._inbox or self._attached != self._hub.era):
+                    self._changed.wait()
+                if self._stopping:
+                    return
+                turn = self._attached != self._hub.era
+                delivery = None if turn else self._inbox.popleft()
+            if delivery is not None:
+                self._deliver(delivery)
+            elif self._attached is not None:
+                self._lose()
+            else:
+                self._connect()
+
+    def _deliver(self, delivery: _Delivery) -> None:
+        self.counters.add("received")
+        message = delivery.message
+        targets = self._matching(message.topic) if delivery.only is None else [delivery.only]
+        for subscription in targets:
+            if subscription.echo or delivery.author is not self:
+                subscription.offer(message)
+
+    def _lose(self) -> None:
+        with self._hub.lock:
+            self._attached = None
+            self._hub.detach(self)
+            self._inbox.clear()
+        self.problem = "the hub is away"
+        self._set_state(State.CONNECTING)
+
+    def _connect(self) -> None:
+        self._renew()
+        with self._hub.lock:
+            if self._stopping or self._hub.era is None:
+                return
+            self._attached = self._hub.era
+            self._hub.attach(self)
+            known = set(self._hub.kept)
+            with self._lock:
+                subscriptions = list(self._subscriptions)
+            for subscription in subscriptions:
+                self._ask_for_kept(subscription)
+        self._settle_in(known)

@@ -1,0 +1,48 @@
+"""What a backend needs to know to connect; plain data, so that reading a config imports no client library."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TlsSettings:
+    """Certificates of one link. Paths are absolute by the time they get here."""
+
+    ca_cert: Path | None = None  # None: the system's authorities
+    client_cert: Path | None = None
+    client_key: Path | None = None
+    insecure: bool = False  # True: do not check the host name
+    ciphers: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MqttSettings:
+    """One broker connection."""
+
+    host: str
+    port: int = 1883
+    keepalive_s: int = 15
+    username: str | None = None
+    password: str | None = field(default=None, repr=False)
+    tls: TlsSettings | None = None
+    protocol: str = "3.1.1"  # or "5"
+    #: Ask the broker for exact ``echo=False`` and for the retain flag of live messages (bridge mode on 3.1.1,
+    #: noLocal and retain-as-published on 5). See T7 and T16 in docs/transports.md.
+    as_published: bool = False
+    reconnect_max_s: float = 0.5  # 0.5 inside the robot, 2.0 towards a remote broker
+    silence_s: float = 2.0  # a connection that does not answer for this long is opened anew (T19)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZenohSettings:
+    """One peer of a robot's Zenoh fabric; ``run_dir`` holds the unix sockets of the hub and of all peers."""
+
+    run_dir: Path
+    listen: tuple[str, ...] = ()  # extra endpoints beyond the unix socket; never a default
+    connect: tuple[str, ...] = ()
+    tls: TlsSettings | None = None
+    lease_ms: int = 2000
+    client: bool = False  # a short-lived tool: talks through the hub only, opens no socket of its own
+    journal: Path | None = None  # where the hub remembers kept copies and wills across restarts; only the hub reads it

@@ -1,0 +1,79 @@
+"""Topics and filters as MQTT defines them, and the limits that hold on every transport (T1, T2)."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+
+from pebble.errors import TransportError
+
+MAX_BYTES = 1024  # our own limit; MQTT's is 65,535
+MAX_LEVELS = 200  # mosquitto closes the connection beyond it (TOPIC_HIERARCHY_LIMIT)
+
+# Control characters and Unicode non-characters: MQTT lets a receiver close the connection on them, and mosquitto does.
+_NON_CHARACTERS = "\ufdd0-\ufdef" + "".join(
+    chr(plane * 0x10000 + last) for plane in range(17) for last in (0xFFFE, 0xFFFF)
+)
+_FORBIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f{_NON_CHARACTERS}]")
+
+
+def _check(what: str, text: str) -> None:
+    if not isinstance(text, str) or not text:
+        raise TransportError(f"{what} must be a non-empty string, not {text!r}")
+    try:
+        size = len(text.encode())
+    except UnicodeEncodeError:
+        raise TransportError(f"{what} {text!r} cannot be written as UTF-8") from None
+    if size > MAX_BYTES:
+        raise TransportError(f"{what} {text[:40]!r}… has {size} bytes, more than {MAX_BYTES}")
+    if text.count("/") >= MAX_LEVELS:
+        raise TransportError(f"{what} {text[:40]!r}… has more than {MAX_LEVELS} levels")
+    if bad := _FORBIDDEN.search(text):
+        raise TransportError(f"{what} {text!r} contains the control or non-character {bad.group()!r}")
+
+
+@lru_cache(maxsize=4096)
+def check_topic(topic: str) -> str:
+    """Return ``topic`` if it may be published to; raise TransportError naming what is wrong with it."""
+    _check("topic", topic)
+    if "+" in topic or "#" in topic:
+        raise TransportError(f"topic {topic!r} contains a wildcard; wildcards belong in filters")
+    if topic.startswith("$"):
+        raise TransportError(f"topic {topic!r} starts with $: those belong to the broker")
+    return topic
+
+
+@lru_cache(maxsize=4096)
+def check_filter(filter_: str) -> str:
+    """Return ``filter_`` if it may be subscribed to; raise TransportError naming what is wrong with it."""
+    _check("filter", filter_)
+    levels = filter_.split("/")
+    if levels[0] == "$share":
+        raise TransportError(f"filter {filter_!r}: shared subscriptions are not supported")
+    for index, level in enumerate(levels):
+        if "#" in level and (level != "#" or index != len(levels) - 1):
+            raise TransportError(f"filter {filter_!r}: # must stand alone as the last level")
+        if "+" in level and level != "+":
+            raise TransportError(f"filter {filter_!r}: + must stand alone in its level")
+    return filter_
+
+
+def is_pattern(filter_: str) -> bool:
+    """Does this filter have wildcards?"""
+    return "+" in filter_ or "#" in filter_
+
+
+@lru_cache(maxsize=16384)
+def matches(filter_: str, topic: str) -> bool:
+    """MQTT's rules: ``+`` is one level, a final ``#`` is the rest and its parent, wildcards skip ``$…`` topics."""
+    if filter_ == topic:
+        return True
+    want, have = filter_.split("/"), topic.split("/")
+    if topic.startswith("$") and want[0] in ("+", "#"):
+        return False
+    for index, level in enumerate(want):
+        if level == "#":
+            return True
+        if index >= len(have) or level not in ("+", have[index]):
+            return False
+    return len(want) == len(have)
