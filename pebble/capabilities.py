@@ -1,0 +1,105 @@
+"""What a robot offers and under which effective names, from its config (paper A.8.6). Pure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pebble import contract as c
+from pebble.addresses import Addresses
+from pebble.config import Config, SystemControl
+from pebble.process import view_of
+
+_MOTOR_PROTOCOL = "goob_base_v1"
+#: Video, audio, sounds and scripts: their names are fixed, the services behind them arrive in a later release.
+_LATER = {"available": False, "controls": False}
+
+
+def capabilities(config: Config, addresses: Addresses) -> dict[str, Any]:
+    """The ``value`` of a capabilities message: what is there is ``available``, what can be asked of it ``controls``."""
+    return {
+        "identity": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
+        "transport": {"kind": config.transport.kind},
+        "video": _LATER | _video(config, addresses),
+        "audio": _LATER | _audio(config, addresses),
+        "soundboard": _LATER | _topics(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
+        "autonomy": _LATER | _topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
+        "system": _system(config, addresses),
+        **_motor(config, addresses),
+    }
+
+
+def _video(config: Config, addresses: Addresses) -> dict[str, Any]:
+    sent, captured = config.services.mqtt_bridge.media.video_publisher, config.services.av_daemon.video
+    return {
+        "topic": addresses[c.CAMERA].topic,
+        "command_topic": addresses[c.VIDEO_CONTROL].topic,
+        "flag_topic": addresses[c.MQTT_VIDEO].topic,
+        "overlays_topic": addresses[c.VIDEO_OVERLAYS].topic,
+        "width": _first(sent.publish_width, sent.width, captured.width),
+        "height": _first(sent.publish_height, sent.height, captured.height),
+        "fps": _first(sent.publish_fps, sent.target_fps, sent.fps, captured.fps),
+    }
+
+
+def _audio(config: Config, addresses: Addresses) -> dict[str, Any]:
+    sent, captured = config.services.mqtt_bridge.media.audio_publisher, config.services.av_daemon.audio
+    return {
+        "topic": addresses[c.AUDIO].topic,
+        "uplink_topic": addresses[c.AUDIO_STREAM].topic,
+        "command_topic": addresses[c.AUDIO_CONTROL].topic,
+        "flag_topic": addresses[c.MQTT_AUDIO].topic,
+        "rate": _first(sent.rate, captured.rate),
+        "channels": _first(sent.channels, captured.channels),
+    }
+
+
+def _topics(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> dict[str, Any]:
+    return {
+        "command_topic": addresses[command].topic,
+        "files_topic": addresses[files].topic,
+        "status_topic": addresses[status].topic,
+    }
+
+
+def _system(config: Config, addresses: Addresses) -> dict[str, Any]:
+    bridge = config.services.mqtt_bridge
+
+    def entry(control: SystemControl, channel: c.Channel) -> dict[str, Any]:
+        controls = bridge.enabled and bool(control.command)
+        return {"available": True, "controls": controls, "flag_topic": addresses[channel].topic}
+
+    return {
+        "reboot": entry(bridge.reboot_control, c.REBOOT),
+        "service_restart": entry(bridge.service_restart_control, c.SERVICE_RESTART),
+        "git_pull": entry(bridge.git_pull_control, c.GIT_PULL),
+    }
+
+
+def _motor(config: Config, addresses: Addresses) -> dict[str, Any]:
+    """Drive, lights and telemetry: what the serial line to the motor MCU offers, under *its* names."""
+    lines = {name: line for name, line in config.serial_instances().items() if line.protocol == _MOTOR_PROTOCOL}
+    present = bool(lines)
+    name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
+    if name:
+        addresses = Addresses(view_of(config, name))
+    return {
+        "drive": {"available": present, "controls": present, "topic": addresses[c.DRIVE].topic},
+        "lights": {
+            "solid": present,
+            "flash": present,
+            "solid_topic": addresses[c.LIGHTS_SOLID].topic,
+            "flash_topic": addresses[c.LIGHTS_FLASH].topic,
+        },
+        "telemetry": {
+            "touch_sensors": present and line.telemetry.publish_touch_sensors,
+            "charging_status": present,
+            "touch_topic": addresses[c.TOUCH_SENSORS].topic,
+            "charging_topic": addresses[c.CHARGING_STATUS].topic,
+            "charging_level_topic": addresses[c.CHARGING_LEVEL].topic,
+        },
+    }
+
+
+def _first(*values: float | None) -> float | None:
+    """The first that was set: 0 is a value."""
+    return next((value for value in values if value is not None), None)

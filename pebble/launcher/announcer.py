@@ -1,0 +1,127 @@
+"""The process that says to the world what the launcher has to say: ``python -m pebble.launcher.announcer CONFIG``.
+
+The launcher itself never opens a transport: it could not fork any more, and a broker might keep it waiting.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from pebble.config import load
+from pebble.errors import PebbleError
+from pebble.launched import ALIVE_PERIOD_S, Notifier, set_up_logging
+from pebble.launcher.news import Word, next_word
+from pebble.launcher.reactor import Reactor
+from pebble.links import local_transport
+from pebble.process import exit_at_the_latest
+from pebble.transports import Message, State, Transport
+
+_STDIN = 0
+
+log = logging.getLogger(__name__)
+
+
+class Announcer:
+    """Publishes the words that come in on ``news``. States are said again on every new connection, records are not."""
+
+    def __init__(self, news: int, transport: Transport) -> None:
+        self._news, self._transport = news, transport
+        self._states: dict[str, Message] = {}
+        self._reactor = Reactor()
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._stopping = False
+        os.set_blocking(news, False)
+
+    def run(self, notify: Notifier) -> None:
+        """Live until :meth:`stop`, or until no more will come; then say the rest, and the will."""
+        self._reactor.watch(self._news, self._hear)
+        self._reactor.watch(self._wake, self._repeat)
+        self._reactor.every(ALIVE_PERIOD_S, notify.alive)
+        self._transport.on_state(self._on_state)
+        notify.ready()
+        try:
+            self._transport.open(timeout=0.0)
+            self._reactor.run_until(lambda: self._stopping)
+            self._hear_rest()
+        finally:
+            self._transport.close()
+
+    def stop(self) -> None:
+        """End :meth:`run` soon. Safe from signal handlers."""
+        self._stopping = True
+        os.eventfd_write(self._wake, 1)
+
+    def _hear(self) -> None:
+        word = next_word(self._news)
+        if word is None:
+            self._stopping = True
+        else:
+            self._say(word)
+
+    def _hear_rest(self) -> None:
+        try:
+            while (word := next_word(self._news)) is not None:
+                self._say(word)
+        except BlockingIOError:
+            pass
+
+    def _say(self, word: Word) -> None:
+        if word.what == "state":
+            self._states[word.message.topic] = word.message
+        self._publish(word.message)
+
+    def _repeat(self) -> None:
+        os.eventfd_read(self._wake)
+        for message in self._states.values():
+            self._publish(message)
+
+    def _publish(self, message: Message) -> None:
+        self._transport.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
+
+    def _on_state(self, state: State) -> None:
+        if state is State.CONNECTED:
+            os.eventfd_write(self._wake, 1)
+
+
+def run(make_transport: Callable[[Message], Transport]) -> int:
+    """Announce what comes in on stdin through ``make_transport(will)``; returns the exit code."""
+    try:
+        will = next_word(_STDIN)
+        if will is None:  # the launcher has ended already
+            return 0
+        announcer = Announcer(_STDIN, make_transport(will.message))
+    except PebbleError as error:
+        log.error("the launcher publishes nothing: %s", error)
+        return 1
+
+    def stop(_signal: int, _frame: object) -> None:
+        exit_at_the_latest()
+        announcer.stop()
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    announcer.run(Notifier())
+    return 0
+
+
+def main(arguments: list[str]) -> int:
+    set_up_logging("INFO")
+    if len(arguments) != 1:
+        log.error("usage: python -m pebble.launcher.announcer CONFIG, with words from the launcher on stdin")
+        return 2
+    try:
+        config = load(Path(arguments[0]))
+    except PebbleError as error:
+        log.error("%s", error)
+        return 1
+    logging.getLogger().setLevel(config.log_level_of("launcher"))
+    return run(lambda will: local_transport(config, "launcher", will=will))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,96 @@
+"""One child process and the pipes to it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import NoReturn
+
+from pebble.launcher.forked import become
+from pebble.launcher.program import Program
+
+_READ_BYTES = 65_536
+
+
+class Child:
+    """A process of its own group, so that a terminal's Ctrl-C reaches only the launcher and nobody outlives it.
+
+    ``output`` (stdout and stderr, in order), ``notes`` (READY and ALIVE lines) and ``exited`` are descriptors to wait
+    on. ``stdin`` stays the caller's. Forks: only for a process with one thread and without sessions. Raises OSError.
+    """
+
+    def __init__(self, program: Program, environment: Mapping[str, str], *, stdin: int) -> None:
+        opened: list[int] = []
+        try:
+            self.notes, notes_end = _pipe(opened)
+            self.output, output_end = _pipe(opened)
+            os.set_blocking(output_end, True)
+            self.pid = _fork(lambda: become(program, environment, stdin=stdin, output=output_end, notes=notes_end))
+            self._reaped = False
+            self.exited = self._watch_exit()
+        except OSError:
+            for descriptor in opened:
+                os.close(descriptor)
+            raise
+        os.close(notes_end)
+        os.close(output_end)
+
+    def terminate(self) -> None:
+        """Ask it to stop."""
+        if not self._reaped:
+            os.kill(self.pid, signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it, and whatever it started that stayed in its group. Safe at any time, from a signal handler too."""
+        if self._reaped:  # the number may be somebody else's by now
+            return
+        try:
+            os.killpg(self.pid, signal.SIGKILL)
+        except (ProcessLookupError, PermissionError):  # nobody left, or only what runs as another user by sudo
+            os.kill(self.pid, signal.SIGKILL)
+
+    def end(self) -> str:
+        """Clean up after it has exited; says how it ended: ``exit code 1`` or ``signal 9``."""
+        self._reaped = True  # first: a signal handler may come in between
+        code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+        for descriptor in (self.output, self.notes, self.exited):
+            os.close(descriptor)
+        return f"signal {-code}" if code < 0 else f"exit code {code}"
+
+    def _watch_exit(self) -> int:
+        try:
+            return os.pidfd_open(self.pid)
+        except OSError:  # no descriptors left: a child whose end nobody would notice must not live
+            self.kill()
+            os.waitpid(self.pid, 0)
+            raise
+
+
+def read_available(descriptor: int) -> bytes | None:
+    """What a non-blocking pipe holds just now, up to 64 KiB; empty at its end, None when there is nothing."""
+    try:
+        return os.read(descriptor, _READ_BYTES)
+    except BlockingIOError:
+        return None
+
+
+def _pipe(opened: list[int]) -> tuple[int, int]:
+    ends = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+    opened.extend(ends)
+    return ends
+
+
+def _fork(run: Callable[[], NoReturn]) -> int:
+    """With signals blocked: until ``run`` has handlers of its own, a child would answer in the launcher's way."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    try:
+        pid = os.fork()
+        if pid == 0:
+            run()
+        with suppress(OSError):  # the child does the same: whoever comes first
+            os.setpgid(pid, pid)
+        return pid
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

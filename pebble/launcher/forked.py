@@ -1,0 +1,108 @@
+"""How a forked copy of the launcher becomes one of its programs: the first and the last lines of every child."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import fcntl
+import logging
+import os
+import runpy
+import signal
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import NoReturn
+
+from pebble.launched import NOTIFY_FD, die_with_launcher
+from pebble.launcher.program import Program
+
+_NOTES = 3  # the descriptor of READY and ALIVE, next after stdin, stdout and stderr
+_PR_SET_NAME, _NAME_BYTES = 15, 15
+
+
+def become(program: Program, environment: Mapping[str, str], *, stdin: int, output: int, notes: int) -> NoReturn:
+    """Run ``program`` with these descriptors and no others, and exit with its code. Call right after the fork.
+
+    Expects all signals blocked. Never returns or raises: the frames below belong to the launcher. They must stay,
+    too, because closing an object of theirs would close a descriptor that by then is somebody else's.
+    """
+    code = 1
+
+    def begin() -> None:
+        os.setpgid(0, 0)
+        _arrange_descriptors(stdin, output, notes)
+        _reset_signals()
+        _forget_launcher({**environment, NOTIFY_FD: str(_NOTES)})
+        _run(program)
+
+    try:
+        code = _exit_code(begin)
+        _exit_code(_finish)
+    finally:
+        os._exit(code)
+
+
+def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
+    """Nothing else stays open: the launcher's lock, for one, would be held for as long as this child lives."""
+    wanted = (stdin, output, output, notes)
+    clear = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
+    for number, descriptor in enumerate(clear):
+        os.dup2(descriptor, number, inheritable=number != _NOTES)  # what a child starts in turn tells us nothing
+    for name in os.listdir("/proc/self/fd"):  # noqa: PTH208  (a Path for each is slower than the fork itself)
+        if int(name) > _NOTES:
+            with suppress(OSError):  # that of the listing itself
+                os.close(int(name))
+    sys.stdin = os.fdopen(0, encoding="utf-8", errors="replace", closefd=False)
+    sys.stdout = os.fdopen(1, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)
+
+
+def _reset_signals() -> None:
+    """As in a fresh interpreter. What was ignored (nohup) stays ignored."""
+    signal.set_wakeup_fd(-1)
+    for number in signal.valid_signals():
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+
+
+def _forget_launcher(environment: Mapping[str, str]) -> None:
+    atexit._clear()
+    root = logging.getLogger()
+    root.handlers.clear()
+    root.setLevel(logging.WARNING)
+    os.environ.clear()
+    os.environ.update(environment)
+
+
+def _run(program: Program) -> None:
+    die_with_launcher()
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, program.name.encode()[:_NAME_BYTES])  # ps and top show it
+    sys.argv = [program.module, *program.arguments]
+    if not hasattr(sys.modules.get(program.module), "__path__"):
+        sys.modules.pop(program.module, None)  # it is __main__ now; whoever imports it as well gets another, as always
+    runpy.run_module(program.module, run_name="__main__", alter_sys=True)
+
+
+def _finish() -> None:
+    """What the interpreter does at its end, up to where it would take down what belongs to the launcher."""
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+
+
+def _exit_code(job: Callable[[], None]) -> int:
+    try:
+        job()
+    except SystemExit as end:
+        if end.code is None or isinstance(end.code, int):
+            return (end.code or 0) & 0xFF
+        sys.stderr.write(f"{end.code}\n")
+        return 1
+    except BaseException:  # noqa: BLE001  (the process boundary; this writes the traceback)
+        sys.excepthook(*sys.exc_info())
+        return 1
+    return 0

@@ -1,0 +1,98 @@
+"""A child process for launcher tests: ``fake_service NAME BEHAVIOUR JOURNAL``. Says in JOURNAL what happens to it."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+from pebble.launched import NOTIFY_FD, Notifier
+
+WORDS = """12:00:00 [WARNING] mind the gap
+just a print
+12:00:01 [DEBUG] not for the public
+12:00:02 [ERROR] it broke
+Traceback (most recent call last):
+  File "somewhere.py", line 1, in <module>
+ValueError: seven
+12:00:03 [INFO] and goes on
+"""
+
+
+def note(event: str) -> None:
+    name, _, journal = sys.argv[1:4]
+    with Path(journal).open("a") as out:
+        out.write(f"{name} {event} {os.getpid()}\n")
+
+
+def stop(*_: object) -> None:
+    note("stop")
+    sys.exit(0)
+
+
+def live(notify: Notifier, *, alive: bool = True) -> None:
+    note("ready")
+    notify.ready()
+    while True:
+        time.sleep(0.05)
+        if alive:
+            notify.alive()
+
+
+def end(how: str) -> None:
+    """Every way a Python program can end by itself."""
+    if how == "crash":
+        sys.exit(3)
+    if how == "word":
+        sys.exit("a last word")
+    if how == "raise":
+        raise RuntimeError("nobody catches this")
+    if how == "exit":
+        os._exit(7)
+    if how == "done":
+        atexit.register(lambda: note("atexit"))
+        threading.Thread(target=lambda: (time.sleep(0.2), note("thread"))).start()
+
+
+def look_around() -> None:
+    """Descriptors and signals as a program finds them."""
+    found = {number: Path(f"/proc/self/fd/{number}") for number in range(1024)}
+    kinds = (f"{number}={path.readlink().name.partition(':')[0]}" for number, path in found.items() if path.exists())
+    note("fds:" + ",".join(kinds))
+    note("mask:" + ",".join(map(str, signal.pthread_sigmask(signal.SIG_BLOCK, ()))))
+    note("handler:" + str(signal.getsignal(signal.SIGHUP).name))
+    note("group:" + str(os.getpgrp() == os.getpid()))
+
+
+def main() -> None:
+    behaviour = sys.argv[2]
+    if behaviour == "curious":
+        look_around()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN if behaviour == "stubborn" else stop)
+    note("start")
+    if behaviour in ("crash", "word", "raise", "exit", "done"):
+        end(behaviour)
+        return
+    if behaviour == "parent":
+        os.environ.pop(NOTIFY_FD)
+        child = subprocess.Popen(["sleep", "600"])
+        note(f"child:{child.pid}")
+        os._exit(1)
+    if behaviour == "environment":
+        note("systemd:" + str("NOTIFY_SOCKET" in os.environ))
+    if behaviour == "talker":
+        sys.stderr.write(WORDS)
+        sys.stdout.write("x" * 100_000 + "\n")
+        sys.stdout.buffer.write(b"caf\xe9 and a tail without newline")
+        sys.stdout.flush()
+        sys.exit(3)
+    live(Notifier(), alive=behaviour != "mute")
+
+
+if __name__ == "__main__":
+    main()

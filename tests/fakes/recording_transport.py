@@ -1,0 +1,54 @@
+"""A transport that writes down what it is told to send, for tests that look at another process from outside."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+from pebble.transports import Message, State, Transport
+from pebble.transports.base import Subscription
+
+
+class RecordingTransport(Transport):
+    """Appends one JSON line per message to ``file``; connected as soon as it is opened, unless ``hangs``."""
+
+    def __init__(self, client_id: str, file: Path, *, will: Message | None = None, hangs: bool = False) -> None:
+        super().__init__(client_id, will=will)
+        self._file, self._hangs = file, hangs
+
+    def lose(self) -> None:
+        self._set_state(State.CONNECTING)
+
+    def find(self) -> None:
+        self._set_state(State.CONNECTED)
+
+    def _open(self, timeout: float) -> None:
+        if self._hangs:
+            threading.Event().wait()
+        self.find()
+
+    def _close(self, will: Message | None) -> None:
+        if will is not None:
+            self._write(will, "will")
+
+    def _send(self, message: Message, urgent: bool) -> bool:
+        if self.state is not State.CONNECTED:
+            return False
+        self._write(message, "message")
+        return True
+
+    def _write(self, message: Message, what: str) -> None:
+        line = {
+            "what": what,
+            "topic": message.topic,
+            "payload": json.loads(message.payload),
+            "qos": int(message.qos),
+            "retain": message.retain,
+        }
+        with self._file.open("a") as out:
+            out.write(json.dumps(line) + "\n")
+
+    def _declare(self, subscription: Subscription) -> None: ...
+
+    def _undeclare(self, subscription: Subscription) -> None: ...

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from pebble.errors import PebbleError
+from pebble.launcher.run_lock import RunLock
+
+
+def test_the_folder_is_made_for_this_user_alone(tmp_path: Path) -> None:
+    with RunLock(tmp_path / "a" / "b", "x/y/z") as lock:
+        assert (tmp_path / "a" / "b").stat().st_mode & 0o777 == 0o700
+        assert lock.path.read_text() == f"{os.getpid()}\n"
+
+
+def test_an_open_folder_of_ours_is_closed(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir(mode=0o755)
+    with RunLock(tmp_path / "run", "x/y/z"):
+        assert (tmp_path / "run").stat().st_mode & 0o777 == 0o700
+
+
+def test_a_second_lock_names_the_holder(tmp_path: Path) -> None:
+    with RunLock(tmp_path, "x/y/z") as lock:
+        with pytest.raises(PebbleError) as refused:
+            RunLock(tmp_path, "x/y/z").take()
+        assert str(refused.value) == f"x/y/z already runs: process {os.getpid()} holds {lock.path}"
+    with RunLock(tmp_path, "x/y/z"):
+        pass
+
+
+def test_a_link_laid_out_for_us_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(PebbleError, match="is not a folder of this user"):
+        RunLock(tmp_path / "run", "x/y/z").take()
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(PebbleError, match=f"transport.run_dir {tmp_path}/file/run cannot be used: File exists"):
+        RunLock(tmp_path / "file" / "run", "x/y/z").take()

@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.addresses import Addresses
+from pebble.capabilities import capabilities
+from pebble.config import parse
+
+BASE = "pebble/robots/rover"
+MOTOR = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}
+BRIDGE = {"enabled": True, "remote_mqtt": {"host": "far"}}
+
+
+def of(kind: str = "mqtt", **services: Any) -> dict[str, Any]:
+    raw = {"robot": {"id": "rover"}, "transport": {"kind": kind}, "services": services}
+    config = parse(raw, folder=Path("/robots"), env={})
+    return capabilities(config, Addresses(config))
+
+
+def test_a_robot_without_services_says_so_and_names_everything() -> None:
+    assert of() == {
+        "identity": {"system": "pebble", "type": "robots", "id": "rover"},
+        "transport": {"kind": "mqtt"},
+        "video": {
+            "available": False,
+            "controls": False,
+            "topic": f"{BASE}/outgoing/front-camera",
+            "command_topic": f"{BASE}/incoming/front-camera",
+            "flag_topic": f"{BASE}/incoming/flags/mqtt-video",
+            "overlays_topic": f"{BASE}/outgoing/video-overlays",
+            "width": 640,
+            "height": 480,
+            "fps": 15,
+        },
+        "audio": {
+            "available": False,
+            "controls": False,
+            "topic": f"{BASE}/outgoing/audio",
+            "uplink_topic": f"{BASE}/incoming/audio-stream",
+            "command_topic": f"{BASE}/incoming/audio",
+            "flag_topic": f"{BASE}/incoming/flags/mqtt-audio",
+            "rate": 16000,
+            "channels": 1,
+        },
+        "soundboard": {
+            "available": False,
+            "controls": False,
+            "command_topic": f"{BASE}/incoming/soundboard-command",
+            "files_topic": f"{BASE}/outgoing/soundboard-files",
+            "status_topic": f"{BASE}/outgoing/soundboard-status",
+        },
+        "autonomy": {
+            "available": False,
+            "controls": False,
+            "command_topic": f"{BASE}/incoming/autonomy-command",
+            "files_topic": f"{BASE}/outgoing/autonomy-files",
+            "status_topic": f"{BASE}/outgoing/autonomy-status",
+        },
+        "system": {
+            "reboot": {"available": True, "controls": False, "flag_topic": f"{BASE}/incoming/flags/reboot"},
+            "service_restart": {
+                "available": True,
+                "controls": False,
+                "flag_topic": f"{BASE}/incoming/flags/service-restart",
+            },
+            "git_pull": {"available": True, "controls": False, "flag_topic": f"{BASE}/incoming/flags/git-pull"},
+        },
+        "drive": {"available": False, "controls": False, "topic": f"{BASE}/incoming/drive-values"},
+        "lights": {
+            "solid": False,
+            "flash": False,
+            "solid_topic": f"{BASE}/incoming/lights-solid",
+            "flash_topic": f"{BASE}/incoming/lights-flash",
+        },
+        "telemetry": {
+            "touch_sensors": False,
+            "charging_status": False,
+            "touch_topic": f"{BASE}/outgoing/touch-sensors",
+            "charging_topic": f"{BASE}/outgoing/charging-status",
+            "charging_level_topic": f"{BASE}/outgoing/charging-level",
+        },
+    }
+
+
+def test_the_transport_shows() -> None:
+    assert of("zenoh")["transport"] == {"kind": "zenoh"}
+
+
+def test_a_motor_line_offers_driving_lights_and_telemetry() -> None:
+    value = of(serial_mcu_bridge=MOTOR)
+    assert value["drive"]["available"]
+    assert value["drive"]["controls"]
+    assert value["lights"]["solid"]
+    assert value["lights"]["flash"]
+    assert value["telemetry"]["charging_status"]
+    assert not value["telemetry"]["touch_sensors"], "only when it is published"
+    assert of(serial_mcu_bridge={**MOTOR, "telemetry": {"publish_touch_sensors": True}})["telemetry"]["touch_sensors"]
+
+
+@pytest.mark.parametrize("name", ["reboot", "service_restart", "git_pull"])
+def test_a_system_action_can_be_asked_for_where_a_command_is_set(name: str) -> None:
+    control = {f"{name}_control": {"command": ["true"]}}
+    system = of(mqtt_bridge={**BRIDGE, **control})["system"]
+    assert [key for key, entry in system.items() if entry["controls"]] == [name]
+    assert all(entry["available"] for entry in system.values())
+    assert not of(mqtt_bridge={"enabled": False, **control})["system"][name]["controls"]
+
+
+def test_later_services_stay_unavailable_even_when_a_config_enables_them() -> None:
+    value = of(av_daemon={"enabled": True}, soundboard_handler={"enabled": True}, autonomy_manager={"enabled": True})
+    for section in ("video", "audio", "soundboard", "autonomy"):
+        assert (value[section]["available"], value[section]["controls"]) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("publisher", "captured", "expected"),
+    [
+        ({}, {}, (640, 480, 15)),
+        ({}, {"width": 1920, "height": 1080, "fps": 30}, (1920, 1080, 30)),
+        ({"width": 800, "height": 600, "fps": 12}, {"width": 1920, "height": 1080, "fps": 30}, (800, 600, 12)),
+        ({"width": 800, "publish_width": 320, "target_fps": 9, "fps": 12}, {}, (320, 480, 9)),
+        ({"publish_fps": 5, "target_fps": 9, "publish_height": 240, "height": 1}, {}, (640, 240, 5)),
+    ],
+)
+def test_picture_size_and_rate(publisher: Any, captured: Any, expected: tuple[int, int, float]) -> None:
+    video = of(mqtt_bridge={"media": {"video_publisher": publisher}}, av_daemon={"video": captured})["video"]
+    assert (video["width"], video["height"], video["fps"]) == expected
+
+
+def test_sound_format() -> None:
+    assert of(av_daemon={"audio": {"rate": 48000, "channels": 2}})["audio"]["rate"] == 48000
+    audio = of(
+        mqtt_bridge={"media": {"audio_publisher": {"rate": 8000}}}, av_daemon={"audio": {"rate": 48000, "channels": 2}}
+    )["audio"]
+    assert (audio["rate"], audio["channels"]) == (8000, 2)
+
+
+#: Where a config renames a channel, and where capabilities show it.
+OVERRIDES = [
+    ("mqtt_bridge.topics.mqtt_audio", "audio.flag_topic"),
+    ("mqtt_bridge.topics.mqtt_video", "video.flag_topic"),
+    ("mqtt_bridge.topics.reboot", "system.reboot.flag_topic"),
+    ("mqtt_bridge.topics.service_restart", "system.service_restart.flag_topic"),
+    ("mqtt_bridge.topics.git_pull", "system.git_pull.flag_topic"),
+    ("mqtt_bridge.topics.audio_control", "audio.command_topic"),
+    ("mqtt_bridge.topics.video_control", "video.command_topic"),
+    ("mqtt_bridge.media.video_publisher.topic", "video.topic"),
+    ("mqtt_bridge.media.video_publisher.overlays_topic", "video.overlays_topic"),
+    ("mqtt_bridge.media.audio_publisher.topic", "audio.topic"),
+    ("mqtt_bridge.media.audio_receiver.topic", "audio.uplink_topic"),
+    ("soundboard_handler.topics.command", "soundboard.command_topic"),
+    ("soundboard_handler.topics.files", "soundboard.files_topic"),
+    ("soundboard_handler.topics.status", "soundboard.status_topic"),
+    ("autonomy_manager.topics.command", "autonomy.command_topic"),
+    ("autonomy_manager.topics.files", "autonomy.files_topic"),
+    ("autonomy_manager.topics.status", "autonomy.status_topic"),
+    ("serial_mcu_bridge.topics.drive_values", "drive.topic"),
+    ("serial_mcu_bridge.topics.lights_solid", "lights.solid_topic"),
+    ("serial_mcu_bridge.topics.lights_flash", "lights.flash_topic"),
+    ("serial_mcu_bridge.topics.touch_sensors", "telemetry.touch_topic"),
+    ("serial_mcu_bridge.topics.charging_status", "telemetry.charging_topic"),
+    ("serial_mcu_bridge.topics.charging_level", "telemetry.charging_level_topic"),
+]
+
+
+def nested(path: str, value: str) -> dict[str, Any]:
+    tree: Any = value
+    for key in reversed(path.split(".")):
+        tree = {key: tree}
+    result: dict[str, Any] = tree
+    return result
+
+
+def at(tree: Any, path: str) -> Any:
+    for key in path.split("."):
+        tree = tree[key]
+    return tree
+
+
+@pytest.mark.parametrize(("path", "shown"), OVERRIDES, ids=[path for path, _ in OVERRIDES])
+def test_a_renamed_channel_is_advertised_under_its_new_name(path: str, shown: str) -> None:
+    assert at(of(**nested(path, f"{BASE}/other/name")), shown) == f"{BASE}/other/name"
+    assert at(of(), shown) != f"{BASE}/other/name"
+
+
+def test_a_motor_that_is_an_instance_is_advertised_under_its_own_names() -> None:
+    value = of(
+        serial_mcu_bridge={
+            "enabled": False,
+            "topics": {"drive_values": f"{BASE}/incoming/of-the-root"},
+            "instances": {"base": {**MOTOR, "topics": {"drive_values": f"{BASE}/incoming/of-the-instance"}}},
+        }
+    )
+    assert value["drive"] == {"available": True, "controls": True, "topic": f"{BASE}/incoming/of-the-instance"}
