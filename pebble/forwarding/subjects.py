@@ -1,0 +1,95 @@
+"""What a topic means to one robot: its channel, renamed or not, or the family a stranger's metric belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pebble.addresses import Addresses
+from pebble.config import Config
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind
+from pebble.errors import TransportError
+from pebble.process import view_of
+from pebble.transports.topics import check_topic, matches
+
+_REMEMBERED = 4096  # topics; a stranger may invent as many as he likes
+
+#: Metrics the contract does not know, by the families of the paper's Table A.2.
+_FAMILIES = (
+    (f"{INCOMING}/flags/", Kind.FLAG),
+    (f"{INCOMING}/", Kind.COMMAND),
+    (f"{OUTGOING}/", Kind.EVENT),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """One topic below our own identity. ``channel`` is None for metrics that are not in the contract."""
+
+    kind: Kind
+    channel: Channel | None = None
+    qos: int = 0
+    retain: bool = False  # what is to be assumed where the broker hides it
+
+    @property
+    def stays(self) -> bool:
+        """Never leaves the robot."""
+        return self.channel is not None and not self.channel.remote
+
+    @property
+    def bridged(self) -> bool:
+        """Travels with the other messages; media has connections of its own."""
+        return self.channel is None or self.channel.bridged
+
+
+class _Unknown:
+    """Not looked up yet."""
+
+
+_UNKNOWN = _Unknown()
+
+
+class Subjects:
+    """Looks subjects up by effective topic, those of every serial instance included."""
+
+    def __init__(self, config: Config) -> None:
+        self._base = config.base
+        names = dict.fromkeys(["", *config.serial_instances()])
+        self._addresses = [Addresses(view_of(config, name)) for name in names]
+        self._known: dict[str, Subject | _Unknown | None] = {}
+
+    def __getitem__(self, topic: str) -> Subject | None:
+        """The subject of ``topic``; None when it is none of this robot's, or no transport may carry it on."""
+        found = self._known.get(topic, _UNKNOWN)  # one step: another thread may clear them
+        if not isinstance(found, _Unknown):
+            return found
+        if len(self._known) >= _REMEMBERED:
+            self._known.clear()
+        subject = self._known[topic] = self._find(topic)
+        return subject
+
+    def filters(self, *directions: str) -> list[str]:
+        """What to subscribe to for everything of ``directions``: no two of the filters overlap."""
+        families = [f"{self._base}/{direction}/#" for direction in directions]
+        renamed = (
+            addresses[channel].topic
+            for addresses in self._addresses
+            for channel in CHANNELS
+            if channel.direction in directions and not channel.is_pattern
+        )
+        outside = (topic for topic in renamed if not any(matches(family, topic) for family in families))
+        return [*families, *dict.fromkeys(outside)]
+
+    def _find(self, topic: str) -> Subject | None:
+        try:
+            check_topic(topic)
+        except TransportError:
+            return None
+        for addresses in self._addresses:
+            channel = addresses.channel(topic)
+            if channel is not None:
+                address = addresses[channel]
+                return Subject(channel.kind, channel, address.qos, address.retain)
+        suffix = topic.removeprefix(f"{self._base}/")
+        if suffix == topic:
+            return None
+        return next((Subject(kind) for family, kind in _FAMILIES if suffix.startswith(family)), None)

@@ -1,0 +1,8 @@
+"""``python -m pebble.services.mqtt_bridge CONFIG``."""
+
+import sys
+
+from pebble.process import run
+from pebble.services.mqtt_bridge.service import MqttBridge
+
+sys.exit(run(MqttBridge))
