@@ -1,0 +1,1 @@
+"""Hardware that is not there: robots run, and are tested, without any."""

@@ -1,0 +1,90 @@
+"""A simulated Goob or Fred MCU as a program: ``python -m pebble.simulation.mcu --kind goob --link /tmp/goob``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from pebble.simulation.board import FAILSAFE_S, KINDS, BoardState
+from pebble.simulation.pty import PtyMcu
+
+_REPORT_PERIOD_S = 0.1
+_SIGNALS = {signal.SIGTERM, signal.SIGINT}
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What ``--report`` writes ten times a second, as one JSON object per line. ``ns`` is time.monotonic_ns()."""
+
+    ns: int
+    plugged: bool
+    host: bool
+    board: BoardState
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run until SIGTERM or SIGINT, or with ``--control`` until standard input ends."""
+    options = _parser().parse_args(arguments)
+    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # in all threads to come: they are waited for below
+    with PtyMcu(
+        options.kind, options.link, trace=options.trace, failsafe_s=options.failsafe, charging=options.charging
+    ) as mcu:
+        if options.control:
+            threading.Thread(target=_obey, args=(mcu,), name="pebble-sim control", daemon=True).start()
+        while signal.sigtimedwait(_SIGNALS, _REPORT_PERIOD_S) is None:
+            if options.report and not _report(mcu):
+                break
+    return 0
+
+
+def _report(mcu: PtyMcu) -> bool:
+    look = Look(time.monotonic_ns(), mcu.plugged, mcu.host, mcu.state())
+    try:
+        os.write(sys.stdout.fileno(), msgspec.json.encode(look) + b"\n")
+    except BrokenPipeError:  # nobody looks any more
+        return False
+    return True
+
+
+def _obey(mcu: PtyMcu) -> None:
+    actions: dict[str, Callable[[], None]] = {
+        "unplug": mcu.unplug,
+        "replug": mcu.replug,
+        "reset": mcu.reset,
+        "charge": lambda: mcu.charge(True),
+        "discharge": lambda: mcu.charge(False),
+    }
+    for line in sys.stdin:
+        action = actions.get(line.strip())
+        if action is None:
+            sys.stderr.write(f"not one of {', '.join(actions)}: {line.strip()}\n")
+        else:
+            action()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m pebble.simulation.mcu", description=__doc__)
+    parser.add_argument("--kind", choices=KINDS, required=True)
+    parser.add_argument("--link", type=Path, required=True, help="symlink to make: the path of the serial port")
+    parser.add_argument("--trace", type=Path, help="file to append every received line to, with its time")
+    parser.add_argument("--failsafe", type=float, default=FAILSAFE_S, metavar="S", help="stop after this silence")
+    parser.add_argument("--charging", action="store_true", help="start on the charger")
+    parser.add_argument("--report", action="store_true", help="write the state to standard output at 10 Hz")
+    parser.add_argument(
+        "--control", action="store_true", help="read unplug, replug, reset, charge, discharge from stdin"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

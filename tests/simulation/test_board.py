@@ -1,0 +1,209 @@
+"""The simulated firmware, without a clock or a pty."""
+
+import math
+import random
+
+import pytest
+
+from pebble.errors import ConfigError
+from pebble.services.serial_mcu_bridge.goob_base import Charging, Level, Touch, parse
+from pebble.simulation.board import Light, SimulatedMcu
+from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM, RobotMotion
+
+
+def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -> bytes:
+    """Tick for ``seconds``, giving ``command`` at 10 Hz. Returns what the MCU said."""
+    said = b""
+    for step in range(round(seconds / 0.01)):
+        now = start + 0.01 * (step + 1)
+        if command and step % 10 == 0:
+            said += mcu.receive(command, now)
+        said += mcu.tick(now)
+    return said
+
+
+@pytest.mark.parametrize(
+    ("line", "answer", "drive"),
+    [
+        (b"M 0.5 -0.25\n", b"OK M\r\n", (0.5, -0.25)),
+        (b"M 0.5 -0.25\r\n", b"OK M\r\n", (0.5, -0.25)),
+        (b"m 9 -9\n", b"OK M\r\n", (1.0, -1.0)),
+        (b"Motor 0.5 0.5 spare tokens are ignored here\n", b"OK M\r\n", (0.5, 0.5)),
+        (b"M nan inf\n", b"OK M\r\n", (0.0, 0.0)),
+        (b"M x 0.5y\n", b"OK M\r\n", (0.0, 0.5)),
+        (b"M " + b"9" * 200 + b" .5\n", b"OK M\r\n", (1.0, 0.5)),
+        (b"M 0.5\n", b"ERR M needs 2 values\r\n", (0.0, 0.0)),
+        (b"M\n", b"ERR M needs 2 values\r\n", (0.0, 0.0)),
+        (b"X 1 1\n", b"ERR unknown command\r\n", (0.0, 0.0)),
+        (b"\xffM 1 1\n", b"ERR unknown command\r\n", (0.0, 0.0)),
+        (b"\n\r\n \n", b"", (0.0, 0.0)),
+        (b"M 1 1", b"", (0.0, 0.0)),
+        (b"M 1 1 " + b"x" * 300 + b"\n", b"WARN line too long\r\n", (0.0, 0.0)),
+    ],
+)
+def test_commands_as_the_firmware_takes_them(line: bytes, answer: bytes, drive: tuple[float, float]) -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    assert mcu.receive(line, 0.0) == answer
+    assert mcu.state().drive == drive
+
+
+def test_lights() -> None:
+    mcu = SimulatedMcu("fred", 0.0)
+    assert mcu.state().light == Light(0.0, 0.0, 1.0, 2.0)
+    assert mcu.receive(b"L 2 0.5 -1\nF 0 1 0 0.01\nL 1 1\nF 1 1 1\n", 0.0).split(b"\r\n") == [
+        b"OK L",
+        b"OK F",
+        b"ERR L needs 3 values",
+        b"ERR F needs 4 values",
+        b"",
+    ]
+    assert mcu.state().light == Light(0.0, 1.0, 0.0, 0.05)
+    mcu.receive(b"L 2 0.5 -1\n", 0.0)
+    assert mcu.state().light == Light(1.0, 0.5, 0.0)
+
+
+def test_a_command_may_arrive_in_pieces() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    assert b"".join(mcu.receive(bytes([byte]), 0.0) for byte in b"M 0.5 0.5\nL 0 0 0\n") == b"OK M\r\nOK L\r\n"
+
+
+def test_goob_reports() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    lines = run(mcu, 0.0, 10.0).splitlines()
+    assert lines[:2] == [b"Starting setup...", b"Done!"]
+    reports = [report for line in lines[2:] for report in parse(line)]
+    assert sum(isinstance(report, Touch) for report in reports) == 500
+    assert [report for report in reports if isinstance(report, Charging)] == [Charging(None)] * 3
+    volts = [report.volts for report in reports if isinstance(report, Level)]
+    assert volts == sorted(volts, reverse=True)
+    assert 6.0 < volts[-1] < 8.4
+
+
+def test_fred_reports() -> None:
+    mcu = SimulatedMcu("fred", 0.0, charging=True)
+    lines = run(mcu, 0.0, 10.0).splitlines()
+    assert sum(line.startswith(b"T t0=") and line.endswith(b" chg=1") for line in lines) == 20
+    mcu.battery.charging = False
+    assert parse(run(mcu, 10.0, 0.5).strip())[1:] == [Charging(False)]
+    assert not any(line.startswith(b"C") for line in lines)
+
+
+def test_after_a_pause_there_is_one_report_and_not_all_that_were_missed() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.tick(0.0)
+    assert mcu.tick(3.0).count(b"T a0=") == 1
+    assert mcu.tick(3.001) == b""
+
+
+def test_driving_ahead_moves_both_wheels_and_the_magnets() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    said = run(mcu, 0.0, 2.0, b"M 1 1\n")
+    state = mcu.state()
+    assert state.left_mm_s == state.right_mm_s == pytest.approx(FULL_SPEED_MM_S)
+    assert state.pose.x_mm == pytest.approx(FULL_SPEED_MM_S * (2.0 - 0.07), rel=0.02)
+    assert abs(state.pose.y_mm) < 1e-6
+    touches = [report for line in said.splitlines() for report in parse(line) if isinstance(report, Touch)]
+    for wave in zip(*((touch.a0, touch.a1, touch.a2) for touch in touches), strict=True):
+        assert max(wave) > 750
+        assert min(wave) < 270
+
+
+def test_more_left_than_right_turns_right() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    run(mcu, 0.0, 0.5, b"M 0.2 -0.2\n")
+    state = mcu.state()
+    assert state.pose.heading_rad == pytest.approx(-0.4 * FULL_SPEED_MM_S * 0.44 / TRACK_MM, rel=0.05)
+    assert math.hypot(state.pose.x_mm, state.pose.y_mm) < 1e-6
+    assert state.motors == (0.2, 0.2), "Goob's right motor is mounted the other way round"
+
+
+def test_motion_does_not_depend_on_how_time_is_cut() -> None:
+    coarse, fine = RobotMotion(), RobotMotion()
+    coarse.advance(0.5, 0.5, 1.0)
+    for _ in range(1000):
+        fine.advance(0.5, 0.5, 0.001)
+    assert coarse.pose.x_mm == pytest.approx(fine.pose.x_mm)
+
+
+def test_a_circle_comes_back() -> None:
+    motion = RobotMotion()
+    motion.left_mm_s, motion.right_mm_s = 0.25 * FULL_SPEED_MM_S, 0.5 * FULL_SPEED_MM_S
+    around_s = math.tau * TRACK_MM / (0.25 * FULL_SPEED_MM_S)
+    for _ in range(1000):
+        motion.advance(0.25, 0.5, around_s / 1000)
+    assert math.hypot(motion.pose.x_mm, motion.pose.y_mm) < 1.0
+    assert abs(motion.pose.heading_rad) < 0.01
+
+
+@pytest.mark.parametrize("failsafe_s", [1.0, 5.0])
+def test_the_failsafe_stops_the_wheels(failsafe_s: float) -> None:
+    mcu = SimulatedMcu("goob", 0.0, failsafe_s=failsafe_s)
+    mcu.receive(b"M 1 1\n", 0.0)
+    run(mcu, 0.0, failsafe_s - 0.05)
+    assert mcu.state().drive == (1.0, 1.0)
+    run(mcu, failsafe_s - 0.05, 1.0)
+    assert mcu.state().drive == (0.0, 0.0)
+    assert mcu.state().left_mm_s == 0.0
+
+
+def test_the_failsafe_stops_at_its_time_even_if_nobody_ticks() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.receive(b"M 1 1\n", 0.0)
+    mcu.tick(100.0)
+    assert mcu.state().pose.x_mm < 1.1 * FULL_SPEED_MM_S
+
+
+def test_lights_do_not_keep_the_wheels_turning() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.receive(b"M 1 1\n", 0.0)
+    run(mcu, 0.0, 1.5, b"L 0 0 0\n")
+    assert mcu.state().drive == (0.0, 0.0)
+
+
+def test_freds_trims_and_reverse_block() -> None:
+    mcu = SimulatedMcu("fred", 0.0)
+    mcu.receive(b"M 1 1\n", 0.0)
+    assert mcu.state().motors == pytest.approx((0.93, 1.0))
+    mcu.receive(b"M -1 -1\n", 0.3)
+    assert mcu.state().motors == (0.0, 0.0), "no way back at once"
+    mcu.receive(b"M -1 0\n", 0.33)
+    assert mcu.state().motors == pytest.approx((-0.5 * 0.93, 0.5)), "but the turn is kept"
+    mcu.receive(b"M -1 -1\n", 0.35)
+    assert mcu.state().motors == pytest.approx((-0.7 * 0.93, -0.7))
+    assert mcu.state().drive == (-1.0, -1.0)
+
+
+def test_the_battery_drains_with_driving_and_fills_on_the_charger() -> None:
+    idle, driving, charging = (SimulatedMcu("goob", 0.0) for _ in range(3))
+    charging.battery.charging = True
+    run(idle, 0.0, 20.0)
+    run(driving, 0.0, 20.0, b"M 1 1\n")
+    run(charging, 0.0, 20.0)
+    assert driving.state().volts < idle.state().volts < charging.state().volts
+    run(driving, 20.0, 2.0)
+    charging.tick(1e6)
+    assert charging.state().volts == pytest.approx(8.4)
+
+
+def test_a_reboot_stops_and_says_so() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    run(mcu, 0.0, 1.0, b"M 1 1\n")
+    way = mcu.state().pose
+    mcu.boot(1.0)
+    assert mcu.tick(1.0).startswith(b"Starting setup...\r\nDone!\r\nC chg=-1 v=")
+    assert mcu.state().drive == (0.0, 0.0)
+    assert mcu.state().pose == way
+
+
+def test_garbage_moves_nothing() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    noise = random.Random(2)
+    for number in range(20_000):
+        mcu.receive(b"#" + noise.randbytes(20).replace(b"\n", b"") + b"\n", number * 0.001)
+    assert mcu.state().commands == 0
+    assert mcu.state().pose.x_mm == 0.0
+
+
+def test_an_unknown_kind_is_refused() -> None:
+    with pytest.raises(ConfigError, match="goob and fred"):
+        SimulatedMcu("pitcam", 0.0)
