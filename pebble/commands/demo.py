@@ -1,0 +1,31 @@
+"""``pebble demo``: two simulated robots, on MQTT and on Zenoh, driven through one broker."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def demo(
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", "-s", min=1, help="Stop after this long of driving.", show_default=False),
+    ] = None,
+) -> int:
+    """Two simulated robots, driven by a scripted operator.
+
+    Goob on Zenoh and Fred on MQTT, without hardware, until Ctrl-C.
+    With --seconds it exits 0 only if every robot moved and stopped as commanded.
+
+    \b
+        pebble demo
+        pebble demo --seconds 20
+    """
+    from pebble.demo.main import run
+
+    return run(seconds)
+
+
+def register(app: typer.Typer) -> None:
+    app.command("demo")(demo)

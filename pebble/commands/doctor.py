@@ -1,0 +1,51 @@
+"""``pebble doctor``: is this machine ready for the robot? Prints the findings of :mod:`pebble.doctor.checks`."""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pebble.config import load
+from pebble.doctor.checks import Finding, Level, examine
+
+_COLOURS = {Level.OK: typer.colors.GREEN, Level.WARN: typer.colors.YELLOW, Level.FAIL: typer.colors.RED}
+_INDENT = " " * 6
+
+
+def doctor(
+    config: Annotated[
+        Path | None, typer.Argument(help="Also look at what this robot needs.", show_default=False)
+    ] = None,
+) -> int:
+    """Is this machine ready for the robot?
+
+    Each finding comes with the command that fixes it. Exits 1 if anything fails; warnings alone do not.
+
+    \b
+        pebble doctor
+        pebble doctor configs/goob.json
+    """
+    counts = dict.fromkeys(Level, 0)
+    for finding in examine(None if config is None else load(config)):
+        counts[finding.level] += 1
+        _print(finding)
+    failed, warned = counts[Level.FAIL], counts[Level.WARN]
+    typer.echo(f"checks: {sum(counts.values())}, warnings: {warned}, failures: {failed}")
+    return 1 if failed else 0
+
+
+def register(app: typer.Typer) -> None:
+    app.command("doctor")(doctor)
+
+
+def _print(finding: Finding) -> None:
+    width = shutil.get_terminal_size().columns
+    typer.secho(f"{finding.level.value:<4}  ", fg=_COLOURS[finding.level], nl=False)
+    text = textwrap.fill(f"{finding.what}: {finding.text}", width, initial_indent=_INDENT, subsequent_indent=_INDENT)
+    typer.echo(text.removeprefix(_INDENT))
+    if finding.fix:  # on one line, however long: it is there to be copied
+        typer.secho(f"{_INDENT}fix: {finding.fix}", bold=True)

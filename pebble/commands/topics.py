@@ -1,0 +1,90 @@
+"""``pebble topics``: the contract as a table, or as JSON."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from pebble.commands.names import base_of
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel
+from pebble.topic_docs import authority, payload_name, rate, travels
+
+
+def topics(
+    base: Annotated[
+        str | None, typer.Option("--base", help="Write whole topics of this robot.", metavar="[SYSTEM/TYPE/]ID")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The contract as JSON, for programs.")] = False,
+    json_schema: Annotated[bool, typer.Option("--json-schema", help="JSON Schemas of all payloads.")] = False,
+) -> int:
+    """The contract: every topic, and how it is delivered.
+
+    \b
+        pebble topics
+        pebble topics --base goob
+        pebble topics --json | jq '.[] | select(.kind == "STATE") | .topic'
+        pebble topics --json-schema > payloads.schema.json
+    """
+    prefix = "" if base is None else f"{base_of(base)}/"
+    if json_schema:
+        from pebble.topic_schemas import schemas
+
+        typer.echo(json.dumps(schemas(), indent=2))
+    elif as_json:
+        typer.echo(json.dumps([_plain(channel, prefix) for channel in CHANNELS], indent=2))
+    else:
+        _print_table(prefix)
+    return 0
+
+
+def register(app: typer.Typer) -> None:
+    app.command("topics")(topics)
+
+
+def _plain(channel: Channel, prefix: str) -> dict[str, Any]:
+    override = channel.override
+    return {
+        "topic": prefix + channel.suffix,
+        "direction": channel.direction,
+        "kind": channel.kind.name,
+        "meaning": channel.kind.meaning,
+        "doc": channel.doc,
+        "payload": payload_name(channel),
+        "qos": channel.default_qos,
+        "retain": channel.default_retain,
+        "rate_hz": channel.rate_hz,
+        "travels": travels(channel),
+        "authority": authority(channel),
+        "renamed_at": None if override is None else override.topic,
+        "synonym_of": channel.synonym_of,
+    }
+
+
+def _print_table(prefix: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("topic", no_wrap=True)
+    table.add_column("kind")
+    table.add_column("qos", justify="right")
+    table.add_column("kept")
+    table.add_column("rate", justify="right", no_wrap=True)
+    table.add_column("what it is", ratio=1)
+    for direction in (INCOMING, OUTGOING):
+        table.add_row(Text(f"{prefix}{direction}/" if prefix else direction, style="bold"))
+        for channel in CHANNELS:
+            if channel.direction == direction:
+                table.add_row(
+                    Text(f"  {channel.metric}"),
+                    channel.kind.name.lower(),
+                    str(channel.default_qos),
+                    "yes" if channel.default_retain else "",
+                    rate(channel),
+                    Text(channel.doc),
+                )
+    console.print(table)

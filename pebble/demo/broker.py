@@ -1,0 +1,92 @@
+"""MQTT brokers for the demo, on loopback: mosquitto where it is installed, else amqtt from the extra ``demo``."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import sys
+import threading
+from enum import StrEnum
+from importlib.util import find_spec
+from pathlib import Path
+
+from pebble.demo.programs import Program
+from pebble.errors import PebbleError
+
+_SBIN = "/usr/sbin:/usr/local/sbin"  # where Debian puts brokers and users' PATH does not look
+_START_S = 15.0  # amqtt takes a while to import on a small machine
+
+
+class BrokerKind(StrEnum):
+    MOSQUITTO = "mosquitto"
+    EMBEDDED = "embedded"
+
+
+class Broker:
+    """A running broker; ``program`` is to be ended by whoever made it."""
+
+    def __init__(self, name: str, kind: BrokerKind, folder: Path) -> None:
+        self.port = _free_port()
+        command = (
+            _mosquitto(self.port, folder / name) if kind is BrokerKind.MOSQUITTO else _amqtt(self.port, folder / name)
+        )
+        self.program = Program(name, command, folder / f"{name}.log")
+
+    def wait(self, ending: threading.Event) -> None:
+        """Until it answers, or ``ending``; raises PebbleError if it does not."""
+        self.program.wait_until(self._answers, _START_S, ending)
+
+    def _answers(self) -> bool:
+        try:
+            socket.create_connection(("127.0.0.1", self.port), 0.2).close()
+        except OSError:
+            return False
+        return True
+
+
+def best_kind() -> BrokerKind:
+    """What this machine has. Raises PebbleError naming both remedies when it has neither."""
+    if _mosquitto_path() is not None:
+        return BrokerKind.MOSQUITTO
+    if find_spec("amqtt") is not None:
+        return BrokerKind.EMBEDDED
+    raise PebbleError(
+        "no broker: install mosquitto (apt install mosquitto) or amqtt (pip install 'pebble-robot[demo]')"
+    )
+
+
+def _mosquitto_path() -> str | None:
+    return shutil.which("mosquitto") or shutil.which("mosquitto", path=_SBIN)
+
+
+def _mosquitto(port: int, stem: Path) -> list[str]:
+    path = _mosquitto_path()
+    if path is None:
+        raise PebbleError("mosquitto is not installed: apt install mosquitto")
+    config = stem.with_suffix(".conf")
+    lines = [f"listener {port} 127.0.0.1", "allow_anonymous true", "log_dest stderr"]
+    if os.geteuid() == 0:
+        lines.append("user root")  # a change of user would undo the tie to our life that Program made
+    config.write_text("\n".join(lines) + "\n")
+    return [path, "-c", str(config)]
+
+
+def _amqtt(port: int, stem: Path) -> list[str]:
+    config = stem.with_suffix(".yaml")
+    config.write_text(  # JSON is YAML too
+        json.dumps(
+            {
+                "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
+                "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
+            }
+        )
+    )
+    return [sys.executable, "-m", "amqtt.scripts.broker_script", "-c", str(config)]
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

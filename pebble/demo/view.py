@@ -1,0 +1,160 @@
+"""What the demo shows: a live table in a terminal, plain lines once a second elsewhere, and a table of results."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from pebble.demo.discovery import Sighting
+from pebble.demo.judge import Verdict
+from pebble.demo.operator import Operator
+from pebble.demo.robot import SimulatedRobot
+
+_LINE_PERIOD_S = 1.0
+_RATE_WINDOW = 20  # looks at a counter
+_COLUMN_WIDTH = 26  # characters, of the longest usual cell: a table that does not twitch, in a terminal of 80 columns
+
+
+class Rate:
+    """Messages per second over the last looks."""
+
+    def __init__(self) -> None:
+        self._looks: deque[tuple[float, int]] = deque(maxlen=_RATE_WINDOW)
+
+    def of(self, count: int, now: float) -> float:
+        self._looks.append((now, count))
+        (then, before), (_, after) = self._looks[0], self._looks[-1]
+        return (after - before) / (now - then) if now > then else 0.0
+
+
+class View:
+    """Shows the robots while they run. ``update`` may be called as often as one likes.
+
+    ``ending`` is set when the terminal was closed: its signal reaches make, which only waits for us.
+    """
+
+    def __init__(
+        self, console: Console, operator: Operator, robots: Sequence[SimulatedRobot], ending: threading.Event
+    ) -> None:
+        self._console, self._operator, self._robots, self._ending = console, operator, robots, ending
+        self._began = time.monotonic()
+        self._rates: dict[str, Rate] = {robot.name: Rate() for robot in robots}
+        self._said_at = -math.inf
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._notice_closed_terminal()
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self) -> None:
+        self._notice_closed_terminal()
+        now = time.monotonic()
+        rows = [self._row(robot, now) for robot in self._robots]
+        doing = f"{now - self._began:5.1f} s  operator: {self._operator.doing}"
+        if self._live is not None:
+            self._live.update(Group(_table(rows), Text(doing), Text("Ctrl-C ends it", style="dim")), refresh=True)
+        elif now - self._said_at >= _LINE_PERIOD_S:
+            self._said_at = now
+            for line in (doing, *("  ".join(["       ", *row.values()]) for row in rows)):
+                self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def _notice_closed_terminal(self) -> None:
+        if self._live is not None and not self._console.is_terminal:
+            self._console.quiet = True  # writing to it would be an error from now on
+            self._ending.set()
+
+    def _row(self, robot: SimulatedRobot, now: float) -> dict[str, str]:
+        sighting = self._sighting(robot.name)
+        row = {"robot": robot.name}
+        if sighting is None:
+            return row | {"transport": "not seen yet"}
+        row |= {"transport": sighting.transport, "heartbeat": _heartbeat(sighting, now)}
+        row["last command"] = self._command(sighting, now)
+        row |= _truth(robot)
+        row["battery"] = _battery(sighting)
+        row["messages"] = f"{self._rates[robot.name].of(sighting.messages, now):3.0f}/s"
+        return row
+
+    def _sighting(self, name: str) -> Sighting | None:
+        return next((seen for seen in list(self._operator.discovery.sightings.values()) if seen.name == name), None)
+
+    def _command(self, sighting: Sighting, now: float) -> str:
+        if sighting.base not in self._operator.commands:
+            return "none yet"
+        drive, sent_at = self._operator.commands[sighting.base]
+        return f"x {drive.x:+.2f} z {drive.z:+.2f}, {now - sent_at:3.1f} s ago"
+
+
+def show_results(console: Console, robots: Sequence[str], verdicts: Sequence[Verdict], problems: Sequence[str]) -> None:
+    """One row per step, one column per robot, of several rounds the worst; then every problem in words."""
+    table = Table(title="Seen by the MCUs: the way, and the time until the stop", title_justify="left")
+    table.add_column("step")
+    for name in robots:
+        table.add_column(name)
+    for step in dict.fromkeys(verdict.step for verdict in verdicts):
+        table.add_row(step, *(_cell(step, name, verdicts) for name in robots))
+    if verdicts:
+        console.print(table)
+    for problem in problems:
+        console.print(problem, style="red", highlight=False, markup=False, soft_wrap=True)
+    if verdicts and not problems:
+        console.print("Every robot moved and stopped as commanded.", style="green")
+
+
+def _cell(step: str, name: str, verdicts: Sequence[Verdict]) -> str:
+    mine = [verdict for verdict in verdicts if verdict.step == step and verdict.robot == name]
+    if not mine:
+        return "not done"
+    worst = max(mine, key=lambda verdict: (len(verdict.wrong), verdict.stop_s))
+    way = f"{worst.ahead_mm:+.0f} mm" if worst.done.step.drive.z else f"{math.degrees(-worst.turned_rad):+.0f}° right"
+    return f"{'FAILED' if worst.wrong else 'ok'}  {way}, {worst.stop_s * 1000:.0f} ms"
+
+
+def _table(columns: Sequence[dict[str, str]]) -> Table:
+    """One column per robot: narrow enough for any terminal."""
+    table = Table(show_header=False)
+    table.add_column()
+    for _ in columns:
+        table.add_column(min_width=_COLUMN_WIDTH)
+    for label in max(columns, key=len):
+        table.add_row(label, *(column.get(label, "") for column in columns))
+    return table
+
+
+def _heartbeat(sighting: Sighting, now: float) -> str:
+    age, latency = sighting.liveness.age_s(now), sighting.liveness.latency_s
+    if age is None:
+        return "none yet"
+    state = {True: "online", False: "OFFLINE", None: "new"}[sighting.liveness.online(now)]
+    return f"{state}, {age:.2f} s ago" + ("" if latency is None else f" ({latency * 1000:.0f} ms)")
+
+
+def _truth(robot: SimulatedRobot) -> dict[str, str]:
+    if not robot.looks:
+        return {"wheels": "", "pose": ""}
+    board = robot.looks[-1].board
+    wheels = f"{board.left_mm_s:+4.0f} {board.right_mm_s:+4.0f} mm/s"
+    degrees = math.degrees(board.pose.heading_rad)
+    return {"wheels": wheels, "pose": f"{board.pose.x_mm:+5.0f} {board.pose.y_mm:+5.0f} mm {degrees:+4.0f}°"}
+
+
+def _battery(sighting: Sighting) -> str:
+    if sighting.volts is not None:
+        return f"{sighting.volts:.2f} V"
+    return {True: "charging", False: "not charging", None: "unknown"}[sighting.charging]

@@ -1,0 +1,1 @@
+"""What may be wrong with a robot's machine, and what to type about it."""

@@ -1,0 +1,94 @@
+"""One MQTT login by hand: does the broker answer, how fast, and whom does it let in? No client library needed."""
+
+from __future__ import annotations
+
+import os
+import socket
+import ssl
+import time
+from dataclasses import dataclass
+
+from pebble.errors import TransportError
+from pebble.transports.mqtt_tls import make_context
+from pebble.transports.settings import MqttSettings
+
+_CLEAN, _PASSWORD, _USER = 0x02, 0x40, 0x80
+_KEEPALIVE_S = 10
+_CONNACK, _DISCONNECT = 0x20, b"\xe0\x00"
+#: Return codes of CONNACK (MQTT 3.1.1, table 3.1) that are about who we are.
+REFUSED_LOGINS = {4: "user name or password is wrong", 5: "not authorised"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """What one attempt came to. ``code`` 0 is an open door; None means that nobody spoke MQTT, and ``problem`` why."""
+
+    code: int | None = None
+    connect_ms: float = 0.0  # TCP alone
+    problem: str = ""
+    expires: float | None = None  # the broker's certificate, in epoch seconds
+
+
+def knock(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> Answer:
+    """Connect and leave again, with the settings' user and password or (``login=False``) without."""
+    before = time.monotonic()
+    try:
+        with socket.create_connection((settings.host, settings.port), timeout_s) as plain:
+            connect_ms = (time.monotonic() - before) * 1000
+            if settings.tls is None:
+                return Answer(code=_greet(plain, settings, login), connect_ms=connect_ms)
+            with make_context(settings.tls).wrap_socket(plain, server_hostname=settings.host) as encrypted:
+                code, expires = _greet(encrypted, settings, login), _expiry(encrypted)
+                return Answer(code=code, connect_ms=connect_ms, expires=expires)
+    except TransportError as error:
+        return Answer(problem=str(error))
+    except OSError as error:  # TLS failures are some of these
+        return Answer(problem=getattr(error, "reason", None) or error.strerror or str(error))
+
+
+def _greet(connection: socket.socket, settings: MqttSettings, login: bool) -> int:
+    connection.sendall(connect_packet(settings, login=login))
+    answer = b""
+    while len(answer) < 4:
+        part = connection.recv(4 - len(answer))
+        if not part:
+            raise ConnectionError("it closed the connection: is this an MQTT broker?")
+        answer += part
+    if answer[0] != _CONNACK:
+        raise ConnectionError("it does not speak MQTT")
+    connection.sendall(_DISCONNECT)
+    return answer[3]
+
+
+def connect_packet(settings: MqttSettings, *, login: bool) -> bytes:
+    """A CONNECT of MQTT 3.1.1 (section 3.1) with a clean session and no will."""
+    flags, fields = _CLEAN, [f"pebble-doctor-{os.getpid()}"]
+    if login and settings.username is not None:
+        flags |= _USER
+        fields.append(settings.username)
+        if settings.password is not None:
+            flags |= _PASSWORD
+            fields.append(settings.password)
+    body = _text("MQTT") + bytes((4, flags)) + _KEEPALIVE_S.to_bytes(2, "big") + b"".join(map(_text, fields))
+    return b"\x10" + _length(len(body)) + body
+
+
+def _text(value: str) -> bytes:
+    raw = value.encode()
+    return len(raw).to_bytes(2, "big") + raw
+
+
+def _length(count: int) -> bytes:
+    """Seven bits per byte, the lowest first (section 2.2.3)."""
+    raw = bytearray()
+    while True:
+        count, digit = divmod(count, 128)
+        raw.append(digit | 0x80 if count else digit)
+        if not count:
+            return bytes(raw)
+
+
+def _expiry(connection: ssl.SSLSocket) -> float | None:
+    certificate = connection.getpeercert()
+    until = certificate.get("notAfter") if certificate else None
+    return ssl.cert_time_to_seconds(until) if isinstance(until, str) else None

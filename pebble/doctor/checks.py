@@ -1,0 +1,341 @@
+"""Is this machine ready for a robot? Checks that only look, and return findings for somebody else to print."""
+
+from __future__ import annotations
+
+import grp
+import ipaddress
+import os
+import pwd
+import resource
+import shutil
+import socket
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from importlib import metadata
+from pathlib import Path
+
+from pebble.config import Config, Mqtt
+from pebble.doctor.broker_probe import REFUSED_LOGINS, Answer, knock
+from pebble.links import REMOTE_RECONNECT_S, mqtt_settings
+from pebble.transports.settings import MqttSettings
+
+_SOCKET_PATH_LIMIT = 108  # bytes, sizeof(sun_path)
+_SOCKET_NAME = len("/0123456789abcdef.sock")
+_ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
+_BUILT = 1735689600  # 2025: a clock before this has not been set
+_SOON_S = 14 * 86400
+_TIMEDATECTL_S = 3.0
+
+
+class Level(Enum):
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing looked at: what, how it is, and the command (or the change) that makes it right."""
+
+    level: Level
+    what: str
+    text: str
+    fix: str = ""
+
+
+def examine(config: Config | None) -> Iterator[Finding]:
+    """Everything about this machine, and about ``config``'s robot on it. Takes seconds when a broker is away."""
+    yield python_version(sys.version_info[:3])
+    for package in ("eclipse-zenoh", "paho-mqtt"):
+        yield installed(package)
+    yield memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], root=os.geteuid() == 0)
+    yield clock(time.time(), synchronised())
+    yield leftover_segments(Path("/dev/shm"), Path("/proc"))  # noqa: S108 - where Zenoh puts them
+    if config is not None and config.robot.platform == "linux":
+        yield from _robot(config)
+
+
+def _robot(config: Config) -> Iterator[Finding]:
+    run_dir = config.run_dir()
+    yield run_directory(run_dir, os.geteuid())
+    yield leftover_sockets(run_dir, _answers)
+    for line in config.serial_instances().values():
+        yield serial_port(Path(str(line.serial.port)))
+    for name, mqtt in _brokers(config):
+        yield from broker(name, mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S))
+
+
+def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:
+    bridge, transport = config.services.mqtt_bridge, config.transport
+    if transport.kind == "mqtt":
+        yield "local broker", config.local_mqtt
+    if transport.mqtt_mirror is not None:
+        yield "mirror's broker", transport.mqtt_mirror
+    if bridge.enabled and (bridge.remote is None or bridge.remote.kind == "mqtt"):
+        yield "remote broker", bridge.remote_mqtt
+
+
+# -- this machine
+
+
+def python_version(version: tuple[int, ...]) -> Finding:
+    text = ".".join(map(str, version))
+    if version < (3, 11):
+        return Finding(Level.FAIL, "python", f"{text} is too old, 3.11 is needed", "sudo apt install python3.11")
+    return Finding(Level.OK, "python", text)
+
+
+def installed(package: str) -> Finding:
+    try:
+        return Finding(Level.OK, package, metadata.version(package))
+    except metadata.PackageNotFoundError:
+        return Finding(Level.FAIL, package, "is not installed", f"{sys.executable} -m pip install {package}")
+
+
+def memory_lock(limit: int, *, root: bool) -> Finding:
+    """``limit`` in bytes, or RLIM_INFINITY. A reader that cannot lock a shared segment loses every frame silently."""
+    if limit == resource.RLIM_INFINITY or limit >= _ENOUGH_LOCKED or root:
+        return Finding(Level.OK, "memory lock", "no limit that matters")
+    return Finding(
+        Level.WARN,
+        "memory lock",
+        f"limited to {limit // 1024} kB: too little for shared camera frames",
+        "LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited` in a root shell",
+    )
+
+
+def clock(now: float, synchronised: bool | None) -> Finding:
+    """``now`` in epoch seconds; ``synchronised`` None where nobody knows."""
+    if now < _BUILT:
+        year = time.gmtime(now).tm_year
+        return Finding(Level.FAIL, "clock", f"says it is {year}: stamps will be wrong", "sudo timedatectl set-ntp true")
+    if synchronised is False:
+        return Finding(
+            Level.WARN, "clock", "is not synchronised: latencies will be wrong", "sudo timedatectl set-ntp true"
+        )
+    return Finding(Level.OK, "clock", "synchronised" if synchronised else "plausible; nobody here synchronises it")
+
+
+def synchronised() -> bool | None:
+    """What systemd knows about NTP; None without systemd."""
+    if shutil.which("timedatectl") is None:
+        return None
+    try:
+        done = subprocess.run(
+            ["timedatectl", "show", "--property=NTPSynchronized", "--value"],
+            capture_output=True,
+            text=True,
+            timeout=_TIMEDATECTL_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return {"yes": True, "no": False}.get(done.stdout.strip())
+
+
+def leftover_segments(shm: Path, proc: Path) -> Finding:
+    """Zenoh's shared memory that belongs to us and that no living process has mapped."""
+    mine = {path for path in shm.glob("*.zenoh") if _owner(path) == os.geteuid()}
+    if not mine:
+        return Finding(Level.OK, "shared memory", "no segments left over")
+    unused = sorted(mine - _mapped(proc, mine))
+    if not unused:
+        return Finding(Level.OK, "shared memory", f"segments in use: {len(mine)}")
+    megabytes = sum(path.stat().st_size for path in unused if path.exists()) / 1e6
+    return Finding(
+        Level.WARN,
+        "shared memory",
+        f"left over from processes that are gone: {len(unused)} ({megabytes:.1f} MB)",
+        "rm " + " ".join(map(str, unused)),
+    )
+
+
+def _mapped(proc: Path, paths: set[Path]) -> set[Path]:
+    found: set[Path] = set()
+    for maps in proc.glob("[0-9]*/maps"):
+        try:
+            text = maps.read_text(errors="replace")
+        except OSError:  # ended meanwhile, or somebody else's: ours are readable
+            continue
+        found |= {path for path in paths if str(path) in text}
+    return found
+
+
+def _owner(path: Path) -> int | None:
+    try:
+        return path.lstat().st_uid
+    except OSError:
+        return None
+
+
+# -- one robot on it
+
+
+def run_directory(path: Path, uid: int) -> Finding:
+    what = "run directory"
+    if len(os.fsencode(path)) + _SOCKET_NAME >= _SOCKET_PATH_LIMIT:
+        return Finding(
+            Level.FAIL, what, f"{path} is too long for unix sockets", "set transport.run_dir to a shorter path"
+        )
+    if not path.exists():
+        return _missing_run_directory(path)
+    found = path.lstat()
+    if not stat.S_ISDIR(found.st_mode):
+        return Finding(Level.FAIL, what, f"{path} is no directory", f"rm {path}")
+    if found.st_uid != uid:
+        return Finding(
+            Level.FAIL, what, f"{path} belongs to {_user(found.st_uid)}, not to you", f"sudo chown {_user(uid)} {path}"
+        )
+    if found.st_mode & 0o077:
+        return Finding(Level.WARN, what, f"{path} is open to other users", f"chmod 700 {path}")
+    return Finding(Level.OK, what, str(path))
+
+
+def _missing_run_directory(path: Path) -> Finding:
+    parent = next(folder for folder in path.parents if folder.exists())
+    if not os.access(parent, os.W_OK | os.X_OK):
+        owner = _user(os.geteuid())
+        return Finding(
+            Level.FAIL, "run directory", f"{path} cannot be made", f"sudo install -d -m 700 -o {owner} {path}"
+        )
+    return Finding(Level.OK, "run directory", f"{path} will be made")
+
+
+def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> Finding:
+    """Sockets that nobody listens on any more; harmless, the next start removes those it uses."""
+    sockets = sorted(run_dir.glob("*.sock")) if os.access(run_dir, os.R_OK) else []
+    dead = [path for path in sockets if not answers(path)]
+    if dead:
+        return Finding(
+            Level.WARN,
+            "sockets",
+            f"left over from processes that are gone: {len(dead)}",
+            "rm " + " ".join(map(str, dead)),
+        )
+    return Finding(Level.OK, "sockets", f"{len(sockets)} in use" if sockets else "none: the robot is not up")
+
+
+def _answers(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(os.fspath(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:  # busy, or not ours to ask: then it is not dead
+            return True
+    return True
+
+
+def serial_port(path: Path) -> Finding:
+    what = f"serial port {path}"
+    try:
+        found = path.stat()
+    except OSError:
+        return Finding(Level.FAIL, what, "is not there: is the MCU plugged in?", "ls -l /dev/serial/by-id/")
+    if not stat.S_ISCHR(found.st_mode):
+        return Finding(Level.FAIL, what, "is no device", "correct services.serial_mcu_bridge.serial.port")
+    if not os.access(path, os.R_OK | os.W_OK):
+        group = _group(found.st_gid)
+        return Finding(
+            Level.FAIL,
+            what,
+            f"may only be used by {group}",
+            f"sudo usermod -aG {group} {_user(os.geteuid())}, then log in again",
+        )
+    return Finding(Level.OK, what, "readable and writable")
+
+
+# -- brokers
+
+
+def broker(
+    name: str, settings: MqttSettings, attempt: Callable[..., Answer] = knock, now: float | None = None
+) -> Iterator[Finding]:
+    """Does it answer, does it know us, and does it let strangers in?"""
+    what = f"{name} {settings.host}:{settings.port}"
+    own = attempt(settings, login=True)
+    if own.code is None:
+        start = (
+            "sudo systemctl start mosquitto"
+            if is_loopback(settings.host)
+            else f"nc -vz {settings.host} {settings.port}"
+        )
+        yield Finding(Level.FAIL, what, f"cannot be reached: {own.problem}", start)
+        return
+    yield _login(what, settings, own)
+    stranger = own if settings.username is None else attempt(settings, login=False)
+    yield _strangers(what, settings, stranger)
+    yield _encryption(what, settings, own, time.time() if now is None else now)
+
+
+def _login(what: str, settings: MqttSettings, answer: Answer) -> Finding:
+    if answer.code == 0:
+        return Finding(Level.OK, what, f"answers, connected in {answer.connect_ms:.1f} ms")
+    why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
+    if settings.username is None:
+        return Finding(Level.FAIL, what, f"refuses us: {why}", "set username and password_file of this broker")
+    return Finding(
+        Level.FAIL,
+        what,
+        f"refuses user {settings.username}: {why}",
+        f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {settings.username}",
+    )
+
+
+def _strangers(what: str, settings: MqttSettings, answer: Answer) -> Finding:
+    if answer.code != 0:
+        return Finding(Level.OK, what, "lets nobody in without a login")
+    if is_loopback(settings.host):
+        return Finding(Level.OK, what, "lets in anybody, seen from this machine")
+    return Finding(
+        Level.WARN,
+        what,
+        "lets in anybody: whoever reaches it can drive the robot",
+        "in mosquitto.conf: allow_anonymous false, password_file /etc/mosquitto/passwd",
+    )
+
+
+def _encryption(what: str, settings: MqttSettings, answer: Answer, now: float) -> Finding:
+    if settings.tls is None:
+        if is_loopback(settings.host):
+            return Finding(Level.OK, what, "not encrypted, and need not be on this machine")
+        return Finding(
+            Level.WARN,
+            what,
+            "is not encrypted: commands and passwords can be read on the way",
+            "set tls.enabled to true",
+        )
+    if answer.expires is not None and answer.expires - now < _SOON_S:
+        days = (answer.expires - now) / 86400
+        return Finding(Level.WARN, what, f"its certificate ends in {days:.0f} days", "renew the broker's certificate")
+    return Finding(Level.OK, what, "encrypted")
+
+
+def is_loopback(host: str) -> bool:
+    """By its spelling: names are not looked up."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def _group(gid: int) -> str:
+    try:
+        return grp.getgrgid(gid).gr_name
+    except KeyError:
+        return str(gid)

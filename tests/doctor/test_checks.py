@@ -1,0 +1,245 @@
+"""The doctor finds what is wrong, and says what mends it."""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import resource
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.config import load
+from pebble.doctor import checks as doctor
+from pebble.doctor.broker_probe import Answer, connect_packet, knock
+from pebble.doctor.checks import Finding, Level
+from pebble.transports.settings import MqttSettings, TlsSettings
+from tests.support import Broker, free_port
+
+MEGABYTE = 1024 * 1024
+
+
+@pytest.fixture(scope="module")
+def open_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("open"))
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture(scope="module")
+def closed_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Knows ann, whose password is geheim."""
+    folder = tmp_path_factory.mktemp("closed")
+    subprocess.run(
+        ["mosquitto_passwd", "-b", "-c", str(folder / "passwords"), "ann", "geheim"], check=True, capture_output=True
+    )
+    broker = Broker(folder, "allow_anonymous false", f"password_file {folder / 'passwords'}")
+    yield broker
+    broker.stop()
+
+
+def levels(findings: Iterator[Finding]) -> list[str]:
+    return [finding.level.value for finding in findings]
+
+
+# -- the machine
+
+
+def test_versions() -> None:
+    assert doctor.python_version((3, 11, 2)).level is Level.OK
+    assert doctor.python_version((3, 10, 9)).level is Level.FAIL
+    assert doctor.installed("paho-mqtt").level is Level.OK
+    missing = doctor.installed("no-such-package")
+    assert missing.level is Level.FAIL
+    assert missing.fix.endswith("-m pip install no-such-package")
+
+
+def test_memory_lock() -> None:
+    assert doctor.memory_lock(resource.RLIM_INFINITY, root=False).level is Level.OK
+    assert doctor.memory_lock(64 * MEGABYTE, root=False).level is Level.OK
+    assert doctor.memory_lock(8 * MEGABYTE, root=True).level is Level.OK
+    low = doctor.memory_lock(8 * MEGABYTE, root=False)
+    assert low.level is Level.WARN
+    assert "8192 kB" in low.text
+    assert "LimitMEMLOCK=infinity" in low.fix
+
+
+@pytest.mark.parametrize(
+    ("now", "synchronised", "level"),
+    [(0.0, True, Level.FAIL), (1.8e9, True, Level.OK), (1.8e9, None, Level.OK), (1.8e9, False, Level.WARN)],
+)
+def test_clock(now: float, synchronised: bool | None, level: Level) -> None:
+    finding = doctor.clock(now, synchronised)
+    assert finding.level is level
+    assert bool(finding.fix) == (level is not Level.OK)
+
+
+@pytest.mark.parametrize(
+    ("script", "known"), [("echo yes", True), ("echo no", False), ("exit 1", None), ("echo Failed to connect", None)]
+)
+def test_what_systemd_knows_of_the_clock(
+    script: str, known: bool | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool = tmp_path / "timedatectl"
+    tool.write_text(f"#!/bin/sh\n{script}\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert doctor.synchronised() is known
+    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
+    assert doctor.synchronised() is None
+
+
+def test_segments_in_use_are_no_leftovers(tmp_path: Path) -> None:
+    used, left = tmp_path / "1.zenoh", tmp_path / "2.zenoh"
+    assert doctor.leftover_segments(tmp_path, Path("/proc")).level is Level.OK
+    used.write_bytes(bytes(4096))
+    with used.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
+        assert doctor.leftover_segments(tmp_path, Path("/proc")).level is Level.OK
+        left.write_bytes(bytes(4096))
+        finding = doctor.leftover_segments(tmp_path, Path("/proc"))
+    assert finding.level is Level.WARN
+    assert finding.fix == f"rm {left}"
+
+
+# -- the robot
+
+
+def test_run_directory(tmp_path: Path) -> None:
+    own, uid = tmp_path / "run", os.geteuid()
+    assert doctor.run_directory(own, uid).text.endswith("will be made")
+    own.mkdir(mode=0o700)
+    assert doctor.run_directory(own, uid).level is Level.OK
+    own.chmod(0o755)
+    assert doctor.run_directory(own, uid) == Finding(
+        Level.WARN, "run directory", f"{own} is open to other users", f"chmod 700 {own}"
+    )
+    assert doctor.run_directory(own, uid + 1).fix.startswith("sudo chown")
+    assert doctor.run_directory(tmp_path / ("x" * 100), uid).level is Level.FAIL
+    (tmp_path / "file").touch()
+    assert doctor.run_directory(tmp_path / "file", uid).text.endswith("is no directory")
+
+
+def test_sockets_of_the_dead_are_found(tmp_path: Path) -> None:
+    assert doctor.leftover_sockets(tmp_path / "missing", doctor._answers).level is Level.OK
+    with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:
+        living.bind(str(tmp_path / "living.sock"))
+        living.listen()
+        assert doctor.leftover_sockets(tmp_path, doctor._answers).text == "1 in use"
+        dying.bind(str(tmp_path / "dead.sock"))
+        finding = doctor.leftover_sockets(tmp_path, doctor._answers)
+    assert finding.level is Level.WARN
+    assert finding.fix == f"rm {tmp_path / 'dead.sock'}"
+
+
+def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    missing = doctor.serial_port(tmp_path / "ttyACM0")
+    assert missing.level is Level.FAIL
+    assert "plugged in" in missing.text
+    (tmp_path / "file").touch()
+    assert doctor.serial_port(tmp_path / "file").text == "is no device"
+    tty = os.ttyname(os.openpty()[1])
+    assert doctor.serial_port(Path(tty)).level is Level.OK
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert doctor.serial_port(Path(tty)).fix.startswith("sudo usermod -aG ")
+
+
+# -- brokers
+
+
+def test_an_open_broker_on_this_machine_is_fine(open_broker: Broker) -> None:
+    findings = list(doctor.broker("local broker", MqttSettings(host="127.0.0.1", port=open_broker.port)))
+    assert levels(iter(findings)) == ["ok", "ok", "ok"]
+    assert " ms" in findings[0].text
+    assert "anybody" in findings[1].text
+
+
+def test_a_broker_that_knows_us_and_nobody_else(closed_broker: Broker) -> None:
+    def found(username: str | None, password: str | None) -> list[Finding]:
+        settings = MqttSettings(host="127.0.0.1", port=closed_broker.port, username=username, password=password)
+        return list(doctor.broker("local broker", settings))
+
+    right, wrong, none = found("ann", "geheim"), found("ann", "falsch"), found(None, None)
+    assert [finding.level for finding in right] == [Level.OK] * 3
+    assert right[1].text == "lets nobody in without a login"
+    assert wrong[0].level is Level.FAIL
+    assert wrong[0].text.startswith("refuses user ann: ")
+    assert none[0].fix == "set username and password_file of this broker"
+    assert "falsch" not in str(wrong)
+
+
+def test_nobody_there() -> None:
+    port = free_port()
+    finding, *more = doctor.broker("local broker", MqttSettings(host="127.0.0.1", port=port))
+    assert more == []
+    assert finding == Finding(
+        Level.FAIL,
+        f"local broker 127.0.0.1:{port}",
+        "cannot be reached: Connection refused",
+        "sudo systemctl start mosquitto",
+    )
+
+
+def answering(own: Answer, stranger: Answer) -> Callable[..., Answer]:
+    return lambda _settings, *, login: own if login else stranger
+
+
+def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
+    let_in, shut_out = Answer(code=0, connect_ms=3.0), Answer(code=5)
+    plain = MqttSettings(host="broker.example", username="ann", password="geheim")
+    tls = MqttSettings(host="broker.example", port=8883, username="ann", password="geheim", tls=TlsSettings())
+    assert levels(doctor.broker("b", plain, answering(let_in, let_in))) == ["ok", "warn", "warn"]
+    assert levels(doctor.broker("b", plain, answering(let_in, shut_out))) == ["ok", "ok", "warn"]
+    assert levels(doctor.broker("b", tls, answering(let_in, shut_out))) == ["ok", "ok", "ok"]
+    ending = Answer(code=0, expires=1000.0 + 3 * 86400)
+    *_, last = doctor.broker("b", tls, answering(ending, shut_out), 1000.0)
+    assert (last.level, last.text) == (Level.WARN, "its certificate ends in 3 days")
+
+
+def test_what_is_no_broker_is_told_apart() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1])
+        assert "timed out" in knock(settings, login=True, timeout_s=0.2).problem
+    wrong_file = MqttSettings(host="127.0.0.1", port=free_port(), tls=TlsSettings(ca_cert=Path("/nowhere/ca.pem")))
+    assert knock(wrong_file, login=True).problem != ""
+
+
+def test_the_login_is_spelled_as_mqtt_says() -> None:
+    settings = MqttSettings(host="b", username="ann", password="p" * 200)
+    anonymous, named = connect_packet(settings, login=False), connect_packet(settings, login=True)
+    assert anonymous[:1] + anonymous[2:12] == b"\x10\x00\x04MQTT\x04\x02\x00\x0a"
+    assert anonymous[1] == len(anonymous) - 2
+    assert named[1] & 0x80  # two bytes of length
+    assert (named[1] & 0x7F) + named[2] * 128 == len(named) - 3
+    assert named[10] == 0xC2
+    assert named.endswith(b"\x00\x03ann\x00\xc8" + b"p" * 200)
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [("localhost", True), ("127.0.0.1", True), ("::1", True), ("192.168.1.2", False), ("b", False)],
+)
+def test_loopback(host: str, loopback: bool) -> None:
+    assert doctor.is_loopback(host) is loopback
+
+
+def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
+    path = tmp_path / "fred.json"
+    bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": free_port()}}
+    serial = {"enabled": True, "serial": {"port": str(tmp_path / "ttyACM0")}}
+    text = {
+        "robot": {"id": "fred"},
+        "local_mqtt": {"port": open_broker.port},
+        "services": {"mqtt_bridge": bridge, "serial_mcu_bridge": serial},
+    }
+    path.write_text(json.dumps(text))
+    findings = list(doctor.examine(load(path)))
+    failed = [finding.what.split(" ")[0] for finding in findings if finding.level is Level.FAIL]
+    assert failed == ["serial", "remote"]
+    assert {"python", "eclipse-zenoh", "memory lock", "clock", "shared memory", "run directory", "sockets"} <= {
+        finding.what for finding in findings
+    }
+    assert [finding for finding in findings if finding.level is not Level.OK and not finding.fix] == []

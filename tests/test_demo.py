@@ -1,0 +1,162 @@
+"""The demo as a user starts it: real brokers, real launchers, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.demo.script import ROUND_S
+from tests.support import ROOT, until
+
+START_S, END_S = 40.0, 5.0
+MARK = "PEBBLE_TEST_DEMO"
+
+
+class Demo:
+    """One run, with everything it starts marked by a variable that children inherit."""
+
+    def __init__(self, folder: Path, code: str, terminal: int | None = None) -> None:
+        self.temporary = folder
+        self.log = folder / "demo.log"
+        self._mark = uuid.uuid4().hex
+        with self.log.open("wb") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", code],
+                cwd=ROOT,
+                env={**os.environ, MARK: self._mark, "TMPDIR": str(folder)},
+                stdout=output if terminal is None else terminal,
+                stderr=output,
+            )
+
+    @property
+    def said(self) -> str:
+        return self.log.read_text()
+
+    def leftovers(self) -> list[str]:
+        """Command lines of living processes that this demo started."""
+        entry = f"{MARK}={self._mark}".encode()
+        return [line for pid in _pids() if entry in _read(pid, "environ") and (line := _command(pid))]
+
+    def folders(self) -> list[Path]:
+        return list(self.temporary.glob("pebble-demo-*"))
+
+    def end(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait(10)
+
+
+def _pids() -> list[str]:
+    return [path.name for path in Path("/proc").iterdir() if path.name.isdecimal() and int(path.name) != os.getpid()]
+
+
+def _read(pid: str, name: str) -> bytes:
+    try:
+        return Path("/proc", pid, name).read_bytes()
+    except OSError:  # it ended while we looked
+        return b""
+
+
+def _command(pid: str) -> str:
+    return _read(pid, "cmdline").replace(b"\0", b" ").decode()
+
+
+@pytest.fixture
+def temporary() -> Iterator[Path]:
+    """Short: the robots' unix sockets live below, and their paths end at 108 bytes."""
+    with tempfile.TemporaryDirectory(prefix="pebble-", dir="/tmp") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
+def demos(temporary: Path) -> Iterator[list[Demo]]:
+    """Whatever is put in here surely ends."""
+    running: list[Demo] = []
+    yield running
+    for demo in running:
+        demo.end()
+
+
+def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None = None) -> Demo:
+    imports = "import sys; from pebble.demo.broker import BrokerKind; from pebble.demo.main import run"
+    demos.append(Demo(folder, f"{imports}; sys.exit(run({arguments}))", terminal))
+    return demos[-1]
+
+
+@pytest.mark.parametrize("broker", ["MOSQUITTO", "EMBEDDED"])
+def test_both_robots_do_what_they_are_told(demos: list[Demo], temporary: Path, broker: str) -> None:
+    demo = start(demos, temporary, f"{ROUND_S + 1.0}, broker=BrokerKind.{broker}")
+    assert demo.process.wait(START_S + ROUND_S + END_S) == 0, demo.said
+    assert demo.said.count("ok ") == 8, demo.said  # four steps, two robots
+    assert " zenoh " in demo.said
+    assert " mqtt " in demo.said
+    assert demo.leftovers() == []
+    assert demo.folders() == []
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_everything_within_five_seconds(demos: list[Demo], temporary: Path, sign: signal.Signals) -> None:
+    demo = start(demos, temporary, "")
+    assert until(lambda: "forward, stop" in demo.said, START_S), demo.said
+    demo.process.send_signal(sign)
+    began = time.monotonic()
+    assert demo.process.wait(30) == 0, demo.said
+    assert time.monotonic() - began <= END_S
+    assert demo.leftovers() == []
+    assert demo.folders() == []
+
+
+def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demos: list[Demo], temporary: Path) -> None:
+    """To make, for example, if that leads the session: it only waits for us."""
+    ours, terminal = pty.openpty()
+    demo = start(demos, temporary, "", terminal)
+    os.close(terminal)
+    shown = bytearray()
+
+    def shows(text: bytes) -> bool:
+        shown.extend(os.read(ours, 65536))  # a frame comes ten times a second
+        return text in shown
+
+    try:
+        assert until(lambda: shows(b"forward, stop"), START_S), shown
+    finally:
+        os.close(ours)
+    assert demo.process.wait(END_S) == 0, demo.said
+    assert demo.said == ""
+    assert demo.leftovers() == []
+    assert demo.folders() == []
+
+
+def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Path) -> None:
+    demo = start(demos, temporary, "")
+    assert until(lambda: "forward, stop" in demo.said, START_S), demo.said
+    assert len(demo.leftovers()) >= 10  # the demo, two brokers, two MCUs, two launchers and what they launched
+    demo.process.kill()
+    demo.process.wait(10)
+    assert until(lambda: demo.leftovers() == [], END_S), demo.leftovers()
+
+
+def test_a_robot_that_does_not_come_up_is_a_failure_with_a_place_to_look(demos: list[Demo], temporary: Path) -> None:
+    code = """
+import sys
+import pebble.demo.main as main
+import pebble.demo.robot as robot
+main._DISCOVERY_S = 1.0
+robot.SimulatedRobot.start = lambda self, ending: None
+sys.exit(main.run(10))
+"""
+    demos.append(Demo(temporary, code))
+    assert demos[0].process.wait(START_S) == 1
+    assert "goob did not become ready to drive" in demos[0].said
+    (folder,) = demos[0].folders()
+    assert str(folder) in demos[0].said
