@@ -1,0 +1,127 @@
+"""An operator made of nothing but a stock MQTT client and the contract: no code of ours between it and the wire."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion
+
+from tests.support import until
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One message as the operator received it."""
+
+    at: float  # time.monotonic()
+    topic: str
+    payload: bytes
+    retain: bool
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.payload)
+
+
+class Operator:
+    """Connects to one broker, listens to one robot, remembers what it saw, and sends what it is told."""
+
+    def __init__(self, port: int, base: str) -> None:
+        self.base = base
+        self.seen: list[Seen] = []
+        self._client = paho.Client(CallbackAPIVersion.VERSION2)
+        self._client.on_connect = self._subscribe
+        self._client.on_message = self._remember
+        self._client.reconnect_delay_set(min_delay=1, max_delay=1)
+        self._client.connect("127.0.0.1", port, keepalive=5)
+        self._client.loop_start()
+        assert until(self._client.is_connected, 10)
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def drop(self) -> None:
+        """Vanish without a goodbye, as a laptop that is shut does."""
+        self._client.loop_stop()
+        sock = self._client.socket()
+        if sock is not None:
+            sock.close()
+
+    def send(self, suffix: str, body: Any, *, qos: int = 1, retain: bool = False) -> None:
+        """Publish ``body`` (bytes as they are, anything else as JSON) below the robot's base."""
+        raw = body if isinstance(body, bytes) else json.dumps(body).encode()
+        self._client.publish(f"{self.base}/{suffix}", raw, qos=qos, retain=retain)
+
+    def on(self, suffix: str, since: float = 0.0) -> list[Seen]:
+        """Everything seen on one topic after ``since`` (monotonic)."""
+        return [seen for seen in list(self.seen) if seen.topic == f"{self.base}/{suffix}" and seen.at >= since]
+
+    def last(self, suffix: str) -> Seen | None:
+        seen = self.on(suffix)
+        return seen[-1] if seen else None
+
+    def wait_for(self, suffix: str, timeout: float = 10.0, since: float = 0.0) -> Seen:
+        """The first message on a topic after ``since``; fails when none comes in time."""
+        assert until(lambda: self.on(suffix, since), timeout), f"nothing on {suffix} within {timeout} s"
+        return self.on(suffix, since)[0]
+
+    def _subscribe(self, client: paho.Client, *_: Any) -> None:
+        client.subscribe(f"{self.base}/#", qos=1)
+
+    def _remember(self, _client: paho.Client, _data: Any, message: paho.MQTTMessage) -> None:
+        self.seen.append(Seen(time.monotonic(), message.topic, bytes(message.payload), bool(message.retain)))
+
+
+def kept_copies(port: int, base: str, settle_s: float = 0.5) -> dict[str, bytes]:
+    """What a late operator finds below ``base``: kept copies only, by suffix."""
+    late = Operator(port, base)
+    time.sleep(settle_s)  # nothing announces that the last kept copy has come
+    late.close()
+    return {seen.topic.removeprefix(f"{base}/"): seen.payload for seen in late.seen if seen.retain}
+
+
+# -- numbered driving: every command is told apart by what it makes the wheels do
+
+_STEPS = 800  # wheel values 0.100 … 0.899, three decimals as on the serial line
+
+
+def numbered(number: int) -> dict[str, float]:
+    """The drive command number ``number`` (0 … 639,999): both wheels turn, each command differently."""
+    left = 0.1 + (number % _STEPS) / 1000
+    right = 0.1 + (number // _STEPS % _STEPS) / 1000
+    return {"x": (left - right) / 2, "z": (left + right) / 2}
+
+
+def number_of(left: float, right: float) -> int:
+    """Which command set these wheels."""
+    return round((left - 0.1) * 1000) + _STEPS * round((right - 0.1) * 1000)
+
+
+class Driver:
+    """Sends numbered commands at ``rate_hz`` until stopped, and remembers when each was sent."""
+
+    def __init__(self, operator: Operator, rate_hz: float = 20.0, first: int = 0) -> None:
+        self.sent_at: dict[int, float] = {}
+        self._operator, self._period, self._first = operator, 1 / rate_hz, first
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        number, due = self._first, time.monotonic()
+        while not self._stop.is_set():
+            self.sent_at[number] = time.monotonic()
+            self._operator.send("incoming/drive-values", numbered(number))
+            number += 1
+            due += self._period
+            self._stop.wait(max(0.0, due - time.monotonic()))

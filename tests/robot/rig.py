@@ -1,0 +1,236 @@
+"""A whole robot as real processes, to be looked at from outside only: the remote broker and the MCU's pty."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from pebble.simulation.trace import Entry, read_trace
+from tests.link import Link
+from tests.robot.operator import Operator
+from tests.support import ROOT, Broker, until
+
+BASE = "pebble/robots/rover"
+STOP = (0.0, 0.0)
+PROGRAMS = ("zenoh_hub", "announcer", "serial_mcu_bridge", "mqtt_bridge", "mqtt_mirror")
+
+
+class Mcu:
+    """The simulated motor MCU in its own process, and the trace of what it was told."""
+
+    def __init__(self, folder: Path, kind: str = "goob") -> None:
+        self.port, self._trace = folder / "tty", folder / "trace.jsonl"
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "pebble.simulation.mcu", "--kind", kind, "--link", str(self.port),
+             "--trace", str(self._trace), "--control"],
+            cwd=ROOT, stdin=subprocess.PIPE,
+        )  # fmt: skip
+        assert until(self.port.exists, 10), "the simulated MCU did not start"
+
+    def tell(self, word: str) -> None:
+        """``unplug``, ``replug``, ``charge``, …"""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{word}\n".encode())
+        self._process.stdin.flush()
+
+    def entries(self, since: float = 0.0) -> list[Entry]:
+        """What happened on the line after ``since`` (monotonic seconds)."""
+        return [entry for entry in read_trace(self._trace) if entry.ns >= since * 1e9]
+
+    def drives(self, since: float = 0.0) -> list[tuple[float, tuple[float, float]]]:
+        """Every drive line after ``since`` as (monotonic seconds, (left, right))."""
+        return [(entry.ns / 1e9, entry.drive) for entry in self.entries(since) if entry.drive is not None]
+
+    def moving(self, since: float = 0.0) -> bool:
+        drives = self.drives(since)
+        return bool(drives) and drives[-1][1] != STOP
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.wait(10)
+
+
+class Rig:
+    """Brokers, MCU, robot and operator. ``kind`` is ``mqtt``, ``zenoh`` or ``single`` (one broker for both sides).
+
+    The way to the remote broker leads through ``uplink``, which can fail; ``direct`` goes without it, because a program
+    in between answers TCP in the robot's place and so changes the timing.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        *,
+        mirror: bool = False,
+        mcu: str = "goob",
+        start: bool = True,
+        direct: bool = False,
+        **config: Any,
+    ) -> None:
+        self.kind, self._extra, self._direct = kind, config, direct
+        self.charge_later = "charge"  # what to tell the MCU in the middle of a fault
+        self._folder = tempfile.TemporaryDirectory(prefix="pbl")
+        self.folder = Path(self._folder.name)
+        self.remote = Broker(self.folder)
+        self.uplink = Link(self.remote.port)
+        self.local = Broker(self.folder) if kind == "mqtt" or mirror else None
+        self.mirror = mirror
+        self.mcu = Mcu(self.folder, mcu)
+        self.config = self.folder / "robot.json"
+        self.config.write_text(json.dumps(self._config(), indent=1))
+        self.log = self.folder / "robot.log"
+        self._robot: subprocess.Popen[bytes] | None = None
+        self.operator = Operator(self.remote.port, BASE)
+        if start:
+            try:
+                self.start()
+            except BaseException:
+                self.close()  # nobody else can: there is no rig yet
+                raise
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- the robot
+
+    def start(self, ready: bool = True) -> float:
+        """Start the launcher; returns the monotonic time just before. Waits until the robot is up if asked."""
+        began = time.monotonic()
+        with self.log.open("ab") as log:
+            self._robot = subprocess.Popen(
+                [sys.executable, "-m", "pebble.cli", "up", str(self.config)], cwd=ROOT, stderr=log, stdout=log
+            )
+        if ready:
+            self.wait_until_up(began)
+        return began
+
+    def wait_until_up(self, since: float, timeout: float = 15.0) -> None:
+        """Every service says ready, and the heart beats."""
+        assert until(lambda: self._up(since), timeout), f"the robot is not up:\n{self.log.read_text()[-4000:]}"
+
+    def stop(self) -> int:
+        """Stop the robot politely; returns the launcher's exit code."""
+        assert self._robot is not None
+        self._robot.send_signal(signal.SIGTERM)
+        return self._robot.wait(20)
+
+    def kill_launcher(self) -> list[int]:
+        """SIGKILL for the launcher; returns the pids of the children it leaves."""
+        assert self._robot is not None
+        children = list(self.processes().values())
+        self._robot.kill()
+        self._robot.wait(10)
+        return children
+
+    def processes(self) -> dict[str, int]:
+        """The launcher's children by program: ``{"mqtt_bridge": pid, …}``."""
+        assert self._robot is not None
+        task = Path(f"/proc/{self._robot.pid}/task/{self._robot.pid}/children")
+        return {_program(pid): pid for pid in map(int, task.read_text().split())}
+
+    @property
+    def launcher_pid(self) -> int:
+        assert self._robot is not None
+        return self._robot.pid
+
+    def kill(self, program: str) -> float:
+        """SIGKILL one process of the robot; returns when."""
+        pid = self.processes()[program]
+        os.kill(pid, signal.SIGKILL)
+        return time.monotonic()
+
+    def kill_local_broker(self) -> None:
+        """The robot's own broker dies, is away for a second, and has forgotten everything."""
+        assert self.local is not None
+        self.local.kill()
+        time.sleep(1)
+        self.local.start()
+
+    @staticmethod
+    def alive(pid: int) -> bool:
+        """Does this process still run? (A zombie does not.)"""
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        except FileNotFoundError:
+            return False
+
+    def close(self) -> None:
+        self.operator.close()
+        if self._robot is not None and self._robot.poll() is None:
+            self.stop()
+        self.mcu.close()
+        self.uplink.stop()
+        for broker in (self.local, self.remote):
+            if broker is not None:
+                broker.stop()
+        self._folder.cleanup()
+
+    def _up(self, since: float) -> bool:
+        status, heartbeat = self.operator.last("outgoing/status"), self.operator.last("outgoing/online")
+        if status is None or heartbeat is None or status.at < since or heartbeat.at < since:
+            return False
+        states = [service["state"] for service in status.json["value"]["services"].values()]
+        return bool(states) and set(states) == {"ready"} and heartbeat.json.get("online") is not False
+
+    # -- its config
+
+    def _config(self) -> dict[str, Any]:
+        services: dict[str, Any] = {
+            "mqtt_bridge": {
+                "enabled": True,
+                "remote_mqtt": {
+                    "host": "127.0.0.1",
+                    "port": self.remote.port if self._direct else self.uplink.port,
+                },
+                **self._actions(),
+            },
+            "serial_mcu_bridge": {
+                "enabled": True,
+                "serial": {"port": str(self.mcu.port), "baud": 460800},
+                "telemetry": {"publish_touch_sensors": True},
+            },
+        }
+        for name, more in self._extra.items():
+            services[name] = {**services.get(name, {}), **more}
+        return {"robot": {"id": "rover"}, **self._transport(), "services": services}
+
+    def _transport(self) -> dict[str, Any]:
+        if self.kind == "zenoh":
+            own: dict[str, Any] = {"kind": "zenoh", "run_dir": str(self.folder / "run")}
+            if self.mirror:
+                assert self.local is not None
+                own["mqtt_mirror"] = {"host": "127.0.0.1", "port": self.local.port}
+            return {"transport": own}
+        # localhost here and 127.0.0.1 there: one broker under two names must be recognised, too
+        port = self.remote.port if self.kind == "single" or self.local is None else self.local.port
+        return {
+            "local_mqtt": {"host": "localhost", "port": port},
+            "transport": {"kind": "mqtt", "run_dir": str(self.folder / "run")},
+        }
+
+    def recorded(self) -> list[str]:
+        """Which action commands ran, in order; recorders stand in for reboot and the like."""
+        record = self.folder / "actions.txt"
+        return record.read_text().split() if record.exists() else []
+
+    def _actions(self) -> dict[str, Any]:
+        def recorder(name: str) -> dict[str, Any]:
+            return {"command": ["sh", "-c", f"echo {name} >> {self.folder}/actions.txt"], "cooldown_seconds": 0}
+
+        return {f"{name}_control": recorder(name) for name in ("reboot", "service_restart", "git_pull")}
+
+
+def _program(pid: int) -> str:
+    """What a child of the launcher is. The kernel knows the first 15 bytes of its name."""
+    said = Path(f"/proc/{pid}/comm").read_text().strip()
+    return next((name for name in PROGRAMS if name[:15] == said), said)

@@ -1,0 +1,202 @@
+"""100,000 malformed messages and as many garbage lines: nothing dies, nothing moves, every refusal is counted."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import select
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.contract import CHANNELS, INCOMING, Channel
+from pebble.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand
+from tests.robot.rig import Rig
+from tests.support import until
+
+MESSAGES = 100_000
+CHUNK = 2_000  # sent before waiting for a sign that the robot has read them
+
+
+# -- an oracle of its own: what the contract accepts, written with nothing but the standard library
+
+
+def valid(channel: Channel, raw: bytes) -> bool:
+    """Might this do something? Generous: everything doubtful counts as valid and is not sent."""
+    try:
+        body = json.loads(raw.decode())
+    except (ValueError, RecursionError):
+        return False
+    if channel.payload is bool:
+        return isinstance(body, bool) or (
+            isinstance(body, dict) and any(isinstance(body.get(key), bool) for key in ("value", "enabled"))
+        )
+    if channel.payload in (SoundboardCommand, AutonomyCommand) and isinstance(body, bool):
+        return True
+    if not isinstance(body, dict):
+        return False
+    inner = body["value"] if isinstance(body.get("value"), dict) else body
+    names = {Drive: "xzy", LightsSolid: "bgr", LightsFlash: ["b", "g", "r", "period"]}.get(channel.payload)
+    return names is None or all(_number(inner[name], channel.payload is Drive) for name in names if name in inner)
+
+
+def _number(value: Any, strings: bool) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float, str) if strings else (int, float)):
+        return False
+    try:
+        return math.isfinite(float(value))
+    except (ValueError, OverflowError):
+        return False
+
+
+# -- garbage of many kinds
+
+
+def garbage(channel: Channel, chance: random.Random) -> bytes:
+    """One message that the oracle refuses."""
+    while True:
+        raw = chance.choice(_KINDS)(chance)
+        if not valid(channel, raw):
+            return raw
+
+
+def _noise(chance: random.Random) -> bytes:
+    return chance.randbytes(chance.randrange(0, 60))
+
+
+def _wrong_number(chance: random.Random) -> bytes:
+    axis = chance.choice(["x", "z", "y", "b", "g", "r", "period", "on", "value", "enabled"])
+    value = chance.choice(
+        ["NaN", "Infinity", "-Infinity", '"nan"', '"inf"', "1e999", "-1e999", "null", "[]", "{}", '"on"']
+    )
+    return f'{{"{axis}": {value}, "x": {value}, "z": {value}, "r": {value}}}'.encode()
+
+
+def _nested(chance: random.Random) -> bytes:
+    depth = chance.randrange(33, 3000)
+    return chance.choice([b"[" * depth, b'{"value":' * depth, b"[" * depth + b"]" * depth])
+
+
+def _scalar(chance: random.Random) -> bytes:
+    return chance.choice([b"null", b"0", b"1", b'"true"', b"[true]", b'"on"', b"TRUE", b"True", b"1.5e308", b"-0"])
+
+
+def _broken_utf8(chance: random.Random) -> bytes:
+    return b'{"x": 1, "z": 1, "value": true, "n": "' + chance.randbytes(3).replace(b'"', b"\xff") + b'\xff"}'
+
+
+def _truncated(chance: random.Random) -> bytes:
+    whole = b'{"value": {"x": 0.5, "z": 0.5, "action": "play", "on": true}, "enabled": true}'
+    return whole[: chance.randrange(len(whole))]
+
+
+def _oversized(chance: random.Random) -> bytes:
+    return b'{"x": "' + b"9" * chance.randrange(400, 900) + b'", "z": "1e400"}'
+
+
+_KINDS = (_noise, _wrong_number, _nested, _scalar, _broken_utf8, _truncated, _oversized)
+
+STOP = b"M 0.000 0.000\n"
+
+_TARGETS = [channel for channel in CHANNELS if channel.direction == INCOMING and channel.payload is not bytes]
+
+
+@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with Rig(request.param, mcu="goob") as rig:
+        yield rig
+
+
+@pytest.mark.timeout(180)
+def test_malformed_messages(rig: Rig) -> None:
+    chance = random.Random(7)
+    processes, memory, began = rig.processes(), _memory(rig), time.monotonic()
+    for first in range(0, MESSAGES, CHUNK):
+        for _ in range(CHUNK):
+            channel = chance.choice(_TARGETS)
+            topic = channel.suffix.format(uid="u", name="n", outlet="o1")
+            rig.operator.send(topic, garbage(channel, chance), qos=0)
+        assert _listens(rig, first / MESSAGES), f"deaf after {first + CHUNK} messages"
+    assert rig.processes() == processes
+    assert not rig.mcu.moving(began)
+    assert rig.recorded() == []
+    assert _memory(rig) - memory < 30 * 1024, "memory grew by more than 30 MB"
+    assert until(lambda: any("refused" in seen.json["message"] for seen in rig.operator.on("outgoing/logs", began)), 10)
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("rig", ["zenoh"], indirect=True)  # what reads the line knows nothing of transports
+def test_garbage_lines(rig: Rig) -> None:
+    """Written by something at the other end of the line, as fast as the host reads."""
+    chance = random.Random(11)
+    processes, memory, began = rig.processes(), _memory(rig), time.monotonic()
+    rig.mcu.tell("unplug")
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    assert until(lambda: not rig.mcu.port.is_symlink(), 5)
+    rig.mcu.port.symlink_to(os.ttyname(slave))
+    answers = b""
+    for _ in range(MESSAGES // CHUNK):
+        answers += _write(master, b"".join(garbage_line(chance) for _ in range(CHUNK)))
+    assert answers.startswith(STOP)
+    assert set(answers.splitlines()) == {STOP.strip()}
+    rig.mcu.port.unlink()
+    os.close(slave)
+    os.close(master)
+    rig.mcu.tell("replug")
+    assert until(lambda: _listens(rig, 0.5), 10)
+    assert rig.processes() == processes
+    assert not rig.mcu.moving(began)
+    assert _memory(rig) - memory < 30 * 1024
+    assert rig.recorded() == []
+
+
+def garbage_line(chance: random.Random) -> bytes:
+    """What a broken, confused or malicious MCU might say."""
+    junk = chance.randbytes(chance.randrange(0, 40))
+    value = chance.choice([b"nan", b"inf", b"1e999", b"-", b"", b"9" * 300, b"0x10", junk])
+    return chance.choice(
+        [
+            junk,
+            b"T a0=" + value,
+            b"C v=" + value + b" chg=" + value,
+            b"M 1.000 1.000",
+            b"T" * 300,
+            b"\0\0OK",
+            b"ERR " + junk,
+        ]
+    ) + chance.choice([b"\n", b"\r\n", b"\n\n"])
+
+
+def _write(master: int, data: bytes) -> bytes:
+    """Push ``data`` into the line; returns what the host said meanwhile. Fails if the host stops reading."""
+    heard, deadline = b"", time.monotonic() + 30
+    os.set_blocking(master, False)
+    while data:
+        assert time.monotonic() < deadline, "the host has stopped reading the line"
+        readable, writable, _ = select.select([master], [master], [], 1)
+        if readable:
+            heard += os.read(master, 65536)
+        if writable:
+            data = data[os.write(master, data[:4096]) :]
+    return heard
+
+
+def _listens(rig: Rig, shade: float) -> bool:
+    """A good message behind all the bad ones still arrives."""
+    began = time.monotonic()
+    rig.operator.send("incoming/lights-solid", {"g": round(shade, 3)})
+    line = f"L 0.000 {shade:.3f} 0.000"
+    return until(lambda: any(entry.line == line for entry in rig.mcu.entries(began)), 20)
+
+
+def _memory(rig: Rig) -> int:
+    """Resident memory of all the robot's processes, KB."""
+    pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in rig.processes().values())
+    return pages * os.sysconf("SC_PAGE_SIZE") // 1024

@@ -1,0 +1,102 @@
+"""Programs that know only plain MQTT take part on a Zenoh robot: mosquitto's clients in C, and one in JavaScript."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.robot.operator import Operator, kept_copies
+from tests.robot.rig import BASE, Rig
+from tests.support import until
+
+CLIENT = Path(__file__).with_name("client.mjs")
+DRIVE = f"{BASE}/incoming/drive-values"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[Rig]:
+    """A Zenoh robot with a mirror on its local broker, up and linked."""
+    with Rig("zenoh", mirror=True) as rig:
+        assert rig.local is not None
+        program = Operator(rig.local.port, BASE)
+        program.wait_for("outgoing/charging-level")
+        program.close()
+        yield rig
+
+
+def local_port(rig: Rig) -> str:
+    assert rig.local is not None
+    return str(rig.local.port)
+
+
+def pub(rig: Rig, topic: str, body: Any, *options: str) -> None:
+    command = ["mosquitto_pub", "-p", local_port(rig), "-t", topic, "-q", "1", "-m", json.dumps(body), *options]
+    subprocess.run(command, check=True, timeout=10)
+
+
+def sub(rig: Rig, filter_: str, *options: str) -> subprocess.Popen[str]:
+    """``mosquitto_sub``, printing "retained topic payload" for each message."""
+    command = ["mosquitto_sub", "-p", local_port(rig), "-t", filter_, "-q", "1", "-F", "%r %t %p", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def test_a_c_client_hears_kept_state_and_streams(rig: Rig) -> None:
+    out, _ = sub(rig, f"{BASE}/outgoing/#", "-W", "2").communicate(timeout=10)
+    heard = [line.split(" ", 2)[:2] for line in out.splitlines()]
+    kept = {topic.removeprefix(f"{BASE}/outgoing/") for retained, topic in heard if retained == "1"}
+    live = {topic.removeprefix(f"{BASE}/outgoing/") for retained, topic in heard if retained == "0"}
+    assert kept >= {"capabilities", "status", "charging-level", "charging-status"}
+    assert "touch-sensors" in live - kept
+
+
+def test_a_c_client_drives(rig: Rig) -> None:
+    began = time.monotonic()
+    pub(rig, DRIVE, {"x": 0.1, "z": 0.4})
+    assert until(lambda: (0.5, 0.3) in [wheels for _, wheels in rig.mcu.drives(began)], 3)
+
+
+def test_a_c_client_hears_each_command_once(rig: Rig) -> None:
+    """Its own publish, the operator's from afar: neither comes twice, neither is kept."""
+    listener = sub(rig, DRIVE, "-C", "3", "-W", "5")
+    time.sleep(0.5)  # nothing tells when mosquitto_sub has subscribed
+    pub(rig, DRIVE, {"z": 0.11})
+    rig.operator.send("incoming/drive-values", {"z": 0.22})
+    out, _ = listener.communicate(timeout=10)
+    assert sorted(out.splitlines()) == [f'0 {DRIVE} {{"z": 0.11}}', f'0 {DRIVE} {{"z": 0.22}}']
+
+
+def test_a_c_client_sets_a_flag_for_everybody(rig: Rig) -> None:
+    pub(rig, f"{BASE}/incoming/flags/mqtt-video", {"value": True}, "-r")
+    assert until(lambda: rig.operator.last("incoming/flags/mqtt-video") is not None, 5)
+    assert until(
+        lambda: kept_copies(rig.remote.port, BASE, 0.2).get("incoming/flags/mqtt-video") == b'{"value": true}', 5
+    )
+    rig.operator.send("incoming/flags/mqtt-video", {"value": False}, retain=True)
+    assert until(
+        lambda: kept_copies(int(local_port(rig)), BASE, 0.2).get("incoming/flags/mqtt-video") == b'{"value": false}', 5
+    )
+
+
+def test_a_javascript_program_hears_and_drives(rig: Rig) -> None:
+    began = time.monotonic()
+    program = subprocess.Popen(
+        ["node", str(CLIENT), local_port(rig), f"{BASE}/#", DRIVE, '{"x": -0.1, "z": 0.6}'],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert until(lambda: (0.5, 0.7) in [wheels for _, wheels in rig.mcu.drives(began)], 5)
+        time.sleep(0.5)  # some of the stream
+    finally:
+        program.terminate()
+    heard = [json.loads(line) for line in program.communicate()[0].splitlines() if line.endswith("}")]
+    kept = {message["topic"] for message in heard if message["retain"]}
+    assert {f"{BASE}/outgoing/capabilities", f"{BASE}/outgoing/charging-level"} <= kept
+    assert [m["payload"] for m in heard if m["topic"] == DRIVE] == ['{"x": -0.1, "z": 0.6}']
+    touch = next(m for m in heard if m["topic"] == f"{BASE}/outgoing/touch-sensors")
+    assert set(json.loads(touch["payload"])["value"]) == {"a0", "a1", "a2"}

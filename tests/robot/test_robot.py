@@ -1,0 +1,187 @@
+"""What an operator may expect of a robot, whichever transport it runs on and whichever broker he sits at."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+from tests.robot.conftest import Seat
+from tests.robot.operator import kept_copies
+from tests.robot.rig import BASE, STOP
+from tests.support import until
+
+DRIVE = "incoming/drive-values"
+
+
+def settle(seat: Seat) -> None:
+    """Stand still and wait until the wheels do."""
+    seat.operator.send(DRIVE, {"x": 0, "z": 0})
+    assert until(lambda: not seat.rig.mcu.moving(), 3)
+
+
+def first_motion(seat: Seat, since: float) -> tuple[float, tuple[float, float]]:
+    """When the wheels first turned after ``since``, and how fast."""
+    return next((at, wheels) for at, wheels in seat.rig.mcu.drives(since) if wheels != STOP)
+
+
+@pytest.mark.parametrize(
+    ("body", "wheels"),
+    [
+        ({"x": 0.2, "z": 0.5}, (0.7, 0.3)),
+        ({"value": {"x": 0.2, "z": 0.5}}, (0.7, 0.3)),
+        ({"x": -0.25, "z": -0.5}, (-0.75, -0.25)),
+        ({"z": 0.4}, (0.4, 0.4)),
+        ({"x": 0.3}, (0.3, -0.3)),
+        ({"x": "0.1", "z": "0.2"}, (0.3, 0.1)),
+        ({"x": 0, "z": 7}, (1.0, 1.0)),
+        ({"x": 1, "z": -1e300, "y": 0.5}, (0.0, -1.0)),
+        ({"z": 0.6, "extra": [1, {"deep": None}]}, (0.6, 0.6)),
+    ],
+)
+def test_drive_forms_reach_the_wheels(seat: Seat, body: Any, wheels: tuple[float, float]) -> None:
+    settle(seat)
+    began = time.monotonic()
+    seat.operator.send(DRIVE, body)
+    assert until(lambda: seat.rig.mcu.moving(began), 3)
+    assert first_motion(seat, began)[1] == pytest.approx(wheels)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b'{"x": NaN, "z": 1}',
+        b'{"x": 0, "z": Infinity}',
+        b'{"x": "nan", "z": "1"}',
+        b'{"x": 0, "z": 1e999}',
+        b'{"x": null, "z": 1}',
+        b'{"x": [1], "z": 1}',
+        b'{"x": true, "z": 1}',
+        b"[1, 1]",
+        b"1",
+        b"not json",
+        b'\xff\xfe{"z": 1}',
+        b"",
+        b'{"z": 1, "a": ' + b"[" * 40 + b"]" * 40 + b"}",
+        b'{"z": 1, "a": "' + b"x" * 70_000 + b'"}',
+    ],
+    ids=range(14),
+)
+def test_malformed_drive_moves_nothing(seat: Seat, body: bytes) -> None:
+    settle(seat)
+    began = time.monotonic()
+    seat.operator.send(DRIVE, body)
+    seat.operator.send("incoming/lights-solid", {"r": 0.123})  # in order behind it
+    assert until(lambda: any(entry.line == "L 0.000 0.000 0.123" for entry in seat.rig.mcu.entries(began)), 3)
+    assert not seat.rig.mcu.moving(began)
+
+
+def test_silence_stops_the_wheels(seat: Seat) -> None:
+    settle(seat)
+    began = time.monotonic()
+    seat.operator.send(DRIVE, {"x": 0.1, "z": 0.3})
+    assert until(lambda: seat.rig.mcu.moving(began), 3)
+    assert until(lambda: not seat.rig.mcu.moving(began), 3)
+    started, _ = first_motion(seat, began)
+    stopped, _ = next((at, wheels) for at, wheels in seat.rig.mcu.drives(started) if wheels == STOP)
+    assert 0.70 <= stopped - started <= 0.85
+
+
+def test_a_burst_of_commands_ends_with_the_last_one(seat: Seat) -> None:
+    settle(seat)
+    began = time.monotonic()
+    for step in range(1, 301):
+        seat.operator.send(DRIVE, {"x": 0, "z": step / 1000})
+    assert until(lambda: seat.rig.mcu.drives(began)[-1:] and seat.rig.mcu.drives(began)[-1][1] == (0.3, 0.3), 3)
+    speeds = [wheels[0] for _, wheels in seat.rig.mcu.drives(began)]
+    assert speeds == sorted(speeds)
+
+
+@pytest.mark.parametrize(
+    ("topic", "body", "line"),
+    [
+        ("incoming/lights-solid", {"b": 0.1, "g": 0.2, "r": 0.3}, "L 0.100 0.200 0.300"),
+        ("incoming/lights-solid", {"value": {"r": 9}}, "L 0.000 0.000 1.000"),
+        ("incoming/lights-flash", {"b": 0.4, "g": 0.5, "r": 0.6, "period": 1.2}, "F 0.400 0.500 0.600 1.200"),
+        ("incoming/lights-flash", {"value": {"g": 1}}, "F 0.000 1.000 0.000 2.000"),
+        ("incoming/lights-flash", {"g": 0.5, "period": 0}, "F 0.000 0.500 0.000 0.050"),
+    ],
+)
+def test_lights(seat: Seat, topic: str, body: Any, line: str) -> None:
+    began = time.monotonic()
+    seat.operator.send(topic, body)
+    assert until(lambda: any(entry.line == line for entry in seat.rig.mcu.entries(began)), 3)
+
+
+def test_telemetry(seat: Seat) -> None:
+    touch = seat.operator.wait_for("outgoing/touch-sensors").json
+    assert set(touch["value"]) == {"a0", "a1", "a2"}
+    assert touch["unit"] == "adc"
+    level = seat.operator.wait_for("outgoing/charging-level").json
+    assert level["unit"] == "v"
+    assert 5 < level["value"] < 9
+    assert seat.operator.wait_for("outgoing/charging-status").json == {"value": None}
+
+
+@pytest.mark.parametrize("seat", ["mqtt", "zenoh", "mirror"], indirect=True)  # one plain broker alone hides the flag
+def test_a_kept_drive_command_never_moves_the_robot(seat: Seat) -> None:
+    settle(seat)
+    began = time.monotonic()
+    seat.operator.send(DRIVE, {"x": 0, "z": 0.9}, retain=True)
+    seat.operator.send(DRIVE, b"", retain=True)
+    seat.operator.send("incoming/lights-solid", {"r": 0.321})
+    assert until(lambda: any(entry.line == "L 0.000 0.000 0.321" for entry in seat.rig.mcu.entries(began)), 3)
+    assert not seat.rig.mcu.moving(began)
+
+
+def test_actions_run_once_and_only_for_true(seat: Seat) -> None:
+    before = len(seat.rig.recorded())
+    for body in (False, {"value": False}, 1, "true", {"value": 1}, None, {"on": True}, b"true\xff"):
+        seat.operator.send("incoming/flags/reboot", body)
+    seat.operator.send("incoming/flags/reboot", True, retain=True)
+    seat.operator.send("incoming/flags/reboot", b"", retain=True)
+    seat.operator.send("incoming/flags/service-restart", {"enabled": True})
+    assert until(lambda: len(seat.rig.recorded()) > before, 3)
+    assert seat.rig.recorded()[before:] == ["service_restart"]
+
+
+def test_kept_state_is_there_for_a_late_operator(seat: Seat) -> None:
+    port = seat.rig.remote.port
+    kept = kept_copies(port, BASE)
+    assert {"outgoing/capabilities", "outgoing/status", "outgoing/charging-level", "outgoing/charging-status"} <= set(
+        kept
+    )
+    assert not [topic for topic in kept if topic.startswith(("outgoing/touch", "outgoing/logs", "incoming/drive"))]
+
+
+def test_capabilities_name_the_transport_and_the_topics(seat: Seat) -> None:
+    said = seat.operator.wait_for("outgoing/capabilities").json
+    assert said["schema"] == "pebble-capabilities/v1"
+    assert said["value"]["transport"]["kind"] == ("zenoh" if seat.rig.kind == "zenoh" else "mqtt")
+    assert said["value"]["drive"]["topic"] == f"{BASE}/{DRIVE}"
+
+
+# -- the way to the remote broker
+
+
+def test_the_heart_beats_four_times_a_second(uplinked: Seat) -> None:
+    began = time.monotonic()
+    assert until(lambda: len(uplinked.operator.on("outgoing/online", began)) >= 9, 5)
+    beats = uplinked.operator.on("outgoing/online", began)[:9]
+    assert 1.5 <= beats[-1].at - beats[0].at <= 3.0
+    assert abs(beats[-1].json["t"] / 1000 - time.time()) < 3
+    assert "outgoing/online" in kept_copies(uplinked.rig.remote.port, BASE)
+
+
+def test_goodbye_stops_the_wheels_and_tells_the_world(uplinked: Seat) -> None:
+    rig = uplinked.rig
+    began = time.monotonic()
+    uplinked.operator.send(DRIVE, {"x": 0, "z": 0.5})
+    assert until(lambda: rig.mcu.moving(began), 3)
+    left_behind = rig.processes()
+    assert rig.stop() == 0
+    assert rig.mcu.drives(began)[-1][1] == STOP
+    assert until(lambda: (last := uplinked.operator.last("outgoing/online")) and last.json.get("online") is False, 3)
+    assert not [pid for pid in left_behind.values() if rig.alive(pid)]
+    rig.start()
