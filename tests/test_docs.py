@@ -1,0 +1,37 @@
+"""The hand-written documents point to things that are there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.support import ROOT
+
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    *(path for path in sorted((ROOT / "docs").rglob("*.md")) if path.name not in ("topics.md", "configuration.md")),
+]
+LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
+#: `folder/`, `folder/file.py` or `file.py`; what begins like a topic below a robot's identity is none
+CODE = re.compile(r"`((?!incoming/|outgoing/|flags/|sensors/|mcu/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`")
+OURS = ("pebble", "transports", "services")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(document: Path) -> None:
+    broken = [link for link in LINK.findall(document.read_text()) if not (document.parent / link).exists()]
+    assert broken == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_files_it_names_exist(document: Path) -> None:
+    missing = [name for name in CODE.findall(document.read_text()) if not _exists(name)]
+    assert missing == []
+
+
+def _exists(name: str) -> bool:
+    """A path from the top, or the name of a file somewhere in the sources."""
+    return (ROOT / name).exists() or any(any((ROOT / folder).rglob(name)) for folder in OURS)
