@@ -13,7 +13,7 @@ from math import ceil
 from pebble.errors import TransportError
 from pebble.transports.base import Message, QoS, State, Subscription, Transport
 from pebble.transports.mqtt_as_published import AsPublished
-from pebble.transports.mqtt_connection import Connection, Lost, Refused, Silent
+from pebble.transports.mqtt_connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt_filters import BrokerFilters, overlap
 from pebble.transports.mqtt_ledger import Ticket
 from pebble.transports.mqtt_tls import make_context
@@ -148,7 +148,7 @@ class MqttTransport(Transport):
             self._connect(connection, stopping)
             self._begin(connection, stopping)
             while not stopping.is_set():
-                self._dispatch(connection.pump(_IDLE_S))
+                connection.pump(_IDLE_S, self._dispatch)
                 if self._parked and connection.has_room:
                     self._announce(self._own.keys())
             self._say_goodbye(connection)
@@ -194,7 +194,7 @@ class MqttTransport(Transport):
         """Before we subscribe: a broker that wakes up finds what others typed while it slept, and would pass it on."""
         end = time.monotonic() + _CATCH_UP_S
         while not stopping.is_set() and (left := end - time.monotonic()) > 0:
-            connection.pump(left)
+            connection.pump(left, ignore)
         self._stood_still = False
 
     def _ask_for_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
@@ -228,7 +228,7 @@ class MqttTransport(Transport):
                 raise Lost("closed")
             if time.monotonic() > deadline:
                 raise Silent(f"{connection.where} does not answer")
-            receive(connection.pump(deadline - time.monotonic()))
+            connection.pump(deadline - time.monotonic(), receive)
 
     def _dispatch(self, messages: list[Message]) -> None:
         for message in messages:
@@ -249,7 +249,7 @@ class MqttTransport(Transport):
         last = connection.ping()
         deadline = time.monotonic() + _GOODBYE_S
         while time.monotonic() < deadline and not (last.done and connection.quiet):
-            connection.pump(deadline - time.monotonic())
+            connection.pump(deadline - time.monotonic(), ignore)
         connection.disconnect()
 
     def _repark(self, connection: Connection) -> None:

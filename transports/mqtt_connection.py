@@ -56,6 +56,10 @@ class Refused(Lost):
     """The broker answered our CONNECT with a no, or by hanging up."""
 
 
+def ignore(_messages: list[Message]) -> None:
+    """For :meth:`Connection.pump` where nobody listens: before a connection is accepted, and at its end."""
+
+
 class _Client(paho.Client):
     """paho, with a ping that can be sent and heard; it offers neither (its keepalive is too slow for T19)."""
 
@@ -119,7 +123,7 @@ class Connection:
                     raise Lost("closed")
                 if time.monotonic() > deadline:
                     raise Silent(f"{self.where} accepts connections but does not speak MQTT in time")
-                self.pump(deadline - time.monotonic())
+                self.pump(deadline - time.monotonic(), ignore)
         except Refused:
             raise
         except Lost as lost:
@@ -152,8 +156,12 @@ class Connection:
 
     # -- the network thread
 
-    def pump(self, timeout: float) -> list[Message]:
-        """Wait up to ``timeout`` seconds for the socket, serve it, and return what came. Raises Lost."""
+    def pump(self, timeout: float, receive: Callable[[list[Message]], None]) -> None:
+        """Wait up to ``timeout`` seconds for the socket, serve it, and hand over what came. Raises Lost.
+
+        Whoever waits for an answer is told after ``receive`` has had the messages that came before it: a kept copy is
+        never delivered later than the confirmation of its subscription.
+        """
         readable = self._wait(timeout)
         with self._lock:
             # Before reading: what has piled up during a silence must not arrive as if it were fresh (T19).
@@ -165,7 +173,8 @@ class Connection:
                 self._ping()
             self._acknowledge()
             messages, self._inbox = self._inbox, []
-        return messages
+        receive(messages)
+        self._ledger.settle()
 
     def _wait(self, timeout: float) -> bool:
         with self._lock:

@@ -45,6 +45,7 @@ class Ledger:
         self._unacked: dict[int, str | None] = {}  # by message id: the topic, if kept
         self._unproven: dict[str, _Unproven] = {}  # newest kept message of each topic, oldest first
         self._requests: dict[int, Ticket] = {}
+        self._answered: list[Ticket] = []  # nobody has been told yet
         self._pings: deque[tuple[float, Ticket | None]] = deque()  # unanswered: when sent, and who waits
         self._ping_number = self._pong_number = 0
 
@@ -91,7 +92,13 @@ class Ledger:
 
     def answer(self, mid: int) -> None:
         if mid in self._requests:
-            self._requests.pop(mid).settle()
+            self._answered.append(self._requests.pop(mid))
+
+    def settle(self) -> None:
+        """Tell those who wait for answers that they have come, once what came before them has been delivered."""
+        answered, self._answered = self._answered, []
+        for ticket in answered:
+            ticket.settle()
 
     def ping(self, now: float, ticket: Ticket | None) -> None:
         self._pings.append((now, ticket))
@@ -106,7 +113,7 @@ class Ledger:
         for topic in [t for t, entry in self._unproven.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unproven[topic]
         if ticket is not None:
-            ticket.settle()
+            self._answered.append(ticket)
 
     def measured(self, round_trip_s: float) -> None:
         self._round_trips.append(round_trip_s)
@@ -123,6 +130,7 @@ class Ledger:
 
     def end(self) -> None:
         """Nobody will answer any more."""
+        self.settle()
         for ticket in [*self._requests.values(), *(ticket for _, ticket in self._pings if ticket)]:
             ticket.settle()
         self._requests.clear()

@@ -79,7 +79,10 @@ def test_answers_settle_their_request_only() -> None:
     ledger.ping(0.0, ping)
     ledger.answer(2)
     ledger.answer(7)
+    assert not second.done, "not before what came before the answer has been delivered"
+    ledger.settle()
     assert (first.done, second.done, ping.done) == (False, True, False)
     ledger.pong(1.0)
+    ledger.settle()
     assert ping.done
     ledger.pong(1.0)  # one too many: nobody asked
