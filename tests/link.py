@@ -26,9 +26,10 @@ class Link:
     what comes, until `mend`. `drop` only resets what is connected now.
     """
 
-    def __init__(self, target: int, *, delay_s: float = 0.0) -> None:
+    def __init__(self, target: int, *, delay_s: float = 0.0, piece: int = 65536) -> None:
         self.port = free_port()
         self.delay_s = delay_s  # added to every piece in either direction
+        self.piece = piece  # bytes at most; small ones part what was sent together
         self._target = target
         self._lock = threading.Lock()
         self._pairs: list[_Pair] = []
@@ -146,7 +147,7 @@ class _Pair:
             while not self.gone:
                 if not self._link.wait_until_passing() or not select.select([source], [], [], _STEP_S)[0]:
                     continue
-                data = source.recv(65536)
+                data = source.recv(self._link.piece)
                 if not data:
                     break
                 time.sleep(self._link.delay_s)

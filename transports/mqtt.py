@@ -21,7 +21,7 @@ from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
 
-_ANSWER_S = 2.0  # longest wait for a SUBACK
+_ANSWER_S = 2.0  # longest wait for a SUBACK, and for the kept copies after it
 _GOODBYE_S = 1.0  # longest wait for what a polite close still has to deliver
 _DIALLING_S = 0.2  # longest wait for a thread that may be in connect(2)
 _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_max_s
@@ -95,7 +95,9 @@ class MqttTransport(Transport):
             if connection is None:
                 return  # the next connection will ask for it
             self._memory.subscribe_again(filter_)
-            tickets = [connection.subscribe([(filter_, self._quiet(filter_))]), connection.unsubscribe(replaced)]
+            asked = connection.subscribe([(filter_, self._quiet(filter_))])
+            # Kept copies come after the SUBACK, over a bad link long after it; the answer to a ping follows them.
+            tickets = [asked, connection.unsubscribe(replaced), connection.ping()]
         if threading.current_thread() is not self._thread:
             deadline = time.monotonic() + _ANSWER_S
             for ticket in tickets:
@@ -187,7 +189,9 @@ class MqttTransport(Transport):
         with self._routing:
             self._connection = connection
             subscribed = connection.subscribe([(filter_, self._quiet(filter_)) for filter_ in self._filters])
+            copied = connection.ping()
         self._await(connection, subscribed, stopping, self._dispatch)
+        self._await(connection, copied, stopping, self._dispatch)
         self._settle_in(known)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:

@@ -81,7 +81,7 @@ class Forwarder:
             self._restarted.add(side)
 
     def subscribed(self, side: Side) -> None:
-        """``side`` is connected and subscribed to, and a :func:`barrier` is behind us."""
+        """``side`` is connected and subscribed to, and what it keeps has come."""
         self._copies_until[side] = self._clock() + _COPIES_S
         if self.gate is Gate.OPEN:
             self._events[side].flush()

@@ -228,11 +228,11 @@ class TestKept:
         assert not [m for m in crossed.seen if m.topic.removeprefix(f"{rig.base}/") in ONE_SHOTS]
         assert not (tmp_path / "ran").exists()
 
-    @pytest.mark.parametrize("delay_s", [0.0, 0.15])
+    @pytest.mark.parametrize(("delay_s", "piece"), [(0.0, 65536), (0.15, 65536), (0.02, 8)])
     def test_flags_that_differ_at_the_start(
-        self, brokers: tuple[Broker, Broker], rigs: Rigs, link: Link, delay_s: float
+        self, brokers: tuple[Broker, Broker], rigs: Rigs, link: Link, delay_s: float, piece: int
     ) -> None:
-        link.delay_s = delay_s
+        link.delay_s, link.piece = delay_s, piece
         rig = rigs(at(brokers[0]), at(brokers[1]), uplink=link.port)
         rig.local.say(VIDEO_FLAG, TRUE, retain=True)
         rig.remote.say(VIDEO_FLAG, FALSE, retain=True)

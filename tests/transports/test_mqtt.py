@@ -142,6 +142,22 @@ def test_as_published_gives_kept_copies_once_to_each_subscription(
     assert second.until(b"A", b"A", b"A", b"B")
 
 
+@both_protocols
+def test_subscribed_means_that_kept_copies_have_come_however_long_after_the_suback(
+    broker: Broker, clients: Clients, protocol: str
+) -> None:
+    """And so none of them reaches, as news, whoever subscribes next."""
+    topic = f"crumbs/{protocol}"
+    clients(broker.port).publish(topic, b"kept", qos=DELIVERED, retain=True)
+    with Link(broker.port, delay_s=0.02, piece=5) as crumbs:
+        bridge = clients(crumbs.port, "bridge", as_published=True, protocol=protocol)
+        for _ in range(2):
+            heard = Heard()
+            subscription = bridge.subscribe(topic, heard, echo=False, direct=True)
+            assert heard.payloads == [b"kept"]
+            subscription.close()
+
+
 def test_as_published_refuses_to_promise_an_echo(broker: Broker, clients: Clients, topic: str) -> None:
     with pytest.raises(TransportError, match="echo=False"):
         clients(broker.port, as_published=True).subscribe(topic, Heard())
