@@ -3,10 +3,6 @@
 
 VENV := .venv/bin/python
 
-# With real brokers on a machine of unknown load a test may fail once; the summary says how many were run again. One that
-# needs it is a bug to be found: RERUNS= shows it.
-RERUNS := --reruns 2
-
 .DEFAULT_GOAL := help
 .PHONY: help demo test check footprint clean
 
@@ -24,9 +20,9 @@ demo: .venv/.ready-demo
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs
 	@echo "pebble: tests"
-	@$(VENV) -m pytest $(RERUNS) --numprocesses 2 --dist loadscope --ignore tests/robot
+	@$(VENV) -m pytest --numprocesses 2 --dist loadscope --ignore tests/robot
 	@echo "pebble: whole robots, one at a time because their deadlines are checked"
-	@$(VENV) -m pytest $(RERUNS) tests/robot
+	@$(VENV) -m pytest tests/robot
 
 footprint: .venv/.ready-dev
 	@$(VENV) -m tests.robot.footprint

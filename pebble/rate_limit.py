@@ -19,8 +19,9 @@ class RateLimitedLog:
         self._totals: dict[str, int] = {}
         self._windows: dict[str, tuple[float, int]] = {}  # when it began, lines said in it
 
-    def warning(self, subject: str, text: str, *values: object) -> None:
-        total = self._count(subject)
+    def warning(self, subject: str, text: str, *values: object, times: int = 1) -> None:
+        """Say that it happened, ``times`` times since the last call."""
+        total = self._count(subject, times)
         if total:
             self._log.warning(text + " (%d so far)", *values, total)
 
@@ -34,11 +35,11 @@ class RateLimitedLog:
         with self._lock:
             return dict(self._totals)
 
-    def _count(self, subject: str) -> int:
+    def _count(self, subject: str, times: int = 1) -> int:
         """How often ``subject`` has come up if it may be said now, else 0."""
         now = time.monotonic()
         with self._lock:
-            total = self._totals[subject] = self._totals.get(subject, 0) + 1
+            total = self._totals[subject] = self._totals.get(subject, 0) + times
             began, said = self._windows.get(subject, (float("-inf"), 0))
             if now - began >= self._period:
                 began, said = now, 0

@@ -64,9 +64,9 @@ class SerialMcuBridge(Service):
     def stop(self) -> None:
         if hasattr(self, "_line"):
             self._line.close()
-            refused = self._chatter_log.totals()
-            if refused:
-                self.log.info("lines of the MCU that were no report: %s", refused)
+            chatter, dropped = self._chatter_log.totals(), self.counters["input_dropped"]
+            if chatter or dropped:
+                self.log.info("lines of the MCU that were no report: %s; bytes dropped unread: %d", chatter, dropped)
 
     @property
     def republish_interval_s(self) -> float:
@@ -127,9 +127,10 @@ class SerialMcuBridge(Service):
         for line in self._splitter.feed(chunk):
             for report in self._protocol.parse(line):
                 self._report(report)
-        if self._splitter.discarded_lines > self.counters["lines_discarded"]:
-            self.counters.add("lines_discarded", self._splitter.discarded_lines - self.counters["lines_discarded"])
-            self._chatter_log.warning("long lines", "a line of the MCU was too long")
+        too_long = self._splitter.discarded_lines - self.counters["lines_discarded"]
+        if too_long:
+            self.counters.add("lines_discarded", too_long)
+            self._chatter_log.warning("too long", "a line of the MCU was too long", times=too_long)
 
     def _report(self, report: Report) -> None:
         match report:
