@@ -35,7 +35,7 @@ def measure(kind: str) -> dict[str, str]:
     launches = [_launch(kind) for _ in range(LAUNCHES)]
     with Rig(kind, direct=True) as rig:
         time.sleep(3)  # start-up work is over
-        latencies = sorted(_latencies(rig))
+        latencies, floor = _latencies(rig)
         time.sleep(1)
         processes = {"launcher": rig.launcher_pid, **rig.processes()}
         cpu = _cpu_percent(list(processes.values()))
@@ -49,10 +49,15 @@ def measure(kind: str) -> dict[str, str]:
         "PSS, mean per process, MB": f"{statistics.mean(pss.values()):.1f}",
         **{f"  {name}, MB (threads)": f"{pss[name]:.1f} ({threads[name]})" for name in processes},
         f"CPU idle, % of one core over {IDLE_S:.0f} s": f"{cpu:.1f}",
-        f"drive command, remote broker to pty, n={len(latencies)}: p50, ms": f"{latencies[len(latencies) // 2]:.2f}",
-        "  p99, ms": f"{latencies[int(len(latencies) * 0.99)]:.2f}",
-        "  max, ms": f"{latencies[-1]:.2f}",
+        f"drive command, operator to pty, n={len(latencies)}: p50 / p99 / max, ms": _spread(latencies),
+        "  the same messages, operator to a stock client of that broker, ms": _spread(floor),
+        "  ratio of the medians": f"{statistics.median(latencies) / statistics.median(floor):.1f}",
     }
+
+
+def _spread(figures: list[float]) -> str:
+    ordered = sorted(figures)
+    return f"{statistics.median(ordered):.2f} / {ordered[int(len(ordered) * 0.99)]:.2f} / {ordered[-1]:.2f}"
 
 
 def _launch(kind: str) -> float:
@@ -61,8 +66,11 @@ def _launch(kind: str) -> float:
         return rig.operator.wait_for("outgoing/online").at - began
 
 
-def _latencies(rig: Rig) -> list[float]:
-    """Milliseconds from the operator's publish call to the line at the pty, for every command of a drive."""
+def _latencies(rig: Rig) -> tuple[list[float], list[float]]:
+    """Milliseconds from the operator's publish call to the line at the pty, for every command of a drive.
+
+    And to a plain paho client that listens to the same broker: what one hop costs on this machine with no robot in it.
+    """
     driver, began = Operator(rig.remote.port, "nobody/listens/here"), time.monotonic()
     driver.base = BASE
     sent: list[tuple[float, float]] = []
@@ -73,7 +81,9 @@ def _latencies(rig: Rig) -> list[float]:
     until(lambda: not rig.mcu.moving(began), 3)
     arrived = {wheels[0]: at for at, wheels in rig.mcu.drives(began) if wheels != STOP}
     driver.close()
-    return [1000 * (arrived[left] - at) for at, left in sent if left in arrived]
+    heard = [seen.at for seen in rig.operator.on("incoming/drive-values", began)]
+    floor = [1000 * (there - at) for (at, _), there in zip(sent, heard, strict=True)]
+    return [1000 * (arrived[left] - at) for at, left in sent if left in arrived], floor
 
 
 def _cpu_percent(pids: list[int]) -> float:
