@@ -10,7 +10,7 @@ import msgspec
 
 from pebble.contract import INCOMING, Channel
 from pebble.errors import PayloadError
-from pebble.payloads import AutonomyCommand, Drive, SoundboardCommand
+from pebble.payloads import AutonomyCommand, Drive, MediaRequest, SoundboardCommand
 
 MAX_COMMAND_BYTES = 64 * 1024
 MAX_DEPTH = 32
@@ -104,6 +104,8 @@ def _unwrap(channel: Channel, plain: Any) -> Any:
     """Commands: the object under ``value`` if there is one, else the root (paper A.4.5)."""
     if channel.payload in (SoundboardCommand, AutonomyCommand):
         return _switch(plain)
+    if channel.payload is MediaRequest:
+        return _request(channel, plain)
     if not isinstance(plain, dict):
         raise PayloadError(f"{channel.metric}: an object is needed, not {_name_of(plain)}")
     inner = plain["value"] if isinstance(plain.get("value"), dict) else plain
@@ -122,6 +124,12 @@ def _switch(plain: Any) -> Any:
             outer = {key: plain[key] for key in ("file",) if key in plain}
             return {**outer, **value}
     return plain
+
+
+def _request(channel: Channel, plain: Any) -> Any:
+    """A boolean control in any of its forms, perhaps with more fields beside it."""
+    inner = plain["value"] if isinstance(plain, dict) and isinstance(plain.get("value"), dict) else plain
+    return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
 
 
 def _axes(channel: Channel, plain: dict[str, Any]) -> dict[str, Any]:

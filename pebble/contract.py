@@ -122,9 +122,9 @@ LIGHTS_FLASH = _c("lights-flash", Kind.COMMAND, p.LightsFlash, "A colour fading 
                   newest=True, override=_serial("lights_flash"))  # fmt: skip
 
 # -- incoming: media, sounds, scripts
-VIDEO_CONTROL = _c("front-camera", Kind.COMMAND, bool, "Start or stop remote video.",
+VIDEO_CONTROL = _c("front-camera", Kind.COMMAND, p.MediaRequest, "Start or stop remote video.",
                    override=_bridge("video_control"))  # fmt: skip
-AUDIO_CONTROL = _c("audio", Kind.COMMAND, bool, "Start or stop remote audio, both directions.",
+AUDIO_CONTROL = _c("audio", Kind.COMMAND, p.MediaRequest, "Start or stop remote audio, both directions.",
                    override=_bridge("audio_control"))  # fmt: skip
 AUDIO_STREAM = _c("audio-stream", Kind.FEED, bytes, "An operator's voice as PBAT packets.",
                   rate_hz=50, bridged=False, override=Override(f"{_MEDIA}.audio_receiver.topic",
@@ -185,6 +185,9 @@ CAMERA = _c("front-camera", Kind.STREAM, bytes, "Pictures: JSON, PBVD or JPEG, t
             rate_hz=15, bridged=False, override=Override(f"{_MEDIA}.video_publisher.topic"))  # fmt: skip
 AUDIO = _c("audio", Kind.STREAM, bytes, "Sound as PBAT packets.", rate_hz=50, bridged=False,
            override=Override(f"{_MEDIA}.audio_publisher.topic", f"{_MEDIA}.audio_publisher.qos"))  # fmt: skip
+MEDIA_STATUS = _c("media-status", Kind.STATE, p.MediaStatus, "How camera, microphone and media programs fare.")
+MEDIA_REPORT = _c("media-report/{program}", Kind.EVENT, p.MediaReport,
+                  "What one media program does; becomes media-status.", rate_hz=1, remote=False)  # fmt: skip
 VIDEO_OVERLAYS = _c("video-overlays", Kind.STREAM, p.VideoOverlays, "Shapes and labels to draw over the picture.",
                     rate_hz=12, override=Override(f"{_MEDIA}.video_publisher.overlays_topic"))  # fmt: skip
 

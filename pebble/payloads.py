@@ -82,6 +82,14 @@ class AutonomyCommand(Payload, frozen=True, kw_only=True):
     config: dict[str, Any] | None = None
 
 
+class MediaRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Start or stop remote video or audio; ``encoding`` None, or one we do not have: as configured."""
+
+    enabled: bool
+    encoding: str | None = None
+    keyframe: bool = False  # a full picture next, please
+
+
 class OutletCommand(Payload, frozen=True, kw_only=True):
     """Switch an outlet; only a JSON boolean switches anything."""
 
@@ -158,6 +166,31 @@ class Status(Payload, frozen=True, kw_only=True):
 
     t: int | UnsetType = UNSET  # epoch milliseconds
     value: dict[str, Any] = field(default_factory=dict)
+
+
+class MediaReport(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """How one stream (``camera``, ``microphone``) or one media program fares; what does not apply is absent."""
+
+    running: bool
+    doing: str | None = None  # for people: "h264 640x480, 10 fps, 212 kbit/s"
+    encoding: str | None = None
+    width: int | None = None  # of what is sent, or captured
+    height: int | None = None
+    rate: float | None = None  # frames, or packets of sound, per second, over the last seconds
+    bitrate: int | None = None  # bits per second of what left, over the last seconds
+    readers: int | None = None
+    fallbacks: int | None = None  # frames that could not travel through shared memory
+    dropped: int | None = None  # frames or packets thrown away because somebody was too slow
+    restarts: int | None = None  # how often the device was opened again
+    reduced: str | None = None  # what is done about a slow link: "quality 6", "size 1/2", "rate 1/2"
+    last_error: str | None = None
+
+
+class MediaStatus(Payload, frozen=True, kw_only=True):
+    """Everything about pictures and sound: by stream and by program."""
+
+    t: int  # epoch milliseconds
+    value: dict[str, MediaReport]
 
 
 class Vector(Payload, frozen=True, kw_only=True):

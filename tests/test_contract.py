@@ -121,7 +121,7 @@ def test_delivery_rules_are_those_of_the_wire() -> None:
 
 
 def test_what_stays_on_the_robot_and_what_never_passes_the_bridge() -> None:
-    assert [channel.metric for channel in CHANNELS if not channel.remote] == ["sensors/imu-fast"]
+    assert [channel.metric for channel in CHANNELS if not channel.remote] == ["sensors/imu-fast", "media-report/{program}"]
     assert {channel.suffix for channel in CHANNELS if not channel.bridged} == {
         "incoming/audio-stream", "outgoing/front-camera", "outgoing/audio",
     }  # fmt: skip

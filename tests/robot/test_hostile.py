@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from pebble.contract import CHANNELS, INCOMING, Channel
-from pebble.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand
+from pebble.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, MediaRequest, SoundboardCommand
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.service import SerialMcuBridge
 from tests.robot.rig import Rig
@@ -45,7 +45,7 @@ def valid(channel: Channel, raw: bytes) -> bool:
         return isinstance(body, bool) or (
             isinstance(body, dict) and any(isinstance(body.get(key), bool) for key in ("value", "enabled"))
         )
-    if channel.payload in (SoundboardCommand, AutonomyCommand) and isinstance(body, bool):
+    if channel.payload in (SoundboardCommand, AutonomyCommand, MediaRequest) and isinstance(body, bool):
         return True
     if not isinstance(body, dict):
         return False

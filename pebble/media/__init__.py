@@ -1,0 +1,1 @@
+"""Pictures and sound on the wire: encoders, decoders, and what makes up for lost packets."""
