@@ -6,6 +6,7 @@ from pebble.transports.base import QoS as QoS
 from pebble.transports.base import State as State
 from pebble.transports.base import Subscription as Subscription
 from pebble.transports.base import Transport as Transport
+from pebble.transports.outgoing import Outgoing as Outgoing
 from pebble.transports.registry import check_kind as check_kind
 from pebble.transports.registry import create as create
 from pebble.transports.settings import MqttSettings as MqttSettings

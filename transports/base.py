@@ -18,6 +18,7 @@ from typing import Self
 
 from pebble.errors import TransportError
 from pebble.transports.counters import Counters
+from pebble.transports.outgoing import Outgoing
 from pebble.transports.topics import check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
@@ -194,6 +195,11 @@ class Transport(ABC):
     @property
     def state(self) -> State:
         return self._state
+
+    @property
+    def outgoing(self) -> Outgoing:
+        """What was accepted and is still on its way, where the backend can tell (T20)."""
+        return Outgoing()
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport: it must return at once."""

@@ -17,6 +17,7 @@ from pebble.transports.mqtt_connection import Connection, Lost, Refused, Silent,
 from pebble.transports.mqtt_filters import BrokerFilters, overlap
 from pebble.transports.mqtt_ledger import Ticket
 from pebble.transports.mqtt_tls import make_context
+from pebble.transports.outgoing import Outgoing
 from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
@@ -54,6 +55,11 @@ class MqttTransport(Transport):
         self._stood_still = False  # the broker may have, and have old messages to hand out first
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
         self._memory = AsPublished()
+
+    @property
+    def outgoing(self) -> Outgoing:
+        connection = self._connection
+        return Outgoing() if connection is None else connection.outgoing
 
     # -- the interface to base
 

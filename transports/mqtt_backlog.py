@@ -22,6 +22,11 @@ class Backlog:
     def __bool__(self) -> bool:
         return bool(self._waiting)
 
+    @property
+    def size(self) -> int:
+        """Bytes of all payloads that wait."""
+        return sum(len(message.payload) for message in self._waiting.values())
+
     def __contains__(self, topic: str) -> bool:
         return topic in self._waiting
 

@@ -31,6 +31,7 @@ from pebble.transports.base import Message, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt_backlog import Backlog
 from pebble.transports.mqtt_ledger import Ledger, Ticket
+from pebble.transports.outgoing import Outgoing, shortest_round_trip_s, unconfirmed
 from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
@@ -61,9 +62,14 @@ def ignore(_messages: list[Message]) -> None:
 
 
 class _Client(paho.Client):
-    """paho, with a ping that can be sent and heard; it offers neither (its keepalive is too slow for T19)."""
+    """paho, with a ping that can be sent and heard (its keepalive is too slow for T19), and what it has not written."""
 
     on_pong: Callable[[], None]
+
+    @property
+    def unwritten(self) -> int:
+        """Bytes that the kernel has not taken."""
+        return sum(packet["to_process"] for packet in self._out_packet)
 
     def ping(self) -> None:
         self._send_pingreq()
@@ -342,6 +348,15 @@ class Connection:
     @property
     def unacked(self) -> int:
         return self._ledger.unacked
+
+    @property
+    def outgoing(self) -> Outgoing:
+        with self._lock:
+            sock = self._socket()
+            if sock is None:
+                return Outgoing()
+            waiting = self._backlog.size + self._client.unwritten + unconfirmed(sock)
+            return Outgoing(waiting, shortest_round_trip_s(sock))
 
     def unproven(self) -> list[Message]:
         """Kept messages that the broker may never have got, oldest first."""

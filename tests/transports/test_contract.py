@@ -201,7 +201,7 @@ def test_T03_a_short_lived_sender_is_heard(net: Net, base: str) -> None:
     heard = Heard()
     net.client("receiver").subscribe(f"{base}/#", heard)
     for number in range(5):
-        sender = net.client(f"brief{number}")
+        sender = net.client(f"short-lived{number}")
         assert sender.publish(f"{base}/x", b"%d" % number, qos=DELIVERED)
         sender.close()
     assert heard.until(*(b"%d" % number for number in range(5)))
@@ -843,3 +843,16 @@ def test_T18_everything_is_counted(net: Net, base: str) -> None:
     client.close()
     client.publish(base, b"x")
     assert client.counters["refused"] >= 1
+
+
+def test_T20_nothing_is_on_its_way_once_everything_has_arrived(net: Net, base: str) -> None:
+    client, heard = net.client("client"), Heard()
+    client.subscribe(base, heard)
+    for _ in range(50):
+        client.publish(base, bytes(10_000), qos=DELIVERED)
+        assert client.outgoing.waiting >= 0
+    assert until(lambda: len(heard.messages) == 50)
+    assert until(lambda: client.outgoing.waiting == 0)
+    assert 0 <= client.outgoing.round_trip_s < 5
+    client.close()
+    assert client.outgoing.waiting == 0

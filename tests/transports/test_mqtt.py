@@ -462,6 +462,28 @@ def test_no_broker_is_a_problem_in_words(clients: Clients, caplog: pytest.LogCap
     assert len([record for record in caplog.records if record.levelno == logging.WARNING]) == 1
 
 
+# -- what is on its way
+
+
+@both_protocols
+def test_what_a_broker_does_not_take_is_told_whole(broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
+    client = clients(broker.port, protocol=protocol, silence_s=30)
+    assert until(lambda: client.outgoing.waiting == 0)
+    broker.freeze()
+    try:
+        sent = 0
+        while client.counters["dropped"] == 0:  # through the kernels' buffers, the client's, and the backlog
+            assert client.publish(topic, bytes(50_000))
+            sent += 50_000
+            waiting = client.outgoing.waiting
+            assert waiting <= sent + 10_000
+        assert waiting > 256 * 1024  # more than a full backlog: the kernel's part is told, too
+    finally:
+        broker.thaw()
+    assert until(lambda: client.outgoing.waiting == 0)
+    assert 0 < client.outgoing.round_trip_s < 5
+
+
 # -- logins and TLS
 
 
