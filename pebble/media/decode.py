@@ -1,0 +1,170 @@
+"""Any video payload to pictures; what cannot be right is not shown, and a full picture is asked for instead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from pebble.errors import PayloadError, PebbleError
+from pebble.media import h264
+from pebble.media.h264 import H264Decoder
+from pebble.media.inflate import inflate
+from pebble.media.jpeg import MAX_BYTES, SOI, Pixels, decode_jpeg
+from pebble.media.jpeg_delta import add
+from pebble.media.json_video import JsonPicture, plausible
+from pebble.packets import KEY_FRAME, PBVD, Picture, PictureKind
+
+MAX_PAYLOAD: Final = MAX_BYTES * 3 // 2  # base64 takes a third more
+_FRAME_LIMIT: Final = 1 << 32
+#: Longer between two pictures, or backwards: the number may be the next by chance, after a restart nobody saw.
+_LONGEST_STEP_MS: Final = 5000
+
+_KINDS: Final = {
+    PictureKind.JPEG: ("pbvd", True),
+    PictureKind.DELTA_JPEG: ("pbvd", False),
+    PictureKind.ZLIB_JPEG: ("pbvz", True),
+    PictureKind.ZLIB_DELTA_JPEG: ("pbvz", False),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A picture that may be shown."""
+
+    picture: Pixels  # BGR, (height, width, 3), the caller's own
+    captured_ms: int | None  # epoch time at the sender; None: it did not say
+    frame: int | None  # its number; None: raw JPEG has none
+    keyframe: bool
+    encoding: str  # json | pbvd | pbvz | h264 | jpeg
+
+
+@dataclass(slots=True)
+class DecodeCounters:
+    """Every payload is counted as one of ``pictures``, ``refused`` and ``waiting``."""
+
+    pictures: int = 0
+    refused: int = 0  # garbage, damaged, too large
+    waiting: int = 0  # differences without what they build on
+    gaps: int = 0  # times that the numbering was broken
+
+
+class _Arrival(NamedTuple):
+    encoding: str
+    keyframe: bool
+    frame: int | None
+    captured_ms: int | None
+    body: bytes
+
+
+class VideoDecoder:
+    """Reads one topic: json, pbvd, pbvz, h264 and raw JPEG, whatever comes.
+
+    After a lost frame, a restart of the sender or anything refused it is silent until the next key frame.
+    Damage is found by the checksums of json, pbvz and h264; of pbvd and raw JPEG, which have none, by their structure.
+    """
+
+    def __init__(self) -> None:
+        self.counters = DecodeCounters()
+        self.wants_keyframe = False  # ask the sender for one, at most once a second
+        self.problem = ""  # why the last payload was refused, for people
+        self._last: _Arrival | None = None  # without its body; None: the next difference builds on nothing
+        self._reference: Pixels | None = None
+        self._h264: H264Decoder | None = None
+
+    def feed(self, payload: bytes) -> Decoded | None:
+        """The picture of this payload, or None: refused, or waiting for a key frame. Never raises for what came in."""
+        try:
+            arrival = _read(payload)
+            if not arrival.keyframe and not self._follows(arrival):
+                self._wait()
+                return None
+            self._notice_gap(arrival)
+            picture = self._decode(arrival)
+        except PebbleError as error:
+            self._refuse(str(error))
+            self.wants_keyframe = isinstance(error, PayloadError)  # against a missing library a key frame does not help
+            return None
+        self._last = arrival._replace(body=b"")
+        self.wants_keyframe = False
+        self.counters.pictures += 1
+        return Decoded(picture, arrival.captured_ms, arrival.frame, arrival.keyframe, arrival.encoding)
+
+    def _follows(self, arrival: _Arrival) -> bool:
+        last = self._last
+        if last is None or last.encoding != arrival.encoding or arrival.frame != _after(last):
+            return False
+        if last.captured_ms is None or arrival.captured_ms is None:
+            return last.captured_ms == arrival.captured_ms
+        return 0 <= arrival.captured_ms - last.captured_ms <= _LONGEST_STEP_MS
+
+    def _notice_gap(self, arrival: _Arrival) -> None:
+        """A key frame needs nothing before it, yet frames before it may be lost. (Numbers that fall: a new sender.)"""
+        last = self._last
+        if last is not None and last.encoding == arrival.encoding and last.frame is not None and arrival.frame:
+            self.counters.gaps += arrival.frame > last.frame + 1
+
+    def _wait(self) -> None:
+        self.counters.waiting += 1
+        self.counters.gaps += self._last is not None
+        self._break()
+
+    def _refuse(self, problem: str) -> None:
+        self.counters.refused += 1
+        self.problem = problem
+        self._break()
+
+    def _break(self) -> None:
+        self._last = self._reference = None
+        self.wants_keyframe = True
+
+    def _decode(self, arrival: _Arrival) -> Pixels:
+        if arrival.encoding == "h264":
+            return self._decode_h264(arrival)
+        pixels = decode_jpeg(arrival.body)
+        if arrival.encoding == "jpeg":
+            return pixels
+        if arrival.keyframe or self._reference is None:
+            self._reference = pixels
+        elif pixels.shape == self._reference.shape:
+            add(self._reference, pixels, self._reference)
+        else:
+            raise PayloadError("a difference of another size than the picture it builds on")
+        return self._reference.copy()
+
+    def _decode_h264(self, arrival: _Arrival) -> Pixels:
+        if self._h264 is None or self._last is None:
+            self._h264 = H264Decoder()
+        return self._h264.decode(arrival.body, keyframe=arrival.keyframe)
+
+
+def _after(last: _Arrival) -> int | None:
+    if last.frame is None:
+        return None
+    return last.frame + 1 if last.encoding == "json" else (last.frame + 1) % _FRAME_LIMIT
+
+
+def _read(payload: bytes) -> _Arrival:
+    """Told apart by the first bytes. PayloadError for everything else."""
+    if len(payload) > MAX_PAYLOAD:
+        raise PayloadError(f"{len(payload)} bytes, more than {MAX_PAYLOAD}")
+    if payload.startswith(PBVD):
+        return _read_pbvd(Picture.unpack(payload))
+    if payload.startswith(SOI):
+        return _Arrival("jpeg", True, None, None, payload)
+    if payload[:1] in (b"{", b" ", b"\t", b"\r", b"\n"):
+        message = JsonPicture.unpack(payload)
+        return _Arrival("json", message.keyframe, message.frame, message.captured_ms, message.jpeg)
+    raise PayloadError("none of the forms of a picture")
+
+
+def _read_pbvd(packet: Picture) -> _Arrival:
+    captured_ms = plausible(packet.captured_ms)
+    if packet.kind == PictureKind.H264:
+        if not h264.installed():
+            raise PebbleError(f"h264 {h264.INSTALL}")
+        return _Arrival("h264", bool(packet.flags & KEY_FRAME), packet.frame, captured_ms, packet.body)
+    if packet.kind not in _KINDS:
+        raise PayloadError(f"PBVD: kind {packet.kind} is unknown")
+    encoding, keyframe = _KINDS[PictureKind(packet.kind)]
+    body = inflate(packet.body, MAX_BYTES) if encoding == "pbvz" else packet.body
+    return _Arrival(encoding, keyframe, packet.frame, captured_ms, body)

@@ -1,0 +1,67 @@
+"""Pictures as JSON: id, keyframe, base64 of the zlib of a JPEG, seconds (paper 8.8)."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import msgspec
+
+from pebble.errors import PayloadError
+from pebble.media.inflate import inflate
+from pebble.media.jpeg import MAX_BYTES
+
+_MILLISECONDS_FROM: Final = 1e11  # a stamp as large as this is in milliseconds already
+_LATEST_MS: Final = 253_402_300_800_000  # the year 10000
+_MAX_TEXT: Final = MAX_BYTES * 4 // 3 + 1024
+
+
+class _Message(msgspec.Struct):
+    id: Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
+    keyframe: bool
+    data: bytes  # msgspec reads and writes bytes as base64
+    timestamp: float | None = None
+
+
+_encoder = msgspec.json.Encoder()
+_decoder = msgspec.json.Decoder(_Message)
+
+
+@dataclass(frozen=True, slots=True)
+class JsonPicture:
+    """One message. ``jpeg``: a full picture, or a difference plus 128. ``captured_ms``: epoch, None if unusable."""
+
+    frame: int
+    keyframe: bool
+    captured_ms: int | None
+    jpeg: bytes
+
+    def pack(self) -> bytes:
+        packed = zlib.compress(self.jpeg)
+        seconds = None if self.captured_ms is None else self.captured_ms / 1000
+        return _encoder.encode(_Message(self.frame, self.keyframe, packed, seconds))
+
+    @classmethod
+    def unpack(cls, raw: bytes) -> JsonPicture:
+        """Raises PayloadError for anything that is no complete message."""
+        if len(raw) > _MAX_TEXT:
+            raise PayloadError(f"JSON picture: {len(raw)} bytes")
+        try:
+            message = _decoder.decode(raw)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+            raise PayloadError(f"JSON picture: {error}") from None
+        jpeg = inflate(message.data, MAX_BYTES)
+        return cls(message.id, message.keyframe, _milliseconds(message.timestamp), jpeg)
+
+
+def _milliseconds(stamp: float | None) -> int | None:
+    if stamp is None or not math.isfinite(stamp):
+        return None
+    return plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
+
+
+def plausible(captured_ms: int) -> int | None:
+    """A moment that can be written as a date, or None."""
+    return captured_ms if 0 < captured_ms < _LATEST_MS else None

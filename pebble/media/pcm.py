@@ -1,0 +1,78 @@
+"""Samples as arrays: other rates, other numbers of channels. Pure."""
+
+from __future__ import annotations
+
+from math import ceil, gcd
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Samples = npt.NDArray[np.int16]  # (samples, channels)
+
+_CROSSINGS = 16  # zero crossings of the filter to each side: alias and image are below -60 dB
+_PASS = 0.92  # of the lower of the two Nyquist frequencies
+_PHASES = 512  # at most; rates whose ratio needs more are met to 1/512 of a sample
+
+
+def to_samples(pcm: bytes, channels: int) -> Samples:
+    """Interleaved s16le as (samples, channels); an unfinished sample at the end is left out."""
+    whole = len(pcm) // (2 * channels) * channels
+    return np.frombuffer(pcm, "<i2", whole).reshape(-1, channels)
+
+
+def to_bytes(samples: Samples) -> bytes:
+    """Interleaved s16le."""
+    return samples.astype("<i2", copy=False).tobytes()
+
+
+def remix(samples: Samples, channels: int) -> Samples:
+    """Another number of channels: the mean of all of them on each, because ears expect no more of a robot."""
+    if samples.shape[1] == channels:
+        return samples
+    mean = samples.mean(axis=1, dtype=np.float32)
+    return np.repeat(np.rint(mean).astype(np.int16)[:, None], channels, axis=1)
+
+
+def to_int16(samples: npt.NDArray[np.floating[Any]]) -> Samples:
+    """Rounded, and clipped instead of wrapped."""
+    clipped: Samples = np.rint(np.clip(samples, -32768, 32767)).astype(np.int16)
+    return clipped
+
+
+class Resampler:
+    """One stream from one rate to another by a windowed sinc, without a seam between chunks; delays by about 1 ms.
+
+    Chunks that hold a whole number of output samples yield exactly that many.
+    """
+
+    def __init__(self, rate: int, wanted: int, channels: int) -> None:
+        common = gcd(rate, wanted)
+        self._up, self._down = wanted // common, rate // common
+        widened = max(1.0, self._down / self._up)
+        self._taps = 2 * ceil(_CROSSINGS * widened)
+        self._filter = _filter(min(self._up, _PHASES), self._taps, _PASS / widened)
+        self._tail = np.zeros((self._taps - 1, channels), np.float32)
+        self._at = 0  # of the next output sample, from the tail's beginning, in input samples / _up
+
+    def feed(self, samples: Samples) -> Samples:
+        if self._up == self._down:
+            return samples
+        held = np.concatenate((self._tail, samples.astype(np.float32)))
+        windows = len(held) - self._taps + 1
+        count = max(0, ceil((windows * self._up - self._at) / self._down))
+        at = self._at + self._down * np.arange(count, dtype=np.int64)
+        phases = at % self._up * len(self._filter) // self._up
+        seen = np.lib.stride_tricks.sliding_window_view(held, self._taps, axis=0)[at // self._up]
+        mixed = np.einsum("nck,nk->nc", seen, self._filter[phases], optimize=False)
+        self._at += self._down * count - windows * self._up
+        self._tail = held[windows:]
+        return to_int16(mixed)
+
+
+def _filter(phases: int, taps: int, passed: float) -> npt.NDArray[np.float32]:
+    """(phases, taps): the low pass as it looks from each position between two input samples; each row sums up to 1."""
+    offsets = np.arange(taps) - (taps / 2 - 1) - np.arange(phases)[:, None] / phases
+    shape = np.sinc(offsets * passed) * np.cos(np.pi * np.clip(offsets / taps, -0.5, 0.5)) ** 2
+    normal: npt.NDArray[np.float32] = (shape / shape.sum(axis=1, keepdims=True)).astype(np.float32)
+    return normal

@@ -1,0 +1,182 @@
+"""A moving scene drawn from nothing but the number of the frame: for robots without a camera, tests and measurements.
+
+The counter in it can be read back from what is left of a picture after lossy encoding and resizing.
+"""
+
+from __future__ import annotations
+
+from binascii import crc_hqx
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pebble.media.noise import noise
+
+Picture: TypeAlias = NDArray[np.uint8]
+
+COUNTER_LIMIT: Final = 1 << 24  # the counter starts again at 0: after 13 days at 15 frames per second
+TAG_ID: Final = 7
+
+# The inner bits of tag 7 of the family 36h11, 1 is white; a black border of one cell belongs around them.
+_TAG_BITS = ("001010", "111000", "011101", "001010", "011000", "001000")
+_TAG_CELLS = 10  # 6 of bits, 2 of black border, 2 of quiet zone
+
+_ROWS, _COLUMNS = 2, 20  # of the counter's cells: 24 bits of number, 16 of checksum
+_BAND = 10  # the counter takes the lowest tenth of the picture
+# The swing stays below 128: encoders that send differences clip them there, and the counter changes in every frame.
+_DARK, _LIGHT = 72, 184
+_MIDDLE = (_DARK + _LIGHT) / 2
+_MARGIN = 20  # a cell nearer than this to the middle is neither dark nor light: the picture is damaged
+_WITHIN = (0.3, 0.4, 0.5, 0.6, 0.7)  # where a reader looks, as shares of a cell
+_SMALLEST_BAND = 2 * _ROWS  # pixels; below, and below 2 pixels per column, nobody can read it
+
+_TURN = 320  # frames until the background has passed once
+_LAP = 450  # frames of one round of the tag
+_BOUNCE_X, _BOUNCE_Y = 211, 89  # frames of one swing of the ball: it takes long until it comes by the same way again
+_STRIPE = 16  # rows of the background that are made at a time
+_BALL_BGR = np.array((60, 90, 220), np.uint8)
+
+
+class Scene:
+    """Draws any frame of the scene into an array that the caller owns. The same number gives the same pixels."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        self._floor = height - height // _BAND  # the counter begins here, everything else ends here
+        self._background = _landscape(width, self._floor)
+        self._tag = _tag(max(1, self._floor // (3 * _TAG_CELLS)))
+        self._ball = _disc(max(1, self._floor // 12))
+        self._cell = np.arange(width).repeat(3) * _COLUMNS // width  # to which a byte of the counter's lines belongs
+
+    def render(self, number: int, out: Picture) -> None:
+        """Draw frame ``number`` into ``out``, of shape (height, width, 3), BGR."""
+        self._draw_background(number, out)
+        self._draw_ball(number, out)
+        self._draw_tag(number, out)
+        self._draw_counter(number % COUNTER_LIMIT, out)
+
+    def tag_centre(self, number: int) -> tuple[int, int]:
+        """Where the middle of the tag is in frame ``number``: pixels from the left and from the top."""
+        left, top = self._tag_corner(number)
+        return left + self._tag.shape[1] // 2, top + self._tag.shape[0] // 2
+
+    def _draw_background(self, number: int, out: Picture) -> None:
+        shift = number % _TURN * self.width // _TURN
+        split = self.width - shift
+        out[: self._floor, :split] = self._background[:, shift:]
+        out[: self._floor, split:] = self._background[:, :shift]
+
+    def _draw_ball(self, number: int, out: Picture) -> None:
+        size = self._ball.shape[0]
+        left = _swing(number, _BOUNCE_X, self.width - size)
+        top = _swing(number, _BOUNCE_Y, self._floor - size)
+        under = out[top : top + size, left : left + size]
+        np.copyto(under, _BALL_BGR, where=self._ball[: under.shape[0], : under.shape[1], None])
+
+    def _draw_tag(self, number: int, out: Picture) -> None:
+        left, top = self._tag_corner(number)
+        under = out[top : min(top + self._tag.shape[0], self._floor), left : left + self._tag.shape[1]]
+        under[:] = self._tag[: under.shape[0], : under.shape[1], None]
+
+    def _tag_corner(self, number: int) -> tuple[int, int]:
+        angle = 2 * np.pi * (number % _LAP) / _LAP
+        size = self._tag.shape[0]
+        left = (self.width - size) * (0.5 + 0.45 * np.cos(angle))
+        top = (self._floor - size) * (0.5 + 0.45 * np.sin(angle))
+        return max(0, int(left)), max(0, int(top))
+
+    def _draw_counter(self, value: int, out: Picture) -> None:
+        lines = np.where(_bits(value), np.uint8(_LIGHT), np.uint8(_DARK))[:, self._cell]
+        for row, line in enumerate(lines):
+            top, bottom = (self._floor + (self.height - self._floor) * edge // _ROWS for edge in (row, row + 1))
+            out[top:bottom] = line.reshape(1, self.width, 3)
+
+
+def read_counter(picture: Picture) -> int | None:
+    """The number of the frame, out of a picture of any size, in colour (h, w, 3) or grey (h, w).
+
+    None where there is no counter, or a damaged one: of those, one in 65,536 is told as a wrong number.
+    """
+    height, width = picture.shape[:2]
+    band = height // _BAND
+    if band < _SMALLEST_BAND or width < 2 * _COLUMNS:
+        return None
+    rows, columns = _samples(band, _ROWS) + height - band, _samples(width, _COLUMNS)
+    grid = picture[np.ix_(rows, columns)].astype(np.float32)
+    grey = grid if grid.ndim == 2 else grid.mean(axis=2)
+    cells = grey.reshape(_ROWS, len(_WITHIN), _COLUMNS, len(_WITHIN)).mean(axis=(1, 3)).ravel()
+    return None if np.any(np.abs(cells - _MIDDLE) < _MARGIN) else _value(cells > _MIDDLE)
+
+
+def _bits(value: int) -> NDArray[np.bool_]:
+    raw = value.to_bytes(3)
+    checked = raw + crc_hqx(raw, 0xFFFF).to_bytes(2)
+    return np.unpackbits(np.frombuffer(checked, np.uint8)).astype(bool).reshape(_ROWS, _COLUMNS)
+
+
+def _value(bits: NDArray[np.bool_]) -> int | None:
+    raw = np.packbits(bits).tobytes()
+    return int.from_bytes(raw[:3]) if crc_hqx(raw[:3], 0xFFFF) == int.from_bytes(raw[3:]) else None
+
+
+def _samples(length: int, cells: int) -> NDArray[np.intp]:
+    """Where to look for ``cells`` cells on ``length`` pixels: some places within each, away from its edges."""
+    return (np.add.outer(np.arange(cells), _WITHIN) * length / cells).astype(np.intp).ravel()
+
+
+def _swing(number: int, period: int, room: int) -> int:
+    """To and fro between 0 and ``room``."""
+    phase = number % period / period
+    return int(max(0, room) * abs(2 * phase - 1))
+
+
+def _landscape(width: int, height: int) -> Picture:
+    """A texture with detail of all sizes, as nature has it, whose right edge continues at its left."""
+    light = _grids(0, octaves=6, contrast=100)
+    tints = [_grids(100 * channel, octaves=2, contrast=40) for channel in (1, 2, 3)]
+    picture = np.empty((height, width, 3), np.uint8)
+    for top in range(0, height, _STRIPE):  # whole planes of floats would need many times the picture's memory
+        rows = np.arange(top, min(top + _STRIPE, height), dtype=np.float32) / np.float32(height)
+        grey = _texture(light, rows, width) + np.float32(118)
+        for channel, tint in enumerate(tints):
+            stripe = np.asarray(grey + _texture(tint, rows, width), np.float32)
+            picture[top : top + _STRIPE, :, channel] = np.clip(stripe, np.float32(0), np.float32(255))
+    return picture
+
+
+def _grids(seed: int, *, octaves: int, contrast: float) -> list[NDArray[np.float32]]:
+    """Random points, from few and strong to many and weak."""
+    shapes = [((3 << octave) + 1, 4 << octave) for octave in range(octaves)]
+    return [
+        (noise(seed + octave, rows * columns).reshape(rows, columns) - 0.5) * np.float32(contrast / 1.6**octave)
+        for octave, (rows, columns) in enumerate(shapes)
+    ]
+
+
+def _texture(grids: list[NDArray[np.float32]], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """The sum of the grids, each stretched over the picture; only the given rows, 0 (top) to 1."""
+    return np.asarray(sum(_stretched(grid, rows, width) for grid in grids), np.float32)
+
+
+def _stretched(grid: NDArray[np.float32], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Linear between the grid's points; it wraps around from right to left."""
+    x = np.arange(width, dtype=np.float32) * grid.shape[1] / width
+    y = rows * (grid.shape[0] - 1)
+    left, top = x.astype(np.intp), y.astype(np.intp)
+    across, down = x - left, (y - top)[:, None]
+    lines = grid[top] * (1 - down) + grid[top + 1] * down
+    return np.asarray(lines[:, left] * (1 - across) + lines[:, (left + 1) % grid.shape[1]] * across)
+
+
+def _tag(cell: int) -> Picture:
+    """The AprilTag with its quiet zone, ``cell`` pixels per cell."""
+    cells = np.full((_TAG_CELLS, _TAG_CELLS), 215, np.uint8)
+    cells[1:-1, 1:-1] = 40
+    cells[2:-2, 2:-2] = [[215 if bit == "1" else 40 for bit in row] for row in _TAG_BITS]
+    return cells.repeat(cell, axis=0).repeat(cell, axis=1)
+
+
+def _disc(size: int) -> NDArray[np.bool_]:
+    offset = np.arange(size) - (size - 1) / 2
+    return offset[:, None] ** 2 + offset**2 <= (size / 2) ** 2

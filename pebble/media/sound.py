@@ -1,0 +1,244 @@
+"""Sound to PBAT packets and back. What travels in which order, and when it is played, is not known here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+
+from pebble.errors import PayloadError, PebbleError
+from pebble.media import opus
+from pebble.media.opus import OpusDecoder, OpusEncoder
+from pebble.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
+from pebble.packets import SEQUENCE_LIMIT, Codec, Sound
+from pebble.transports.counters import Counters
+
+#: Those this installation can make.
+SOUND_ENCODINGS: Final[tuple[str, ...]] = ("pcm", "opus") if opus.available() else ("pcm",)
+
+CHANNELS_LIMIT: Final = 8
+LOWEST_RATE: Final = 4000  # Hz; nobody means less, and a player would fail
+_HIGHEST_PCM_RATE = 65_535  # what the header can express
+_LONGEST_S = 1.0  # of one packet: the most the original can be configured to send
+_SEAM_MS = 60  # a capture time further than this from where the last chunk ended: something is missing between them
+
+
+class SoundEncoder(Protocol):
+    """Any amount of s16le in, whole packets out; what is left over waits for more."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def rate(self) -> int:
+        """Of what is sent."""
+
+    @property
+    def channels(self) -> int:
+        """Of what is sent."""
+
+    def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
+        """No, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
+
+
+def sequence_numbers() -> Iterator[int]:
+    """1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
+    while True:
+        yield from range(1, SEQUENCE_LIMIT)
+
+
+def make_sound_encoder(
+    name: str,
+    *,
+    rate: int,
+    channels: int,
+    chunk_ms: int = 20,
+    bitrate: int = 24_000,
+    bundle: int = 1,
+    sent_rate: int | None = None,
+    sent_channels: int | None = None,
+    numbers: Iterator[int] | None = None,
+) -> SoundEncoder:
+    """``rate`` and ``channels`` are those of what is fed; ``sent_…`` those wanted on the wire, where it can have them.
+
+    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share one of ours.
+    Raises PebbleError for an unknown name and for one this installation cannot make.
+    """
+    numbers = sequence_numbers() if numbers is None else numbers
+    rate_out, channels_out = sent_rate or rate, sent_channels or channels
+    if name == "pcm":
+        rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
+        return _PcmEncoder(_Intake(rate, channels, rate_out, channels_out), chunk_ms, numbers)
+    if name == "opus":
+        rate_out = next((known for known in opus.RATES if known >= rate_out), opus.RATES[-1])
+        intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
+        frame_ms = next((known for known in opus.FRAMES_MS if known >= chunk_ms), opus.FRAMES_MS[-1])
+        return _OpusPackets(intake, frame_ms, bitrate, min(max(bundle, 1), opus.BUNDLE_LIMIT), numbers)
+    raise PebbleError(f'there is no sound encoding "{name}": use {" or ".join(SOUND_ENCODINGS)}')
+
+
+class _Intake:
+    """Sound on its way into packets: at the rate and with the channels of the wire, cut into equal frames."""
+
+    def __init__(self, rate: int, channels: int, rate_out: int, channels_out: int) -> None:
+        self.rate, self.channels = rate_out, channels_out
+        self._fed_rate, self._fed_channels = rate, channels
+        self._resampler = Resampler(rate, rate_out, channels_out)
+        self._left = np.zeros((0, channels_out), np.int16)
+        self._next_ms: float | None = None  # when the first sample of the next chunk should have been captured
+
+    def has_seam(self, captured_ms: int) -> bool:
+        """Is something missing before what begins at ``captured_ms``? Then what was left over is of no more use."""
+        if self._next_ms is None or abs(captured_ms - self._next_ms) <= _SEAM_MS:
+            return False
+        self._left = self._left[:0]
+        return True
+
+    def frames(self, pcm: bytes, captured_ms: int, size: int) -> Iterator[tuple[Samples, int]]:
+        """Frames of ``size`` samples, each with the epoch milliseconds of its first one."""
+        fed = to_samples(pcm, self._fed_channels)
+        start_ms = captured_ms - 1000 * len(self._left) / self.rate
+        held = np.concatenate((self._left, self._resampler.feed(remix(fed, self.channels))))
+        whole = len(held) // size * size
+        for at in range(0, whole, size):
+            yield held[at : at + size], round(start_ms + 1000 * at / self.rate)
+        self._left = held[whole:]
+        self._next_ms = captured_ms + 1000 * len(fed) / self._fed_rate
+
+
+class _PcmEncoder:
+    """Codec 1: the samples as they are."""
+
+    name = "pcm"
+
+    def __init__(self, intake: _Intake, chunk_ms: int, numbers: Iterator[int]) -> None:
+        self.rate, self.channels = intake.rate, intake.channels
+        self._intake, self._numbers = intake, numbers
+        self._size = min(max(1, self.rate * chunk_ms // 1000), _HIGHEST_PCM_RATE)
+
+    def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
+        self._intake.has_seam(captured_ms)
+        return [self._packet(frame, first_ms) for frame, first_ms in self._intake.frames(pcm, captured_ms, self._size)]
+
+    def _packet(self, frame: Samples, first_ms: int) -> bytes:
+        body, number, first_ms = to_bytes(frame), next(self._numbers), max(0, first_ms)
+        return Sound(Codec.PCM16LE, self.channels, self.rate, len(frame), number, first_ms, body).pack()
+
+
+class _OpusPackets:
+    """Codec 2: see pebble.media.opus."""
+
+    name = "opus"
+
+    def __init__(self, intake: _Intake, frame_ms: int, bitrate: int, bundle: int, numbers: Iterator[int]) -> None:
+        self.rate, self.channels = intake.rate, intake.channels
+        self._intake, self._numbers, self._bundle = intake, numbers, bundle
+        self._encoder = OpusEncoder(self.rate, self.channels, frame_ms=frame_ms, bitrate=bitrate)
+        self._ready: list[bytes] = []
+        self._ready_ms = 0  # when the first of them was captured
+
+    def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
+        packets = []
+        if self._intake.has_seam(captured_ms):
+            self._ready = []
+        for frame, first_ms in self._intake.frames(pcm, captured_ms, self._encoder.samples):
+            if not self._ready:
+                self._ready_ms = first_ms
+            self._ready += self._encoder.encode(frame)
+            if len(self._ready) >= self._bundle:
+                packets.append(self._packet())
+        return packets
+
+    def _packet(self) -> bytes:
+        samples, body = len(self._ready) * self._encoder.samples, opus.join(self._ready)
+        self._ready = []
+        number, first_ms = next(self._numbers), max(0, self._ready_ms)
+        return Sound(Codec.OPUS, self.channels, self.rate, samples, number, first_ms, body).pack()
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A packet that was decoded: samples are (samples, channels)."""
+
+    samples: Samples
+    rate: int
+    channels: int
+    captured_ms: int
+    sequence: int
+    encoding: str
+
+    @property
+    def pcm(self) -> bytes:
+        """Interleaved s16le."""
+        return to_bytes(self.samples)
+
+
+def unpack(payload: bytes) -> Sound:
+    """The packet in ``payload``, if it may be played. Raises PayloadError for anything else."""
+    sound = Sound.unpack(payload)
+    if sound.channels > CHANNELS_LIMIT or sound.rate < LOWEST_RATE:
+        raise PayloadError(f"PBAT: {sound.channels} channels at {sound.rate} Hz are not to be played")
+    if sound.samples > _LONGEST_S * sound.rate:
+        raise PayloadError(f"PBAT: one packet of {sound.samples / sound.rate:.1f} s")
+    if sound.codec == Codec.PCM16LE:
+        if len(sound.body) < 2 * sound.samples * sound.channels:
+            raise PayloadError("PBAT: fewer samples than its header says")
+    elif sound.codec == Codec.OPUS and "opus" in SOUND_ENCODINGS:
+        _check_opus(sound)
+    else:
+        raise PayloadError(f"PBAT: codec {sound.codec} is not known here")
+    return sound
+
+
+def _check_opus(sound: Sound) -> None:
+    if sound.rate not in opus.RATES or sound.channels > 2:
+        raise PayloadError(f"PBAT: no Opus has {sound.channels} channels at {sound.rate} Hz")
+    if sound.samples * 1000 != sum(map(opus.milliseconds, opus.split(sound.body))) * sound.rate:
+        raise PayloadError("PBAT: not as many samples as its Opus packets hold")
+
+
+class SoundDecoder:
+    """Packets to samples, in the order they are fed; any may differ from the one before in codec, rate and channels.
+
+    ``counters``: packets, refused.
+    """
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._format = (0, 0, 0)
+        self._opus: OpusDecoder | None = None
+
+    def feed(self, payload: bytes) -> Heard | None:
+        """The sound of one MQTT payload; None for what cannot be played."""
+        try:
+            return self.decode(unpack(payload))
+        except PayloadError:
+            self.counters.add("refused")
+            return None
+
+    def decode(self, sound: Sound) -> Heard:
+        """The sound of a packet that :func:`unpack` let through. Raises PayloadError if it cannot be decoded after all.
+
+        Raises PebbleError for Opus where PyAV is missing.
+        """
+        format_ = (sound.codec, sound.rate, sound.channels)
+        if format_ != self._format:
+            self._opus = OpusDecoder(sound.rate, sound.channels) if sound.codec == Codec.OPUS else None
+            self._format = format_
+        samples = self._samples(sound)
+        self.counters.add("packets")
+        encoding = "pcm" if self._opus is None else "opus"
+        return Heard(samples, sound.rate, sound.channels, sound.captured_ms, sound.sequence, encoding)
+
+    def conceal(self) -> Samples | None:
+        """One more frame as it might have been, by the codec's own means; None if it has none."""
+        if self._opus is None:
+            return None
+        made = self._opus.conceal()
+        return made if len(made) else None
+
+    def _samples(self, sound: Sound) -> Samples:
+        if self._opus is None:
+            return to_samples(sound.body[: 2 * sound.samples * sound.channels], sound.channels)
+        return np.concatenate([self._opus.decode(packet) for packet in opus.split(sound.body)])

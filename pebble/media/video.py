@@ -1,0 +1,157 @@
+"""Video encoders by name: a picture in, one MQTT payload out."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Final, Protocol
+
+from pebble.errors import ConfigError
+from pebble.media import h264
+from pebble.media.h264 import H264Encoder
+from pebble.media.jpeg import Pixels
+from pebble.media.jpeg_delta import JpegDelta
+from pebble.media.json_video import JsonPicture
+from pebble.packets import KEY_FRAME, Picture, PictureKind
+
+_ALL: Final = ("json", "pbvd", "pbvz", "h264")
+#: Those this installation can make.
+VIDEO_ENCODINGS: Final[tuple[str, ...]] = _ALL if h264.installed() else _ALL[:-1]
+
+DEFAULT_QUALITY: Final = 10
+_FRAME_LIMIT: Final = 1 << 32
+_H264_INTERVAL_S: Final = 4.0  # a receiver that misses a frame asks for a key frame; this is for those who cannot ask
+
+
+class VideoEncoder(Protocol):
+    """One stream to one topic; frames are numbered from 0, by one."""
+
+    name: str
+    quality: float  # 1..100, as of a JPEG; may be set at any time
+    bitrate: int | None  # bits per second, of h264 only; may be set at any time, None: constant quality
+    last_was_keyframe: bool
+
+    def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
+        """``picture``: BGR, uint8, (height, width, 3), only read. ``keyframe``: make this one a full picture."""
+        ...
+
+
+def make_encoder(
+    name: str,
+    *,
+    fps: float,
+    keyframe_interval: int | None = None,
+    quality: float = DEFAULT_QUALITY,
+    bitrate: int | None = None,
+) -> VideoEncoder:
+    """The encoder called ``name``: json, pbvd, pbvz or h264.
+
+    ``keyframe_interval``: pictures from one key frame to the next; None means as many as come in a third of a second
+    (the paper's rule), for h264 in four. Raises ConfigError for an unknown name, PebbleError saying what to install.
+    """
+    if keyframe_interval is None:
+        keyframe_interval = round(fps * _H264_INTERVAL_S) if name == "h264" else int(fps / 3)
+    interval = max(1, keyframe_interval)
+    match name:
+        case "json":
+            return JsonEncoder(interval, quality)
+        case "pbvd":
+            return PbvdEncoder(interval, quality)
+        case "pbvz":
+            return PbvzEncoder(interval, quality)
+        case "h264":
+            return H264VideoEncoder(fps, interval, quality, bitrate)
+    raise ConfigError(f"video encoding {name!r}: unknown; there are {', '.join(_ALL)}")
+
+
+class _JpegEncoder:
+    """What the three forms made of JPEGs share."""
+
+    optimize = True
+
+    def __init__(self, interval: int, quality: float) -> None:
+        self.last_was_keyframe = False
+        self.bitrate: int | None = None
+        self._film = JpegDelta(interval=interval, quality=quality, optimize=self.optimize)
+        self._frame = 0
+
+    @property
+    def quality(self) -> float:
+        return self._film.quality
+
+    @quality.setter
+    def quality(self, quality: float) -> None:
+        self._film.quality = quality
+
+    def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
+        coded = self._film.code(picture, keyframe=keyframe)
+        self.last_was_keyframe = coded.keyframe
+        frame = self._frame
+        self._frame = (frame + 1) % _FRAME_LIMIT
+        return self._pack(coded.jpeg, coded.keyframe, frame, captured_ms)
+
+    def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
+        raise NotImplementedError
+
+
+class JsonEncoder(_JpegEncoder):
+    """Paper 8.8: what every operator page understands."""
+
+    name = "json"
+
+    def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
+        return JsonPicture(frame, keyframe, captured_ms, jpeg).pack()
+
+
+class PbvdEncoder(_JpegEncoder):
+    """A binary header and the bare JPEG."""
+
+    name = "pbvd"
+
+    def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
+        kind = PictureKind.JPEG if keyframe else PictureKind.DELTA_JPEG
+        return Picture(kind, frame, captured_ms, jpeg).pack()
+
+
+class PbvzEncoder(_JpegEncoder):
+    """A binary header and the zlib of the JPEG: its tables and its empty blocks shrink to little."""
+
+    name = "pbvz"
+
+    def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
+        kind = PictureKind.ZLIB_JPEG if keyframe else PictureKind.ZLIB_DELTA_JPEG
+        return Picture(kind, frame, captured_ms, zlib.compress(jpeg, 9)).pack()
+
+
+class H264VideoEncoder:
+    """A binary header and one access unit."""
+
+    name = "h264"
+
+    def __init__(self, fps: float, interval: int, quality: float, bitrate: int | None) -> None:
+        self.last_was_keyframe = False
+        self._codec = H264Encoder(fps=fps, interval=interval, quality=quality, bitrate=bitrate)
+        self._frame = 0
+
+    @property
+    def quality(self) -> float:
+        return self._codec.quality
+
+    @quality.setter
+    def quality(self, quality: float) -> None:
+        self._codec.quality = quality
+
+    @property
+    def bitrate(self) -> int | None:
+        return self._codec.bitrate
+
+    @bitrate.setter
+    def bitrate(self, bitrate: int | None) -> None:
+        self._codec.bitrate = bitrate
+
+    def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
+        unit = self._codec.encode(picture, keyframe=keyframe)
+        self.last_was_keyframe = self._codec.keyframe
+        frame = self._frame
+        self._frame = (frame + 1) % _FRAME_LIMIT
+        flags = KEY_FRAME if self.last_was_keyframe else 0
+        return Picture(PictureKind.H264, frame, captured_ms, unit, flags).pack()
