@@ -90,6 +90,11 @@ class Channel(Struct, frozen=True, kw_only=True):
         """What to subscribe to in order to receive this channel of ``base`` (which may hold ``+`` levels)."""
         return f"{base}/{re.sub(r'{[^}]*}', '+', self.suffix)}"
 
+    def names(self, topic: str) -> dict[str, str]:
+        """What fills this pattern's levels in one of its topics: ``{"program": "camera_publisher"}``."""
+        found = re.search(re.sub(r"{([^}]*)}", r"(?P<\1>[^/]+)", self.suffix) + r"\Z", topic)
+        return found.groupdict() if found is not None else {}
+
 
 def _c(metric: str, kind: Kind, payload: Any, doc: str, **more: Any) -> Channel:
     return Channel(metric=metric, kind=kind, payload=payload, doc=doc, **more)

@@ -25,7 +25,10 @@ Method = TypeVar("Method", bound=Callable[..., None])
 
 
 def on(channel: Channel) -> Callable[[Method], Method]:
-    """Mark a method as the handler of ``channel``; it is called with the decoded payload."""
+    """Mark a method as the handler of ``channel``; it is called with the decoded payload.
+
+    That of a pattern is also told by name what filled its levels: ``def hear(self, report, program)``.
+    """
 
     def mark(method: Method) -> Method:
         method.__dict__["channel"] = channel
@@ -163,7 +166,7 @@ class Service:
         if totals or self._inbox.dropped:
             self.log.info("refused in all: %s; dropped from the inbox: %d", totals or "nothing", self._inbox.dropped)
 
-    def _handle(self, channel: Channel, method: Callable[[Any], None], value: Any, arrived: float) -> None:
+    def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
         """Call the handler, unless we hung or stood still for so long that nobody means this command any more.
 
         Only where newer ones follow: of others none may be missed.
@@ -172,17 +175,17 @@ class Service:
             self.counters.add("late")
             self._quiet_log.warning(f"{channel.metric} late", "dropped a late %s", channel.metric)
             return
-        method(value)
+        method()
 
     # -- the transport's threads: decode and post, nothing else
 
-    def _listen(self, channel: Channel, method: Callable[[Any], None]) -> None:
+    def _listen(self, channel: Channel, method: Callable[..., None]) -> None:
         def receive(message: Message) -> None:
             self._receive(channel, method, message)
 
         self.transport.subscribe(self.addresses[channel].topic, receive, qos=QoS(channel.default_qos), direct=True)
 
-    def _receive(self, channel: Channel, method: Callable[[Any], None], message: Message) -> None:
+    def _receive(self, channel: Channel, method: Callable[..., None], message: Message) -> None:
         """Refuse what is stale or malformed *before* it may take a newer message's place in the inbox."""
         if message.retain and channel.kind in _ONE_SHOT:
             self.counters.add("stale")
@@ -195,8 +198,10 @@ class Service:
             self._quiet_log.warning(channel.metric, "refused a message: %s", error)
             return
         arrived = time.monotonic()
+        names = channel.names(message.topic) if channel.is_pattern else {}
         self._inbox.post(
-            lambda: self._handle(channel, method, value, arrived), newest_of=message.topic if channel.newest else None
+            lambda: self._handle(channel, lambda: method(value, **names), arrived),
+            newest_of=message.topic if channel.newest else None,
         )
 
     def _on_state(self, state: State) -> None:

@@ -12,8 +12,25 @@ from typing import Any
 import pytest
 
 from pebble.config import parse
-from pebble.contract import CHARGING_STATUS, DRIVE, MCU_DESCRIBE, MQTT_VIDEO, REBOOT, SOUNDBOARD_COMMAND, TOUCH_SENSORS
-from pebble.payloads import ChargingStatus, Drive, McuManifest, SoundboardCommand, TouchSensors, TouchValues
+from pebble.contract import (
+    CHARGING_STATUS,
+    DRIVE,
+    MCU_DESCRIBE,
+    MEDIA_REPORT,
+    MQTT_VIDEO,
+    REBOOT,
+    SOUNDBOARD_COMMAND,
+    TOUCH_SENSORS,
+)
+from pebble.payloads import (
+    ChargingStatus,
+    Drive,
+    McuManifest,
+    MediaReport,
+    SoundboardCommand,
+    TouchSensors,
+    TouchValues,
+)
 from pebble.service import Service, every, on
 from pebble.transports import Message, QoS, State
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -60,6 +77,10 @@ class Recorder(Service):
     @on(REBOOT)
     def reboot(self, value: bool) -> None:
         self._note(f"reboot {value}")
+
+    @on(MEDIA_REPORT)
+    def report(self, report: MediaReport, program: str) -> None:
+        self._note((program, report.running))
 
     @every(seconds=0.01)
     def tick(self) -> None:
@@ -306,7 +327,7 @@ def test_a_renamed_channel_is_heard_under_its_new_name() -> None:
 
 
 def test_what_a_service_handles_can_be_asked() -> None:
-    assert set(Recorder.handles()) == {DRIVE, SOUNDBOARD_COMMAND, MQTT_VIDEO, REBOOT}
+    assert set(Recorder.handles()) == {DRIVE, SOUNDBOARD_COMMAND, MQTT_VIDEO, REBOOT, MEDIA_REPORT}
 
 
 # -- publishing
@@ -330,6 +351,13 @@ def test_delivery_follows_the_channel(robot: Robot) -> None:
         True,
     )
     assert (stream.topic, stream.qos, stream.keep) == (f"{BASE}/outgoing/touch-sensors", QoS.DELIVERED, False)
+
+
+def test_the_handler_of_a_pattern_is_told_who_speaks(robot: Robot) -> None:
+    robot.start()
+    robot.say(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
+    robot.say(MEDIA_REPORT.topic(BASE, program="audio_receiver"), '{"running": false}')
+    assert robot.saw(("camera_publisher", True), ("audio_receiver", False))
 
 
 def test_a_pattern_channel_takes_its_names(robot: Robot) -> None:
