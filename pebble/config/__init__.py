@@ -75,6 +75,14 @@ class Config(Root, frozen=True, kw_only=True):
             if line.enabled and line.serial.port is not None and line.protocol in SERIAL_PROTOCOLS
         }
 
+    def media_programs(self) -> tuple[str, ...]:
+        """What runs while operators want pictures or sound: programs of the launcher, by the services' names."""
+        devices = self.services.av_daemon
+        if not (self.services.mqtt_bridge.enabled and devices.enabled):
+            return ()
+        video = ("camera_publisher",) if devices.video.enabled else ()
+        return (*video, *(("audio_publisher", "audio_receiver") if devices.audio.enabled else ()))
+
 
 def load(path: Path | str, env: Mapping[str, str] = os.environ) -> Config:
     """Read a config file. Raises ConfigError that holds every problem found in it."""
@@ -107,9 +115,14 @@ def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -
 
 
 def _run_folder(root: Root, base: str, env: Mapping[str, str]) -> Path:
-    """Short, because a unix socket's path ends at 108 bytes; one per robot, because a host may run two."""
-    if root.transport.run_dir is not None:
-        return root.transport.run_dir
+    return root.transport.run_dir or default_run_folder(base, env)
+
+
+def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
+    """Of the robot with this base topic, where its config names none.
+
+    Short, because a unix socket's path ends at 108 bytes; one per robot, because a host may run two.
+    """
     if by_systemd := env.get("RUNTIME_DIRECTORY"):
         return Path(by_systemd.split(":")[0])  # one per RuntimeDirectory= of the unit
     robot = f"{zlib.crc32(base.encode()):08x}"

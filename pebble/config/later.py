@@ -8,6 +8,7 @@ from pebble.config.links import Mqtt
 from pebble.config.types import (
     EMPTY,
     AudioChannels,
+    BitsPerSecond,
     Command,
     Count,
     File,
@@ -38,10 +39,13 @@ class CameraCapture(Section, frozen=True, kw_only=True):
     retired: ClassVar = _SHARED_MEMORY
 
     enabled: Annotated[bool, doc("Open the camera.")] = True
-    backend: Annotated[Literal["v4l2", "libcamera", "arducam", "picamera2"], doc("How the camera is reached.")] = "v4l2"
-    device: Annotated[str, doc("Device of a v4l2 camera.")] = "/dev/video0"
+    backend: Annotated[
+        Literal["v4l2", "libcamera", "arducam", "picamera2", "synthetic"],
+        doc("How the camera is reached; `synthetic` needs none."),
+    ] = "v4l2"
+    device: Annotated[str, doc("Device of a v4l2 camera; or a file or URL that plays its part.")] = "/dev/video0"
     capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
-    io_mode: Annotated[str | int, doc("How v4l2 hands over its buffers.")] = "auto"
+    io_mode: Annotated[str | int, doc("Not used: OpenCV knows the best way by itself.")] = "auto"
     camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None
     camera_controls: Annotated[dict[str, Any], doc("Settings handed to the camera as they are.")] = field(
         default_factory=dict
@@ -58,7 +62,9 @@ class Microphone(Section, frozen=True, kw_only=True):
     retired: ClassVar = _SHARED_MEMORY
 
     enabled: Annotated[bool, doc("Open the microphone.")] = True
-    source: Annotated[Literal["alsa", "auto"], doc("How the microphone is reached.")] = "alsa"
+    source: Annotated[
+        Literal["alsa", "auto", "synthetic"], doc("How the microphone is reached; `synthetic` needs none.")
+    ] = "alsa"
     device: Annotated[str | None, doc("ALSA device; unset: the default.")] = None
     rate: Annotated[SampleRate, doc("Samples per second.")] = 16000
     channels: Annotated[AudioChannels, doc("1 is mono, 2 stereo.")] = 1
@@ -80,6 +86,9 @@ class VideoPublisher(Section, frozen=True, kw_only=True):
 
     retired: ClassVar = {**_INPUT, "source_*": _SOURCE}
 
+    encoding: Annotated[
+        Literal["json", "pbvd", "pbvz", "h264"], doc("How pictures are sent unless a request names another form.")
+    ] = "json"
     profile: Annotated[str, doc("Name of this set of values.")] = "default"
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/front-camera`.")] = None
     overlays_topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/video-overlays`.")] = None
@@ -92,6 +101,7 @@ class VideoPublisher(Section, frozen=True, kw_only=True):
     target_fps: Annotated[FramesPerSecond | None, doc("Where publish_fps is not set.")] = None
     keyframe_interval: Annotated[Count | None, doc("Frames from one full picture to the next; unset: fps / 3.")] = None
     jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="1 is worst and smallest.")] = 10
+    bitrate: Annotated[BitsPerSecond | None, doc("Of h264, at most; unset: it looks as jpeg_quality does.")] = None
     rotate_degrees: Annotated[Rotation, doc("Clockwise, beyond what the camera's section says.")] = 0
     reconnect_seconds: Annotated[Seconds, doc("Wait between attempts to reach the broker.")] = 10.0
 
@@ -101,10 +111,16 @@ class AudioPublisher(Section, frozen=True, kw_only=True):
 
     retired: ClassVar = _INPUT
 
+    encoding: Annotated[Literal["pcm", "opus"], doc("How sound is sent unless a request names another form.")] = "pcm"
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/audio`.")] = None
     rate: Annotated[SampleRate | None, doc("Samples per second; unset: as captured.")] = None
     channels: Annotated[AudioChannels | None, doc("1 is mono, 2 stereo; unset: as captured.")] = None
-    chunk_ms: Annotated[int, Meta(ge=1, le=1000, description="Milliseconds of sound in one packet.")] = 20
+    chunk_ms: Annotated[
+        int,
+        Meta(ge=1, le=1000, description="Milliseconds of sound in one packet; of opus 20, 40 or 60, and each part."),
+    ] = 20
+    bitrate: Annotated[int, Meta(ge=6_000, le=256_000, description="Of opus, bits per second.")] = 24_000
+    bundle: Annotated[int, Meta(ge=1, le=3, description="How many parts a packet of opus has.")] = 2
     qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
 
 
@@ -115,6 +131,12 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
     device: Annotated[str, doc("ALSA device to play on.")] = "default"
     rate: Annotated[SampleRate, doc("Samples per second until a packet says otherwise.")] = 16000
     channels: Annotated[AudioChannels, doc("Channels until a packet says otherwise.")] = 1
+    command: Annotated[
+        Command, doc("What plays sound from its standard input; `{rate}`, `{channels}` and `{device}` are filled in.")
+    ] = ("aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-D", "{device}", "-")
+    latency_ms: Annotated[
+        int, Meta(ge=0, le=1000, description="Sound that waits to make up for uneven arrival; more where it must.")
+    ] = 60
     queue_limit: Annotated[Count, doc("Packets that wait to be played; beyond it the oldest is dropped.")] = 48
     concealment_ms: Annotated[int, Meta(ge=0, le=10_000, description="Longest gap filled with the last packet.")] = 100
     qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None

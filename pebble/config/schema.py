@@ -140,4 +140,4 @@ def write(root: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(__file__).resolve().parent.parent)
+    write(Path(__file__).resolve().parent.parent.parent)
