@@ -7,8 +7,11 @@ import logging
 import os
 import signal
 import sys
+from typing import NamedTuple
 
-NOTIFY_FD = "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, then "ALIVE" every second
+NOTIFY_FD = "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, and "WANT …"
+WANTED = "PEBBLE_WANTED"  # "name=encoding …": what a predecessor of this process had wanted, and what still runs
+ENCODING = "PEBBLE_ENCODING"  # the form that was asked for when this media program was wanted
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 ALIVE_PERIOD_S = 1.0
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
@@ -32,6 +35,24 @@ def die_with_launcher() -> None:
         sys.exit(1)
 
 
+class Want(NamedTuple):
+    """Whether an on-demand program is to run, and which encoding it is to begin with; empty: as configured."""
+
+    on: bool
+    encoding: str = ""
+
+
+def wanted_before() -> dict[str, Want]:
+    """The on-demand programs that run because our predecessor wanted them."""
+    words = (word.partition("=") for word in os.environ.get(WANTED, "").split())
+    return {name: Want(on=True, encoding=encoding) for name, _, encoding in words}
+
+
+def encoding_asked_for() -> str | None:
+    """What the request asked for that has this program run; None: nothing special. Later ones it hears by itself."""
+    return os.environ.get(ENCODING) or None
+
+
 class Notifier:
     """Tells the launcher that this service listens, and that its thread is not stuck; silent without a launcher."""
 
@@ -40,6 +61,7 @@ class Notifier:
         self._fd = None if number is None else int(number)
         if self._fd is not None:
             os.set_blocking(self._fd, False)
+        self._said_alone = False
 
     def ready(self) -> None:
         self._write(b"READY\n")
@@ -47,10 +69,23 @@ class Notifier:
     def alive(self) -> None:
         self._write(b"ALIVE\n")
 
-    def _write(self, line: bytes) -> None:
+    def want(self, program: str, want: Want) -> bool:
+        """Have an on-demand program run, or run no more. False: say it again, the launcher was too busy to hear it.
+
+        Only a program that may ask (pebble.launcher.programs) is listened to. When it ends, its wants count for
+        another 5 s.
+        """
+        if self._fd is None and not self._said_alone:
+            self._said_alone = True
+            log.info("there is no launcher: others have to start %s", program)
+        return self._write(f"WANT {program} {int(want.on)} {want.encoding}".rstrip().encode() + b"\n")
+
+    def _write(self, line: bytes) -> bool:
         if self._fd is None:
-            return
+            return True
         try:
-            os.write(self._fd, line)
+            os.write(self._fd, line)  # a line is short: the pipe takes the whole of it, or nothing
         except OSError:  # the launcher is gone or busy: the next sign of life tells
             log.debug("the launcher did not take %s", line)
+            return False
+        return True

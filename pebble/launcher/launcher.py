@@ -19,9 +19,10 @@ from pebble.launcher.child import Child
 from pebble.launcher.keeper import Keeper
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.news import News
+from pebble.launcher.on_demand import OnDemand
 from pebble.launcher.preload import preload
 from pebble.launcher.program import Program, Stage
-from pebble.launcher.programs import programs, transport_modules
+from pebble.launcher.programs import programs, shared_modules, transport_modules
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.run_lock import RunLock
 from pebble.launcher.sd_notify import SystemdNotifier
@@ -58,6 +59,10 @@ class Launcher:
         self._systemd = SystemdNotifier()
         self._environment = _environment()
         self._keepers = [self._keeper(program) for program in (programs(config) if table is None else table)]
+        self._always = [keeper for keeper in self._keepers if not keeper.program.on_demand]
+        self._on_demand = OnDemand(
+            self._reactor, {keeper.program.name: keeper for keeper in self._keepers if keeper.program.on_demand}
+        )
         self._news = News(self._reactor)
         self._logs = LogForwarder(self._record, config.services.launcher.logs)
         self._signals = StopSignals(self._kill_all)
@@ -85,8 +90,8 @@ class Launcher:
     def _start(self) -> None:
         """Nobody waits for anybody: every process connects by itself as soon as it can."""
         self._reactor.watch(self._signals.wake, self._signals.drain)
-        preload([*transport_modules(self._config), *(keeper.program.module for keeper in self._keepers)])
-        for keeper in self._keepers:
+        preload([*transport_modules(self._config), *shared_modules(self._config), *_preloaded(self._keepers)])
+        for keeper in self._always:
             if self._must_stop():
                 return
             keeper.start()
@@ -111,16 +116,23 @@ class Launcher:
             self._reactor,
             spawn=self._spawn,
             on_line=lambda pid, line: self._logs.child_line(program.name, pid, line, published=not program.told),
+            on_note=lambda line: self._on_demand.hear(program, line),
             on_change=self._changed,
+            on_end=lambda: self._on_demand.ended(program),
         )
 
     def _spawn(self, program: Program) -> Child:
         self._logs.child_started(program.name)
         stdin = self._news.connect(self._will()) if program.told else os.open(os.devnull, os.O_RDONLY)
         try:
-            return Child(program, self._environment, stdin=stdin)
+            return Child(program, self._environment_of(program), stdin=stdin)
         finally:
             os.close(stdin)
+
+    def _environment_of(self, program: Program) -> dict[str, str]:
+        """The config's variables replace what we were given, and never what we have to say to our children."""
+        inherited, ours = self._environment, {LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
+        return {**inherited, **program.environment, **ours}
 
     # -- stopping
 
@@ -162,7 +174,7 @@ class Launcher:
     # -- telling
 
     def _changed(self) -> None:
-        if not self._said_ready and all(keeper.life.settled for keeper in self._keepers):
+        if not self._said_ready and all(keeper.life.settled for keeper in self._always):
             self._said_ready = True
             self._systemd.ready()
         if not self._status_due:
@@ -171,9 +183,13 @@ class Launcher:
 
     def _say_status(self) -> None:
         self._status_due = False
-        states = {keeper.program.name: _state(keeper.life) for keeper in self._keepers}
-        self._systemd.status(_summary(states))
+        states = {keeper.program.name: _state(keeper.life) for keeper in self._keepers if keeper.shown}
+        self._systemd.status(_summary({name: state for name, state in states.items() if name not in self._resting()}))
         self._say_state(STATUS, _status(states))
+
+    def _resting(self) -> set[str]:
+        """Stopped because nobody wants them: nothing to worry about."""
+        return {k.program.name for k in self._keepers if k.program.on_demand and not k.wanted and not k.running}
 
     def _say_capabilities(self) -> None:
         value = capabilities(self._config, self._addresses)
@@ -191,7 +207,8 @@ class Launcher:
 
     def _will(self) -> Message:
         """Children die with us, so that is what others are to believe when we are gone."""
-        gone = _status({keeper.program.name: ServiceState(state="stopped") for keeper in self._keepers})
+        shown = (keeper.program.name for keeper in self._keepers if keeper.shown)
+        gone = _status({name: ServiceState(state="stopped") for name in shown})
         return self._message(STATUS, gone)
 
     def _record(self, record: LogRecord) -> None:
@@ -208,10 +225,13 @@ def _running(keepers: list[Keeper]) -> list[str]:
     return [keeper.program.name for keeper in keepers if keeper.running]
 
 
+def _preloaded(keepers: list[Keeper]) -> list[str]:
+    return [keeper.program.module for keeper in keepers if keeper.program.preloaded]
+
+
 def _environment() -> dict[str, str]:
     """Children do not speak to systemd in our name."""
-    inherited = {name: value for name, value in os.environ.items() if name not in SystemdNotifier.VARIABLES}
-    return {**inherited, LAUNCHER_PID: str(os.getpid())}
+    return {name: value for name, value in os.environ.items() if name not in SystemdNotifier.VARIABLES}
 
 
 def _state(life: Life) -> ServiceState:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import os
 from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pkgutil import iter_modules
@@ -13,6 +14,7 @@ log = logging.getLogger(__name__)
 
 def preload(modules: Iterable[str]) -> None:
     """Import ``modules``, and what lies in those that are packages. What cannot be imported is left to the child."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else numpy starts threads, and no fork may follow
     for name in modules:
         try:
             for part in _parts(name):

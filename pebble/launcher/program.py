@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from pathlib import Path
 
 from msgspec import Struct
 
@@ -27,3 +28,9 @@ class Program(Struct, frozen=True):
     arguments: tuple[str, ...]
     stage: Stage
     told: bool = False  # its stdin is the launcher's news; the others have none
+    asks: bool = False  # may say which on-demand programs are wanted
+    on_demand: bool = False  # runs only while it is wanted
+    preloaded: bool = True  # False: it imports what only few need, and that much memory is not for all to carry
+    environment: dict[str, str] = {}
+    folder: Path | None = None  # to run in; None: the launcher's
+    stop_timeout_s: float = 10.0  # of an on-demand program that is not wanted any more; then it is killed

@@ -12,6 +12,7 @@ LOOP_EXITS, LOOP_WINDOW_S = 5, 60.0  # this many exits within this time are a cr
 LOOP_RETRY_S = 10.0  # at least this long between attempts in a crash loop: it may heal by itself
 START_LIMIT_S = 30.0  # from start to the first sign of life
 ALIVE_LIMIT_S = 10.0  # between signs of life; services give one every second
+REST_S = 1.0  # between two starts of a program that is wanted, unwanted, wanted, …: a start costs half a second of CPU
 
 
 class Life:
@@ -32,15 +33,21 @@ class Life:
         self._delay_s = restart_delay_s
         self._exits: deque[float] = deque(maxlen=LOOP_EXITS)
         self._in_a_row = 0
-        self._started = 0.0
+        self._started = float("-inf")
 
     @property
     def looping(self) -> bool:
         """Does it end again and again, faster than starting it could be worth?"""
         return len(self._exits) == LOOP_EXITS and self._exits[-1] - self._exits[0] <= LOOP_WINDOW_S
 
+    def rest_s(self, now: float) -> float:
+        """How many seconds to wait before a program that was stopped is started because it is wanted again."""
+        return max(0.0, self._started + REST_S - now)
+
     def started(self, now: float) -> None:
-        if self.last_exit is not None:
+        if self.state == "stopped":  # that was asked for: no restart
+            self.state = "init"
+        elif self.last_exit is not None:
             self.restarts += 1
         self._started = now
         self.stuck_at = now + START_LIMIT_S

@@ -11,7 +11,7 @@ import threading
 import time
 from pathlib import Path
 
-from pebble.launched import NOTIFY_FD, Notifier
+from pebble.launched import NOTIFY_FD, Notifier, Want, encoding_asked_for, wanted_before
 
 WORDS = """12:00:00 [WARNING] mind the gap
 just a print
@@ -42,6 +42,37 @@ def live(notify: Notifier, *, alive: bool = True) -> None:
         time.sleep(0.05)
         if alive:
             notify.alive()
+
+
+def ask(notify: Notifier) -> None:
+    """Want what the lines say that somebody appends to the file ``JOURNAL.orders.NAME``: ``media 1 h264``.
+
+    ``half media 1`` says it in two pieces, ``noise media 1`` after 100 kB of anything.
+    """
+    orders = Path(f"{sys.argv[3]}.orders.{sys.argv[1]}")
+    orders.write_text("")  # those of the one before are old
+    note("before:" + ",".join(f"{name}={want.encoding}" for name, want in wanted_before().items()))
+    note("ready")
+    notify.ready()
+    with orders.open() as lines:
+        while True:
+            for line in lines:
+                first, *rest = line.split()
+                if first in ("half", "noise"):
+                    blurt(first, f"WANT {' '.join(rest)}\n".encode())
+                else:
+                    notify.want(first, Want(rest[0] == "1", *rest[1:]))
+            notify.alive()
+            time.sleep(0.01)
+
+
+def blurt(how: str, note_: bytes) -> None:
+    pipe = int(os.environ[NOTIFY_FD])
+    os.set_blocking(pipe, True)
+    for piece in (note_[:6], note_[6:]) if how == "half" else (b"x" * 100_000 + b"\n", note_):
+        os.write(pipe, piece)
+        time.sleep(0.05)
+    os.set_blocking(pipe, False)
 
 
 def end(how: str) -> None:
@@ -83,6 +114,10 @@ def main() -> None:
         child = subprocess.Popen(["sleep", "600"])
         note(f"child:{child.pid}")
         os._exit(1)
+    if behaviour == "asker":
+        ask(Notifier())
+    if behaviour == "curious about itself":
+        note(f"env:{os.environ.get('MARK', '')}:{Path.cwd().name.replace(' ', '-')}:{encoding_asked_for()}")
     if behaviour == "environment":
         note("systemd:" + str("NOTIFY_SOCKET" in os.environ))
     if behaviour == "talker":

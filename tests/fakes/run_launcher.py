@@ -1,8 +1,9 @@
 """A launcher in a process of its own: ``run_launcher.py ROOT CONFIG TABLE RECORD [option…]``, with fakes around it.
 
-TABLE is JSON: a list of [name, module, arguments, stage]; what is published goes to RECORD. Options: those of
-fake_announcer, ``hasty`` (0.5 s without a sign of life is stuck), ``signal`` (a stop signal comes while the first child
-is being started), ``tireless`` (nothing is a crash loop), ``missing`` (one more program, which does not exist).
+TABLE is JSON: a list of [name, module, arguments, stage] and perhaps an object of what else a program is; what is
+published goes to RECORD. Options: those of fake_announcer, ``hasty`` (2 s without a sign of life is stuck),
+``signal`` (a stop signal comes while the first child is being started), ``tireless`` (nothing is a crash loop),
+``forgetful`` (what the dead wanted counts for 1 s), ``missing`` (one more program, which does not exist).
 """
 
 import json
@@ -15,7 +16,7 @@ sys.path.insert(0, root)
 
 from pebble.config import load  # noqa: E402
 from pebble.errors import PebbleError  # noqa: E402
-from pebble.launcher import launcher, supervisor  # noqa: E402
+from pebble.launcher import launcher, on_demand, supervisor  # noqa: E402
 from pebble.launcher.child import Child  # noqa: E402
 from pebble.launcher.program import Program, Stage  # noqa: E402
 
@@ -27,12 +28,17 @@ class SignalledChild(Child):
         super().__init__(*arguments, **named)  # type: ignore[arg-type]
 
 
-table = [Program(name, module, tuple(args), Stage(stage)) for name, module, args, stage in json.loads(table_json)]
+table = [
+    Program(name, module, tuple(args), Stage(stage), **(more[0] if more else {}))
+    for name, module, args, stage, *more in json.loads(table_json)
+]
 table.append(Program("announcer", "fake_announcer", (record, *options), Stage.NEWS, told=True))
 if "hasty" in options:
-    supervisor.ALIVE_LIMIT_S = 0.5
+    supervisor.ALIVE_LIMIT_S = 2.0
 if "tireless" in options:
     supervisor.LOOP_WINDOW_S = 0.0
+if "forgetful" in options:
+    on_demand.OUTLIVE_S = 1.0
 if "missing" in options:
     table.append(Program("missing", "no_such_module", (), Stage.LINK))
 if "signal" in options:

@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,132 +18,11 @@ from pebble.config import Config, load, parse
 from pebble.errors import ConfigError
 from pebble.launched import NOTIFY_FD
 from pebble.launcher.launcher import Launcher
-from pebble.launcher.program import Stage
-from pebble.launcher.programs import programs, transport_modules
+from pebble.launcher.program import Program, Stage
+from pebble.launcher.programs import programs, shared_modules, transport_modules
 from pebble.launcher.run_lock import RunLock
+from tests.launcher.robot import BASE, DEVICE, FABRIC, LINK, Launch, gone, lines_of
 from tests.support import ROOT, until
-
-BASE = "pebble/robots/rover"
-FAKES = ROOT / "tests" / "fakes"
-FABRIC, NEWS, DEVICE, LINK = (int(stage) for stage in Stage)
-
-Row = tuple[str, str, int]  # name, behaviour, stage
-
-
-class Robot:
-    """A launcher under test, seen from outside: its children's journal, what it published, what it wrote."""
-
-    def __init__(self, folder: Path, rows: list[Row], *options: str, env: dict[str, str], **launcher: Any) -> None:
-        self.journal, self.record, self.errors = folder / "journal", folder / "record", folder / "errors"
-        self.run_dir = folder / "run"
-        self.config = folder / "rover.json"
-        self.config.write_text(json.dumps(_config(self.run_dir, launcher)))
-        table = [(name, "fake_service", (name, behaviour, str(self.journal)), stage) for name, behaviour, stage in rows]
-        self._command = [
-            *(sys.executable, str(FAKES / "run_launcher.py"), str(ROOT), str(self.config)),
-            *(json.dumps(table), str(self.record), *options),
-        ]
-        self._folder = folder / "somewhere else"
-        self._folder.mkdir()
-        (self._folder / "json.py").write_text("raise SystemExit('the working directory was imported from')\n")
-        self._environment = {**os.environ, "PYTHONPATH": str(FAKES), **env}
-        self.process = self._start(self.errors)
-
-    def second(self) -> subprocess.CompletedProcess[str]:
-        """Another launcher for the same robot."""
-        return subprocess.run(
-            self._command, cwd=self._folder, env=self._environment, capture_output=True, text=True, timeout=20
-        )
-
-    def _start(self, errors: Path) -> subprocess.Popen[bytes]:
-        with errors.open("wb") as out:
-            return subprocess.Popen(self._command, cwd=self._folder, env=self._environment, stderr=out)
-
-    def stop(self) -> int:
-        self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(20)
-
-    def events(self, name: str, event: str) -> list[int]:
-        """The pids with which ``name`` noted ``event``."""
-        lines = [line.split() for line in _lines(self.journal)]
-        return [int(pid) for who, what, pid in lines if (who, what) == (name, event)]
-
-    def end_leftovers(self) -> list[int]:
-        """Every process the journal knows that is still there; none should be."""
-        pids = [int(pid) for pid in re.findall(r"(?:start |child:)(\d+)", "\n".join(_lines(self.journal)))]
-        until(lambda: all(_gone(pid) for pid in pids))
-        left = [pid for pid in pids if not _gone(pid)]
-        for pid in left:
-            os.kill(pid, signal.SIGKILL)
-        return left
-
-    def published(self, metric: str, what: str = "message") -> list[Any]:
-        lines = [json.loads(line) for line in _lines(self.record)]
-        return [line for line in lines if line["topic"] == f"{BASE}/outgoing/{metric}" and line["what"] == what]
-
-    def states(self) -> dict[str, str]:
-        """What the robot says of its services just now."""
-        return {name: one["state"] for name, one in self.services().items()}
-
-    def children(self) -> dict[str, int]:
-        """The living children, by the names that the kernel has for them."""
-        task = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        pids = map(int, task.read_text().split())
-        return {Path(f"/proc/{pid}/comm").read_text().strip(): pid for pid in pids}
-
-    def services(self) -> dict[str, Any]:
-        said = self.published("status")
-        return said[-1]["payload"]["value"]["services"] if said else {}
-
-    def ready(self, *names: str) -> bool:
-        return until(lambda: all(self.states().get(name) == "ready" for name in names), 20)
-
-    def logs(self) -> list[Any]:
-        return [line["payload"] for line in self.published("logs")]
-
-    def stderr(self) -> str:
-        return self.errors.read_text()
-
-
-def _config(run_dir: Path, launcher: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "robot": {"id": "rover"},
-        "transport": {"kind": "mqtt", "run_dir": str(run_dir)},
-        "local_mqtt": {"password": "hush"},
-        "services": {"launcher": launcher},
-    }
-
-
-def _lines(file: Path) -> list[str]:
-    """The complete lines of a file that may still be written to."""
-    return file.read_text().rpartition("\n")[0].splitlines() if file.exists() else []
-
-
-def _gone(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
-Launch = Callable[..., Robot]
-
-
-@pytest.fixture
-def launch(tmp_path: Path) -> Iterator[Launch]:
-    robots: list[Robot] = []
-
-    def make(*rows: Row, options: tuple[str, ...] = (), env: dict[str, str] | None = None, **launcher: Any) -> Robot:
-        robots.append(Robot(tmp_path, list(rows), *options, env=env or {}, **launcher))
-        return robots[-1]
-
-    yield make
-    for robot in robots:
-        robot.process.kill()  # the children notice by themselves
-        robot.process.wait(10)
-        left = robot.end_leftovers()
-        assert not left, f"processes that outlived their launcher: {left}"
-
 
 # -- starting
 
@@ -238,7 +116,7 @@ def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:
 def test_a_stuck_child_is_killed_and_started_again(launch: Launch) -> None:
     robot = launch(("serial", "mute", DEVICE), ("bridge", "good", LINK), options=("hasty",))
     assert until(lambda: len(robot.events("serial", "ready")) >= 2, 20)
-    assert _gone(robot.events("serial", "ready")[0])
+    assert gone(robot.events("serial", "ready")[0])
     assert len(robot.events("bridge", "start")) == 1
     assert until(lambda: any("serial gives no sign of life: killed" in one["message"] for one in robot.logs()))
     assert until(lambda: robot.services()["serial"]["last_exit"] == "stuck, killed")
@@ -248,10 +126,10 @@ def test_what_a_child_started_ends_with_it(launch: Launch) -> None:
     robot = launch(("player", "parent", LINK), restart_delay_seconds=600)
 
     def grandchildren() -> list[int]:
-        return [int(pid) for pid in re.findall(r"child:(\d+)", "\n".join(_lines(robot.journal)))]
+        return [int(pid) for pid in re.findall(r"child:(\d+)", "\n".join(lines_of(robot.journal)))]
 
     assert until(lambda: len(grandchildren()) == 2, 20)
-    assert until(lambda: all(_gone(pid) for pid in grandchildren()))
+    assert until(lambda: all(gone(pid) for pid in grandchildren()))
 
 
 def test_a_killed_launcher_leaves_no_orphans(launch: Launch) -> None:
@@ -259,7 +137,7 @@ def test_a_killed_launcher_leaves_no_orphans(launch: Launch) -> None:
     assert robot.ready("hub", "serial")
     pids = robot.events("hub", "start") + robot.events("serial", "start")
     robot.process.kill()
-    assert until(lambda: all(_gone(pid) for pid in pids))
+    assert until(lambda: all(gone(pid) for pid in pids))
     assert robot.events("serial", "stop"), "children are told, so that they can stop their hardware"
 
 
@@ -304,7 +182,7 @@ def test_a_stopped_announcer_disturbs_nobody_and_is_replaced(launch: Launch) -> 
 def test_a_child_finds_what_a_fresh_interpreter_would(launch: Launch) -> None:
     robot = launch(("serial", "curious", DEVICE))
     assert robot.ready("serial")
-    words = [line.split()[1] for line in _lines(robot.journal)]
+    words = [line.split()[1] for line in lines_of(robot.journal)]
     assert words[:4] == ["fds:0=null,1=pipe,2=pipe,3=pipe", "mask:", "handler:SIG_DFL", "group:True"]
 
 
@@ -334,7 +212,7 @@ def test_the_end_of_a_program_is_the_end_of_its_process(launch: Launch, behaviou
 def test_threads_are_waited_for_before_the_exit_functions_run(launch: Launch) -> None:
     robot = launch(("serial", "done", DEVICE), restart_delay_seconds=600)
     assert until(lambda: robot.events("serial", "atexit"), 20)
-    assert [line.split()[1] for line in _lines(robot.journal)][:3] == ["start", "thread", "atexit"]
+    assert [line.split()[1] for line in lines_of(robot.journal)][:3] == ["start", "thread", "atexit"]
 
 
 def test_the_lock_of_a_killed_launcher_is_free_at_once(launch: Launch) -> None:
@@ -344,7 +222,7 @@ def test_the_lock_of_a_killed_launcher_is_free_at_once(launch: Launch) -> None:
     robot.process.kill()
     robot.process.wait(10)
     try:
-        assert not _gone(pid)
+        assert not gone(pid)
         with RunLock(robot.run_dir, BASE):
             pass
     finally:
@@ -376,9 +254,9 @@ def test_stages_stop_one_after_the_other_and_nothing_is_left(launch: Launch) -> 
     assert robot.ready("hub", "serial", "bridge")
     pids = [robot.events(name, "start")[0] for name in ("hub", "serial", "bridge")]
     assert robot.stop() == 0
-    stopped = [line.split()[0] for line in _lines(robot.journal) if line.split()[1] == "stop"]
+    stopped = [line.split()[0] for line in lines_of(robot.journal) if line.split()[1] == "stop"]
     assert stopped == ["bridge", "serial", "hub"]
-    assert all(_gone(pid) for pid in pids)
+    assert all(gone(pid) for pid in pids)
     expected = {"hub": "ready", "serial": "stopped", "bridge": "stopped", "announcer": "ready"}
     assert robot.states() == expected, "who carries the news, and who tells it, can only be alive"
     (will,) = robot.published("status", "will")
@@ -394,7 +272,7 @@ def test_who_ignores_the_request_to_stop_is_killed_and_takes_no_time_from_others
     assert robot.ready("hub", "serial", "bridge")
     stubborn = robot.events("bridge", "start")[0]
     assert robot.stop() == 0
-    assert _gone(stubborn)
+    assert gone(stubborn)
     assert robot.events("serial", "stop"), "was asked before it was killed"
     assert robot.events("hub", "stop")
     assert "did not stop in time: bridge" in robot.stderr()
@@ -407,7 +285,7 @@ def test_a_second_signal_ends_everything_at_once(launch: Launch) -> None:
     assert until(lambda: "[launcher] stopping" in robot.stderr())
     robot.process.send_signal(signal.SIGINT)
     assert robot.process.wait(20) == 1
-    assert _gone(robot.events("bridge", "start")[0])
+    assert gone(robot.events("bridge", "start")[0])
 
 
 # -- telling
@@ -498,6 +376,72 @@ def test_an_mqtt_robot_has_no_hub() -> None:
     ]
     arm = _table(services=services)[2]
     assert arm == ("serial_mcu_bridge:arm", "pebble.services.serial_mcu_bridge", ("None", "arm"), Stage.DEVICE)
+
+
+DEVICES = {"enabled": True, "env": {"MARK": "d"}, "cwd": "cameras"}
+CONTROLS = {
+    "video_control": {"env": {"MARK": "v"}, "stop_timeout": 4},
+    "audio_control": {
+        "env": {"MARK": "a"},
+        "publisher_env": {"MARK": "p"},
+        "receiver_env": {"MORE": "r"},
+        "stop_timeout": 0,
+    },
+}
+
+
+def _programs(devices: dict[str, Any], **bridge: Any) -> dict[str, Program]:
+    services = {"av_daemon": devices, "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}, **bridge}}
+    return {program.name: program for program in programs(_parsed(services=services))}
+
+
+def test_camera_and_microphone_start_with_the_robot_and_media_only_when_they_are_wanted() -> None:
+    table = _programs(DEVICES, **CONTROLS)
+    assert list(table) == [
+        *("announcer", "av_daemon", "mqtt_bridge"),
+        *("camera_publisher", "audio_publisher", "audio_receiver"),
+    ]
+    assert [name for name, program in table.items() if program.on_demand] == list(table)[3:]
+    assert [name for name, program in table.items() if program.asks] == ["mqtt_bridge"]
+    assert [name for name, program in table.items() if program.preloaded] == ["announcer", "mqtt_bridge"]
+    assert (table["av_daemon"].stage, table["camera_publisher"].stage) == (Stage.DEVICE, Stage.LINK)
+    assert (table["av_daemon"].environment, table["av_daemon"].folder) == ({"MARK": "d"}, Path("/robots/cameras"))
+    environments = [table[name].environment for name in list(table)[3:]]
+    assert environments == [{"MARK": "v"}, {"MARK": "p"}, {"MARK": "a", "MORE": "r"}]
+    assert [table[name].stop_timeout_s for name in list(table)[3:]] == [4, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("devices", "bridge", "media"),
+    [
+        ({"enabled": True, "audio": {"enabled": False}}, {}, ["camera_publisher"]),
+        ({"enabled": True, "video": {"enabled": False}}, {}, ["audio_publisher", "audio_receiver"]),
+        ({"enabled": True}, {"enabled": False}, []),
+        ({"enabled": False}, {}, []),
+    ],
+)
+def test_there_are_media_for_what_there_is(devices: dict[str, Any], bridge: dict[str, Any], media: list[str]) -> None:
+    assert [name for name, program in _programs(devices, **bridge).items() if program.on_demand] == media
+
+
+def test_the_launcher_of_a_robot_with_a_camera_imports_only_what_several_share_and_stays_single_threaded() -> None:
+    names = ", ".join(f'"{one.name}": "{one.module}"' for one in _programs(DEVICES).values() if one.preloaded)
+    services = {"av_daemon": DEVICES, "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}}
+    shared = shared_modules(_parsed(services=services))
+    assert shared
+    code = f"""
+import os, sys
+from pebble.launcher import launcher
+from pebble.launcher.preload import preload
+preload([*{{{names}}}.values(), *{shared}, "pebble.transports.mqtt", "pebble.transports.zenoh"])
+print([name for name in ("numpy", "cv2", "av") if name in sys.modules], len(os.listdir("/proc/self/task")))
+"""
+    ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert ran.stdout.strip() == "['numpy'] 1", ran.stderr
+
+
+def test_the_launcher_of_a_robot_without_media_carries_nothing_for_them() -> None:
+    assert shared_modules(_parsed(services={"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}})) == ()
 
 
 def test_a_zenoh_robot_starts_its_hub_first() -> None:

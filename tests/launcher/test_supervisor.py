@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.launcher.supervisor import ALIVE_LIMIT_S, LOOP_RETRY_S, START_LIMIT_S, Life
+from pebble.launcher.supervisor import ALIVE_LIMIT_S, LOOP_RETRY_S, REST_S, START_LIMIT_S, Life
 
 
 def crash(life: Life, at: float, ran_for: float = 0.0) -> float:
@@ -84,3 +84,24 @@ def test_stopping_one_that_does_not_run_keeps_its_last_exit() -> None:
     crash(life, 0.0)
     life.stopped(None)
     assert (life.state, life.last_exit) == ("stopped", "exit code 1")
+
+
+def test_started_anew_after_it_was_asked_to_stop_is_no_restart() -> None:
+    life = Life()
+    life.started(0.0)
+    life.ready(0.5)
+    life.stopped("exit code 0")
+    life.started(10.0)
+    assert (life.state, life.restarts, life.last_exit) == ("init", 0, "exit code 0")
+    life.exited(11.0, "signal 9")
+    life.started(11.0)
+    assert life.restarts == 1
+
+
+def test_a_program_rests_between_two_starts() -> None:
+    life = Life()
+    assert life.rest_s(0.0) == 0.0
+    life.started(5.0)
+    life.stopped("exit code 0")
+    assert life.rest_s(5.25) == REST_S - 0.25
+    assert life.rest_s(5.0 + REST_S) == 0.0
