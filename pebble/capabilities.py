@@ -1,7 +1,8 @@
-"""What a robot offers and under which effective names, from its config (paper A.8.6). Pure."""
+"""What a robot offers and under which effective names, from its config (paper A.8.6)."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 from pebble import contract as c
@@ -10,7 +11,7 @@ from pebble.config import Config, SystemControl
 from pebble.process import view_of
 
 _MOTOR_PROTOCOL = "goob_base_v1"
-#: Video, audio, sounds and scripts: their names are fixed, the services behind them arrive in a later release.
+#: Sounds and scripts: their names are fixed, the services behind them arrive in a later release.
 _LATER = {"available": False, "controls": False}
 
 
@@ -19,8 +20,8 @@ def capabilities(config: Config, addresses: Addresses) -> dict[str, Any]:
     return {
         "identity": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
         "transport": {"kind": config.transport.kind},
-        "video": _LATER | _video(config, addresses),
-        "audio": _LATER | _audio(config, addresses),
+        "video": _video(config, addresses),
+        "audio": _audio(config, addresses),
         "soundboard": _LATER | _topics(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
         "autonomy": _LATER | _topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
         "system": _system(config, addresses),
@@ -31,6 +32,7 @@ def capabilities(config: Config, addresses: Addresses) -> dict[str, Any]:
 def _video(config: Config, addresses: Addresses) -> dict[str, Any]:
     sent, captured = config.services.mqtt_bridge.media.video_publisher, config.services.av_daemon.video
     return {
+        **_offered(config, captured.enabled),
         "topic": addresses[c.CAMERA].topic,
         "command_topic": addresses[c.VIDEO_CONTROL].topic,
         "flag_topic": addresses[c.MQTT_VIDEO].topic,
@@ -38,19 +40,35 @@ def _video(config: Config, addresses: Addresses) -> dict[str, Any]:
         "width": _first(sent.publish_width, sent.width, captured.width),
         "height": _first(sent.publish_height, sent.height, captured.height),
         "fps": _first(sent.publish_fps, sent.target_fps, sent.fps, captured.fps),
+        "encoding": sent.encoding,
+        "encodings": ["json", "pbvd", "pbvz", *_by_av("h264")],
     }
 
 
 def _audio(config: Config, addresses: Addresses) -> dict[str, Any]:
     sent, captured = config.services.mqtt_bridge.media.audio_publisher, config.services.av_daemon.audio
     return {
+        **_offered(config, captured.enabled),
         "topic": addresses[c.AUDIO].topic,
         "uplink_topic": addresses[c.AUDIO_STREAM].topic,
         "command_topic": addresses[c.AUDIO_CONTROL].topic,
         "flag_topic": addresses[c.MQTT_AUDIO].topic,
         "rate": _first(sent.rate, captured.rate),
         "channels": _first(sent.channels, captured.channels),
+        "encoding": sent.encoding,
+        "encodings": ["pcm", *_by_av("opus")],
     }
+
+
+def _offered(config: Config, captured: bool) -> dict[str, bool]:
+    """The bridge has the programs that send it started; without one nobody can ask for it."""
+    available = config.services.av_daemon.enabled and captured
+    return {"available": available, "controls": available and config.services.mqtt_bridge.enabled}
+
+
+def _by_av(encoding: str) -> list[str]:
+    """What this installation can make only with PyAV. It is looked for, not imported: it is large."""
+    return [encoding] if find_spec("av") is not None else []
 
 
 def _topics(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> dict[str, Any]:

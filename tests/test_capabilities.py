@@ -34,6 +34,8 @@ def test_a_robot_without_services_says_so_and_names_everything() -> None:
             "width": 640,
             "height": 480,
             "fps": 15,
+            "encoding": "json",
+            "encodings": ["json", "pbvd", "pbvz", "h264"],
         },
         "audio": {
             "available": False,
@@ -44,6 +46,8 @@ def test_a_robot_without_services_says_so_and_names_everything() -> None:
             "flag_topic": f"{BASE}/incoming/flags/mqtt-audio",
             "rate": 16000,
             "channels": 1,
+            "encoding": "pcm",
+            "encodings": ["pcm", "opus"],
         },
         "soundboard": {
             "available": False,
@@ -110,9 +114,31 @@ def test_a_system_action_can_be_asked_for_where_a_command_is_set(name: str) -> N
 
 
 def test_later_services_stay_unavailable_even_when_a_config_enables_them() -> None:
-    value = of(av_daemon={"enabled": True}, soundboard_handler={"enabled": True}, autonomy_manager={"enabled": True})
-    for section in ("video", "audio", "soundboard", "autonomy"):
+    value = of(soundboard_handler={"enabled": True}, autonomy_manager={"enabled": True})
+    for section in ("soundboard", "autonomy"):
         assert (value[section]["available"], value[section]["controls"]) == (False, False)
+
+
+@pytest.mark.parametrize(("section", "device"), [("video", "video"), ("audio", "audio")])
+def test_pictures_and_sound_are_there_with_their_device_and_on_request_with_a_bridge(section: str, device: str) -> None:
+    def offered(**services: Any) -> tuple[bool, bool]:
+        value = of(**services)[section]
+        return value["available"], value["controls"]
+
+    on, off = {"enabled": True}, {"enabled": True, device: {"enabled": False}}
+    assert offered(av_daemon=on, mqtt_bridge=BRIDGE) == (True, True)
+    assert offered(av_daemon=on) == (True, False)
+    assert offered(av_daemon=off, mqtt_bridge=BRIDGE) == (False, False)
+    assert offered(av_daemon={"enabled": False}, mqtt_bridge=BRIDGE) == (False, False)
+
+
+def test_encodings_are_those_of_this_installation(monkeypatch: pytest.MonkeyPatch) -> None:
+    publishers = {"video_publisher": {"encoding": "pbvz"}, "audio_publisher": {"encoding": "opus"}}
+    value = of(mqtt_bridge={"media": publishers})
+    assert (value["video"]["encoding"], value["audio"]["encoding"]) == ("pbvz", "opus")
+    monkeypatch.setattr("pebble.capabilities.find_spec", lambda _name: None)
+    value = of()
+    assert (value["video"]["encodings"], value["audio"]["encodings"]) == (["json", "pbvd", "pbvz"], ["pcm"])
 
 
 @pytest.mark.parametrize(

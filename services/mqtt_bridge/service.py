@@ -11,10 +11,13 @@ from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import SETTLE_S, Forwarder, Gate, barrier
 from pebble.forwarding.routing import Drop, Forward, Side
 from pebble.forwarding.subjects import Subject, Subjects
+from pebble.launched import Notifier, Want, wanted_before
 from pebble.links import remote_transport
-from pebble.service import Service
+from pebble.payloads import MediaRequest
+from pebble.service import Service, every
 from pebble.services.mqtt_bridge.actions import ACTIONS, Actions
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
+from pebble.services.mqtt_bridge.media import MEDIA, Media
 from pebble.services.mqtt_bridge.one_broker import OneBroker
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.routing import TABLE_A1
@@ -23,6 +26,9 @@ from pebble.transports import Message, State, Subscription
 #: After the barrier, for brokers that hand messages from connection to connection at their leisure.
 _VERDICT_S = 0.1
 _PROBE_PERIOD_S = 1.0
+_RETRY_S = 1.0
+_REQUESTS = tuple(row.request for row in MEDIA)
+_MEDIA_FLAGS = tuple(row.flag for row in MEDIA)
 
 
 class MqttBridge(Service):
@@ -39,13 +45,17 @@ class MqttBridge(Service):
 
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
-        return (REMOTE_MIRROR, *(row.channel for row in ACTIONS))
+        media = (channel for row in MEDIA for channel in (row.flag, row.request))
+        return (REMOTE_MIRROR, *media, *(row.channel for row in ACTIONS))
 
     def start(self) -> None:
         section = self.config.services.mqtt_bridge
         self._subjects = Subjects(self.config)
         self._private = PrivateTopics(self.config.base)
         self._actions = Actions(section)
+        self._media = Media(self.config.media_programs(), wanted_before())
+        self._notifier = Notifier()
+        self._told: dict[str, Want] = {}  # as the launcher knows it
         self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None
         self._one_broker = OneBroker(self.config.base)
         remote_kind = "mqtt" if section.remote is None else section.remote.kind
@@ -177,9 +187,25 @@ class MqttBridge(Service):
         self._forwarder.shut()  # again: it may just have been opened
         self._stop_listening_remotely()
         self.log.info("the local and the remote side are one broker: nothing is mirrored")
+        self._forwarder.settle(Side.REMOTE)  # kept flags have waited for copies that it will not send
 
     def _run_action(self, channel: Channel) -> None:
         self.counters.add("actions" if self._actions.request(channel) else "actions_refused")
+
+    def _allow_media(self, flag: Channel, allowed: bool) -> None:
+        self._media.allow(flag, allowed)
+        self._say_wants()
+
+    def _request_media(self, channel: Channel, request: MediaRequest) -> None:
+        self._media.request(channel, request)
+        self._say_wants()
+
+    @every(_RETRY_S)
+    def _say_wants(self) -> None:
+        """Tell the launcher what has changed; it starts and stops the programs, and we wait for nobody."""
+        for program, want in self._media.wants().items():
+            if self._told.get(program) != want and self._notifier.want(program, want):
+                self._told[program] = want
 
     # -- the transports' threads
 
@@ -220,19 +246,29 @@ class MqttBridge(Service):
         self._follow_up(Side.REMOTE, message, self._forwarder.receive(Side.REMOTE, message))
 
     def _follow_up(self, side: Side, message: Message, result: Forward | Drop) -> None:
-        """Run an action's command, on the service's thread, whether or not there was anybody to forward it to.
+        """Do what is asked of ourselves, on the service's thread, whether or not there was anybody to forward it to.
 
-        One that we forward to the local side never comes back to us, so it runs right now.
+        What we forward to the local side never comes back to us, so it is done right now.
         """
         subject = self._subjects[message.topic]
-        channel = subject.channel if subject is not None and subject.kind is Kind.ACTION else None
-        local = side is Side.LOCAL
-        if result is Drop.STALE and not (local and channel is not None and self._actions.accepts_kept(channel)):
+        channel = subject.channel if subject is not None else None
+        local, action = side is Side.LOCAL, channel is not None and channel.kind is Kind.ACTION
+        if result is Drop.STALE and not (local and channel and action and self._actions.accepts_kept(channel)):
             self._refuse_stale(subject)
         elif channel is None or result is Drop.ECHO or not (local or isinstance(result, Forward)):
             return
-        elif self._switch(channel, message.payload):
+        elif _is_one_of(_REQUESTS, channel):
+            self._hear_request(channel, message.payload)
+        elif action and self._switch(channel, message.payload):
             self.post(partial(self._run_action, channel), newest_of=channel.metric)
+
+    def _hear_request(self, channel: Channel, payload: bytes) -> None:
+        try:
+            request: MediaRequest = codec.decode(channel, payload)
+        except PayloadError as error:
+            self._refuse(channel, error)
+        else:
+            self.post(partial(self._request_media, channel, request), newest_of=channel.metric)
 
     def _refuse_stale(self, subject: Subject | None) -> None:
         what = "a command" if subject is None or subject.channel is None else subject.channel.metric
@@ -240,17 +276,27 @@ class MqttBridge(Service):
         self._quiet_log.warning(f"{what} kept", "refused a kept copy of %s", what)
 
     def _on_agreed(self, subject: Subject, payload: bytes) -> None:
-        if subject.channel is REMOTE_MIRROR:
+        channel = subject.channel
+        if channel is REMOTE_MIRROR:
             self._forwarder.mirroring = self._switch(REMOTE_MIRROR, payload)
+        elif channel is not None and _is_one_of(_MEDIA_FLAGS, channel):
+            self.post(partial(self._allow_media, channel, self._switch(channel, payload)), newest_of=channel.metric)
 
     def _switch(self, channel: Channel, payload: bytes) -> bool:
         """What a boolean control says; nothing (a removed flag) and nonsense are false."""
         try:
             return bool(payload) and bool(codec.decode(channel, payload))
         except PayloadError as error:
-            self.counters.add("refused")
-            self._quiet_log.warning(channel.metric, "refused a message: %s", error)
+            self._refuse(channel, error)
             return False
+
+    def _refuse(self, channel: Channel, error: PayloadError) -> None:
+        self.counters.add("refused")
+        self._quiet_log.warning(channel.metric, "refused a message: %s", error)
+
+
+def _is_one_of(channels: tuple[Channel, ...], channel: Channel) -> bool:
+    return any(channel is one for one in channels)  # comparing all they say takes longer
 
 
 def _close_all(subscriptions: list[Subscription]) -> None:

@@ -24,12 +24,20 @@ BASE = "pebble/robots/rover"
 _numbers = itertools.count(1)
 
 
-def make_config(robot: str = "rover", local_mqtt: dict[str, Any] | None = None, **bridge: Any) -> Config:
+def make_config(
+    robot: str = "rover",
+    local_mqtt: dict[str, Any] | None = None,
+    av_daemon: dict[str, Any] | None = None,
+    **bridge: Any,
+) -> Config:
     """A robot with a bridge; further keywords are keys of services.mqtt_bridge."""
     raw = {
         "robot": {"id": robot},
         "local_mqtt": local_mqtt or {},
-        "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}, **bridge}},
+        "services": {
+            "av_daemon": av_daemon or {},
+            "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}, **bridge},
+        },
     }
     return parse(raw, folder=Path.cwd(), env={})
 
