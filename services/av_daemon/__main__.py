@@ -1,0 +1,8 @@
+"""``python -m pebble.services.av_daemon CONFIG``."""
+
+import sys
+
+from pebble.process import run
+from pebble.services.av_daemon.service import AvDaemon
+
+sys.exit(run(AvDaemon))

@@ -1,0 +1,154 @@
+"""The thread of one device: opens it while somebody reads, hands its frames on, lets it rest, tries again."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from msgspec.structs import replace
+
+from pebble.errors import PebbleError
+from pebble.services.av_daemon.health import Health
+from pebble.services.av_daemon.source import Bytes, Capture, Source
+from pebble.transports.counters import Counters
+from pebble.transports.frames import FrameInfo
+
+log = logging.getLogger(__name__)
+
+_LOOK_S = 0.1  # how soon the first reader is noticed
+
+
+class Slot(Protocol):
+    @property
+    def array(self) -> Bytes: ...
+    def send(self, info: FrameInfo) -> bool: ...
+    def drop(self) -> None: ...
+
+
+class Writer(Protocol):
+    """What is needed of a FrameWriter."""
+
+    counters: Counters
+    problem: str
+
+    @property
+    def wanted(self) -> bool: ...
+    @property
+    def readers(self) -> int: ...
+    def write(self, data: Bytes, info: FrameInfo) -> bool: ...
+    def slot(self, size: int) -> Slot | None: ...
+
+
+class Capturer:
+    """One try after the other, until it is ended. A device can hang: so it can be ended without waiting for it.
+
+    An ended one neither writes nor reports any more, whenever its device answers at last.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        writer: Writer,
+        open_source: Callable[[], Source],
+        health: Health,
+        *,
+        rest_s: float,
+        wait_s: float,
+    ) -> None:
+        self._name, self._writer, self._open_source, self._health = name, writer, open_source, health
+        self._rest_s, self._wait_s = rest_s, wait_s
+        self._ended = threading.Event()
+        self._source: Source | None = None
+        self._scratch: Bytes = np.empty(0, np.uint8)
+        self._thread = threading.Thread(target=self._run, name=f"pebble-{name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def end(self) -> None:
+        """Returns at once, whatever the device does."""
+        self._ended.set()
+        source = self._source
+        if source is not None:
+            source.interrupt()
+
+    def join(self, timeout: float) -> bool:
+        """Did the device let go?"""
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    # -- its thread
+
+    def _run(self) -> None:
+        self._ended.wait(self._wait_s)
+        while not self._ended.is_set():
+            if not self._writer.wanted:
+                self._health.rests()
+                self._ended.wait(_LOOK_S)
+                continue
+            try:
+                self._capture()
+            except PebbleError as error:
+                self._failed(str(error))
+            except Exception as error:  # of a device's library: whatever it is, this thread must go on
+                log.exception("%s failed unexpectedly", self._name)
+                self._failed(f"{type(error).__name__}: {error}")
+
+    def _capture(self) -> None:
+        self._health.opening(time.monotonic())
+        self._source = source = self._open_source()
+        try:
+            self._pump(source)
+        finally:
+            self._source = None
+            source.close()
+
+    def _pump(self, source: Source) -> None:
+        read_at = time.monotonic()
+        while not self._ended.is_set():
+            now = time.monotonic()
+            if self._writer.wanted:
+                read_at = now
+            elif now - read_at >= self._rest_s:
+                return
+            self._hand_on(source.grab())
+
+    def _hand_on(self, capture: Capture) -> None:
+        if self._writer.wanted:
+            self._write(capture)
+        if not self._ended.is_set():
+            self._health.frame(capture.info, time.monotonic(), skipped=capture.skipped)
+
+    def _write(self, capture: Capture) -> None:
+        slot = self._writer.slot(capture.size) if capture.draw is not None else None
+        pixels = capture.pixels(self._room(capture) if slot is None else slot.array)
+        if self._ended.is_set():  # the device came to itself after another thread had taken over
+            return
+        if slot is None:
+            self._writer.write(pixels, _stamped(capture))
+        else:
+            slot.send(_stamped(capture))
+
+    def _room(self, capture: Capture) -> Bytes:
+        if capture.draw is not None and len(self._scratch) != capture.size:
+            self._scratch = np.empty(capture.size, np.uint8)
+        return self._scratch
+
+    def _failed(self, why: str) -> None:
+        if self._ended.is_set():
+            return
+        delay = self._health.failed(why)
+        log.warning("%s: %s; it is opened again in %g s", self._name, why, delay)
+        self._ended.wait(delay)
+
+
+def _stamped(capture: Capture) -> FrameInfo:
+    now_ns = time.monotonic_ns()
+    at_ns = capture.at_ns or now_ns
+    return replace(capture.info, captured_ns=at_ns, captured_ms=(time.time_ns() - (now_ns - at_ns)) // 1_000_000)

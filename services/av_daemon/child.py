@@ -1,0 +1,112 @@
+"""A program whose output is a camera's or a microphone's: it cannot hang us, and it never outlives us."""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, cast
+
+from pebble.errors import LinkError
+
+SILENCE_S = 3.0  # a device that says nothing for so long hangs
+_FIRST_SILENCE_S = 10.0  # it may take its time to start
+_PR_SET_PDEATHSIG = 1
+_COMPLAINT_LIMIT = 500  # bytes of its last words that are kept
+_LAST_READS = 64  # of 4096 bytes: more than a pipe holds
+_CHUNK = 256 * 1024
+
+_libc = ctypes.CDLL(None)
+
+
+class Child:
+    """A running program. ``read`` fails when it ends, or says nothing for 3 s; ``stop_s``: how long it may end."""
+
+    def __init__(self, command: Sequence[str], *, stop_s: float = 5.0, pipe_bytes: int = 0) -> None:
+        self.name = Path(command[0]).name
+        self._stop_s = stop_s
+        self._complaint = b""
+        self._silence_s = _FIRST_SILENCE_S
+        try:
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                preexec_fn=_die_with_parent, bufsize=0,
+            )  # fmt: skip
+        except (OSError, subprocess.SubprocessError) as error:
+            raise LinkError(f"cannot start {self.name}: {error}") from error
+        self._pipes = cast(tuple[IO[bytes], IO[bytes]], (self._process.stdout, self._process.stderr))
+        self._out, self._err = (pipe.fileno() for pipe in self._pipes)
+        os.set_blocking(self._out, False)
+        os.set_blocking(self._err, False)
+        if pipe_bytes:
+            with suppress(OSError):  # beyond what the system allows: slower, not wrong
+                fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, pipe_bytes)
+        self._poll = select.poll()
+        self._poll.register(self._out, select.POLLIN)
+        self._poll.register(self._err, select.POLLIN)
+
+    def read(self, limit: int = _CHUNK) -> bytes:
+        """What it has written, at least one byte."""
+        deadline = time.monotonic() + self._silence_s
+        while True:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise LinkError(f"{self.name} hangs: nothing came for {self._silence_s:.0f} s{self._last_words()}")
+            ready = dict(self._poll.poll(left * 1000))
+            if self._err in ready:
+                self._listen()
+            if self._out in ready:
+                chunk = os.read(self._out, limit)
+                if not chunk:
+                    raise LinkError(self._end())
+                self._silence_s = SILENCE_S
+                return chunk
+
+    def interrupt(self) -> None:
+        """Kill it, from any thread: a waiting ``read`` fails."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """End it: politely first, then by force."""
+        self._process.terminate()
+        for pipe in self._pipes:  # one that is stuck writing to us is freed by this
+            pipe.close()
+        try:
+            self._process.wait(self._stop_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _listen(self) -> None:
+        said = os.read(self._err, 4096)
+        if said:
+            self._complaint = (self._complaint + said)[-_COMPLAINT_LIMIT:]
+        else:
+            self._poll.unregister(self._err)
+
+    def _end(self) -> str:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.5)
+        with suppress(BlockingIOError, KeyError):  # nothing more at present, or ever
+            for _ in range(_LAST_READS):
+                self._listen()
+        code = self._process.poll()
+        how = "closed its output" if code is None else f"exit code {code}" if code >= 0 else f"signal {-code}"
+        return f"{self.name} ended: {how}{self._last_words()}"
+
+    def _last_words(self) -> str:
+        lines = self._complaint.decode("utf-8", "replace").split("\n")
+        last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return f" ({''.join(c if c.isprintable() else '?' for c in last)})" if last else ""
+
+
+def _die_with_parent() -> None:
+    """In the child: the kernel kills it when the thread that reads it is no more."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

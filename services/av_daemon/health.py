@@ -1,0 +1,90 @@
+"""How one device fares: told by its thread, asked by the service. Clock values are passed in."""
+
+from __future__ import annotations
+
+import threading
+
+from msgspec.structs import replace
+
+from pebble.payloads import MediaReport
+from pebble.services.av_daemon.rate import Rate
+from pebble.transports.frames import FrameInfo
+
+_OPENING_S = 15.0  # a device that has not opened by then hangs
+_SILENCE_S = 4.0  # and one that gives no frame for so long; a second more than what sources wait for by themselves
+_LONGEST_DELAY_S = 30.0
+_GOOD_RUN_S = 10.0  # after which a failure is the first again
+
+
+class Health:
+    """Safe from any thread. After a first failure a device gets ``restart_delay_s``, with each that follows double."""
+
+    def __init__(self, restart_delay_s: float) -> None:
+        self._first_delay_s = restart_delay_s
+        self._lock = threading.Lock()
+        self._doing = "starts"
+        self._deadline: float | None = None  # for the next sign of life; None: none is expected
+        self._opened_at = 0.0
+        self._info: FrameInfo | None = None  # of the latest frame; None while there are none
+        self._rate = Rate()
+        self._failures = 0  # in a row
+        self._restarts = 0
+        self._dropped = 0
+        self._last_error: str | None = None
+
+    # -- the device's thread
+
+    def rests(self) -> None:
+        with self._lock:
+            self._no_frames("rests: nobody reads")
+
+    def opening(self, now: float) -> None:
+        with self._lock:
+            self._no_frames("opens the device")
+            self._restarts += self._failures > 0
+            self._opened_at = now
+            self._deadline = now + _OPENING_S
+
+    def frame(self, info: FrameInfo, now: float, *, skipped: int = 0) -> None:
+        with self._lock:
+            self._dropped += skipped
+            self._info, self._doing = info, "runs"
+            self._rate.count(now)
+            self._deadline = now + _SILENCE_S
+            if now - self._opened_at >= _GOOD_RUN_S:
+                self._failures = 0
+
+    def failed(self, why: str) -> float:
+        """Returns how long to wait before the device is opened again."""
+        with self._lock:
+            delay: float = min(self._first_delay_s * 2**self._failures, max(_LONGEST_DELAY_S, self._first_delay_s))
+            self._failures = min(self._failures + 1, 32)
+            self._last_error = why
+            self._no_frames(f"failed, opens it again in {delay:g} s")
+            return delay
+
+    # -- the service's thread
+
+    def silent(self, now: float) -> bool:
+        """Should there have been a sign of life by now?"""
+        with self._lock:
+            return self._deadline is not None and now > self._deadline
+
+    def report(self, now: float) -> MediaReport:
+        with self._lock:
+            report = MediaReport(
+                running=self._info is not None,
+                doing=self._doing,
+                restarts=self._restarts,
+                dropped=self._dropped,
+                last_error=self._last_error,
+            )
+            info = self._info
+            if info is None:
+                return report
+            rate = round(self._rate.per_second(now), 1)
+        return replace(report, encoding=info.format, rate=rate, width=info.width or None, height=info.height or None)
+
+    def _no_frames(self, doing: str) -> None:
+        self._doing, self._info, self._deadline = doing, None, None
+        self._rate.clear()

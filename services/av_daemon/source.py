@@ -1,0 +1,53 @@
+"""What a camera or microphone must offer, and what it hands over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pebble.transports.frames import FrameInfo
+
+Bytes: TypeAlias = NDArray[np.uint8]  # of any shape
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """A frame from a device: either its ``data``, or how to ``draw`` its ``size`` bytes into an array given to it.
+
+    ``at_ns`` is when it was complete (monotonic); 0: when it is drawn. ``skipped``: how many were thrown away before
+    it because this program was too slow, or because they were broken.
+    """
+
+    info: FrameInfo
+    size: int
+    data: bytes | bytearray | memoryview | NDArray[Any] | None = None
+    draw: Callable[[Bytes], None] | None = None
+    at_ns: int = 0
+    skipped: int = 0
+
+    def pixels(self, scratch: Bytes) -> Bytes:
+        """The frame as bytes in one dimension; drawn into ``scratch``, of ``size`` bytes, where it has no data."""
+        if self.draw is not None:
+            self.draw(scratch)
+            return scratch
+        data = self.data
+        if isinstance(data, np.ndarray):
+            return data.reshape(-1).view(np.uint8)
+        return np.frombuffer(data or b"", np.uint8)
+
+
+class Source(Protocol):
+    """An open device. One thread uses it, except for ``interrupt``."""
+
+    def grab(self) -> Capture:
+        """Wait for the next frame; what it returns is good until the next call. LinkError: the device failed."""
+
+    def close(self) -> None:
+        """Let the device go."""
+
+    def interrupt(self) -> None:
+        """From any thread: make a waiting ``grab`` fail soon, where that is possible."""

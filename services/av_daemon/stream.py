@@ -1,0 +1,71 @@
+"""One stream: a device and its writer, with somebody who notices when the device does not answer."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from msgspec.structs import replace
+
+from pebble.payloads import MediaReport
+from pebble.services.av_daemon.capturer import Capturer, Writer
+from pebble.services.av_daemon.health import Health
+from pebble.services.av_daemon.source import Source
+
+log = logging.getLogger(__name__)
+
+REST_S = 5.0  # without a reader, until the device is closed
+_HUNG_LIMIT = 3  # attempts whose device never answers, before no more are made
+
+
+class Stream:
+    """All methods are for the service's thread. ``look`` has to be called now and then."""
+
+    def __init__(
+        self,
+        name: str,
+        writer: Writer,
+        open_source: Callable[[], Source],
+        *,
+        restart_delay_s: float,
+        rest_s: float = REST_S,
+    ) -> None:
+        self.name, self._writer, self._open_source, self._rest_s = name, writer, open_source, rest_s
+        self._health = Health(restart_delay_s)
+        self._capturer = self._start(0.0)
+        self._hung: list[Capturer] = []
+
+    def look(self, now: float) -> None:
+        """Give a device up that has been silent for too long, and try again beside it."""
+        self._hung = [capturer for capturer in self._hung if capturer.alive]
+        if len(self._hung) >= _HUNG_LIMIT or not self._health.silent(now):
+            return
+        self._capturer.end()
+        self._hung.append(self._capturer)
+        delay = self._health.failed("the device does not answer")
+        log.warning("%s: the device does not answer; it is opened again in %g s", self.name, delay)
+        self._capturer = self._start(delay)
+
+    def report(self, now: float) -> MediaReport:
+        report = self._health.report(now)
+        return replace(
+            report,
+            readers=self._writer.readers,
+            fallbacks=self._writer.counters["fallbacks"],
+            last_error=report.last_error or self._writer.problem or None,
+        )
+
+    def end(self) -> None:
+        """Begin to let the device go. Returns at once."""
+        self._capturer.end()
+
+    def join(self, timeout: float = 0.5) -> None:
+        """Wait for the device to let go; one that does not is left to the end of the process."""
+        deadline = time.monotonic() + timeout
+        for capturer in (self._capturer, *self._hung):
+            if not capturer.join(max(0.0, deadline - time.monotonic())):
+                log.warning("%s: its device does not answer; left to the end of the process", self.name)
+
+    def _start(self, wait_s: float) -> Capturer:
+        return Capturer(self.name, self._writer, self._open_source, self._health, rest_s=self._rest_s, wait_s=wait_s)

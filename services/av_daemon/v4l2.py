@@ -1,0 +1,116 @@
+"""Cameras of the Linux kernel (V4L2), and files and streams that play a camera's part, through OpenCV."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pebble.config.later import CameraCapture
+from pebble.errors import LinkError
+from pebble.services.av_daemon.child import SILENCE_S
+from pebble.services.av_daemon.opencv import opencv
+from pebble.services.av_daemon.source import Bytes, Capture
+from pebble.transports.frames import FrameInfo
+
+log = logging.getLogger(__name__)
+
+_ASKED = {"mjpeg": "MJPG", "yuyv": "YUYV", "raw": "YUYV"}  # V4L2's name; others are its names already
+_PASSED_ON = {"MJPG": "mjpeg", "YUYV": "yuyv"}  # frames that may travel as the camera made them
+
+
+class V4l2Camera:
+    """A camera by its device. What one compresses itself is shared as it is, unless ``raw`` says otherwise.
+
+    A read that hangs cannot be interrupted; the time-out in OpenCV ends it after 3 s.
+    """
+
+    def __init__(self, video: CameraCapture) -> None:
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", f"{SILENCE_S:.0f}")  # seconds; else 10
+        self._cv2: Any = opencv()
+        self._device = video.device
+        self._capture = self._open(video)
+        try:
+            self._format = self._agree(video)
+            self._info = self._first_picture()  # it also says what the camera really sends
+        except LinkError:
+            self.close()
+            raise
+
+    def grab(self) -> Capture:
+        self._wait()
+        at_ns = time.monotonic_ns()
+        if self._info.format == "bgr24":
+            return Capture(self._info, self._info.stride * self._info.height, draw=self._draw, at_ns=at_ns)
+        data = self._retrieve().reshape(-1)
+        return Capture(self._info, data.size, data, at_ns=at_ns)
+
+    def close(self) -> None:
+        self._capture.release()
+
+    def interrupt(self) -> None:
+        """Nothing would be safe while another thread reads."""
+
+    def _open(self, video: CameraCapture) -> Any:
+        cv2, device = self._cv2, self._device
+        is_device = device.isdecimal() or device.startswith("/dev/")
+        name = int(device) if device.isdecimal() else device
+        capture = cv2.VideoCapture(name, cv2.CAP_V4L2 if is_device else cv2.CAP_ANY)
+        if not capture.isOpened():
+            raise LinkError(f"cannot open {device}: not there, in use, or no camera")
+        if video.capture_format != "auto":
+            asked = _ASKED.get(video.capture_format, video.capture_format.upper())
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*f"{asked:4.4}"))
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, video.width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, video.height)
+        capture.set(cv2.CAP_PROP_FPS, video.fps)
+        for control, value in video.camera_controls.items():
+            prop = getattr(cv2, f"CAP_PROP_{control.upper()}", None)
+            if prop is None or not isinstance(value, int | float) or not capture.set(prop, float(value)):
+                log.warning("%s does not take camera_controls.%s = %s", device, control, value)
+        return capture
+
+    def _agree(self, video: CameraCapture) -> str:
+        """The format of the frames: the camera's own if it may be passed on and OpenCV leaves it alone."""
+        code = int(self._capture.get(self._cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
+        has = code.to_bytes(4, "little").decode("latin-1")
+        wanted = video.capture_format
+        own = _PASSED_ON.get(has) if self._capture.getBackendName() == "V4L2" else None  # others decode regardless
+        if own is None or wanted not in (own, "auto") or (wanted == "auto" and own != "mjpeg"):
+            return "bgr24"
+        return own if self._capture.set(self._cv2.CAP_PROP_CONVERT_RGB, 0) else "bgr24"
+
+    def _first_picture(self) -> FrameInfo:
+        self._wait()
+        first = self._retrieve()
+        if self._format == "bgr24":
+            if first.ndim != 3 or first.shape[2] != 3:
+                raise LinkError(f"{self._device} sends pictures of shape {first.shape}, not BGR")
+            height, width = first.shape[:2]
+            return FrameInfo(format="bgr24", width=width, height=height, stride=3 * width)
+        width, height = (
+            int(self._capture.get(prop)) for prop in (self._cv2.CAP_PROP_FRAME_WIDTH, self._cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        return FrameInfo(format=self._format, width=width, height=height, stride=2 * width * (self._format == "yuyv"))
+
+    def _wait(self) -> None:
+        if not self._capture.grab():
+            raise LinkError(f"{self._device} gives no picture: unplugged, hung, or at its end")
+
+    def _retrieve(self, into: Bytes | None = None) -> NDArray[np.uint8]:
+        good, picture = self._capture.retrieve(into)
+        if not good or picture is None:
+            raise LinkError(f"{self._device} gave a picture that cannot be read")
+        return np.asarray(picture)
+
+    def _draw(self, target: Bytes) -> None:
+        wanted = target.reshape(self._info.height, self._info.width, 3)
+        got = self._retrieve(wanted)
+        if got.shape != wanted.shape:
+            raise LinkError(f"{self._device} changed the size of its pictures")
+        if not np.shares_memory(got, wanted):  # not every part of OpenCV writes where it is told to
+            np.copyto(wanted, got)
