@@ -1,0 +1,8 @@
+"""``python -m pebble.services.camera_publisher CONFIG``."""
+
+import sys
+
+from pebble.process import run
+from pebble.services.camera_publisher.service import CameraPublisher
+
+sys.exit(run(CameraPublisher))

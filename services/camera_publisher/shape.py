@@ -1,0 +1,48 @@
+"""From a frame as the camera gives it to the picture that is sent: decoded, as large as wanted, and turned."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from pebble.errors import PayloadError
+from pebble.transports.frame import Frame
+
+Pixels = np.ndarray[Any, np.dtype[np.uint8]]
+
+_TURNS: Final = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+
+class Shape:
+    """``width`` and ``height`` are those of what is sent, None as captured or in proportion; ``turn`` is clockwise."""
+
+    def __init__(self, width: int | None, height: int | None, turn: int) -> None:
+        self._wanted = (height, width) if turn in (90, 270) else (width, height)  # before it is turned
+        self._turn = turn
+
+    def picture(self, frame: Frame, part: Fraction = Fraction(1)) -> Pixels:
+        """``part`` of the wanted size, BGR; may be a view into the frame. PayloadError for what is no picture."""
+        width, height = self._size(frame.info.width, frame.info.height, part)
+        picture = frame.picture(width)  # at a fraction of the work where a JPEG need not be decoded whole
+        if picture.shape[:2] != (height, width):
+            how = cv2.INTER_AREA if height < picture.shape[0] else cv2.INTER_LINEAR
+            picture = np.asarray(cv2.resize(picture, (width, height), interpolation=how), np.uint8)
+        return np.asarray(cv2.rotate(picture, _TURNS[self._turn]), np.uint8) if self._turn else picture
+
+    def _size(self, width: int, height: int, part: Fraction) -> tuple[int, int]:
+        if not (width > 0 and height > 0):
+            raise PayloadError(f"a picture of {width}x{height} pixels")
+        wanted_width, wanted_height = self._wanted
+        if wanted_width is not None and wanted_height is not None:
+            return _scaled(wanted_width, part), _scaled(wanted_height, part)
+        if wanted_height is not None:
+            wanted_width = round(width * wanted_height / height)
+        across = _scaled(wanted_width or width, part)
+        return across, max(1, round(height * across / width))
+
+
+def _scaled(length: int, part: Fraction) -> int:
+    return max(1, round(length * part))

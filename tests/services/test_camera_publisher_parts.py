@@ -1,0 +1,246 @@
+"""The publisher's small parts: full pictures on request, shapes, rates, and frames that turn bad while looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.config import Config, parse
+from pebble.errors import PayloadError, PebbleError
+from pebble.media.decode import VideoDecoder
+from pebble.media.video import make_encoder
+from pebble.services.camera_publisher import service as module
+from pebble.services.camera_publisher.keyframes import Keyframes
+from pebble.services.camera_publisher.service import CameraPublisher
+from pebble.services.camera_publisher.shape import Shape
+from pebble.services.camera_publisher.tally import Tally
+from pebble.transports import Message
+from pebble.transports.frames import Frame, FrameInfo
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.services.bridge_rig import Running
+from tests.support import until
+
+BASE = "pebble/robots/rover"
+
+
+class TestKeyframes:
+    def test_whoever_asks_is_answered_once_a_second(self) -> None:
+        keyframes, answers = Keyframes(), []
+        for tick in range(300):
+            keyframes.ask()
+            if keyframes.wanted(tick / 100):
+                keyframes.sent(tick / 100)
+                answers.append(tick)
+        assert answers == [0, 100, 200]
+
+    def test_one_full_picture_serves_everybody(self) -> None:
+        keyframes = Keyframes()
+        keyframes.ask()
+        keyframes.sent(5.0)  # the encoder made one of its own accord
+        assert not keyframes.wanted(7.0)
+
+    def test_what_the_sender_needs_is_not_rationed(self) -> None:
+        keyframes = Keyframes()
+        keyframes.sent(1.0)
+        keyframes.need()
+        assert keyframes.wanted(1.1)
+
+
+def test_rates_are_those_of_the_last_seconds() -> None:
+    tally = Tally()
+    assert tally.rates(0.0) == (0.0, 0.0)
+    tally.start(0.0)
+    for number in range(100):
+        tally.add(1000, number / 10)
+    frames, size = tally.rates(9.95)
+    assert frames == pytest.approx(10, rel=0.05)
+    assert size == pytest.approx(10_000, rel=0.05)
+    assert tally.rates(60.0) == (0.0, 0.0)
+
+
+def frame(width: int = 64, height: int = 48, form: str = "bgr24") -> Frame:
+    """Red in its upper left quarter, black elsewhere."""
+    picture = np.zeros((height, width, 3), np.uint8)
+    picture[: height // 2, : width // 2] = (0, 0, 255)
+    packed = {"bgr24": _bgr24, "mjpeg": _mjpeg, "nv12": _nv12}[form](picture)
+    return Frame(FrameInfo(captured_ns=1, captured_ms=1, format=form, width=width, height=height), packed, shared=False)
+
+
+def _bgr24(picture: Any) -> Any:
+    return picture.reshape(-1)
+
+
+def _mjpeg(picture: Any) -> Any:
+    return cv2.imencode(".jpg", picture)[1].reshape(-1)
+
+
+def _nv12(picture: Any) -> Any:
+    height, width = picture.shape[:2]
+    i420 = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).reshape(-1)
+    luma, quarter = width * height, width * height // 4
+    chroma = np.stack([i420[luma : luma + quarter], i420[luma + quarter :]], axis=1)
+    return np.concatenate([i420[:luma], chroma.reshape(-1)])
+
+
+def red_corner(picture: Any) -> tuple[bool, bool]:
+    """Where the red quarter is: (in the lower half, in the right half)."""
+    height, width = picture.shape[:2]
+    rows, columns = np.nonzero(picture[:, :, 2] > 128)
+    return bool(rows.mean() > height / 2), bool(columns.mean() > width / 2)
+
+
+@pytest.mark.parametrize("form", ["bgr24", "mjpeg", "nv12"])
+@pytest.mark.parametrize(
+    ("turn", "corner"), [(0, (False, False)), (90, (False, True)), (180, (True, True)), (270, (True, False))]
+)
+def test_pictures_are_turned_clockwise(form: str, turn: int, corner: tuple[bool, bool]) -> None:
+    picture = Shape(None, None, turn).picture(frame(form=form))
+    assert picture.shape == ((48, 64, 3) if turn in (0, 180) else (64, 48, 3))
+    assert red_corner(picture) == corner
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "turn", "part", "size"),
+    [
+        (None, None, 0, "1", (64, 48)),
+        (32, None, 0, "1", (32, 24)),
+        (None, 24, 0, "1", (32, 24)),
+        (40, 40, 0, "1", (40, 40)),
+        (128, None, 0, "1", (128, 96)),
+        (None, None, 0, "1/2", (32, 24)),
+        (32, 24, 0, "3/4", (24, 18)),
+        (24, None, 90, "1", (24, 32)),
+        (None, 32, 270, "1/2", (12, 16)),
+        (1, 1, 0, "1/4", (1, 1)),
+    ],
+)
+@pytest.mark.parametrize("form", ["bgr24", "mjpeg"])
+def test_what_is_sent_has_the_wanted_size(
+    form: str, width: int | None, height: int | None, turn: int, part: str, size: tuple[int, int]
+) -> None:
+    picture = Shape(width, height, turn).picture(frame(form=form), Fraction(part))
+    assert (picture.shape[1], picture.shape[0]) == size
+
+
+@pytest.mark.parametrize("form", ["bgr24", "mjpeg", "nv12", "yuyv", "s16le", "", "hdr"])
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (0, 0), (-4, 8), (1 << 40, 2)])
+def test_what_is_no_picture_is_refused(form: str, width: int, height: int) -> None:
+    info = FrameInfo(format=form, width=width, height=height)
+    for size in (0, 1, 1000):
+        with pytest.raises(PayloadError):
+            Shape(None, None, 0).picture(Frame(info, np.zeros(size, np.uint8), shared=False))
+
+
+class Doubtful(Frame):
+    """A view whose memory was given to another frame while it was looked at."""
+
+    def valid(self) -> bool:
+        return False
+
+
+class Bench:
+    """The service in this process; frames are put into its feed, as its reader would."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        self.local, self.remote = MemoryHub(), MemoryHub()
+
+        def remote_transport(_config: Config, name: str) -> MemoryTransport:
+            return MemoryTransport(name, self.remote)
+
+        monkeypatch.setattr(module, "remote_transport", remote_transport)
+        monkeypatch.setattr(CameraPublisher, "_make_reader", lambda _service: Silent())
+        config = parse({"robot": {"id": "rover"}}, folder=folder, env={})
+        self.operator = MemoryTransport("operator", self.remote).open()
+        self.heard: list[Message] = []
+        self.operator.subscribe(f"{BASE}/outgoing/#", self.heard.append)
+        self.service = CameraPublisher(config, MemoryTransport("robot", self.local))
+        self._running = Running(self.service)
+        assert until(lambda: hasattr(self.service, "_feed") and self.service._feed.wanted)
+        self._captured = 0
+
+    def show(self, kind: type[Frame] = Frame, form: str = "bgr24", data: Any = None) -> None:
+        """A frame, long after the one before it; returns once it has been dealt with."""
+        self._captured += 1
+        original = frame()
+        info = FrameInfo(
+            captured_ns=self._captured * 1_000_000_000,
+            captured_ms=self._captured,
+            format=form,
+            width=64,
+            height=48,
+        )
+        before = sum(self.service.counters[what] for what in ("sent", "overwritten", "failed", "refused"))
+        self.service._feed._put(kind(info, original.data if data is None else data, shared=False))
+        self.service._feed._arrived()
+        assert until(
+            lambda: sum(self.service.counters[what] for what in ("sent", "overwritten", "failed", "refused")) > before
+        )
+
+    def close(self) -> None:
+        self._running.stop()
+        self.operator.close()
+
+
+class Silent:
+    """A reader without a writer."""
+
+    def __enter__(self) -> Silent:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def read(self, timeout: float) -> None:
+        until(lambda: False, timeout, step=0.05)
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(monkeypatch, tmp_path)
+    yield bench
+    bench.close()
+
+
+def spoil_view(bench: Bench) -> None:
+    bench.show(Doubtful)
+    assert bench.service.counters["overwritten"] == 1
+
+
+def spoil_frame(bench: Bench) -> None:
+    bench.show(form="mjpeg", data=np.zeros(100, np.uint8))
+    assert bench.service.counters["failed"] == 1
+
+
+@pytest.mark.parametrize("spoil", [spoil_view, spoil_frame])
+def test_after_a_bad_frame_comes_a_full_picture(bench: Bench, spoil: Callable[[Bench], None]) -> None:
+    decoder = VideoDecoder()
+    for _ in range(2):
+        bench.show()
+    spoil(bench)
+    for _ in range(2):
+        bench.show()
+    assert until(lambda: len(bench.heard) == 4)
+    pictures = [decoder.feed(message.payload) for message in bench.heard]
+    assert [picture is not None and picture.captured_ms for picture in pictures] == [1, 2, 4, 5]
+    assert [picture is not None and picture.keyframe for picture in pictures][2]
+
+
+def test_no_h264_here_is_said_and_json_is_sent(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_av(name: str, **options: Any) -> Any:
+        if name == "h264":
+            raise PebbleError("h264 needs PyAV")
+        return make_encoder(name, **options)
+
+    monkeypatch.setattr(module, "make_encoder", without_av)
+    operator = MemoryTransport("somebody", bench.local).open()
+    operator.publish(f"{BASE}/incoming/front-camera", b'{"enabled": true, "encoding": "h264"}')
+    assert until(lambda: bench.service._problem == "h264 needs PyAV")
+    bench.show()
+    assert until(lambda: bench.heard)
+    assert bench.heard[-1].payload.startswith(b"{")
+    operator.close()
