@@ -1,0 +1,1 @@
+"""An operator's voice: evened out, and handed to a program that plays it."""

@@ -1,0 +1,83 @@
+"""What the audio publisher makes of a slow link, on a clock of its own."""
+
+from __future__ import annotations
+
+import pytest
+
+from pebble.services.audio_publisher.sender import encoding_of
+from pebble.services.audio_publisher.thrift import Step, Thrift, steps
+from pebble.services.audio_publisher.under_way import UnderWay
+
+
+def watch(thrift: Thrift, age_s: float, begin: float, seconds: float) -> list[float]:
+    """A look every 20 ms; returns when the level changed."""
+    return [
+        round(at, 2)
+        for at in (begin + 0.02 * number for number in range(round(50 * seconds)))
+        if thrift.look(age_s, at)
+    ]
+
+
+def test_steps_save_headers_first_and_then_bits() -> None:
+    assert [(step.bundle, step.bitrate) for step in steps(1, 24_000)] == [(1, 24_000), (3, 24_000), (3, 16_000)]
+    assert [(step.bundle, step.bitrate) for step in steps(3, 24_000)] == [(3, 24_000), (3, 16_000)]
+    assert steps(3, 12_000) == (Step(3, 12_000),)
+
+
+def test_a_link_that_is_fast_changes_nothing() -> None:
+    thrift = Thrift(2, 0.0)
+    assert watch(thrift, 0.06, 0.0, 600) == []
+
+
+def test_slowness_goes_down_step_by_step() -> None:
+    thrift = Thrift(2, 0.0)
+    assert len(watch(thrift, 0.18, 10.0, 10)) == 2
+    assert thrift.level == 2
+
+
+def test_a_moment_of_slowness_is_nothing() -> None:
+    thrift = Thrift(2, 0.0)
+    for begin in range(10, 100):
+        assert watch(thrift, 0.19, begin, 0.2) == []
+        assert watch(thrift, 0.0, begin + 0.2, 0.8) == []
+
+
+def test_steps_back_are_tried_ever_more_rarely() -> None:
+    thrift = Thrift(2, 0.0)
+    watch(thrift, 0.18, 10.0, 3.0)
+    tries, at = [], 13.0
+    for _ in range(4):
+        begin = at
+        while thrift.level == 2:
+            at += 0.02
+            thrift.look(0.0, at)
+        tries.append(at - begin)
+        while thrift.level == 1:
+            at += 0.02
+            thrift.look(0.18, at)
+    assert tries == sorted(tries)
+    assert tries[-1] > 4 * tries[0]
+
+
+def test_all_is_as_before_in_the_end() -> None:
+    thrift = Thrift(2, 0.0)
+    watch(thrift, 0.18, 10.0, 5.0)
+    watch(thrift, 0.0, 15.0, 100)
+    assert thrift.level == 0
+
+
+def test_age_of_what_is_not_confirmed() -> None:
+    under_way = UnderWay()
+    assert under_way.age_s(5000, 0.0) == 0
+    for number in range(10):
+        under_way.sent(600, number / 10)
+    assert under_way.age_s(10 * 650, 1.0) == pytest.approx(1.0)
+    assert under_way.age_s(3 * 650, 1.0) == pytest.approx(0.3)
+    assert under_way.age_s(20, 1.0) == 0  # a ping
+    under_way.sent(600, 2.0)
+    under_way.clear()
+    assert under_way.age_s(600, 3.0) == 0
+
+
+def test_what_a_request_means() -> None:
+    assert [encoding_of(asked, "opus") for asked in ("pcm", "opus", "mp3", None)] == ["pcm", "opus", "opus", "opus"]
