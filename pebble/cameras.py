@@ -1,0 +1,127 @@
+"""A robot's camera in three lines of anybody's Python: `for picture in camera("goob"): …`."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from pebble.config import default_run_folder, load
+from pebble.config.tree import Robot
+from pebble.errors import ConfigError, LinkError, PayloadError, PebbleError
+from pebble.identity import Identity
+from pebble.transports.frames import Frame, FrameReader
+
+log = logging.getLogger(__name__)
+
+Picture = np.ndarray[Any, np.dtype[np.uint8]]
+STREAM = "camera"
+
+
+def camera(
+    robot: str | Path,
+    *,
+    width: int | None = None,
+    views: bool = False,
+    timeout: float | None = None,
+    env: Mapping[str, str] = os.environ,
+) -> Camera:
+    """The pictures of a robot on this machine, as the camera makes them: the newest, never a queue of old ones.
+
+    ``robot`` is its id (``"goob"``), its base topic (``"pebble/robots/goob"``), its config file, or its run directory.
+    Pictures are arrays of (height, width, 3) bytes, blue first; they are yours. With ``width`` they are scaled to that
+    many pixels, which for a JPEG camera also saves most of the decoding. With ``views`` they may look straight into
+    the camera's memory: use them at once, and throw the result away if ``Camera.frame.valid()`` is false afterwards.
+
+    Raises LinkError if no such robot runs here, and while waiting if no picture comes for ``timeout`` seconds.
+    """
+    if width is not None and width <= 0:
+        raise PebbleError(f"camera: a width of {width} pixels shows nothing")
+    return Camera(_run_dir(robot, env), width=width, views=views, timeout=timeout)
+
+
+class Camera:
+    """Iterate over it; close it, or use it in a ``with`` statement, when you are done."""
+
+    def __init__(self, run_dir: Path, *, width: int | None, views: bool, timeout: float | None) -> None:
+        self.frame: Frame | None = None  # what the last picture was made of: when, by whom, and whether still valid
+        self._width = width
+        self._timeout = timeout
+        self._run_dir = run_dir
+        self._reader = FrameReader(run_dir, STREAM, views=views).open()
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What became of the frames so far: see `FrameReader`."""
+        return self._reader.counters.snapshot()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Picture:
+        end = None if self._timeout is None else time.monotonic() + self._timeout
+        while True:
+            frame = self._reader.read(None if end is None else max(0.0, end - time.monotonic()))
+            if frame is None:
+                self._nothing_came()
+            else:
+                try:
+                    return self._picture(frame)
+                except PayloadError as error:
+                    log.warning("%s", error)
+
+    def _picture(self, frame: Frame) -> Picture:
+        picture = frame.picture(self._width)
+        self.frame = frame
+        return picture
+
+    def _nothing_came(self) -> None:
+        if self._reader.closed:
+            raise StopIteration
+        raise LinkError(f"no picture for {self._timeout:g} s from the camera in {self._run_dir}")
+
+    def close(self) -> None:
+        """Ends the iteration, from any thread."""
+        self._reader.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        with contextlib.suppress(AttributeError):  # never opened
+            self.close()
+
+
+def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
+    text, path = str(robot), Path(robot)
+    if path.is_dir() and (isinstance(robot, Path) or path.is_absolute()):
+        return path.absolute()
+    places = [load(path, env).run_dir()] if text.endswith(".json") else _usual_places(text, env)
+    for place in places:
+        if place.is_dir():
+            return place
+    looked = ", ".join(map(str, places))
+    raise LinkError(
+        f"no robot {text} runs on this machine (no {looked}): is it up, and does its config name a run_dir? "
+        "Then give its config file instead of its name"
+    )
+
+
+def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
+    """Where it would be if started like us, and without a login's folder."""
+    levels = robot.split("/")
+    if len(levels) not in (1, 3):
+        raise ConfigError(f"camera: {robot} is neither a robot's id nor a base topic nor a config file")
+    usual = Robot(id=robot)
+    identity = Identity(*levels) if len(levels) == 3 else Identity(usual.system, usual.type, usual.id)
+    bare = {name: value for name, value in env.items() if name not in ("XDG_RUNTIME_DIR", "RUNTIME_DIRECTORY")}
+    return list(dict.fromkeys(default_run_folder(identity.base, known) for known in (env, bare)))

@@ -1,0 +1,128 @@
+"""Three lines of anybody's Python read a robot's camera."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble import camera
+from pebble.config import default_run_folder
+from pebble.errors import PebbleError
+from pebble.transports.frames import FrameInfo, FrameWriter
+from tests.support import ROOT
+
+WIDTH, HEIGHT = 320, 240
+
+
+class Filming:
+    """A camera of one colour, 50 times a second."""
+
+    def __init__(self, folder: Path, *, mjpeg: bool = False) -> None:
+        self._picture = np.full((HEIGHT, WIDTH, 3), (10, 20, 30), np.uint8)
+        self._form = "mjpeg" if mjpeg else "bgr24"
+        self._data = cv2.imencode(".jpg", self._picture)[1] if mjpeg else self._picture
+        self._writer = FrameWriter(folder, "camera", capacity=self._picture.size).open()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ended.wait(0.02):
+            info = FrameInfo(format=self._form, width=WIDTH, height=HEIGHT, captured_ns=time.monotonic_ns())
+            self._writer.write(b"no picture", FrameInfo(format="text"))
+            self._writer.write(self._data, info)
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._writer.close()
+
+
+@pytest.fixture
+def env() -> Iterator[dict[str, str]]:
+    with tempfile.TemporaryDirectory(prefix="pebble-") as folder:  # pytest's own may be too long for a socket
+        yield {"TMPDIR": folder}
+
+
+@pytest.fixture
+def filming(env: dict[str, str]) -> Iterator[Filming]:
+    filming = Filming(default_run_folder("pebble/robots/goob", env))
+    yield filming
+    filming.close()
+
+
+def test_pictures_of_a_robot_by_its_id(filming: Filming, env: dict[str, str]) -> None:
+    for number, picture in enumerate(camera("goob", env=env), 1):
+        assert picture.shape == (HEIGHT, WIDTH, 3)
+        assert picture[5, 5].tolist() == [10, 20, 30]
+        picture[:] = 0  # it is ours
+        if number == 5:
+            break
+
+
+def test_by_its_base_topic_its_run_directory_and_its_config(
+    filming: Filming, env: dict[str, str], tmp_path: Path
+) -> None:
+    config = tmp_path / "goob.json"
+    config.write_text(json.dumps({"robot": {"id": "goob"}}))
+    for robot in ("pebble/robots/goob", default_run_folder("pebble/robots/goob", env), config, str(config)):
+        with camera(robot, env=env, timeout=5) as pictures:
+            assert next(pictures).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_views_are_the_cameras_own_memory(filming: Filming, env: dict[str, str]) -> None:
+    with camera("goob", env=env, views=True, timeout=5) as pictures:
+        picture = next(pictures)
+        assert not picture.flags.writeable
+        assert pictures.frame is not None
+        assert pictures.frame.valid()
+        assert pictures.frame.info.captured_ns > 0
+
+
+@pytest.mark.parametrize("width", [40, 100, 320, 640])
+def test_scaled(env: dict[str, str], width: int) -> None:
+    filming = Filming(default_run_folder("pebble/robots/goob", env), mjpeg=True)
+    try:
+        with camera("goob", env=env, width=width, timeout=5) as pictures:
+            assert next(pictures).shape == (width * HEIGHT // WIDTH, width, 3)
+    finally:
+        filming.close()
+
+
+def test_no_such_robot_is_one_clear_sentence(env: dict[str, str]) -> None:
+    with pytest.raises(PebbleError, match=r"no robot fred runs on this machine \(no .*pebble-.*config"):
+        camera("fred", env=env)
+    for wrong in ("a/b", "", "go#b", "/nowhere/robot.json"):
+        with pytest.raises(PebbleError):
+            camera(wrong, env=env)
+    with pytest.raises(PebbleError, match="width"):
+        camera("fred", width=0)
+
+
+def test_a_robot_without_a_picture_is_said_after_the_timeout(env: dict[str, str]) -> None:
+    folder = default_run_folder("pebble/robots/goob", env)
+    folder.mkdir(parents=True)
+    with pytest.raises(PebbleError, match=r"no picture for 0\.1 s"):
+        next(camera("goob", env=env, timeout=0.1))
+
+
+def test_closing_ends_the_iteration(env: dict[str, str]) -> None:
+    default_run_folder("pebble/robots/goob", env).mkdir(parents=True)
+    pictures = camera("goob", env=env)
+    threading.Timer(0.1, pictures.close).start()
+    assert list(pictures) == []
+
+
+def test_importing_pebble_imports_nothing_for_cameras() -> None:
+    program = "import sys, pebble; assert not {'zenoh', 'numpy', 'cv2'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True)
