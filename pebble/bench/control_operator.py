@@ -1,0 +1,84 @@
+"""An operator who drives at a steady pace over MQTT and remembers when each command was sent."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from typing import Any
+
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pebble.contract import AUDIO_CONTROL, DRIVE, MQTT_AUDIO, MQTT_VIDEO, ONLINE, STATUS, VIDEO_CONTROL, Channel
+from pebble.errors import PebbleError
+
+_STEPS = 800  # wheel values 0.100 … 0.899, three decimals as on the serial line
+_UP_S = 30.0
+_LOOK_S = 0.02
+
+
+class Operator:
+    """One stock MQTT connection to the remote broker. Commands are numbered by what they make the wheels do."""
+
+    def __init__(self, port: int, base: str) -> None:
+        self._base, self._number = base, 0
+        self._services: dict[str, Any] = {}
+        self._beats = 0
+        self._client = Client(CallbackAPIVersion.VERSION2)
+        self._client.on_connect = self._subscribe
+        self._client.on_message = self._hear
+        self._client.connect("127.0.0.1", port)
+        self._client.loop_start()
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def wait_until_up(self) -> None:
+        """Every service says it is ready, and the heart beats. Raises PebbleError if that takes too long."""
+        end = time.monotonic() + _UP_S
+        while time.monotonic() < end:
+            states = {name: service.get("state") for name, service in self._services.items()}
+            waiting = [name for name, state in states.items() if state not in ("ready", "stopped")]
+            if states and not waiting and self._beats > 1:
+                return
+            time.sleep(_LOOK_S)
+        raise PebbleError(f"the robot is not up after {_UP_S:.0f} s: {states}")
+
+    def media(self, wanted: bool) -> None:
+        """Allow and ask for video and audio, or have both stop."""
+        for flag in (MQTT_VIDEO, MQTT_AUDIO):
+            self._send(flag, wanted, retain=True)
+        for request in (VIDEO_CONTROL, AUDIO_CONTROL):
+            self._send(request, {"enabled": wanted})
+
+    def drive(self, seconds: float, rate_hz: float) -> dict[tuple[float, float], int]:
+        """Returns when (CLOCK_MONOTONIC, ns) the command for each pair of wheel speeds was handed to the client."""
+        sent: dict[tuple[float, float], int] = {}
+        pause, due = threading.Event(), time.monotonic()
+        for _ in range(round(seconds * rate_hz)):
+            self._number += 1
+            left, right = wheels(self._number)
+            sent[left, right] = time.monotonic_ns()
+            self._send(DRIVE, {"x": (left - right) / 2, "z": (left + right) / 2})
+            due += 1 / rate_hz
+            pause.wait(max(0.0, due - time.monotonic()))
+        return sent
+
+    def _send(self, channel: Channel, body: Any, *, retain: bool = False) -> None:
+        self._client.publish(channel.topic(self._base), json.dumps(body), qos=channel.default_qos, retain=retain)
+
+    def _subscribe(self, client: Client, *_: Any) -> None:
+        client.subscribe([(STATUS.topic(self._base), 1), (ONLINE.topic(self._base), 1)])
+
+    def _hear(self, _client: Client, _data: Any, message: Any) -> None:
+        if message.topic == STATUS.topic(self._base):
+            self._services = json.loads(message.payload).get("value", {}).get("services", {})
+        elif not message.retain:
+            self._beats += 1
+
+
+def wheels(number: int) -> tuple[float, float]:
+    """The speeds that command ``number`` (0 … 639,999) sets: no two alike."""
+    return round(0.1 + (number % _STEPS) / 1000, 3), round(0.1 + (number // _STEPS % _STEPS) / 1000, 3)

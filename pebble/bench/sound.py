@@ -1,0 +1,176 @@
+"""What sound costs on the wire: Opus against the original's PCM, headers of MQTT, TCP and IP included."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from pebble.contract import AUDIO
+from pebble.errors import PebbleError
+from pebble.media.opus import BUNDLE_LIMIT
+from pebble.media.pcm import to_bytes
+from pebble.media.sound import SOUND_ENCODINGS, SoundDecoder, make_sound_encoder
+from pebble.media.speech import Speech
+
+TOPIC = AUDIO.topic("pebble/robots/goob")
+AIM = 0.16  # of PCM's bytes
+_IP, _TCP = 20, 32  # bytes; version 4 without options, TCP with time stamps as Linux sends them
+_CHUNK_MS = 20
+_DELAY_S = 0.02  # at most, of codec and resampler, when both sounds are compared
+_STEP_S = 0.02  # of an envelope
+
+Wave = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One way of sending the same sound. ``likeness``: of the samples for PCM, of the envelopes for Opus."""
+
+    encoding: str
+    bitrate: int | None
+    bundle: int
+    packets_per_s: float
+    payload_kbits: float
+    wire_kbits: float
+    ratio: float  # of PCM's bytes on the wire
+    likeness: float
+    encode_cpu: float  # share of one core
+    decode_cpu: float
+
+
+def wire_bytes(payload: int, topic: str = TOPIC) -> int:
+    """Of one PUBLISH with QoS 0 in a TCP segment of its own (MQTT 3.1.1, 3.3)."""
+    length = 2 + len(topic.encode()) + payload
+    digits = max(1, (length.bit_length() + 6) // 7)  # of the remaining length
+    return _IP + _TCP + 1 + digits + length
+
+
+def run(
+    json_file: Path | None = None,
+    seconds: float = 10.0,
+    *,
+    rate: int = 16_000,
+    bitrates: Sequence[int] = (16_000, 24_000, 32_000),
+    console: Console | None = None,
+) -> int:
+    """Measure and show; 0 if Opus as configured by default stays within AIM. Raises PebbleError without PyAV."""
+    if "opus" not in SOUND_ENCODINGS:
+        raise PebbleError("Opus needs PyAV, which is not installed: pip install 'pebble-robot[media]'")
+    if seconds < 1:
+        raise PebbleError("seconds must be 1 at least")
+    rows = list(measure(seconds, rate, bitrates))
+    (console or Console()).print(table(rows, rate))
+    if json_file is not None:
+        json_file.write_text(json.dumps({"rows": [_as_json(row, rate) for row in rows]}, indent=1) + "\n")
+    usual = [row.ratio for row in rows if row.encoding == "opus" and row.bundle > 1]
+    return 0 if max(usual) <= AIM else 1
+
+
+def measure(seconds: float, rate: int, bitrates: Sequence[int]) -> Iterator[Row]:
+    """PCM first: it is what the others are compared with."""
+    said = Speech(rate).samples(0, round(seconds * rate))
+    pcm, pcm_bytes = _row("pcm", said, rate, None, 1, None)
+    yield pcm
+    for bitrate in bitrates:
+        for bundle in range(1, BUNDLE_LIMIT + 1):
+            yield _row("opus", said, rate, bitrate, bundle, pcm_bytes)[0]
+
+
+def _row(
+    name: str, said: npt.NDArray[np.int16], rate: int, bitrate: int | None, bundle: int, pcm_rate: float | None
+) -> tuple[Row, float]:
+    """The row, and how many bytes a second of sound takes on the wire."""
+    encoder = make_sound_encoder(
+        name, rate=rate, channels=1, chunk_ms=_CHUNK_MS, bitrate=bitrate or 24_000, bundle=bundle
+    )
+    size = rate * _CHUNK_MS // 1000
+    began = time.process_time()
+    packets = []
+    for at in range(0, len(said), size):
+        packets += encoder.encode(to_bytes(said[at : at + size]), round(1000 * at / rate))
+    encoded = time.process_time()
+    decoder = SoundDecoder()
+    heard = [one.samples for one in map(decoder.feed, packets) if one is not None]
+    decoded = time.process_time()
+    sound = np.concatenate(heard)[:, 0].astype(np.float64)
+    seconds = len(sound) / encoder.rate
+    wire = sum(wire_bytes(len(packet)) for packet in packets) / seconds
+    row = Row(
+        encoding=name,
+        bitrate=bitrate,
+        bundle=bundle,
+        packets_per_s=len(packets) / seconds,
+        payload_kbits=sum(map(len, packets)) * 8 / 1000 / seconds,
+        wire_kbits=wire * 8 / 1000,
+        ratio=1.0 if pcm_rate is None else wire / pcm_rate,
+        likeness=likeness(sound, said[:, 0].astype(np.float64), rate, by_envelope=name != "pcm"),
+        encode_cpu=(encoded - began) / seconds,
+        decode_cpu=(decoded - encoded) / seconds,
+    )
+    return row, wire
+
+
+def likeness(heard: Wave, said: Wave, rate: int, *, by_envelope: bool) -> float:
+    """Correlation (-1 to 1) after the delay that fits best."""
+    count = min(len(heard), len(said)) - round(_DELAY_S * rate)
+    delays = range(0, round(_DELAY_S * rate), max(1, rate // 2000) if by_envelope else 1)
+    return max(_correlation(heard[delay : delay + count], said[:count], rate, by_envelope) for delay in delays)
+
+
+def _correlation(heard: Wave, said: Wave, rate: int, by_envelope: bool) -> float:
+    if by_envelope:
+        heard, said = _envelope(heard, rate), _envelope(said, rate)
+    return float(np.corrcoef(heard, said)[0, 1])
+
+
+def _envelope(wave: Wave, rate: int) -> Wave:
+    step = round(rate * _STEP_S)
+    loudness: Wave = np.sqrt((wave[: len(wave) // step * step].reshape(-1, step) ** 2).mean(axis=1))
+    return loudness
+
+
+def table(rows: Sequence[Row], rate: int) -> Table:
+    shown = Table(title=f"Sound of {rate / 1000:g} kHz mono on the wire, chunks of {_CHUNK_MS} ms, topic {TOPIC}")
+    for heading in (
+        "encoding",
+        "parts",
+        "packets/s",
+        "payload kbit/s",
+        "wire kbit/s",
+        "× PCM",
+        "likeness",
+        "CPU enc/dec",
+    ):
+        shown.add_column(heading, justify="left" if heading == "encoding" else "right")
+    for row in rows:
+        shown.add_row(
+            row.encoding + (f" {row.bitrate // 1000} kbit/s" if row.bitrate else ""),
+            str(row.bundle),
+            f"{row.packets_per_s:.1f}",
+            f"{row.payload_kbits:.1f}",
+            f"{row.wire_kbits:.1f}",
+            f"{row.ratio:.3f}",
+            f"{row.likeness:.3f}",
+            f"{100 * row.encode_cpu:.1f} / {100 * row.decode_cpu:.1f} %",
+        )
+    shown.caption = "likeness: correlation of the samples for pcm, of the envelopes in steps of 20 ms for opus"
+    return shown
+
+
+def _as_json(row: Row, rate: int) -> dict[str, Any]:
+    values = asdict(row)
+    names = ("bitrate", "bundle")
+    return {
+        "variant": values.pop("encoding"),
+        "params": {"rate": rate, **{name: values.pop(name) for name in names}},
+        **values,
+    }

@@ -1,0 +1,152 @@
+"""Short real comparisons: real processes, real brokers, and nothing of them afterwards."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pebble.bench import frames, frames_variants
+from pebble.bench.frames import Plan
+from pebble.bench.frames_variants import Case, Size, parse_size
+from pebble.bench.usage import children
+from pebble.errors import PebbleError
+from tests.support import ROOT, until
+
+KEYS = {"variant", "params", "n", "p50_us", "p99_us", "max_us", "cpu_writer", "cpu_reader"}
+
+
+def command(*options: str) -> list[str]:
+    return [sys.executable, "-m", "pebble.cli", "bench", "frames", *options]
+
+
+def alive(pid: int) -> bool:
+    """Does it still run? (A zombie does not.)"""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def segments(pid: int) -> set[Path]:
+    """The shared memory it uses."""
+    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    return {Path(line.split()[5]) for line in lines if line.endswith(".zenoh")}
+
+
+@pytest.fixture
+def temporary(tmp_path: Path) -> Path:
+    """Where the bench makes its folders; short, because of unix sockets."""
+    folder = tmp_path / "t"
+    folder.mkdir()
+    return folder
+
+
+def test_a_short_run_of_everything_that_needs_no_gstreamer(temporary: Path, tmp_path: Path) -> None:
+    file = tmp_path / "frames.json"
+    options = ("--seconds", "1", "--rounds", "1", "--size", "64x48", "--readers", "1", "--json", str(file))
+    names = ["zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt"]
+    ended = subprocess.run(
+        command(*options, "--variants", ",".join(names)),
+        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    rows = json.loads(file.read_text())["rows"]
+    assert [row["variant"] for row in rows] == names
+    assert all(row.keys() >= KEYS for row in rows)
+    assert all(row["params"] == {"size": "64x48", "readers": 1} for row in rows)
+    assert all(row["n"] > 10 and 0 < row["p50_us"] <= row["p99_us"] <= row["max_us"] for row in rows)
+    assert "zenoh-shm" in ended.stdout
+    assert list(temporary.iterdir()) == []
+
+
+def test_frames_in_shared_memory_arrive_whole_at_every_reader() -> None:
+    round_ = frames.run_case(Case("zenoh-shm", Size(320, 240), 2), 0.5)
+    assert len(round_.latencies_us) > 10
+    assert (round_.torn, round_.fallbacks) == (0, 0)
+    assert round_.memory_reader_mb > 0
+    assert children(os.getpid()) == []
+
+
+def test_the_bare_copy_is_nobody_s_cpu_but_the_copier_s() -> None:
+    round_ = frames.run_case(Case("memcpy", Size(320, 240), 1), 0.5)
+    assert len(round_.latencies_us) > 3
+    assert round_.cpu_writer == 0.0
+
+
+def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
+    bench = subprocess.Popen(
+        command("--seconds", "30", "--size", "160x120", "--variants", "zenoh-copy"),
+        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        assert until(lambda: len(children(bench.pid)) == 2, 20)
+        started = children(bench.pid)
+        assert until(lambda: all(map(segments, started)), 20)
+        shared = set().union(*map(segments, started))
+        time.sleep(1)  # what is younger than a second is nobody's to sweep
+        bench.send_signal(signal.SIGINT)
+        assert bench.wait(20) == 130
+    finally:
+        bench.kill()
+        bench.wait()
+    assert until(lambda: not any(map(alive, started)), 5)
+    assert not any(segment.exists() for segment in shared)
+    assert list(temporary.iterdir()) == []
+
+
+def test_workers_end_with_a_killed_bench(temporary: Path) -> None:
+    bench = subprocess.Popen(
+        command("--seconds", "30", "--size", "160x120", "--variants", "zenoh-net"),
+        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        assert until(lambda: len(children(bench.pid)) == 2, 20)
+        started = children(bench.pid)
+    finally:
+        bench.kill()
+        bench.wait()
+    assert until(lambda: not any(map(alive, started)), 10)
+
+
+def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(frames_variants, "_SYSTEM_PYTHON", "/nowhere/python3")
+    frames_variants._gstreamer.cache_clear()
+    said = io.StringIO()
+    try:
+        assert frames._installed(["zenoh-shm", "gstreamer-shm"], Console(file=said, width=80)) == ["zenoh-shm"]
+    finally:
+        frames_variants._gstreamer.cache_clear()
+    assert "gstreamer-shm is left out" in said.getvalue()
+    assert frames_variants.INSTALL_GSTREAMER in said.getvalue()
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        Plan(variants=["zenoh"]),
+        Plan(seconds=0.0),
+        Plan(seconds=float("nan")),
+        Plan(rounds=0),
+        Plan(readers=[0]),
+        Plan(sizes=["big"]),
+        Plan(sizes=["1x1"]),
+        Plan(sizes=["30x30"]),
+        Plan(json=Path("/nowhere/x.json")),
+    ],
+)
+def test_nonsense_is_refused_before_anything_starts(plan: Plan) -> None:
+    with pytest.raises(PebbleError):
+        frames.run(plan, Console(file=io.StringIO()))
+
+
+def test_sizes_are_written_with_either_sign() -> None:
+    assert parse_size("640×480") == parse_size("640x480") == Size(640, 480)

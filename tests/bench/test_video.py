@@ -1,0 +1,46 @@
+"""The comparison of video forms: its ruler, its film, and the aims themselves on a short film."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pebble.bench.clips import SCENES, Clip
+from pebble.bench.similarity import psnr, squared_error, ssim
+from pebble.bench.video import AIMS, TOLERANCE, run
+
+
+def test_the_ruler() -> None:
+    random = np.random.default_rng(1)
+    picture = random.integers(0, 256, (64, 64, 3), np.uint8)
+    assert ssim(picture, picture) == pytest.approx(1)
+    assert psnr(squared_error(picture, picture)) == math.inf
+    assert psnr(1.0) == pytest.approx(48.13, abs=0.01)
+    assert ssim(picture, random.integers(0, 256, picture.shape, np.uint8)) < 0.1
+    # Flat pictures differ in lightness only: (2ab + C1) / (a² + b² + C1).
+    flat = np.full((64, 64, 3), 100, np.uint8)
+    assert ssim(flat, flat + 50) == pytest.approx((2 * 100 * 150 + 6.5025) / (100**2 + 150**2 + 6.5025), abs=1e-4)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_film_is_always_the_same(scene: str) -> None:
+    clip = Clip(scene)
+    first, second = clip.frame(3), clip.frame(4)
+    assert np.array_equal(Clip(scene).frame(3), first)
+    assert squared_error(first, second) > 1
+
+
+def test_the_aims_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(tmp_path / "video.json", seconds=1) == 0
+    rows = json.loads((tmp_path / "video.json").read_text())["rows"]
+    assert [row["variant"] for row in rows[:5]] == ["reference", "json", "pbvd", "pbvz", "h264"]
+    for scene in SCENES:
+        ours = {row["variant"]: row for row in rows if row["params"]["scene"] == scene}
+        for name, aim in AIMS.items():
+            assert ours[name]["ratio"] <= aim
+            assert abs(ours[name]["ssim"] - ours["reference"]["ssim"]) <= TOLERANCE
+    assert "reference" in capsys.readouterr().out
