@@ -194,6 +194,23 @@ def test_check_shows_links_processes_and_effective_topics_but_no_secret(run: Run
     assert "hush-hush" not in run.out
 
 
+def test_check_shows_what_runs_on_request(run: Run, tmp_path: Path) -> None:
+    services = {
+        "av_daemon": {"enabled": True},
+        "mqtt_bridge": {
+            "enabled": True,
+            "remote_mqtt": {"host": "broker.example"},
+            "media": {"audio_receiver": {"topic": "else/where"}},
+        },
+    }
+    assert run("check", config_file(tmp_path, services=services), columns=120) == 0
+    lines = [" ".join(line.split()) for line in run.out.splitlines()]
+    assert "processes launcher, announcer, av_daemon, mqtt_bridge" in lines
+    assert "on request camera_publisher, audio_publisher, audio_receiver" in lines
+    for expected in ("camera_publisher says outgoing/front-camera", "audio_receiver hears else/where"):
+        assert any(line.startswith(expected) for line in lines)
+
+
 def test_check_tells_every_problem_of_every_file(run: Run, tmp_path: Path) -> None:
     wrong = {"robot": {"id": "goob", "sistem": "x"}, "local_mqtt": {"port": "1883"}, "services": {"mqtt_brigde": {}}}
     path = config_file(tmp_path, **wrong)

@@ -11,7 +11,7 @@ import typer
 
 from pebble.version import __version__
 
-COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo")
+COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo", "watch", "snapshot", "bench")
 
 _HELP = """Runs Pebble robots, and looks at them.
 
@@ -20,6 +20,7 @@ _HELP = """Runs Pebble robots, and looks at them.
     pebble check goob.json     is this config right, and what does it come to?
     pebble doctor goob.json    is this machine ready for it?
     pebble up goob.json        run the robot
+    pebble watch goob.json     see its camera and hear its microphone
 """
 
 
@@ -31,7 +32,7 @@ def run(arguments: list[str]) -> int:
     app.callback(help=_HELP)(_options)
     for name in wanted or COMMANDS:
         import_module(f"pebble.commands.{name}").register(app)
-    line = [*arguments, "--help"] if arguments in ([], ["topic"]) else arguments
+    line = [*arguments, "--help"] if arguments in ([], ["topic"], ["bench"]) else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:

@@ -7,11 +7,18 @@ from typing import NamedTuple
 
 from pebble.addresses import Addresses
 from pebble.config import Config, Mqtt, RemoteLink
-from pebble.contract import CHANNELS, STATUS, TOUCH_SENSORS, Channel
+from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.launcher.programs import programs
 from pebble.process import view_of
 
 _LAUNCHER = "launcher"
+_MEDIA = {
+    "camera_publisher": "video_publisher",
+    "audio_publisher": "audio_publisher",
+    "audio_receiver": "audio_receiver",
+}
+#: What nobody can rename.
+_FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
 class TopicLine(NamedTuple):
@@ -35,8 +42,10 @@ def facts(config: Config) -> list[tuple[str, str]]:
     if config.services.mqtt_bridge.enabled:
         found.append(("uplink", _uplink(config)))
     found += [("serial", line) for line in _serial_lines(config)]
-    found.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in programs(config))])))
-    return found
+    table = programs(config)
+    found.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
+    on_request = ", ".join(program.name for program in table if program.on_demand)
+    return [*found, ("on request", on_request)] if on_request else found
 
 
 def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
@@ -50,7 +59,7 @@ def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
 
 def _lines(config: Config, service: str) -> list[TopicLine]:
     addresses = Addresses(config)
-    mine = [channel for channel in CHANNELS if _is_of(channel, service) or (service == _LAUNCHER and channel is STATUS)]
+    mine = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _FIXED.get(service)]
     if service == "serial_mcu_bridge":
         mine = [channel for channel in mine if _is_of_line(channel, config)]
     return [
@@ -61,8 +70,10 @@ def _lines(config: Config, service: str) -> list[TopicLine]:
 
 
 def _is_of(channel: Channel, service: str) -> bool:
-    """The path that renames a channel begins with the service whose it is; media programs arrive in a later release."""
+    """The path that renames a channel begins with the service whose it is; media programs have the bridge's."""
     path = "" if channel.override is None else channel.override.topic
+    if service in _MEDIA:
+        return path == f"services.mqtt_bridge.media.{_MEDIA[service]}.topic"
     return path.startswith(f"services.{service}.") and ".media." not in path
 
 

@@ -1,0 +1,170 @@
+"""Where pictures and sound are shown: a window where there is a screen, files where there is none."""
+
+from __future__ import annotations
+
+import os
+import time
+import wave
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import typer
+
+from pebble.errors import PebbleError
+from pebble.media.audience import Audience
+from pebble.media.sound import Heard
+
+_PICTURE_EVERY_S = 1.0
+
+
+class Screen(ABC):
+    """Shows an audience's newest picture each time it is asked to. ``open``: does anybody still look?"""
+
+    open = True
+
+    @abstractmethod
+    def show(self, audience: Audience) -> None: ...
+
+    @abstractmethod
+    def summary(self) -> str:
+        """What was shown, or where it is now, in a line."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave nothing open."""
+
+
+@contextmanager
+def best(name: str, folder: Path | None) -> Iterator[Screen]:
+    """A window if there is a screen and no folder was asked for; else files. Raises PebbleError if none can be made."""
+    screen = None if folder is not None else _window(name)
+    if screen is None:
+        screen = Files(folder or Path(f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"))
+    try:
+        yield screen
+    finally:
+        screen.close()
+
+
+def save_picture(picture: np.ndarray[Any, Any], file: Path) -> None:
+    """Write a BGR picture; the name's ending says as what. Raises PebbleError when that is not possible."""
+    try:
+        written = cv2.imwrite(str(file), picture)
+    except cv2.error:
+        raise PebbleError(f"{file}: cannot write this kind of picture, name it .png or .jpg") from None
+    if not written:
+        raise PebbleError(f"{file} cannot be written")
+
+
+class Files(Screen):
+    """A PNG once a second, and all of the sound as one WAV: another one when its format changes."""
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise PebbleError(f"{folder} cannot be made: {error.strerror}") from None
+        self._folder = folder
+        self._pictures = self._waves = 0
+        self._due = 0.0
+        self._seconds = 0.0
+        self._wave: wave.Wave_write | None = None
+        self._format = (0, 0)
+
+    def show(self, audience: Audience) -> None:
+        for heard in audience.take_sounds():
+            self._write(heard)
+        now = time.monotonic()
+        if now < self._due:
+            return
+        self._due = now + _PICTURE_EVERY_S
+        if audience.newest is not None:
+            self._pictures += 1
+            save_picture(audience.newest.picture, self._folder / f"{self._pictures:04}.png")
+        typer.echo(
+            f"video  {audience.summary('video', now) or 'nothing yet'}   "
+            f"audio  {audience.summary('audio', now) or 'nothing yet'}"
+        )
+
+    def summary(self) -> str:
+        return f"{self._folder}: {self._pictures} pictures, {self._seconds:.1f} s of sound"
+
+    def close(self) -> None:
+        if self._wave is not None:
+            self._wave.close()
+            self._wave = None
+
+    def _write(self, heard: Heard) -> None:
+        if self._wave is None or self._format != (heard.rate, heard.channels):
+            self._begin(heard)
+        if self._wave is not None:
+            self._wave.writeframes(heard.pcm)
+            self._seconds += len(heard.samples) / heard.rate
+
+    def _begin(self, heard: Heard) -> None:
+        self.close()
+        self._waves += 1
+        name = "sound.wav" if self._waves == 1 else f"sound-{self._waves}.wav"
+        self._wave = wave.open(str(self._folder / name), "wb")  # noqa: SIM115  (closed by close())
+        self._wave.setnchannels(heard.channels)
+        self._wave.setsampwidth(2)
+        self._wave.setframerate(heard.rate)
+        self._format = (heard.rate, heard.channels)
+
+
+class Window(Screen):
+    """A window by Tk, which comes with Python: OpenCV's wheel for servers has none."""
+
+    def __init__(self, name: str) -> None:
+        import tkinter
+
+        self._tk = tkinter
+        self._root = tkinter.Tk()  # raises TclError without a screen
+        self._root.title(f"{name} - Pebble")
+        self._root.protocol("WM_DELETE_WINDOW", self._leave)
+        self._label = tkinter.Label(self._root)
+        self._label.pack()
+        self._line = tkinter.Label(self._root, anchor="w")
+        self._line.pack(fill="x")
+        self._image: Any = None  # Tk shows it only as long as somebody holds it
+        self._shown: object = None
+        self._count = 0
+
+    def show(self, audience: Audience) -> None:
+        newest, now = audience.newest, time.monotonic()
+        audience.take_sounds()
+        if newest is not None and newest is not self._shown:
+            self._shown = newest
+            self._count += 1
+            ok, data = cv2.imencode(".ppm", newest.picture)
+            if ok:
+                self._image = self._tk.PhotoImage(data=data.tobytes(), format="PPM")
+                self._label.configure(image=self._image)
+        self._line.configure(text=audience.summary("video", now) or "no picture yet")
+        with suppress(self._tk.TclError):  # closed a moment ago
+            self._root.update()
+
+    def summary(self) -> str:
+        return f"{self._count} pictures shown"
+
+    def close(self) -> None:
+        with suppress(self._tk.TclError):
+            self._root.destroy()
+
+    def _leave(self) -> None:
+        self.open = False
+
+
+def _window(name: str) -> Screen | None:
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return None
+    try:
+        return Window(name)
+    except Exception as error:  # noqa: BLE001  (no Tk in this Python, or no screen after all: files will do)
+        typer.echo(f"no window: {error}", err=True)
+        return None
