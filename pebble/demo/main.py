@@ -15,13 +15,17 @@ from rich.console import Console
 
 from pebble.demo.broker import BrokerKind, best_kind
 from pebble.demo.judge import Verdict, judge
+from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
+from pebble.demo.media import VIDEO, MediaShow
+from pebble.demo.media_judge import MediaVerdict
 from pebble.demo.operator import Operator
 from pebble.demo.script import ROUND_S, SCRIPT, Done
 from pebble.demo.stage import ROBOTS, Stage
-from pebble.demo.view import View, show_results
+from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
 
 _DISCOVERY_S = 30.0  # until both robots can be driven, on the smallest machine
+_MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _LOOK_S = 0.1
 _SETTLED_S = 0.3  # an MCU reports ten times a second: how a step ended is known a little later
 _REMEMBERED = 200  # verdicts
@@ -39,11 +43,15 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         raise PebbleError(f"one round of driving takes {ROUND_S:.0f} s: give it at least that many seconds")
     kind = broker or best_kind()
     with _ending_on_signals() as ending, Stage(ending) as stage:
-        verdicts, problems = _play(stage, kind, seconds, ending, console)
+        verdicts, media, problems = _play(stage, kind, seconds, ending, console)
         if seconds is not None:
             problems += _not_driven(verdicts)
+        if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
+            problems += _not_seen(media)
         problems += [f"{verdict.robot}, {verdict.step}: {wrong}" for verdict in verdicts for wrong in verdict.wrong]
+        problems += [f"{verdict.robot}: {wrong}" for verdict in media for wrong in verdict.wrong]
         stage.keep = bool(problems)
+        show_media_results(console, ROBOTS, media)
         show_results(console, ROBOTS, verdicts, problems)
         if problems:
             console.print(f"Logs, configs and traces: {stage.folder}", soft_wrap=True)
@@ -52,22 +60,25 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
 
 def _play(
     stage: Stage, kind: BrokerKind, seconds: float | None, ending: threading.Event, console: Console
-) -> tuple[list[Verdict], list[str]]:
-    """Set up, drive and watch. Returns what the steps came to, and what went wrong besides."""
+) -> tuple[list[Verdict], list[MediaVerdict], list[str]]:
+    """Set up, drive and watch. Returns what the steps and the media came to, and what went wrong besides."""
     console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
     stage.start_brokers(kind)
-    console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU.")
+    console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU, camera and microphone.")
     stage.start_robots()
     operator = Operator(stage.remote_port)
     operator.connect()
+    show = MediaShow(stage.remote_port)
     try:
-        with View(console, operator, stage.robots, ending) as view:
+        with View(console, operator, show, stage.robots, ending) as view:
             if not _discovered(operator, view, ending):
-                return [], [] if ending.is_set() else [*_unseen(operator), *stage.fallen()]
+                return [], [], [] if ending.is_set() else [*_unseen(operator), *stage.fallen()]
             operator.begin()
+            show.begin(list(operator.discovery.sightings.values()))
             verdicts = _watch(stage, operator, view, math.inf if seconds is None else seconds, ending)
-        return verdicts, stage.fallen()
+        return verdicts, list(show.verdicts), stage.fallen()
     finally:
+        show.end()
         operator.end()
 
 
@@ -112,6 +123,16 @@ def _judge(stage: Stage, done: Done) -> Verdict:
 def _not_driven(verdicts: list[Verdict]) -> list[str]:
     driven = {(verdict.robot, verdict.step) for verdict in verdicts}
     return [f"{name}, {step.name}: not done" for name in ROBOTS for step in SCRIPT if (name, step.name) not in driven]
+
+
+def _not_seen(media: list[MediaVerdict]) -> list[str]:
+    judged = {(verdict.robot, verdict.encoding) for verdict in media}
+    return [
+        f"{name}: no {encoding} was looked at"
+        for name in ROBOTS
+        for encoding in VIDEO
+        if (name, encoding) not in judged
+    ]
 
 
 @contextmanager

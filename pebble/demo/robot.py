@@ -16,6 +16,7 @@ from pebble.demo.programs import Program
 from pebble.simulation.mcu import Look
 from pebble.simulation.trace import Entry
 
+CAMERA_FPS = 15
 _MCU_START_S = 10.0
 _LOOKS = 600  # a minute of reports
 _LINES = 5_000  # minutes of commands
@@ -73,4 +74,9 @@ class SimulatedRobot:
         services = config["services"]
         services["mqtt_bridge"]["remote_mqtt"] = {"host": "127.0.0.1", "port": remote_port}
         services["serial_mcu_bridge"]["serial"]["port"] = str(self._port)
+        services["av_daemon"] = {
+            "enabled": True,
+            "video": {"backend": "synthetic", "width": 640, "height": 480, "fps": CAMERA_FPS},
+            "audio": {"source": "synthetic"},
+        }
         return config

@@ -17,6 +17,8 @@ from rich.text import Text
 
 from pebble.demo.discovery import Sighting
 from pebble.demo.judge import Verdict
+from pebble.demo.media import AUDIO, VIDEO, MediaShow
+from pebble.demo.media_judge import MediaVerdict
 from pebble.demo.operator import Operator
 from pebble.demo.robot import SimulatedRobot
 
@@ -44,9 +46,15 @@ class View:
     """
 
     def __init__(
-        self, console: Console, operator: Operator, robots: Sequence[SimulatedRobot], ending: threading.Event
+        self,
+        console: Console,
+        operator: Operator,
+        show: MediaShow,
+        robots: Sequence[SimulatedRobot],
+        ending: threading.Event,
     ) -> None:
-        self._console, self._operator, self._robots, self._ending = console, operator, robots, ending
+        self._console, self._operator, self._show = console, operator, show
+        self._robots, self._ending = robots, ending
         self._began = time.monotonic()
         self._rates: dict[str, Rate] = {robot.name: Rate() for robot in robots}
         self._said_at = -math.inf
@@ -88,6 +96,9 @@ class View:
         row["last command"] = self._command(sighting, now)
         row |= _truth(robot)
         row["battery"] = _battery(sighting)
+        watched = self._show.watched.get(robot.name)
+        row["video"] = "" if watched is None else watched.summary("video", now)
+        row["audio"] = "" if watched is None else watched.summary("audio", now)
         row["messages"] = f"{self._rates[robot.name].of(sighting.messages, now):3.0f}/s"
         return row
 
@@ -115,6 +126,27 @@ def show_results(console: Console, robots: Sequence[str], verdicts: Sequence[Ver
         console.print(problem, style="red", highlight=False, markup=False, soft_wrap=True)
     if verdicts and not problems:
         console.print("Every robot moved and stopped as commanded.", style="green")
+
+
+def show_media_results(console: Console, robots: Sequence[str], verdicts: Sequence[MediaVerdict]) -> None:
+    """One row per encoding, one column per robot, of several looks the worst."""
+    table = Table(title="Seen and heard by the operator", title_justify="left")
+    table.add_column("encoding")
+    for name in robots:
+        table.add_column(name)
+    for encoding in (*VIDEO, *AUDIO):
+        cells = [[one for one in verdicts if one.robot == name and one.encoding == encoding] for name in robots]
+        if any(cells):
+            table.add_row(encoding, *(_media_cell(cell) for cell in cells))
+    if verdicts:
+        console.print(table)
+
+
+def _media_cell(verdicts: Sequence[MediaVerdict]) -> str:
+    if not verdicts:
+        return "not done"
+    worst = max(verdicts, key=lambda verdict: len(verdict.wrong))
+    return f"{'FAILED' if worst.wrong else 'ok'}  {worst.measured}"
 
 
 def _cell(step: str, name: str, verdicts: Sequence[Verdict]) -> str:
