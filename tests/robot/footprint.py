@@ -22,9 +22,16 @@ from tests.support import until
 LAUNCHES, IDLE_S, COMMANDS, RATE_HZ = 5, 10.0, 500, 20.0
 
 
+DEVICES = {
+    "enabled": True,
+    "video": {"backend": "synthetic", "width": 640, "height": 480, "fps": 15},
+    "audio": {"source": "synthetic"},
+}
+
+
 def main() -> int:
     table = Table("figure", "mqtt", "zenoh", title=f"{os.cpu_count()} cores, Python {sys.version.split()[0]}")
-    columns = [measure(kind) for kind in ("mqtt", "zenoh")]
+    columns = [measure(kind) | measure_media(kind) for kind in ("mqtt", "zenoh")]
     for name in dict.fromkeys(name for column in columns for name in column):
         table.add_row(name, *(column.get(name, "–") for column in columns))
     Console(width=100).print(table)
@@ -52,6 +59,28 @@ def measure(kind: str) -> dict[str, str]:
         f"drive command, operator to pty, n={len(latencies)}: p50 / p99 / max, ms": _spread(latencies),
         "  the same messages, operator to a stock client of that broker, ms": _spread(floor),
         "  ratio of the medians": f"{statistics.median(latencies) / statistics.median(floor):.1f}",
+    }
+
+
+def measure_media(kind: str) -> dict[str, str]:
+    """The same robot with pictures (640x480, 15 per second, json) and sound (PCM) going to an operator."""
+    with Rig(kind, direct=True, av_daemon=DEVICES) as rig:
+        for flag, ask in (("mqtt-video", "front-camera"), ("mqtt-audio", "audio")):
+            rig.operator.send(f"incoming/flags/{flag}", True, retain=True)
+            rig.operator.send(f"incoming/{ask}", True)
+        until(lambda: len(rig.operator.on("outgoing/front-camera")) > 45, 20)
+        processes = {"launcher": rig.launcher_pid, **rig.processes()}
+        began = time.monotonic()
+        cpu = _cpu_percent(list(processes.values()))
+        fps = len(rig.operator.on("outgoing/front-camera", began)) / (time.monotonic() - began)
+        pss = {name: _pss_mb(pid) for name, pid in processes.items()}
+    return {
+        "with pictures and sound: processes": str(len(processes)),
+        "  PSS, sum, MB": f"{sum(pss.values()):.1f}",
+        **{f"    {name}, MB": f"{pss[name]:.1f}" for name in processes},
+        "  CPU, % of one core": f"{cpu:.1f}",
+        "  frames delivered per second": f"{fps:.2f}",
+        "  CPU per delivered frame, ms": f"{10 * cpu / fps:.1f}" if fps else "–",
     }
 
 

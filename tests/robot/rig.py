@@ -19,7 +19,10 @@ from tests.support import ROOT, Broker, until
 
 BASE = "pebble/robots/rover"
 STOP = (0.0, 0.0)
-PROGRAMS = ("zenoh_hub", "announcer", "serial_mcu_bridge", "mqtt_bridge", "mqtt_mirror")
+PROGRAMS = (
+    *("zenoh_hub", "announcer", "serial_mcu_bridge", "av_daemon", "mqtt_bridge", "mqtt_mirror"),
+    *("camera_publisher", "audio_publisher", "audio_receiver"),
+)
 
 
 class Mcu:

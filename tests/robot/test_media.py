@@ -1,0 +1,181 @@
+"""Sight and sound of a whole robot, as an operator has them: asked for by the original's messages, over MQTT only."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from pebble.media.decode import Decoded, VideoDecoder
+from pebble.media.scene import read_counter
+from pebble.media.sound import SoundDecoder
+from pebble.media.video import VIDEO_ENCODINGS
+from tests.robot.operator import Operator, Seen
+from tests.robot.rig import BASE, Rig
+from tests.support import until
+
+CAMERA, AUDIO = "outgoing/front-camera", "outgoing/audio"
+VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
+ASK_VIDEO, ASK_AUDIO = "incoming/front-camera", "incoming/audio"
+DEVICES = {
+    "enabled": True,
+    "video": {"backend": "synthetic", "width": 320, "height": 240, "fps": 15},
+    "audio": {"source": "synthetic"},
+}
+
+
+def make_rig(kind: str, **more: Any) -> Rig:
+    return Rig(kind, av_daemon=DEVICES, **more)
+
+
+@pytest.fixture(scope="module", params=["mqtt", "zenoh", "single"])
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    with make_rig(request.param) as rig:
+        yield rig
+
+
+@pytest.fixture(autouse=True)
+def _quiet(rig: Rig) -> Iterator[None]:
+    """Every test ends with nothing wanted, nothing running and nothing coming."""
+    yield
+    for ask, flag in ((ASK_VIDEO, VIDEO_FLAG), (ASK_AUDIO, AUDIO_FLAG)):
+        rig.operator.send(ask, {"enabled": False})
+        rig.operator.send(flag, {"value": False}, retain=True)
+    assert until(lambda: not media_programs(rig), 15)
+
+
+def media_programs(rig: Rig) -> set[str]:
+    return {"camera_publisher", "audio_publisher", "audio_receiver"} & set(rig.processes())
+
+
+def shown(seen: list[Seen]) -> list[Decoded]:
+    """The pictures that may be shown."""
+    decoder = VideoDecoder()
+    return [picture for one in seen if (picture := decoder.feed(one.payload)) is not None]
+
+
+def counters(seen: list[Seen]) -> list[int]:
+    """What the frame counter said in every one of them."""
+    return [counter for one in shown(seen) if (counter := read_counter(one.picture)) is not None]
+
+
+def pictures_come(rig: Rig, since: float, timeout: float = 15.0) -> bool:
+    return until(lambda: len(counters(rig.operator.on(CAMERA, since))) > 3, timeout, step=0.1)
+
+
+def want_video(rig: Rig, **more: Any) -> float:
+    began = time.monotonic()
+    rig.operator.send(VIDEO_FLAG, {"value": True}, retain=True)
+    rig.operator.send(ASK_VIDEO, {"enabled": True, **more})
+    return began
+
+
+def test_nothing_runs_and_nothing_comes_until_flag_and_request_agree(rig: Rig) -> None:
+    began = time.monotonic()
+    rig.operator.send(ASK_VIDEO, True)
+    assert not until(lambda: rig.operator.on(CAMERA, began), 1.0)
+    assert not media_programs(rig)
+    rig.operator.send(VIDEO_FLAG, True, retain=True)
+    assert pictures_come(rig, began)
+    rig.operator.send(VIDEO_FLAG, False, retain=True)
+    assert until(lambda: not media_programs(rig), 10)
+    again = time.monotonic()
+    rig.operator.send(VIDEO_FLAG, {"enabled": True}, retain=True)
+    assert pictures_come(rig, again), "what was asked for before starts when the flag goes up"
+
+
+@pytest.mark.parametrize("encoding", ["json", "pbvd", "pbvz", "h264", "nonsense"])
+def test_pictures_in_every_encoding_advance_with_the_camera(rig: Rig, encoding: str) -> None:
+    began = want_video(rig, encoding=encoding)
+    assert until(lambda: len(rig.operator.on(CAMERA, began)) > 10, 15)
+    seen = rig.operator.on(CAMERA, began)
+    assert {one.encoding for one in shown(seen)} == {encoding if encoding in VIDEO_ENCODINGS else "json"}
+    assert len(counters(seen)) > 8
+    assert counters(seen) == sorted(set(counters(seen)))
+
+
+@pytest.mark.parametrize("encoding", ["pcm", "opus"])
+def test_sound_in_every_encoding(rig: Rig, encoding: str) -> None:
+    began = time.monotonic()
+    rig.operator.send(AUDIO_FLAG, {"value": True}, retain=True)
+    rig.operator.send(ASK_AUDIO, {"enabled": True, "encoding": encoding})
+    assert until(lambda: len(rig.operator.on(AUDIO, began)) > 20, 15)
+    assert media_programs(rig) == {"audio_publisher", "audio_receiver"}
+    decoder = SoundDecoder()
+    heard = [decoder.feed(one.payload) for one in rig.operator.on(AUDIO, began)]
+    assert all(one is not None for one in heard)
+    assert {one.encoding for one in heard[-5:] if one is not None} == {encoding}
+
+
+@pytest.mark.parametrize("program", ["camera_publisher", "av_daemon"])
+def test_a_killed_media_process_is_back_while_it_is_wanted(rig: Rig, program: str) -> None:
+    began = want_video(rig)
+    assert pictures_come(rig, began)
+    killed = rig.kill(program)
+    assert until(lambda: program in rig.processes(), 10)
+    assert pictures_come(rig, killed + 1.0)
+
+
+def test_a_kept_request_starts_nothing(rig: Rig) -> None:
+    rig.operator.send(VIDEO_FLAG, True, retain=True)
+    rig.operator.send(ASK_VIDEO, {"enabled": True}, retain=True)
+    assert until(lambda: rig.operator.on(ASK_VIDEO), 5)
+    rig.kill("mqtt_bridge")  # it finds the request as a kept copy when it is back
+    began = time.monotonic()
+    try:
+        assert not until(lambda: rig.operator.on(CAMERA, began + 1.0), 4.0)
+    finally:
+        rig.operator.send(ASK_VIDEO, b"", retain=True)
+
+
+def test_stopping_media_does_not_delay_driving(rig: Rig) -> None:
+    began = want_video(rig)
+    rig.operator.send(AUDIO_FLAG, True, retain=True)
+    rig.operator.send(ASK_AUDIO, True)
+    assert pictures_come(rig, began)
+    drive_from = time.monotonic()
+    for number in range(40):
+        rig.operator.send("incoming/drive-values", {"x": 0, "z": round(0.1 + number / 100, 3)}, qos=0)
+        if number == 10:
+            rig.operator.send(VIDEO_FLAG, False, retain=True)
+            rig.operator.send(AUDIO_FLAG, False, retain=True)
+        time.sleep(0.05)
+    moves = [at for at, wheels in rig.mcu.drives(drive_from) if wheels != (0.0, 0.0)]
+    assert len(moves) > 35
+    assert max(later - earlier for earlier, later in pairwise(moves)) < 0.5
+
+
+def test_media_do_not_pass_the_robots_own_side() -> None:
+    with make_rig("mqtt") as rig:
+        assert rig.local is not None
+        inside = Operator(rig.local.port, BASE)
+        try:
+            assert pictures_come(rig, want_video(rig))
+            assert until(lambda: {"camera", "camera_publisher"} <= status(inside).keys(), 10)
+            assert until(lambda: status(rig.operator).keys() == status(inside).keys(), 10)
+            assert not inside.on(CAMERA)
+        finally:
+            inside.close()
+
+
+def status(operator: Operator) -> dict[str, Any]:
+    """What media-status says now."""
+    last = operator.last("outgoing/media-status")
+    return {} if last is None else dict(last.json["value"])
+
+
+def test_after_an_uplink_outage_pictures_are_new_ones(rig: Rig) -> None:
+    began = want_video(rig, encoding="pbvz")
+    assert pictures_come(rig, began)
+    rig.uplink.hole()
+    time.sleep(3)
+    rig.uplink.resume()
+    back = time.monotonic()
+    assert pictures_come(rig, back + 1.0)
+    late = rig.operator.on(CAMERA, back + 1.0)
+    decoder, offset = VideoDecoder(), time.time() - time.monotonic()
+    decoded = [(one.at + offset, picture) for one in late if (picture := decoder.feed(one.payload)) is not None]
+    assert max(at - (picture.captured_ms or 0) / 1000 for at, picture in decoded) < 2.0, "an old picture came late"
