@@ -77,13 +77,27 @@ def give_back() -> int:
     """Give back what can be; returns how many bytes. Costs nothing when nothing waits."""
     if not _waiting:
         return 0
+    freed, alive = 0, []
     with _guard:
-        freed, before = 0, time.monotonic() - SETTLED_S
-        while _waiting and _waiting[0][2] < before:
+        now = time.monotonic()
+        while _waiting and _waiting[0][2] < now - SETTLED_S:
             file, life, _ = _waiting.popleft()
-            if file not in _pools and _is_over(life):
+            if file in _pools:
+                continue  # somebody looks into it again
+            if _is_over(life):
                 freed += _give_back(file)
-        return freed
+            else:  # a link that broke, or somebody else looks whether it is over, at this moment
+                alive.append((file, life, now))
+        _waiting.extend(alive)
+    if freed:
+        segments.sweep()
+    return freed
+
+
+def left_mapped() -> int:
+    """How many bytes are mapped of segments that belong to no writer we know to be alive, Zenoh's own included."""
+    known = set(_pools)
+    return sum(end - start for start, end, path in segments.mappings() if Path(path).name not in known)
 
 
 def _is_over(life: Path) -> bool:
@@ -105,7 +119,6 @@ def _give_back(file: str) -> int:
             if _replace(start, end - start):
                 freed += end - start
                 _redirect(path)
-    segments.sweep()
     log.debug("%d bytes of a dead writer's segment %s were given back", freed, file)
     return freed
 

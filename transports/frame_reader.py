@@ -57,6 +57,7 @@ class FrameReader:
         self._writers: dict[int, Pool] = {}  # the living, and what they share
         self._lives: set[int] = set()  # of writers, that were counted
         self._last: tuple[int, int] = (0, 0)  # writer and number of the newest frame that arrived
+        self._former = -1  # the writer before that
         self._give_up_sharing = threading.Event()
         self._changing = threading.Lock()
         self._closed = True
@@ -169,8 +170,12 @@ class FrameReader:
         self.counters.add("copied" if buffer is None else "shared")
         if buffer is None:
             return Frame(info, _own(bytes(payload)), shared=False)
+        pool = pool or self._writers.get(info.writer)  # its first frame may come before its token does
+        if pool is None or dead_pools.is_lost(pool):
+            self.counters.add("torn")  # of a life that is over: nothing has kept its memory from being given back
+            return None
         view = views.look(buffer, len(payload), keep=pool)
-        if self._views and view is not None and pool is not None:
+        if self._views and view is not None:
             return Frame(info, view, shared=True, buffer=buffer)
         own = _own(bytes(buffer)) if view is None else view.copy()
         if buffer.is_valid():
@@ -191,6 +196,10 @@ class FrameReader:
                 return  # bytes that a shared frame has overtaken: counted as missed when that came
             if info.sequence > number + 1:
                 self.counters.add("missed", info.sequence - number - 1)
+        elif info.writer == self._former:
+            return  # the last words of a writer that has a successor
+        else:
+            self._former = writer
         self._last = (info.writer, info.sequence)
         self.counters.add("received")
         if skipped := self._lane.put((info, sample.payload, self._writers.get(info.writer))):
@@ -215,7 +224,9 @@ class FrameReader:
     def _why_not_map(self, pool: Pool) -> str:
         if dead_pools.is_lost(pool):
             return f"the writer of {self._stream} was taken for dead: its frames come as bytes until one of us restarts"
-        left = segments.mapped()
+        if pool.file and any(file.endswith(pool.file) for _, _, file in segments.mappings()):
+            return ""  # as before: only the link was broken
+        left = dead_pools.left_mapped()
         if left > LEFT_MAPPED_LIMIT:
             return (
                 f"writers of {self._stream} were restarted so often that {left >> 20} MiB of their memory are lost "

@@ -80,7 +80,7 @@ class FrameWriter:
         self._sequence = 0
         session = self._session = self._open_session()
         self._pid = os.getpid()
-        self._lock = Lock.take(self._names.life(self._life))
+        self._lock = Lock.wait(self._names.life(self._life))  # another writer may be looking at it, sweeping
         close_at_exit(self)
         self._pool = self._make_pool()
         if self.problem:

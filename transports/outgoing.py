@@ -27,7 +27,7 @@ class Outgoing:
 def unconfirmed(sock: socket.socket) -> int:
     """Bytes the kernel has taken and the other side's TCP has not confirmed: sent or not (SIOCOUTQ)."""
     size = bytearray(4)
-    with suppress(OSError):  # closed, or no TCP
+    with suppress(OSError, ValueError):  # closed, or no TCP
         fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, size)
     return int.from_bytes(size, sys.byteorder)
 
@@ -37,7 +37,7 @@ def shortest_round_trip_s(sock: socket.socket) -> float:
     if _TCP_INFO is None:
         return 0.0
     info = b""
-    with suppress(OSError):
+    with suppress(OSError, ValueError):
         info = sock.getsockopt(socket.IPPROTO_TCP, _TCP_INFO, _MIN_RTT_AT + _MIN_RTT.size)
     if len(info) < _MIN_RTT_AT + _MIN_RTT.size:
         return 0.0

@@ -23,9 +23,9 @@ from pebble.bench.control_operator import Operator
 from pebble.bench.control_robot import BASE, Robot
 from pebble.bench.figures import LONGEST_S, percentile, ratio, rounded
 from pebble.bench.frames_process import Worker, end_workers
-from pebble.bench.signals import interrupted_by_signals
 from pebble.bench.usage import cpu_s
 from pebble.errors import PebbleError
+from pebble.signals import interrupted_by_signals
 
 KINDS = ("mqtt", "zenoh")
 UNLOADED, LOADED = "none", "media"

@@ -19,11 +19,11 @@ from pebble.bench.figures import LONGEST_S
 from pebble.bench.frames_process import Worker, end_workers
 from pebble.bench.frames_report import Round, as_json, legend, ratios, row_of, tables
 from pebble.bench.frames_variants import VARIANTS, Case, missing, parse_size
-from pebble.bench.signals import interrupted_by_signals
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.programs import end_all
 from pebble.errors import PebbleError
+from pebble.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
 SIZES = ("640x480", "1920x1080")

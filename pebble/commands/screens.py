@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
 import time
 import wave
 from abc import ABC, abstractmethod
@@ -26,6 +28,7 @@ class Screen(ABC):
     """Shows an audience's newest picture each time it is asked to. ``open``: does anybody still look?"""
 
     open = True
+    can_hear = True  # is there any use in asking for sound?
 
     @abstractmethod
     def show(self, audience: Audience) -> None: ...
@@ -131,13 +134,16 @@ class Window(Screen):
         self._label.pack()
         self._line = tkinter.Label(self._root, anchor="w")
         self._line.pack(fill="x")
+        self._loudspeaker = Loudspeaker()
+        self.can_hear = self._loudspeaker.installed
         self._image: Any = None  # Tk shows it only as long as somebody holds it
         self._shown: object = None
         self._count = 0
 
     def show(self, audience: Audience) -> None:
         newest, now = audience.newest, time.monotonic()
-        audience.take_sounds()
+        for heard in audience.take_sounds():
+            self._loudspeaker.play(heard)
         if newest is not None and newest is not self._shown:
             self._shown = newest
             self._count += 1
@@ -153,11 +159,48 @@ class Window(Screen):
         return f"{self._count} pictures shown"
 
     def close(self) -> None:
+        self._loudspeaker.close()
         with suppress(self._tk.TclError):
             self._root.destroy()
 
     def _leave(self) -> None:
         self.open = False
+
+
+class Loudspeaker:
+    """Plays through aplay as it comes; what it does not take at once is dropped, so that nothing lags behind."""
+
+    def __init__(self) -> None:
+        self._program = shutil.which("aplay")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._format = (0, 0)
+
+    @property
+    def installed(self) -> bool:
+        return self._program is not None
+
+    def play(self, heard: Heard) -> None:
+        if self._process is None or self._format != (heard.rate, heard.channels):
+            self._begin(heard.rate, heard.channels)
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):  # full, or aplay has ended
+                os.write(self._process.stdin.fileno(), heard.pcm)
+
+    def close(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.communicate()
+
+    def _begin(self, rate: int, channels: int) -> None:
+        self.close()
+        if self._program is None:
+            return
+        self._format = (rate, channels)
+        command = [self._program, "-q", "-t", "raw", "-f", "S16_LE", "-c", str(channels), "-r", str(rate), "-"]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        if self._process.stdin is not None:
+            os.set_blocking(self._process.stdin.fileno(), False)
 
 
 def _window(name: str) -> Screen | None:

@@ -12,6 +12,7 @@ import typer
 
 from pebble.commands.connection import PASSWORD, Target, connected
 from pebble.errors import PebbleError
+from pebble.signals import interrupted_by_signals
 
 if TYPE_CHECKING:
     from pebble.media.audience import Audience
@@ -51,7 +52,8 @@ def watch(
 ) -> int:
     """See a robot's camera and hear its microphone, until Ctrl-C.
 
-    Opens a window; without a screen a picture a second (PNG) and the sound (WAV) go into a folder.
+    Opens a window, and plays the sound through aplay; without a screen a picture a second (PNG) and the sound (WAV) go
+    into a folder.
 
     \b
         pebble watch goob.json
@@ -61,9 +63,10 @@ def watch(
 
     end = float("inf") if seconds is None else time.monotonic() + seconds
     with ExitStack() as stack:
+        stack.enter_context(interrupted_by_signals())  # else the camera would go on with nobody watching
         audience = stack.enter_context(_audience(robot, url, password_file, ca_cert))
         screen = stack.enter_context(screens.best(audience.name, out))
-        audience.begin(encoding, sound=sound)
+        audience.begin(encoding, sound=sound and screen.can_hear)
         while time.monotonic() < end and screen.open:
             audience.keep_going()
             screen.show(audience)
@@ -89,7 +92,7 @@ def snapshot(
     """
     from pebble.commands.screens import save_picture
 
-    with _audience(robot, url, password_file, ca_cert) as audience:
+    with interrupted_by_signals(), _audience(robot, url, password_file, ca_cert) as audience:
         audience.begin(encoding, sound=False)
         end = time.monotonic() + _FIRST_PICTURE_S
         while audience.newest is None:

@@ -46,12 +46,14 @@ class OnDemand:
         if said is None or keeper is None or not speaker.asks:
             self._complain(speaker, line)
             return
-        self._encodings[said[1]] = said[3] or ""
+        encoding = said[3] or ""
+        changed = encoding != self._encodings.get(said[1], "")
+        self._encodings[said[1]] = encoding
         self._until.pop(said[1], None)
+        if said[2] == "0" or (changed and keeper.wanted and keeper.life.state != "ready"):
+            keeper.unwant()  # one that still starts would not hear that it is to begin with something else
         if said[2] == "1":
             keeper.want()
-        else:
-            keeper.unwant()
 
     def ended(self, speaker: Program) -> None:
         """Nobody watches over what ``speaker`` wanted: it may go on for a while, but not for ever."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 
-from pebble.media.decode import Decoded, VideoDecoder
+from pebble.media.decode import Decoded, VideoDecoder, encoding_of
 from pebble.media.figures import Figures
 from pebble.media.sound import Heard, SoundDecoder
 from pebble.media.viewer import Medium, Viewer
@@ -43,7 +43,7 @@ class Audience:
         """To be called a few times a second: asks for what is missing."""
         self.viewer.keep_asking()
         if self._video.wants_keyframe:
-            self.viewer.want_keyframe()
+            self.viewer.want_keyframe(self.encoding.get("video"))
 
     def take_sounds(self) -> list[Heard]:
         """What was heard since the last time, in the order it came."""
@@ -76,8 +76,10 @@ class Audience:
         seen = self._video.feed(payload)
         age_s = None if seen is None or seen.captured_ms is None else time.time() - seen.captured_ms / 1000
         self.pictures.add(time.monotonic(), len(payload), age_s)
+        encoding = encoding_of(payload) if seen is None else seen.encoding
+        if encoding is not None:
+            self.encoding["video"] = encoding
         if seen is not None:
-            self.encoding["video"] = seen.encoding
             self.newest = seen
             self.on_picture(seen)
 

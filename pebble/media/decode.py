@@ -137,6 +137,17 @@ class VideoDecoder:
         return self._h264.decode(arrival.body, keyframe=arrival.keyframe)
 
 
+def encoding_of(payload: bytes) -> str | None:
+    """What a payload seems to be, whether it may be shown or not; None: nothing we know."""
+    if payload.startswith(b"{"):
+        return "json"
+    try:
+        kind = Picture.unpack(payload).kind
+    except PayloadError:
+        return None
+    return "h264" if kind == PictureKind.H264 else _KINDS[PictureKind(kind)][0] if kind in _KINDS else None
+
+
 def _after(last: _Arrival) -> int | None:
     if last.frame is None:
         return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import zlib
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -57,7 +56,7 @@ class JsonPicture:
 
 
 def _milliseconds(stamp: float | None) -> int | None:
-    if stamp is None or not math.isfinite(stamp):
+    if stamp is None or not 0 < stamp < _LATEST_MS:  # nor NaN: then neither is true
         return None
     return plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
 

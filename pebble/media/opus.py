@@ -83,6 +83,13 @@ def milliseconds(packet: bytes) -> float:
     return frame_ms * count
 
 
+def _codec(av: Any, mode: str) -> Any:
+    try:
+        return av.CodecContext.create("libopus", mode)
+    except ValueError as error:  # PyAV's UnknownCodecError is one
+        raise PebbleError(f"this PyAV has no libopus: {error}") from None
+
+
 class OpusEncoder:
     """Frames of ``frame_ms`` (one of FRAMES_MS) at one of RATES, mono or stereo, to one Opus packet each."""
 
@@ -90,7 +97,7 @@ class OpusEncoder:
         self._av = _av()
         self.samples = rate * frame_ms // 1000
         self._rate, self._layout = rate, _layout(channels)
-        codec = self._av.CodecContext.create("libopus", "w")
+        codec = _codec(self._av, "w")
         codec.sample_rate, codec.layout, codec.format, codec.bit_rate = rate, self._layout, "s16", bitrate
         codec.options = {
             "application": "voip",
@@ -114,7 +121,7 @@ class OpusDecoder:
 
     def __init__(self, rate: int, channels: int) -> None:
         self._av = _av()
-        self._codec = self._av.CodecContext.create("libopus", "r")
+        self._codec = _codec(self._av, "r")
         self._codec.sample_rate, self._codec.layout = _DECODED_RATE, _layout(channels)
         self._channels = channels
         self._resampler = Resampler(_DECODED_RATE, rate, channels)

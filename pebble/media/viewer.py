@@ -20,6 +20,7 @@ Medium = Literal["video", "audio"]
 _CONTROLS: dict[Medium, Channel] = {"video": VIDEO_CONTROL, "audio": AUDIO_CONTROL}
 _FLAGS: dict[Medium, Channel] = {"video": MQTT_VIDEO, "audio": MQTT_AUDIO}
 _REPEAT_S = 2.0  # a request that nothing followed is said again
+_JOIN_S = 0.4  # what flows already shows within this time
 _KEYFRAME_S = 1.0
 
 
@@ -27,7 +28,7 @@ class Viewer:
     """One robot's media as they come, over ``transport``, which stays the caller's and must be open.
 
     ``hear(medium, payload)`` gets each payload, on a thread of the transport. What :meth:`ask` lifted or started is put
-    back by :meth:`end`.
+    back by :meth:`end`; what others had going before is left to them. A flag that somebody lowers stays down.
     """
 
     def __init__(self, transport: Transport, base: str, hear: Callable[[Medium, bytes], None]) -> None:
@@ -37,6 +38,7 @@ class Viewer:
         self._known = threading.Event()
         self._flags: dict[str, bool] = {}  # by topic: what is kept there
         self._lifted: set[Medium] = set()
+        self._requested: set[Medium] = set()
         self._asked: dict[Medium, str | None] = {}
         self._asked_at: dict[Medium, float] = {}
         self._heard_at: dict[Medium, float] = {}
@@ -59,6 +61,12 @@ class Viewer:
         if medium not in self._asked:
             self._listen(medium)
         self._asked[medium] = encoding
+        if encoding is None and self._flows(medium):
+            self._asked_at[medium] = time.monotonic()  # somebody watches already: change nothing
+            return
+        if not self._flags.get(self._topic(medium, "flag_topic", _FLAGS[medium]), False):
+            self._lifted.add(medium)
+            self._raise_flag(medium, up=True)
         self._request(medium)
 
     def keep_asking(self) -> None:
@@ -69,16 +77,16 @@ class Viewer:
             if now - quiet_since > _REPEAT_S:
                 self._request(medium)
 
-    def want_keyframe(self) -> None:
-        """Ask for a full picture, at most once a second."""
+    def want_keyframe(self, encoding: str | None) -> None:
+        """Ask for a full picture in what is sent now, at most once a second."""
         now = time.monotonic()
         if "video" in self._asked and now - self._keyframe_at >= _KEYFRAME_S:
             self._keyframe_at = now
-            self._send("video", MediaRequest(enabled=True, encoding=self._asked["video"], keyframe=True))
+            self._send("video", MediaRequest(enabled=True, encoding=encoding, keyframe=True))
 
     def end(self) -> None:
         """Withdraw what was asked for, and lower the flags that were down before."""
-        for medium in self._asked:
+        for medium in self._requested:
             self._send(medium, MediaRequest(enabled=False))
         for medium in self._lifted:
             self._raise_flag(medium, up=False)
@@ -89,10 +97,14 @@ class Viewer:
 
     def _request(self, medium: Medium) -> None:
         self._asked_at[medium] = time.monotonic()
-        if not self._flags.get(self._topic(medium, "flag_topic", _FLAGS[medium]), False):
-            self._lifted.add(medium)
-            self._raise_flag(medium, up=True)
+        self._requested.add(medium)
         self._send(medium, MediaRequest(enabled=True, encoding=self._asked[medium]))
+
+    def _flows(self, medium: Medium) -> bool:
+        end = time.monotonic() + _JOIN_S
+        while medium not in self._heard_at and time.monotonic() < end:
+            time.sleep(_JOIN_S / 20)
+        return medium in self._heard_at
 
     def _raise_flag(self, medium: Medium, *, up: bool) -> None:
         topic = self._topic(medium, "flag_topic", _FLAGS[medium])
@@ -125,6 +137,8 @@ class Viewer:
                 self._flags[flag] = bool(message.payload) and bool(codec.decode(_FLAGS[medium], message.payload))
             except PayloadError:  # nonsense lifts nothing
                 self._flags[flag] = False
+            if not self._flags[flag]:
+                self._lifted.discard(medium)  # somebody else has lowered it: that is theirs to undo
 
         def take(message: Message) -> None:
             self._heard_at[medium] = time.monotonic()

@@ -33,6 +33,7 @@ class V4l2Camera:
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", f"{SILENCE_S:.0f}")  # seconds; else 10
         self._cv2: Any = opencv()
         self._device = video.device
+        self._name = _without_secrets(self._device)
         self._capture = self._open(video)
         try:
             self._format = self._agree(video)
@@ -61,7 +62,7 @@ class V4l2Camera:
         name = int(device) if device.isdecimal() else device
         capture = cv2.VideoCapture(name, cv2.CAP_V4L2 if is_device else cv2.CAP_ANY)
         if not capture.isOpened():
-            raise LinkError(f"cannot open {device}: not there, in use, or no camera")
+            raise LinkError(f"cannot open {self._name}: not there, in use, or no camera")
         if video.capture_format != "auto":
             asked = _ASKED.get(video.capture_format, video.capture_format.upper())
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*f"{asked:4.4}"))
@@ -71,7 +72,7 @@ class V4l2Camera:
         for control, value in video.camera_controls.items():
             prop = getattr(cv2, f"CAP_PROP_{control.upper()}", None)
             if prop is None or not isinstance(value, int | float) or not capture.set(prop, float(value)):
-                log.warning("%s does not take camera_controls.%s = %s", device, control, value)
+                log.warning("%s does not take camera_controls.%s = %s", self._name, control, value)
         return capture
 
     def _agree(self, video: CameraCapture) -> str:
@@ -89,7 +90,7 @@ class V4l2Camera:
         first = self._retrieve()
         if self._format == "bgr24":
             if first.ndim != 3 or first.shape[2] != 3:
-                raise LinkError(f"{self._device} sends pictures of shape {first.shape}, not BGR")
+                raise LinkError(f"{self._name} sends pictures of shape {first.shape}, not BGR")
             height, width = first.shape[:2]
             return FrameInfo(format="bgr24", width=width, height=height, stride=3 * width)
         width, height = (
@@ -99,18 +100,27 @@ class V4l2Camera:
 
     def _wait(self) -> None:
         if not self._capture.grab():
-            raise LinkError(f"{self._device} gives no picture: unplugged, hung, or at its end")
+            raise LinkError(f"{self._name} gives no picture: unplugged, hung, or at its end")
 
     def _retrieve(self, into: Bytes | None = None) -> NDArray[np.uint8]:
         good, picture = self._capture.retrieve(into)
         if not good or picture is None:
-            raise LinkError(f"{self._device} gave a picture that cannot be read")
+            raise LinkError(f"{self._name} gave a picture that cannot be read")
         return np.asarray(picture)
 
     def _draw(self, target: Bytes) -> None:
         wanted = target.reshape(self._info.height, self._info.width, 3)
         got = self._retrieve(wanted)
         if got.shape != wanted.shape:
-            raise LinkError(f"{self._device} changed the size of its pictures")
+            raise LinkError(f"{self._name} changed the size of its pictures")
         if not np.shares_memory(got, wanted):  # not every part of OpenCV writes where it is told to
             np.copyto(wanted, got)
+
+
+def _without_secrets(device: str) -> str:
+    """A network camera's URL may hold a password; what is said of a camera is logged and published."""
+    scheme, separator, rest = device.partition("://")
+    if not separator:
+        return device
+    place = rest.partition("?")[0]
+    return f"{scheme}://{place.rpartition('@')[2]}"

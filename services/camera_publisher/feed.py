@@ -19,11 +19,16 @@ _RETRY_S = 2.0
 
 
 class Feed:
-    """Reads while ``wanted``. ``arrived()`` is called on the feed's thread for every frame and must only hand over."""
+    """Reads while ``wanted``. ``arrived()`` is called on the feed's thread for every frame and must only hand over.
 
-    def __init__(self, make_reader: Callable[[], FrameReader], arrived: Callable[[], None]) -> None:
+    ``ended()`` is called there if the thread ends before it was told to.
+    """
+
+    def __init__(
+        self, make_reader: Callable[[], FrameReader], arrived: Callable[[], None], ended: Callable[[], None]
+    ) -> None:
         self.problem = ""  # why there is no reader; empty while there is one
-        self._make_reader, self._arrived = make_reader, arrived
+        self._make_reader, self._arrived, self._ended = make_reader, arrived, ended
         self._wanted, self._stopping = threading.Event(), threading.Event()
         self._lock = threading.Lock()
         self._newest: Frame | None = None
@@ -64,6 +69,13 @@ class Feed:
             old.release()
 
     def _run(self) -> None:
+        try:
+            self._read_while_wanted()
+        finally:
+            if not self._stopping.is_set():
+                self._ended()
+
+    def _read_while_wanted(self) -> None:
         while not self._stopping.is_set():
             if not self._wanted.wait(60.0) or self._stopping.is_set():
                 continue

@@ -6,7 +6,7 @@ import time
 from functools import partial
 
 from pebble.contract import CAMERA, MEDIA_REPORT, VIDEO_CONTROL
-from pebble.errors import PebbleError
+from pebble.errors import LinkError, PebbleError
 from pebble.launched import encoding_asked_for
 from pebble.links import remote_transport
 from pebble.media.video import VIDEO_ENCODINGS, VideoEncoder, make_encoder
@@ -49,7 +49,9 @@ class CameraPublisher(Service):
         self._remote = remote_transport(self.config, "camera-publisher")
         self._uplink = Uplink(self._remote, self.addresses[CAMERA].topic, self._fps, now)
         self._encode_as(self._known(encoding_asked_for()))
-        self._feed = Feed(self._make_reader, partial(self.post, self._on_frame, newest_of="frame"))
+        self._feed = Feed(
+            self._make_reader, partial(self.post, self._on_frame, newest_of="frame"), partial(self.post, self._on_end)
+        )
         self._feed.open()
         self._remote.on_state(lambda _state: self.post(self._on_remote))
         self._remote.open(timeout=0.0)
@@ -138,6 +140,9 @@ class CameraPublisher(Service):
 
     def _make_reader(self) -> FrameReader:
         return FrameReader(self.config.run_dir(), "camera", views=True)
+
+    def _on_end(self) -> None:
+        raise LinkError("the thread that reads the camera's frames has ended")  # the launcher starts us again
 
     def _on_frame(self) -> None:
         frame = self._feed.take()

@@ -6,6 +6,10 @@ from pebble.services.camera_publisher.adapting import Adapter, Step
 from pebble.services.camera_publisher.send_queue import SendQueue
 from pebble.transports import QoS, Transport
 
+#: Bytes beside payload and topic that a message takes on its way: MQTT's header, and TLS's for each record of 16 KiB.
+#: Too many do no harm: what is under way seems to have arrived by that much earlier.
+_HEADER, _PER_RECORD, _RECORD = 8, 30, 16 << 10
+
 
 class Uplink:
     """Gives ``transport`` one picture after the other, each only once those before it are out of the way."""
@@ -35,7 +39,8 @@ class Uplink:
     def send(self, payload: bytes, now: float) -> bool:
         if not self._transport.publish(self._topic, payload, qos=QoS.LATEST):
             return False
-        self._queue.sent(len(payload), now)
+        size = _HEADER + len(self._topic) + len(payload)
+        self._queue.sent(size + _PER_RECORD * (1 + size // _RECORD), now)
         return True
 
     def lose(self, turns: float, now: float) -> None:

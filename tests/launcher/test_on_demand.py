@@ -8,6 +8,7 @@ import signal
 import socket
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -242,6 +243,17 @@ class TestBridgeThatDies:
         reactor.close()
 
 
+@pytest.mark.parametrize(("state", "ended"), [("init", 1), ("ready", 0)])
+def test_one_that_still_starts_begins_again_with_what_is_asked_for_now(state: str, ended: int) -> None:
+    """One that is ready hears the request itself."""
+    keeper = StandIn(state)
+    programs = OnDemand(Reactor(), {"media": cast(Keeper, keeper)})
+    bridge = Program("bridge", "bridge", (), Stage.LINK, asks=True)
+    for line in ("WANT media 1", "WANT media 1", "WANT media 1 h264"):
+        programs.hear(bridge, line)
+    assert (keeper.wanted, keeper.ended) == (True, ended)
+
+
 @pytest.mark.parametrize(
     "line",
     [
@@ -271,9 +283,14 @@ class StandIn:
     """What OnDemand sees of a keeper."""
 
     wanted = False
+    ended = 0  # how often it was told to end
+
+    def __init__(self, state: str = "ready") -> None:
+        self.life = SimpleNamespace(state=state)
 
     def want(self) -> None:
         self.wanted = True
 
     def unwant(self) -> None:
+        self.ended += self.wanted
         self.wanted = False

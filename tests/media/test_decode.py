@@ -169,6 +169,7 @@ def test_a_difference_of_another_size() -> None:
         ("-1", None),
         ("0", None),
         ("1e300", None),
+        ("-1e308", None),
     ],
 )
 def test_stamps(stamp: str, captured_ms: int | None) -> None:

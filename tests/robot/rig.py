@@ -139,7 +139,8 @@ class Rig:
         """The launcher's children by program: ``{"mqtt_bridge": pid, …}``."""
         assert self._robot is not None
         task = Path(f"/proc/{self._robot.pid}/task/{self._robot.pid}/children")
-        return {_program(pid): pid for pid in map(int, task.read_text().split())}
+        named = ((_program(pid), pid) for pid in map(int, task.read_text().split()))
+        return {name: pid for name, pid in named if name}
 
     @property
     def launcher_pid(self) -> int:
@@ -234,6 +235,9 @@ class Rig:
 
 
 def _program(pid: int) -> str:
-    """What a child of the launcher is. The kernel knows the first 15 bytes of its name."""
-    said = Path(f"/proc/{pid}/comm").read_text().strip()
+    """What a child of the launcher is; "" if it has just ended. The kernel knows the first 15 bytes of its name."""
+    try:
+        said = Path(f"/proc/{pid}/comm").read_text().strip()
+    except FileNotFoundError:
+        return ""
     return next((name for name in PROGRAMS if name[:15] == said), said)

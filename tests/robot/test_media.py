@@ -37,6 +37,10 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
         yield rig
 
 
+#: For what does not ask whether there are one broker or two.
+two_kinds = pytest.mark.parametrize("rig", ["mqtt", "zenoh"], indirect=True)
+
+
 @pytest.fixture(autouse=True)
 def _quiet(rig: Rig) -> Iterator[None]:
     """Every test ends with nothing wanted, nothing running and nothing coming."""
@@ -87,6 +91,7 @@ def test_nothing_runs_and_nothing_comes_until_flag_and_request_agree(rig: Rig) -
     assert pictures_come(rig, again), "what was asked for before starts when the flag goes up"
 
 
+@two_kinds
 @pytest.mark.parametrize("encoding", ["json", "pbvd", "pbvz", "h264", "nonsense"])
 def test_pictures_in_every_encoding_advance_with_the_camera(rig: Rig, encoding: str) -> None:
     began = want_video(rig, encoding=encoding)
@@ -97,6 +102,7 @@ def test_pictures_in_every_encoding_advance_with_the_camera(rig: Rig, encoding: 
     assert counters(seen) == sorted(set(counters(seen)))
 
 
+@two_kinds
 @pytest.mark.parametrize("encoding", ["pcm", "opus"])
 def test_sound_in_every_encoding(rig: Rig, encoding: str) -> None:
     began = time.monotonic()
@@ -110,6 +116,7 @@ def test_sound_in_every_encoding(rig: Rig, encoding: str) -> None:
     assert {one.encoding for one in heard[-5:] if one is not None} == {encoding}
 
 
+@two_kinds
 @pytest.mark.parametrize("program", ["camera_publisher", "av_daemon"])
 def test_a_killed_media_process_is_back_while_it_is_wanted(rig: Rig, program: str) -> None:
     began = want_video(rig)
@@ -119,6 +126,7 @@ def test_a_killed_media_process_is_back_while_it_is_wanted(rig: Rig, program: st
     assert pictures_come(rig, killed + 1.0)
 
 
+@two_kinds
 def test_a_kept_request_starts_nothing(rig: Rig) -> None:
     rig.operator.send(VIDEO_FLAG, True, retain=True)
     rig.operator.send(ASK_VIDEO, {"enabled": True}, retain=True)
@@ -131,6 +139,7 @@ def test_a_kept_request_starts_nothing(rig: Rig) -> None:
         rig.operator.send(ASK_VIDEO, b"", retain=True)
 
 
+@two_kinds
 def test_stopping_media_does_not_delay_driving(rig: Rig) -> None:
     began = want_video(rig)
     rig.operator.send(AUDIO_FLAG, True, retain=True)
@@ -167,6 +176,7 @@ def status(operator: Operator) -> dict[str, Any]:
     return {} if last is None else dict(last.json["value"])
 
 
+@two_kinds
 def test_after_an_uplink_outage_pictures_are_new_ones(rig: Rig) -> None:
     began = want_video(rig, encoding="pbvz")
     assert pictures_come(rig, began)

@@ -216,6 +216,12 @@ class TestOpenCv:
         with pytest.raises(LinkError, match="cannot open"):
             V4l2Camera(options(video={"device": device}).video)
 
+    def test_a_password_in_a_url_is_not_told(self) -> None:
+        with pytest.raises(LinkError) as raised:
+            V4l2Camera(options(video={"device": "rtsp://someone:s3cret@127.0.0.1:1/door?key=s3cret"}).video)
+        assert "rtsp://127.0.0.1:1/door" in str(raised.value)
+        assert "s3cret" not in str(raised.value)
+
     def test_controls_it_does_not_know_are_only_a_warning(
         self, film: Path, opened: list[Source], caplog: pytest.LogCaptureFixture
     ) -> None:

@@ -20,9 +20,11 @@ from pebble.services.camera_publisher.keyframes import Keyframes
 from pebble.services.camera_publisher.service import CameraPublisher
 from pebble.services.camera_publisher.shape import Shape
 from pebble.services.camera_publisher.tally import Tally
+from pebble.services.camera_publisher.uplink import Uplink
 from pebble.transports import Message
 from pebble.transports.frames import Frame, FrameInfo
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from pebble.transports.outgoing import Outgoing
 from tests.services.bridge_rig import Running
 from tests.support import until
 
@@ -244,3 +246,34 @@ def test_no_h264_here_is_said_and_json_is_sent(bench: Bench, monkeypatch: pytest
     assert until(lambda: bench.heard)
     assert bench.heard[-1].payload.startswith(b"{")
     operator.close()
+
+
+class Far(MemoryTransport):
+    """Its other end is 0.3 s away, there and back, and takes everything at once."""
+
+    clock = 0.0
+
+    def __init__(self) -> None:
+        super().__init__("publisher", MemoryHub())
+        self._under_way: list[tuple[float, int]] = []
+
+    def _send(self, message: Message, urgent: bool) -> bool:
+        self._under_way.append((self.clock, len(message.payload) + len(message.topic) + 5))  # as MQTT writes it
+        return True
+
+    @property
+    def outgoing(self) -> Outgoing:
+        return Outgoing(sum(size for at, size in self._under_way if self.clock - at < 0.3), 0.3)
+
+
+def test_headers_count_as_bytes_under_way() -> None:
+    """Else a long way would seem slow: of several frames under way the oldest would be taken for unconfirmed."""
+    with Far() as transport:
+        uplink, sent = Uplink(transport, f"{BASE}/outgoing/front-camera", 15, 0.0), 0
+        for look in range(20 * 50):  # every 20 ms, as the service does
+            transport.clock = look / 50
+            uplink.look(transport.clock)
+            if look * 15 // 50 > (look - 1) * 15 // 50 and not uplink.full(transport.clock):
+                sent += uplink.send(bytes(5000), transport.clock)
+        assert not str(uplink.step)
+        assert sent > 0.95 * 20 * 15

@@ -61,14 +61,15 @@ def test_the_pools_of_killed_writers_do_not_add_up(net: FramesNet) -> None:
 
 def test_a_living_writers_pool_is_not_given_back_when_its_link_broke(net: FramesNet) -> None:
     with FrameReader(net.folder, "camera") as reader:
-        net.writer(size=LARGE)
+        writer = net.writer(size=LARGE)
         _frame(reader)
         for life, pool in list(reader._writers.items()):
             del reader._writers[life], pool
         time.sleep(dead_pools.SETTLED_S + 0.1)
         dead_pools.give_back()
         assert _pools() == 1
-        assert until(lambda: not dead_pools._waiting)
+        writer.kill()
+        assert until(lambda: dead_pools.give_back() >= 0 and _pools() == 0), "it is looked at again"
 
 
 def test_a_writer_that_was_taken_for_dead_sends_bytes(net: FramesNet) -> None:

@@ -17,6 +17,7 @@ import pytest
 
 from pebble.errors import TransportError
 from pebble.transports import segments
+from pebble.transports.frame_info import encode
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
 from tests.support import until
 from tests.transports.frames_net import FramesNet
@@ -241,6 +242,27 @@ def test_what_is_not_a_frame_is_refused(tmp_path: Path) -> None:
         assert frame.data.tolist() == [1, 2]
         assert frame.info.rate == 16000
         assert reader.counters["refused"] == 4
+
+
+def test_a_shared_frame_of_a_life_that_is_over_is_not_shown(tmp_path: Path) -> None:
+    """Nothing has kept its memory from being given back meanwhile: it may be black by now."""
+    with FrameWriter(tmp_path, "camera", capacity=100_000) as writer, FrameReader(tmp_path, "camera") as reader:
+        assert until(lambda: writer.wanted and reader.writers == 1)
+        reader._writers.clear()  # as when the writer's token is gone
+        assert writer.write(b"\1" * 100_000, FrameInfo())
+        assert reader.read(0.5) is None
+        assert reader.counters["torn"] == 1
+
+
+def test_the_last_words_of_a_former_writer_are_not_news(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=100) as writer, FrameReader(tmp_path, "camera", depth=9) as reader:
+        assert until(lambda: writer.wanted)
+        assert writer._publisher is not None
+        for life, number in ((7, 5), (8, 1), (7, 6), (8, 1), (8, 2)):
+            writer._publisher.put(bytes([number]), attachment=encode(FrameInfo(sequence=number, writer=life)))
+        frames = [reader.read(5) for _ in range(3)]
+        assert [(frame.info.writer, frame.info.sequence) for frame in frames if frame] == [(7, 5), (8, 1), (8, 2)]
+        assert reader.read(0.2) is None
 
 
 def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:

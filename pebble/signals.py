@@ -1,4 +1,4 @@
-"""Signals end a comparison in order."""
+"""Signals end a command in order."""
 
 from __future__ import annotations
 
