@@ -137,7 +137,3 @@ def _become(options: Options) -> None:
     die_with_parent()
     if options.memlock is not None:
         resource.setrlimit(resource.RLIMIT_MEMLOCK, (options.memlock, options.memlock))
-    if options.user is not None:
-        os.setgid(options.user)
-        os.setuid(options.user)
-        die_with_parent()  # forgotten with the change of user
