@@ -20,9 +20,9 @@ demo: .venv/.ready-demo
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs
 	@echo "pebble: tests"
-	@$(VENV) -m pytest --numprocesses 4 --dist loadscope --ignore tests/robot
+	@$(VENV) -m pytest --numprocesses 4 --dist loadscope -m "not alone"
 	@echo "pebble: whole robots, one at a time because their deadlines are checked"
-	@$(VENV) -m pytest tests/robot
+	@$(VENV) -m pytest -m alone tests/robot
 
 footprint: .venv/.ready-dev
 	@$(VENV) -m tests.robot.footprint

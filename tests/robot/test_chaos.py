@@ -16,6 +16,8 @@ from tests.robot.rig import STOP, Rig
 from tests.robot.test_faults import Drive
 from tests.support import until
 
+pytestmark = pytest.mark.alone  # deadlines are checked
+
 SEED = 20
 ROUNDS = 2
 DEAD_MAN_S = 0.75  # after so long without a command the wheels stop, later than any pause between two of them

@@ -14,6 +14,8 @@ from tests.robot.operator import Driver, Operator, kept_copies, number_of
 from tests.robot.rig import BASE, STOP, Rig
 from tests.support import until
 
+pytestmark = pytest.mark.alone  # deadlines are checked
+
 STOP_LIMIT_S = 0.85  # after the last command seen at the pty
 AGE_LIMIT_S = 2.5  # no older command ever reaches the pty
 BACK_LIMIT_S = 5.0  # after the fault's end somebody can drive again

@@ -12,6 +12,8 @@ from tests.robot.operator import Operator, kept_copies
 from tests.robot.rig import BASE, Rig
 from tests.support import until
 
+pytestmark = pytest.mark.alone  # deadlines are checked
+
 COMMANDS: dict[str, Any] = {
     "incoming/drive-values": {"x": 0, "z": 1},
     "incoming/lights-solid": {"r": 1},

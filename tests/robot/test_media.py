@@ -17,6 +17,8 @@ from tests.robot.operator import Operator, Seen
 from tests.robot.rig import BASE, Rig
 from tests.support import until
 
+pytestmark = pytest.mark.alone  # deadlines are checked
+
 CAMERA, AUDIO = "outgoing/front-camera", "outgoing/audio"
 VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
 ASK_VIDEO, ASK_AUDIO = "incoming/front-camera", "incoming/audio"

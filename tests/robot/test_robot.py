@@ -12,6 +12,8 @@ from tests.robot.operator import kept_copies
 from tests.robot.rig import BASE, STOP
 from tests.support import until
 
+pytestmark = pytest.mark.alone  # deadlines are checked
+
 DRIVE = "incoming/drive-values"
 
 
