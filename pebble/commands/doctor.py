@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 
 from pebble.config import load
-from pebble.doctor.checks import Finding, Level, examine
+from pebble.doctor.checks import examine
+from pebble.doctor.finding import Finding, Level
 
 _COLOURS = {Level.OK: typer.colors.GREEN, Level.WARN: typer.colors.YELLOW, Level.FAIL: typer.colors.RED}
 _INDENT = " " * 6

@@ -14,13 +14,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from enum import Enum
 from importlib import metadata
 from pathlib import Path
 
 from pebble.config import Config, Mqtt
 from pebble.doctor.broker_probe import REFUSED_LOGINS, Answer, knock
+from pebble.doctor.finding import Finding, Level
+from pebble.doctor.media import media
 from pebble.links import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.settings import MqttSettings
 
@@ -30,22 +30,6 @@ _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set
 _SOON_S = 14 * 86400
 _TIMEDATECTL_S = 3.0
-
-
-class Level(Enum):
-    OK = "ok"
-    WARN = "warn"
-    FAIL = "fail"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing looked at: what, how it is, and the command (or the change) that makes it right."""
-
-    level: Level
-    what: str
-    text: str
-    fix: str = ""
 
 
 def examine(config: Config | None) -> Iterator[Finding]:
@@ -66,6 +50,7 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield leftover_sockets(run_dir, _answers)
     for line in config.serial_instances().values():
         yield serial_port(Path(str(line.serial.port)))
+    yield from media(config, Path("/dev"))
     for name, mqtt in _brokers(config):
         yield from broker(name, mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S))
 

@@ -248,7 +248,7 @@ def soak(folder: Path, frames: int, *options: str) -> tuple[int, int, int]:
 def test_a_soak(tmp_path: Path, frames: int, options: tuple[str, ...]) -> None:
     wrong, lost, growth = soak(tmp_path, frames, *options)
     assert wrong == 0
-    assert lost < frames / 10  # in bursts like these, and only then
+    assert lost <= frames / 100  # a reader that stood still for a moment; usually none
     assert growth < 5_000
 
 

@@ -1,0 +1,71 @@
+"""What a machine lacks for pictures and sound, each with what helps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import Config, parse
+from pebble.doctor.finding import Level
+from pebble.doctor.media import camera, codecs, media
+
+
+def config_of(devices: dict[str, Any], **sent: Any) -> Config:
+    services = {"av_daemon": devices, "mqtt_bridge": {"media": sent}}
+    return parse({"robot": {"id": "rover"}, "services": services}, folder=Path.cwd(), env={})
+
+
+def nothing(_name: str) -> None:
+    return None
+
+
+def everything(name: str) -> str:
+    return f"/usr/bin/{name}"
+
+
+def test_a_robot_that_neither_sees_nor_hears_needs_nothing(tmp_path: Path) -> None:
+    assert list(media(config_of({"enabled": False}), tmp_path, nothing)) == []
+
+
+def test_everything_there(tmp_path: Path) -> None:
+    (tmp_path / "video0").touch()
+    config = config_of({"enabled": True, "video": {"device": "0"}})
+    found = list(media(config, tmp_path, everything))
+    assert {finding.level for finding in found} == {Level.OK}
+    assert [finding.what for finding in found] == ["camera", "microphone", "loudspeaker", "codecs"]
+
+
+def test_nothing_there(tmp_path: Path) -> None:
+    config = config_of({"enabled": True, "video": {"device": str(tmp_path / "video0")}})
+    found = {finding.what: finding for finding in media(config, tmp_path, nothing)}
+    assert [found[what].level for what in ("camera", "microphone", "loudspeaker")] == [
+        Level.FAIL,
+        Level.FAIL,
+        Level.WARN,
+    ]
+    assert "alsa-utils" in found["microphone"].fix
+    assert "video0 is not there" in found["camera"].text
+
+
+@pytest.mark.parametrize(
+    ("backend", "level"), [("synthetic", Level.OK), ("libcamera", Level.FAIL), ("picamera2", Level.FAIL)]
+)
+def test_other_cameras(backend: str, level: Level, tmp_path: Path) -> None:
+    assert camera(backend, "", tmp_path, nothing).level is level
+    assert camera(backend, "", tmp_path, everything).level is Level.OK
+
+
+@pytest.mark.parametrize(
+    ("sent", "level"),
+    [
+        ({}, Level.OK),
+        ({"video_publisher": {"encoding": "h264"}}, Level.FAIL),
+        ({"audio_publisher": {"encoding": "opus"}}, Level.FAIL),
+    ],
+)
+def test_codecs_are_missed_where_they_are_asked_for(sent: dict[str, Any], level: Level) -> None:
+    config = config_of({"enabled": True}, **sent)
+    assert codecs(config, installed=False).level is level
+    assert codecs(config, installed=True).level is Level.OK
