@@ -16,7 +16,7 @@ import pytest
 from pebble.config import load
 from pebble.doctor import checks as doctor
 from pebble.doctor.broker_probe import Answer, connect_packet, knock
-from pebble.doctor.checks import Finding, Level
+from pebble.doctor.finding import Finding, Level
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.support import Broker, free_port
 
