@@ -82,8 +82,10 @@ class FrameReader:
             log.warning("%s", self.problem)
         session = self._session = self._open_session()
         self._pid = os.getpid()
-        if self.shared:
-            views.why_not()  # the self-test takes some milliseconds: now is a better time than at the first frame
+        if self.shared and self._views:
+            # The self-test takes some milliseconds: now is a better time than at the first frame. It takes memory, too,
+            # which those who only hear sound are spared: that comes as bytes.
+            views.why_not()
         liveliness = session.liveliness()
         # Called on Zenoh's receiving thread: these must be quick, and nothing may pile up behind them.
         on_writer = zenoh.handlers.Callback(self._on_writer, indirect=False)
