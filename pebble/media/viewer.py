@@ -72,7 +72,7 @@ class Viewer:
     def keep_asking(self) -> None:
         """To be called now and then: says again what was asked for as long as nothing comes."""
         now = time.monotonic()
-        for medium in self._asked:
+        for medium in list(self._asked):
             quiet_since = max(self._asked_at[medium], self._heard_at.get(medium, float("-inf")))
             if now - quiet_since > _REPEAT_S:
                 self._request(medium)
@@ -86,11 +86,11 @@ class Viewer:
 
     def end(self) -> None:
         """Withdraw what was asked for, and lower the flags that were down before."""
-        for medium in self._requested:
+        for medium in list(self._requested):
             self._send(medium, MediaRequest(enabled=False))
-        for medium in self._lifted:
+        for medium in list(self._lifted):  # a broker that sends our own words back shortens it meanwhile
             self._raise_flag(medium, up=False)
-        for subscription in self._subscriptions:
+        for subscription in list(self._subscriptions):
             subscription.close()
 
     # -- sending
