@@ -20,7 +20,7 @@ demo: .venv/.ready-demo
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs
 	@echo "pebble: tests"
-	@$(VENV) -m pytest --numprocesses 3 --dist loadscope -m "not alone"
+	@$(VENV) -m pytest --numprocesses 4 --dist loadscope -m "not alone"
 	@echo "pebble: whole robots, one at a time because their deadlines are checked"
 	@$(VENV) -m pytest -m alone tests/robot
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -510,6 +511,18 @@ def test_the_run_directory_is_private_and_empty_in_the_end(robot: Robot) -> None
         client.close()
     assert robot.hub.end() == (0, "")
     assert list(robot.run_dir.iterdir()) == []
+
+
+def test_no_thread_of_zenoh_takes_signals_away_from_the_main_thread(robot: Robot) -> None:
+    """A hub whose SIGTERM went elsewhere would wait for ever."""
+    blocked = {
+        (task / "comm").read_text().strip(): int((task / "status").read_text().split("SigBlk:")[1].split()[0], 16)
+        for task in Path(f"/proc/{robot.hub.pid}/task").iterdir()
+    }
+    zenohs = {name: mask for name, mask in blocked.items() if re.match(r"(app|net|acc|rx|tx)-", name)}
+    assert len(zenohs) > 2
+    assert all(mask >> (signal.SIGTERM - 1) & 1 for mask in zenohs.values())
+    assert not blocked["python"] >> (signal.SIGTERM - 1) & 1
 
 
 def test_what_the_killed_leave_is_cleared_away_by_the_next(robot: Robot) -> None:

@@ -40,7 +40,7 @@ class HubProcess:
         assert process is not None
         process.send_signal(signal.SIGCONT)
         process.send_signal(number)
-        _, said = process.communicate(timeout=30)
+        _, said = process.communicate(timeout=10)
         return process.returncode, said
 
     def signal(self, number: int) -> None:
