@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from abc import ABC, abstractmethod
 from typing import Final, Protocol
 
 from pebble.errors import ConfigError
@@ -63,7 +64,7 @@ def make_encoder(
     raise ConfigError(f"video encoding {name!r}: unknown; there are {', '.join(_ALL)}")
 
 
-class _JpegEncoder:
+class _JpegEncoder(ABC):
     """What the three forms made of JPEGs share."""
 
     optimize = True
@@ -89,8 +90,8 @@ class _JpegEncoder:
         self._frame = (frame + 1) % _FRAME_LIMIT
         return self._pack(coded.jpeg, coded.keyframe, frame, captured_ms)
 
-    def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
-        raise NotImplementedError
+    @abstractmethod
+    def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes: ...
 
 
 class JsonEncoder(_JpegEncoder):

@@ -37,14 +37,14 @@ class Options(msgspec.Struct, kw_only=True):
     work_s: float = 0.0  # how long a reader looks at a frame
     without_views: bool = False  # as if zenoh had changed
     memlock: int | None = None  # RLIMIT_MEMLOCK, bytes, as the user below
-    user: int | None = None  # become this user
+    user: int | None = None  # become this user, which takes root
 
 
 def main(role: str, folder: str, options: str) -> None:
     chosen = msgspec.json.decode(options, type=Options)
     if chosen.without_views:
         views.KNOWN_VERSIONS = frozenset({"0.0.0"})
-    if chosen.user is not None:
+    if chosen.user not in (None, os.geteuid()):
         become(chosen.user)
     peer = {"writer": Writer, "reader": Reader}[role](Path(folder), chosen)
     worker = threading.Thread(target=peer.run, daemon=True)
