@@ -31,8 +31,11 @@ def capabilities(config: Config, addresses: Addresses) -> dict[str, Any]:
 
 def _video(config: Config, addresses: Addresses) -> dict[str, Any]:
     sent, captured = config.services.mqtt_bridge.media.video_publisher, config.services.av_daemon.video
+    offered = _offered(config, captured.enabled)
+    if "video_stream" in config.on_demand_programs():
+        offered = {"available": True, "controls": True}
     return {
-        **_offered(config, captured.enabled),
+        **offered,
         "topic": addresses[c.CAMERA].topic,
         "command_topic": addresses[c.VIDEO_CONTROL].topic,
         "flag_topic": addresses[c.MQTT_VIDEO].topic,

@@ -16,6 +16,7 @@ LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 ALIVE_PERIOD_S = 1.0
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
 _PR_SET_PDEATHSIG = 1
+_libc = ctypes.CDLL(None)  # now: a child between fork and exec had better not load anything
 
 log = logging.getLogger(__name__)
 
@@ -30,9 +31,14 @@ def die_with_launcher() -> None:
     launcher = os.environ.get(LAUNCHER_PID)
     if launcher is None:
         return
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    end_with_parent(signal.SIGTERM)
     if os.getppid() != int(launcher):  # it died before we could ask
         sys.exit(1)
+
+
+def end_with_parent(number: int = signal.SIGKILL) -> None:
+    """In a child, before its program runs: the kernel sends it ``number`` when the thread that started it is gone."""
+    _libc.prctl(_PR_SET_PDEATHSIG, number)
 
 
 class Want(NamedTuple):

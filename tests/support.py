@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
 import signal
@@ -13,8 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-_PR_SET_PDEATHSIG = 1
-_libc = ctypes.CDLL(None)
+from pebble.launched import end_with_parent as die_with_parent
 
 #: The checkout: tests that start programs of ours start them here.
 ROOT = Path(__file__).resolve().parent.parent
@@ -35,11 +33,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def die_with_parent() -> None:
-    """For a child, before it runs its program: a killed pytest leaves nobody behind (Linux)."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def listening(port: int) -> bool:

@@ -221,3 +221,9 @@ def test_a_motor_that_is_an_instance_is_advertised_under_its_own_names() -> None
         }
     )
     assert value["drive"] == {"available": True, "controls": True, "topic": f"{BASE}/incoming/of-the-instance"}
+
+
+def test_a_foreign_streaming_program_can_be_asked_for() -> None:
+    stream = {"enabled": True, "command": ["mediamtx"]}
+    assert of(mqtt_bridge=BRIDGE, video_stream=stream)["video"]["controls"]
+    assert not of(video_stream=stream)["video"]["available"]

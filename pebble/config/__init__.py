@@ -83,6 +83,12 @@ class Config(Root, frozen=True, kw_only=True):
         video = ("camera_publisher",) if devices.video.enabled else ()
         return (*video, *(("audio_publisher", "audio_receiver") if devices.audio.enabled else ()))
 
+    def on_demand_programs(self) -> tuple[str, ...]:
+        """All that the bridge may want: the media programs, and a streaming program that is none of ours."""
+        own = self.services.video_stream
+        stream = ("video_stream",) if own.enabled and own.command and self.services.mqtt_bridge.enabled else ()
+        return (*self.media_programs(), *stream)
+
 
 def load(path: Path | str, env: Mapping[str, str] = os.environ) -> Config:
     """Read a config file. Raises ConfigError that holds every problem found in it."""

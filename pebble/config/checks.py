@@ -33,6 +33,8 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
     for name in _LATER:
         if getattr(services, name).enabled:
             reader.notes.warning((*path, name), "is enabled, but arrives in a later release; skipped")
+    if services.video_stream.enabled and not services.video_stream.command:
+        reader.notes.doubt((*path, "video_stream", "command"), "is missing, write the program that streams the video")
     return services
 
 

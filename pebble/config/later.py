@@ -81,6 +81,15 @@ class AvDaemon(Service, frozen=True, kw_only=True):
     audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
 
 
+class VideoStream(Service, frozen=True, kw_only=True):
+    """Runs somebody else's streaming program while operators want video."""
+
+    command: Annotated[Command, doc("The program and its arguments, without a shell; required where enabled.")] = ()
+    cwd: Annotated[File | None, doc("Folder to run in; unset: the launcher's.")] = None
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    webrtc_url: Annotated[str | None, doc("Where its pictures are shown; operator pages find it in the status.")] = None
+
+
 class VideoPublisher(Section, frozen=True, kw_only=True):
     """Pictures towards operators."""
 

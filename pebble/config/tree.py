@@ -10,6 +10,7 @@ from pebble.config.later import (
     Media,
     Ros1Bridge,
     SoundboardHandler,
+    VideoStream,
     WebHandler,
     WebInterface,
 )
@@ -279,6 +280,7 @@ class Services(Section, frozen=True, kw_only=True):
     mqtt_bridge: Annotated[MqttBridge, doc("Link to operators.")] = MqttBridge()
     ros1_bridge: Annotated[Ros1Bridge, doc("Link to ROS 1.")] = Ros1Bridge()
     serial_mcu_bridge: Annotated[SerialBridges, doc("Serial line to the motor MCU.")] = SerialBridges()
+    video_stream: Annotated[VideoStream, doc("Somebody else's video program.")] = VideoStream()
     soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()
     autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()
     web_handler: Annotated[WebHandler, doc("Runs the web page.")] = WebHandler()

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO
 
 from pebble.errors import PebbleError
+from pebble.launched import end_with_parent
 
-_PR_SET_PDEATHSIG = 1
-_libc = ctypes.CDLL(None, use_errno=True)
 _STEP_S = 0.01
 
 
@@ -34,7 +33,7 @@ class Program:
                 stdout=subprocess.PIPE if reports else errors,
                 stderr=errors,
                 start_new_session=True,
-                preexec_fn=_end_with_parent,
+                preexec_fn=partial(end_with_parent, signal.SIGTERM),
             )
 
     @property
@@ -85,7 +84,3 @@ def end_all(programs: Iterable[Program], within_s: float) -> None:
         program.ask_to_end()
     for program in programs:
         program.end(deadline)
-
-
-def _end_with_parent() -> None:
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

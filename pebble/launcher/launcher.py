@@ -185,7 +185,7 @@ class Launcher:
         self._status_due = False
         states = {keeper.program.name: _state(keeper.life) for keeper in self._keepers if keeper.shown}
         self._systemd.status(_summary({name: state for name, state in states.items() if name not in self._resting()}))
-        self._say_state(STATUS, _status(states))
+        self._say_state(STATUS, _status(states, self._webrtc_url()))
 
     def _resting(self) -> set[str]:
         """Stopped because nobody wants them: nothing to worry about."""
@@ -204,6 +204,10 @@ class Launcher:
 
     def _say_state(self, channel: Channel, value: Any) -> None:
         self._news.state(self._message(channel, value))
+
+    def _webrtc_url(self) -> str | None:
+        stream = self._config.services.video_stream
+        return stream.webrtc_url if stream.enabled else None
 
     def _will(self) -> Message:
         """Children die with us, so that is what others are to believe when we are gone."""
@@ -238,8 +242,11 @@ def _state(life: Life) -> ServiceState:
     return ServiceState(state=life.state, restarts=life.restarts, last_exit=life.last_exit)
 
 
-def _status(states: dict[str, ServiceState]) -> Status:
+def _status(states: dict[str, ServiceState], webrtc_url: str | None = None) -> Status:
+    """Operator pages show what they find under ``webrtc_url``."""
     value: dict[str, Any] = {"services": states}
+    if webrtc_url is not None:
+        value["webrtc_url"] = webrtc_url
     return Status(t=_now_ms(), value=value)
 
 

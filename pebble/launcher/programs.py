@@ -22,7 +22,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (services.av_daemon.enabled, _av_daemon(config)),
         (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.LINK, asks=True)),
         (config.transport.mqtt_mirror is not None, _service(config, "mqtt_mirror", Stage.LINK)),
-        *((True, _media(config, name)) for name in config.media_programs()),
+        *((True, _on_demand(config, name)) for name in config.on_demand_programs()),
     ]
     return tuple(program for wanted, program in table if wanted)
 
@@ -53,8 +53,10 @@ def _av_daemon(config: Config) -> Program:
     return _service(config, "av_daemon", Stage.DEVICE, preloaded=False, environment=section.env, folder=section.cwd)
 
 
-def _media(config: Config, name: str) -> Program:
+def _on_demand(config: Config, name: str) -> Program:
     """Started when the bridge wants it: pictures and sound for operators."""
+    if name == "video_stream":
+        return _service(config, name, Stage.LINK, on_demand=True)
     bridge = config.services.mqtt_bridge
     control = bridge.video_control if name == "camera_publisher" else bridge.audio_control
     own = control.receiver_env if name == "audio_receiver" else control.publisher_env

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import fcntl
 import os
 import select
-import signal
 import subprocess
 import time
 from collections.abc import Sequence
@@ -15,15 +13,13 @@ from pathlib import Path
 from typing import IO, cast
 
 from pebble.errors import LinkError
+from pebble.launched import end_with_parent
 
 SILENCE_S = 3.0  # a device that says nothing for so long hangs
 _FIRST_SILENCE_S = 10.0  # it may take its time to start
-_PR_SET_PDEATHSIG = 1
 _COMPLAINT_LIMIT = 500  # bytes of its last words that are kept
 _LAST_READS = 64  # of 4096 bytes: more than a pipe holds
 _CHUNK = 256 * 1024
-
-_libc = ctypes.CDLL(None)
 
 
 class Child:
@@ -37,7 +33,7 @@ class Child:
         try:
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                preexec_fn=_die_with_parent, bufsize=0,
+                preexec_fn=end_with_parent, bufsize=0,
             )  # fmt: skip
         except (OSError, subprocess.SubprocessError) as error:
             raise LinkError(f"cannot start {self.name}: {error}") from error
@@ -105,8 +101,3 @@ class Child:
         lines = self._complaint.decode("utf-8", "replace").split("\n")
         last = next((line.strip() for line in reversed(lines) if line.strip()), "")
         return f" ({''.join(c if c.isprintable() else '?' for c in last)})" if last else ""
-
-
-def _die_with_parent() -> None:
-    """In the child: the kernel kills it when the thread that reads it is no more."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

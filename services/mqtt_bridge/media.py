@@ -22,7 +22,7 @@ class Row:
 
 
 MEDIA: Final = (
-    Row(MQTT_VIDEO, VIDEO_CONTROL, ("json", "pbvd", "pbvz", "h264"), ("camera_publisher",)),
+    Row(MQTT_VIDEO, VIDEO_CONTROL, ("json", "pbvd", "pbvz", "h264"), ("camera_publisher", "video_stream")),
     Row(MQTT_AUDIO, AUDIO_CONTROL, ("pcm", "opus"), ("audio_publisher", "audio_receiver")),
 )
 _ROWS: Final = {channel.suffix: row for row in MEDIA for channel in (row.flag, row.request)}

@@ -53,7 +53,7 @@ class MqttBridge(Service):
         self._subjects = Subjects(self.config)
         self._private = PrivateTopics(self.config.base)
         self._actions = Actions(section)
-        self._media = Media(self.config.media_programs(), wanted_before())
+        self._media = Media(self.config.on_demand_programs(), wanted_before())
         self._notifier = Notifier()
         self._told: dict[str, Want] = {}  # as the launcher knows it
         self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None

@@ -88,6 +88,7 @@ class TestMeaning:
         assert (fred.transport.kind, fred.services.serial_mcu_bridge.serial.baud) == ("mqtt", 115200)
         assert (minilamp.robot.platform, benjr.robot.platform) == ("esp32", "esp8266")
         assert pitcam.services.mqtt_bridge.heartbeat.enabled
+        assert (pitcam.media_programs(), pitcam.on_demand_programs()) == ((), ("video_stream",))
         assert pitcam.serial_instances() == {}
 
     def test_zero_and_false_are_values(self) -> None:

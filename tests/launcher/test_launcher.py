@@ -440,6 +440,17 @@ print([name for name in ("numpy", "cv2", "av") if name in sys.modules], len(os.l
     assert ran.stdout.strip() == "['numpy'] 1", ran.stderr
 
 
+def test_a_foreign_streaming_program_is_one_more_program_on_demand() -> None:
+    services = {
+        "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}},
+        "video_stream": {"enabled": True, "command": ["mediamtx"]},
+    }
+    table = _table(services=services)
+    assert [row[:2] for row in table][-1] == ("video_stream", "pebble.services.video_stream")
+    assert {one.name for one in programs(_parsed(services=services)) if one.on_demand} == {"video_stream"}
+    assert shared_modules(_parsed(services=services)) == ()
+
+
 def test_the_launcher_of_a_robot_without_media_carries_nothing_for_them() -> None:
     assert shared_modules(_parsed(services={"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}})) == ()
 

@@ -1,0 +1,1 @@
+"""Somebody else's streaming program, run while operators want video."""
