@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-import sys
-import tempfile
 import threading
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
-
-from pebble.config import Config, load
-from pebble.links import hub_settings, local_transport
 from pebble.media.sound import Heard, SoundDecoder
 from pebble.media.speech import Speech
-from pebble.payloads import MediaReport
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports import Message, QoS
 from pebble.transports.frames import FrameInfo, FrameWriter
-from tests.support import ROOT, die_with_parent, until
+from tests.services.media_rig import BASE, MediaProgram, client
+from tests.support import until
 
-BASE = "pebble/robots/rover"
 CHUNK_MS = 20
 
 # Appends what it hears to a file that is named after how it was called.
@@ -102,83 +91,8 @@ class Ear:
             self.heard.append(one)
 
 
-class Program:
-    """``python -m pebble.services.<name>`` of a robot with ``kind`` inside, and what it reports there."""
+class Program(MediaProgram):
+    """The publisher or the receiver."""
 
     def __init__(self, name: str, kind: str, local_port: int, remote_port: int, **options: Any) -> None:
-        self.name, self._kind, self._ports, self._options = name, kind, (local_port, remote_port), options
-        self._ends = ExitStack()
-        self.reports: list[MediaReport] = []
-        self.process: subprocess.Popen[bytes]
-
-    def __enter__(self) -> Self:
-        self.folder = Path(tempfile.mkdtemp(prefix="pbl"))  # short: it holds unix sockets
-        self._ends.callback(shutil.rmtree, self.folder, ignore_errors=True)
-        self.config = self._write_config()
-        if self._kind == "zenoh":
-            self._start("pebble.hub", msgspec.json.encode(hub_settings(self.config), enc_hook=str).decode())
-        self.local = local_transport(self.config, "somebody").open(10)
-        self._ends.callback(self.local.close)
-        assert self.local.state is State.CONNECTED, self.local.problem
-        self.local.subscribe(f"{BASE}/outgoing/media-report/{self.name}", self._note)
-        self.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._ends.close()
-
-    def start(self) -> None:
-        self.process = self._start(f"pebble.services.{self.name}", str(self.config.path))
-
-    @property
-    def run_dir(self) -> Path:
-        return self.config.run_dir()
-
-    def ask(self, **request: Any) -> None:
-        """What the bridge passes on from operators."""
-        body = json.dumps({"enabled": True, **request}).encode()
-        assert self.local.publish(f"{BASE}/incoming/audio", body, qos=QoS.DELIVERED)
-
-    @property
-    def newest(self) -> MediaReport:
-        """The last report; before the first one, one that says nothing."""
-        return self.reports[-1] if self.reports else MediaReport(running=False)
-
-    def reported(self, timeout: float = 15.0, **expected: Any) -> bool:
-        """Until the newest report says so."""
-
-        return until(lambda: all(getattr(self.newest, name) == value for name, value in expected.items()), timeout)
-
-    def _note(self, message: Message) -> None:
-        self.reports.append(msgspec.json.decode(message.payload, type=MediaReport))
-
-    def _start(self, module: str, argument: str) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen([sys.executable, "-m", module, argument], cwd=ROOT, preexec_fn=die_with_parent)
-        self._ends.callback(process.wait, 10)
-        self._ends.callback(process.terminate)
-        return process
-
-    def _write_config(self) -> Config:
-        run_dir = self.folder / "run"
-        run_dir.mkdir(mode=0o700)
-        local, remote = self._ports
-        bridge = {
-            "enabled": True,
-            "remote_mqtt": {"host": "127.0.0.1", "port": remote},
-            "media": {self.name: self._options},
-        }
-        raw = {
-            "robot": {"id": "rover"},
-            "transport": {"kind": self._kind, "run_dir": str(run_dir)},
-            "local_mqtt": {"host": "127.0.0.1", "port": local},
-            "services": {"mqtt_bridge": bridge},
-        }
-        path = self.folder / "robot.json"
-        path.write_text(json.dumps(raw))
-        return load(path)
-
-
-def client(name: str, port: int) -> Transport:
-    transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port, silence_s=10)).open(10)
-    assert transport.state is State.CONNECTED, transport.problem
-    return transport
+        super().__init__(name, name, "audio", kind, local_port, remote_port, **options)

@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-import sys
-import tempfile
 import threading
 import time
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
 import numpy as np
 
-from pebble.config import Config, load
-from pebble.links import hub_settings, local_transport
 from pebble.media.decode import VideoDecoder
 from pebble.media.scene import Scene, read_counter
-from pebble.payloads import MediaReport
-from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports import Message, QoS
 from pebble.transports.frames import FrameInfo, FrameWriter
-from tests.support import ROOT, die_with_parent, until
-
-BASE = "pebble/robots/rover"
-_SILENCE_S = 10.0  # a machine that does too much at once is not a broker that stopped answering
+from tests.services.media_rig import BASE, MediaProgram, client
+from tests.support import until
 
 
 class Camera:
@@ -113,82 +101,6 @@ class Viewer:
         )
 
 
-class Publisher:
-    """`python -m pebble.services.camera_publisher` of a robot with ``kind`` inside, and what it reports there."""
-
+class Publisher(MediaProgram):
     def __init__(self, kind: str, local_port: int, remote_port: int, **video: Any) -> None:
-        self._ends = ExitStack()
-        self.folder = Path(tempfile.mkdtemp(prefix="pbl"))  # short: it holds unix sockets
-        self._ends.callback(shutil.rmtree, self.folder, ignore_errors=True)
-        self.config = self._write_config(kind, local_port, remote_port, video)
-        self.reports: list[MediaReport] = []
-        self.hub: subprocess.Popen[bytes] | None = None
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def __enter__(self) -> Self:
-        if self.config.transport.kind == "zenoh":
-            settings = msgspec.json.encode(hub_settings(self.config), enc_hook=str).decode()
-            self._start("pebble.hub", settings)
-        self.local = local_transport(self.config, "somebody").open(10)
-        self._ends.callback(self.local.close)
-        assert self.local.state is State.CONNECTED, self.local.problem
-        topic = f"{BASE}/outgoing/media-report/camera_publisher"
-        self.local.subscribe(topic, lambda message: self.reports.append(_report(message.payload)))
-        self.process = self._start("pebble.services.camera_publisher", str(self.config.path))
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._ends.close()
-
-    @property
-    def run_dir(self) -> Path:
-        return self.config.run_dir()
-
-    def ask(self, **request: Any) -> None:
-        """What the bridge passes on from operators."""
-        body = json.dumps({"enabled": True, **request}).encode()
-        topic = f"{BASE}/incoming/front-camera"
-        assert until(lambda: self.local.publish(topic, body, qos=QoS.DELIVERED)), self.local.problem
-
-    def reported(self, timeout: float = 15.0, **expected: Any) -> bool:
-        """Until the newest report says so."""
-
-        def agrees() -> bool:
-            newest = self.reports[-1] if self.reports else None
-            return newest is not None and all(getattr(newest, name) == value for name, value in expected.items())
-
-        return until(agrees, timeout)
-
-    def _start(self, module: str, argument: str) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen([sys.executable, "-m", module, argument], cwd=ROOT, preexec_fn=die_with_parent)
-        self._ends.callback(process.wait, 10)
-        self._ends.callback(process.terminate)
-        return process
-
-    def _write_config(self, kind: str, local_port: int, remote_port: int, video: dict[str, Any]) -> Config:
-        run_dir = self.folder / "run"
-        run_dir.mkdir(mode=0o700)
-        bridge = {
-            "enabled": True,
-            "remote_mqtt": {"host": "127.0.0.1", "port": remote_port, "silence_seconds": _SILENCE_S},
-            "media": {"video_publisher": video},
-        }
-        raw = {
-            "robot": {"id": "rover"},
-            "transport": {"kind": kind, "run_dir": str(run_dir)},
-            "local_mqtt": {"host": "127.0.0.1", "port": local_port, "silence_seconds": _SILENCE_S},
-            "services": {"mqtt_bridge": bridge},
-        }
-        path = self.folder / "robot.json"
-        path.write_text(json.dumps(raw))
-        return load(path)
-
-
-def client(name: str, port: int) -> Transport:
-    transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port, silence_s=_SILENCE_S)).open(10)
-    assert transport.state is State.CONNECTED, transport.problem
-    return transport
-
-
-def _report(payload: bytes) -> MediaReport:
-    return msgspec.json.decode(payload, type=MediaReport)
+        super().__init__("camera_publisher", "video_publisher", "front-camera", kind, local_port, remote_port, **video)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -20,20 +19,6 @@ from tests.slow_link import SlowLink
 from tests.support import Broker, until
 
 NAME = "audio_publisher"
-
-
-@pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("local"))
-    yield broker
-    broker.stop()
-
-
-@pytest.fixture
-def remote(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
 
 
 @pytest.fixture

@@ -21,24 +21,11 @@ from pebble.media.sound import make_sound_encoder, sequence_numbers
 from pebble.media.speech import Speech
 from pebble.packets import Codec, Sound
 from pebble.transports import QoS
-from tests.services.audio_rig import BASE, RECORDER, Program, client
+from tests.services.audio_rig import RECORDER, Program
+from tests.services.media_rig import BASE, client
 from tests.support import Broker, until
 
 NAME = "audio_receiver"
-
-
-@pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("local"))
-    yield broker
-    broker.stop()
-
-
-@pytest.fixture
-def remote(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
 
 
 class Recorder:

@@ -7,30 +7,16 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import pairwise
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import pytest
 
 from pebble.transports import Message, QoS
-from tests.services.camera_rig import Camera, Publisher, Seen, Viewer, client
+from tests.services.camera_rig import Camera, Publisher, Seen, Viewer
+from tests.services.media_rig import client
 from tests.slow_link import SlowLink
 from tests.support import Broker, until
-
-
-@pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("local"))
-    yield broker
-    broker.stop()
-
-
-@pytest.fixture
-def remote(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
 
 
 @pytest.fixture
