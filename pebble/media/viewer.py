@@ -60,10 +60,10 @@ class Viewer:
             raise PebbleError(f"{self.base} cannot send {medium} as {encoding}, only as {', '.join(offered)}")
         if medium not in self._asked:
             self._listen(medium)
+        self._asked_at[medium] = time.monotonic()  # first: another thread may look after what was asked for
         self._asked[medium] = encoding
         if encoding is None and self._flows(medium):
-            self._asked_at[medium] = time.monotonic()  # somebody watches already: change nothing
-            return
+            return  # somebody watches already: change nothing
         if not self._flags.get(self._topic(medium, "flag_topic", _FLAGS[medium]), False):
             self._lifted.add(medium)
             self._raise_flag(medium, up=True)

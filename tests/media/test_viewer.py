@@ -109,3 +109,11 @@ def test_what_is_not_offered_is_refused_in_words(viewer: Viewer) -> None:
         viewer.ask("audio")
     with pytest.raises(PebbleError, match="only as json, h264"):
         viewer.ask("video", "pbvd")
+
+
+def test_another_thread_may_keep_asking_from_the_first_moment(robot: Robot, viewer: Viewer) -> None:
+    asking = threading.Thread(target=viewer.ask, args=("video",))
+    asking.start()
+    while asking.is_alive():  # for the 0.4 s in which it looks whether pictures come anyway
+        viewer.keep_asking()
+    assert until(lambda: robot.asked == [b'{"enabled":true}'])
