@@ -26,7 +26,9 @@ class Addresses:
         self._channels = {address.topic: channel for channel, address in self._of.items() if not channel.is_pattern}
 
     def __getitem__(self, channel: Channel) -> Address:
-        return self._of[channel]
+        """Of a channel that is not in the contract, made while running: as it says itself."""
+        found = self._of.get(channel)
+        return found if found is not None else _default(channel, self.base)
 
     def channel(self, topic: str) -> Channel | None:
         """The channel that travels under ``topic``, renamed or not; None for topics the contract does not know."""
@@ -38,8 +40,12 @@ class Addresses:
 
 
 def _address(channel: Channel, config: Config) -> Address:
-    default = Address(channel.filter(config.base), channel.default_qos, channel.default_retain)
+    default = _default(channel, config.base)
     return default if channel.override is None else _overridden(default, channel.override, config)
+
+
+def _default(channel: Channel, base: str) -> Address:
+    return Address(channel.filter(base), channel.default_qos, channel.default_retain)
 
 
 def _overridden(default: Address, override: Override, config: Config) -> Address:

@@ -117,8 +117,20 @@ def _motor(config: Config, addresses: Addresses) -> dict[str, Any]:
             "touch_topic": addresses[c.TOUCH_SENSORS].topic,
             "charging_topic": addresses[c.CHARGING_STATUS].topic,
             "charging_level_topic": addresses[c.CHARGING_LEVEL].topic,
+            **_imu(config),
         },
     }
+
+
+def _imu(config: Config) -> dict[str, Any]:
+    """An inertial sensor by its line's protocol or name: what a self-describing MCU is, only its manifest says."""
+    lines = [
+        name
+        for name, line in config.serial_instances().items()
+        if line.protocol == "imu_mpu6050_v1" or (line.protocol == "pebble_serial_v1" and name == "imu")
+    ]
+    addresses = Addresses(view_of(config, lines[0]) if lines else config)
+    return {"imu": bool(lines), "imu_topic": addresses[c.IMU].topic}
 
 
 def _first(*values: float | None) -> float | None:

@@ -182,7 +182,8 @@ IMU = _c("sensors/imu", Kind.STREAM, p.Imu, "Summary of the inertial sensor.", r
                            "services.serial_mcu_bridge.publish.low_rate_qos",
                            "services.serial_mcu_bridge.publish.low_rate_retain"))  # fmt: skip
 MCU_DESCRIBE = _c("mcu/{uid}/describe", Kind.STATE, p.McuManifest, "Manifest of a self-describing MCU.")
-MCU_VALUE = _c("mcu/{uid}/{name}", Kind.STREAM, p.McuSample, "A value of a self-describing MCU.")
+MCU_VALUE = _c("mcu/{uid}/{name}", Kind.STREAM, p.McuSample,
+               "A value of a self-describing MCU; delivered and kept as its manifest says.")  # fmt: skip
 OUTLET_STATUS = _c("outlets/{outlet}/status", Kind.STATE, p.OutletStatus, "State of an outlet.")
 
 # -- outgoing: media

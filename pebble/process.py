@@ -6,6 +6,7 @@ import logging
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from msgspec.structs import replace
@@ -21,8 +22,16 @@ _STOP_DEADLINE_S = 3.0
 log = logging.getLogger(__name__)
 
 
-def run(service_class: type[Service], arguments: list[str] | None = None) -> int:
-    """Run one service as this process: ``CONFIG [INSTANCE]``; returns the exit code."""
+def run(
+    service_class: type[Service],
+    arguments: list[str] | None = None,
+    *,
+    choose: Callable[[Config], type[Service]] | None = None,
+) -> int:
+    """Run one service as this process: ``CONFIG [INSTANCE]``; returns the exit code.
+
+    ``choose`` says which class serves a config, where there are several; ``service_class`` is their base then.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not 1 <= len(arguments) <= 2:
         sys.stderr.write(f"usage: python -m {service_class.__module__} CONFIG [INSTANCE]\n")
@@ -33,7 +42,8 @@ def run(service_class: type[Service], arguments: list[str] | None = None) -> int
         config = load(Path(arguments[0]))
         program = f"{service_class.name}:{instance}" if instance else service_class.name
         logging.getLogger().setLevel(config.log_level_of(program))
-        return _serve(service_class, view_of(config, instance), instance)
+        view = view_of(config, instance)
+        return _serve(service_class if choose is None else choose(view), view, instance)
     except PebbleError as error:
         for line in str(error).splitlines():
             log.error("%s", line)

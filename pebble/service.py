@@ -15,7 +15,7 @@ from pebble.errors import PayloadError
 from pebble.inbox import Inbox
 from pebble.rate_limit import RateLimitedLog
 from pebble.timers import Timer, Timers
-from pebble.transports import Message, QoS, State, Transport
+from pebble.transports import Message, QoS, State, Subscription, Transport
 from pebble.transports.counters import Counters
 
 _ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
@@ -87,11 +87,26 @@ class Service:
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
         """Send ``value`` on ``channel`` as its address says; ``names`` fill a pattern channel's levels."""
-        topic = self.addresses[channel].topic if not names else channel.topic(self.config.base, **names)
+        topic = self._topic(channel, names)
         raw = codec.encode(channel, value)
         if channel.kind is Kind.STATE:
             self._states[topic] = (channel, raw)
         return self._send(channel, topic, raw)
+
+    def retract(self, channel: Channel, **names: str) -> None:
+        """Take back what is kept on a STATE ``channel``, here and in its kept copy."""
+        topic = self._topic(channel, names)
+        if self._states.pop(topic, None) is not None:
+            self._send(channel, topic, b"")
+
+    def listen(self, channel: Channel, method: Callable[..., None]) -> Subscription:
+        """Handle ``channel`` from now on, as ``@on`` does from the start; until the subscription is closed."""
+
+        def receive(message: Message) -> None:
+            self._receive(channel, method, message)
+
+        topic = self.addresses[channel].topic
+        return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
 
     def post(self, job: Callable[[], None], *, newest_of: str | None = None) -> None:
         """Run ``job`` on the service's thread. With ``newest_of``, a waiting job of that name is replaced."""
@@ -114,7 +129,7 @@ class Service:
             self.transport.open(timeout=0.0)
             for name in _marked(type(self), "channel"):
                 method = getattr(self, name)
-                self._listen(method.channel, method)
+                self.listen(method.channel, method)
             self._set_timers()
             ready()
             self._loop()
@@ -157,6 +172,9 @@ class Service:
         for topic, (channel, raw) in self._states.items():
             self._send(channel, topic, raw)
 
+    def _topic(self, channel: Channel, names: dict[str, str]) -> str:
+        return self.addresses[channel].topic if not names else channel.topic(self.config.base, **names)
+
     def _send(self, channel: Channel, topic: str, raw: bytes) -> bool:
         address = self.addresses[channel]
         return self.transport.publish(topic, raw, qos=QoS(address.qos), retain=address.retain)
@@ -178,12 +196,6 @@ class Service:
         method()
 
     # -- the transport's threads: decode and post, nothing else
-
-    def _listen(self, channel: Channel, method: Callable[..., None]) -> None:
-        def receive(message: Message) -> None:
-            self._receive(channel, method, message)
-
-        self.transport.subscribe(self.addresses[channel].topic, receive, qos=QoS(channel.default_qos), direct=True)
 
     def _receive(self, channel: Channel, method: Callable[..., None], message: Message) -> None:
         """Refuse what is stale or malformed *before* it may take a newer message's place in the inbox."""

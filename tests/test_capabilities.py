@@ -85,6 +85,8 @@ def test_a_robot_without_services_says_so_and_names_everything() -> None:
             "touch_topic": f"{BASE}/outgoing/touch-sensors",
             "charging_topic": f"{BASE}/outgoing/charging-status",
             "charging_level_topic": f"{BASE}/outgoing/charging-level",
+            "imu": False,
+            "imu_topic": f"{BASE}/outgoing/sensors/imu",
         },
     }
 
@@ -102,6 +104,28 @@ def test_a_motor_line_offers_driving_lights_and_telemetry() -> None:
     assert value["telemetry"]["charging_status"]
     assert not value["telemetry"]["touch_sensors"], "only when it is published"
     assert of(serial_mcu_bridge={**MOTOR, "telemetry": {"publish_touch_sensors": True}})["telemetry"]["touch_sensors"]
+
+
+@pytest.mark.parametrize(
+    ("instances", "there"),
+    [
+        ({"imu": {"protocol": "pebble_serial_v1"}}, True),
+        ({"front": {"protocol": "imu_mpu6050_v1"}}, True),
+        ({"outlets": {"protocol": "pebble_serial_v1"}}, False),
+        ({"imu": {"protocol": "pebble_serial_v1", "enabled": False}}, False),
+        ({"imu": {"protocol": "goob_base_v1"}}, False),
+    ],
+)
+def test_an_inertial_sensor_is_told_under_its_lines_own_name(instances: dict[str, Any], there: bool) -> None:
+    topic = f"{BASE}/outgoing/sensors/rear"
+    lines = {
+        name: {"enabled": True, "serial": {"port": "/dev/imu"}, "topics": {"low_rate": topic}, **line}
+        for name, line in instances.items()
+    }
+    telemetry = of(serial_mcu_bridge={**MOTOR, "instances": lines})["telemetry"]
+    assert telemetry["imu"] is there
+    assert telemetry["imu_topic"] == (topic if there else f"{BASE}/outgoing/sensors/imu")
+    assert telemetry["charging_status"], "the motor's line is still told"
 
 
 @pytest.mark.parametrize("name", ["reboot", "service_restart", "git_pull"])
@@ -189,6 +213,7 @@ OVERRIDES = [
     ("serial_mcu_bridge.topics.touch_sensors", "telemetry.touch_topic"),
     ("serial_mcu_bridge.topics.charging_status", "telemetry.charging_topic"),
     ("serial_mcu_bridge.topics.charging_level", "telemetry.charging_level_topic"),
+    ("serial_mcu_bridge.topics.low_rate", "telemetry.imu_topic"),
 ]
 
 

@@ -21,6 +21,8 @@ from pebble.contract import (
     REBOOT,
     SOUNDBOARD_COMMAND,
     TOUCH_SENSORS,
+    Channel,
+    Kind,
 )
 from pebble.payloads import (
     ChargingStatus,
@@ -32,7 +34,7 @@ from pebble.payloads import (
     TouchValues,
 )
 from pebble.service import Service, every, on
-from pebble.transports import Message, QoS, State
+from pebble.transports import Message, QoS, State, Subscription
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import until
 
@@ -374,6 +376,44 @@ def test_a_pattern_channel_takes_its_names(robot: Robot) -> None:
     )
     robot.on_service_thread(lambda: robot.service.publish(MCU_DESCRIBE, manifest, uid="imu-1"))
     assert until(lambda: robot.received(f"{BASE}/outgoing/mcu/imu-1/describe"))
+
+
+LAMP = Channel(metric="lab/lamp", kind=Kind.COMMAND, payload=dict[str, Any], doc="Made while running.")
+GLOW = Channel(metric="lab/lamp", kind=Kind.STATE, payload=dict[str, Any], doc="Made while running.")
+
+
+def test_a_channel_made_while_running_is_heard_until_its_subscription_is_closed(robot: Robot) -> None:
+    robot.start()
+    subscriptions: list[Subscription] = []
+    robot.on_service_thread(lambda: subscriptions.append(robot.service.listen(LAMP, robot.service._note)))
+    assert until(lambda: subscriptions)
+    robot.say(f"{BASE}/incoming/lab/lamp", '{"value": {"on": true}}')
+    assert robot.saw({"on": True})
+    robot.say(f"{BASE}/incoming/lab/lamp", "[]")
+    assert until(lambda: robot.service.counters["refused"] == 1)
+    subscriptions[0].close()
+    robot.say(f"{BASE}/incoming/lab/lamp", '{"on": false}')
+    robot.say(DRIVE_TOPIC, '{"x": 0.5}')
+    assert robot.saw({"on": True}, 0.5)
+
+
+def test_what_was_kept_can_be_taken_back_and_is_not_said_again(robot: Robot) -> None:
+    robot.start()
+    topic = f"{BASE}/outgoing/lab/lamp"
+    robot.on_service_thread(lambda: robot.service.publish(GLOW, {"on": True}))
+    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
+    assert until(lambda: robot.received(topic) and robot.received(CHARGING_TOPIC))
+    assert robot.hub.kept[topic].payload == b'{"on":true}'
+    robot.on_service_thread(lambda: robot.service.retract(GLOW))
+    assert until(lambda: robot.received(topic)[-1].payload == b"")
+    assert topic not in robot.hub.kept
+    robot.on_service_thread(lambda: robot.service.retract(GLOW))
+    robot.heard.clear()
+    robot.hub.stop(forget=True)
+    assert until(lambda: robot.service.transport.state is State.CONNECTING)
+    robot.hub.start()
+    assert until(lambda: robot.received(CHARGING_TOPIC))
+    assert not robot.received(topic)
 
 
 def test_state_is_said_again_after_a_reconnect_and_streams_are_not(robot: Robot) -> None:

@@ -81,7 +81,7 @@ def _is_of_line(channel: Channel, config: Config) -> bool:
     line = config.services.serial_mcu_bridge
     if channel is TOUCH_SENSORS and not line.telemetry.publish_touch_sensors:
         return False
-    return channel.metric.startswith("sensors/") == line.protocol.startswith("imu_")
+    return channel.metric.startswith("sensors/") == (line.protocol != "goob_base_v1")
 
 
 def _transport(config: Config) -> str:
@@ -115,5 +115,6 @@ def _mqtt(mqtt: Mqtt) -> str:
 def _serial_lines(config: Config) -> Iterator[str]:
     for name, line in config.serial_instances().items():
         own = f"{name}: " if name else ""
-        stop = f"stops {line.safety.drive_timeout_seconds:g} s after the last command"
-        yield f"{own}{line.protocol} at {line.serial.port}, {line.serial.baud} baud, {stop}"
+        drives = line.protocol == "goob_base_v1"
+        stop = f", stops {line.safety.drive_timeout_seconds:g} s after the last command" if drives else ""
+        yield f"{own}{line.protocol} at {line.serial.port}, {line.serial.baud} baud{stop}"

@@ -22,10 +22,10 @@ from pebble.config.links import Tls as Tls
 from pebble.config.links import TransportSection as TransportSection
 from pebble.config.reader import Reader
 from pebble.config.text import decode, plain, read_text
-from pebble.config.tree import SERIAL_PROTOCOLS, Root
 from pebble.config.tree import Heartbeat as Heartbeat
 from pebble.config.tree import Launcher as Launcher
 from pebble.config.tree import MqttBridge as MqttBridge
+from pebble.config.tree import Root
 from pebble.config.tree import SerialBridge as SerialBridge
 from pebble.config.tree import SerialBridges as SerialBridges
 from pebble.config.tree import Services as Services
@@ -63,17 +63,10 @@ class Config(Root, frozen=True, kw_only=True):
         return str(getattr(section, "log_level", self.log_level))
 
     def serial_instances(self) -> dict[str, SerialBridge]:
-        """The serial lines to run, one process each, by instance name; the service's own entry is ``""``.
-
-        Left out are disabled lines and those whose protocol this release does not speak.
-        """
+        """The enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
         own = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": own, **own.instances}
-        return {
-            name: line
-            for name, line in lines.items()
-            if line.enabled and line.serial.port is not None and line.protocol in SERIAL_PROTOCOLS
-        }
+        return {name: line for name, line in lines.items() if line.enabled and line.serial.port is not None}
 
     def media_programs(self) -> tuple[str, ...]:
         """What runs while operators want pictures or sound: programs of the launcher, by the services' names."""

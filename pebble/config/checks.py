@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from pebble.config.links import Mqtt, Tls
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
-from pebble.config.tree import SERIAL_PROTOCOLS, MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
+from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
 
 _LATER = ("ros1_bridge", "soundboard_handler", "autonomy_manager", "web_handler")
@@ -74,8 +74,6 @@ def _serial_line(reader: Reader, line: SerialBridge, path: Path, ports: dict[str
         reader.notes.problem(path, f"shares {port} with {ports[port]}, write another serial.port")
     else:
         ports[port] = name
-    if line.protocol not in SERIAL_PROTOCOLS:
-        reader.notes.warning(path, f"protocol {line.protocol} arrives in a later release; skipped")
 
 
 def _safety(reader: Reader, safety: SerialSafety, path: Path) -> SerialSafety:

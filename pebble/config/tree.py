@@ -239,11 +239,9 @@ class SerialHealth(Section, frozen=True, kw_only=True):
     imu_sample_timeout_seconds: Annotated[
         Seconds | None, doc("No IMU sample for this long: exit; 0: never. Unset: 5 for an IMU, else 0.")
     ] = None
-    exit_on_serial_error: Annotated[bool | None, doc("Exit when the port fails. Unset: only for an IMU.")] = None
-
-
-#: The protocols that this release speaks; a line with another one is checked and skipped.
-SERIAL_PROTOCOLS = ("goob_base_v1",)
+    exit_on_serial_error: Annotated[
+        bool | None, doc("Exit when a self-describing MCU or an IMU goes away. Unset: look for it again instead.")
+    ] = None
 
 
 class SerialBridge(Service, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ import time
 from functools import partial
 
 from pebble import codec
-from pebble.contract import BRIDGE_PROBE, INCOMING, MCU_DESCRIBE, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, Kind
+from pebble.contract import BRIDGE_PROBE, INCOMING, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, Kind
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import SETTLE_S, Forwarder, Gate, barrier
 from pebble.forwarding.routing import Drop, Forward, Side
@@ -226,12 +226,8 @@ class MqttBridge(Service):
             if self._heartbeat.is_ours(message) and self._forwarder.gate is Gate.OPEN:
                 self.post(self._suspect, newest_of="suspect")
             return
-        subject = self._subjects[message.topic]
-        if subject is not None and subject.channel is MCU_DESCRIBE:
-            self._private.learn(message)
-        if message.topic in self._private:
-            return
-        self._follow_up(Side.LOCAL, message, self._forwarder.receive(Side.LOCAL, message))
+        for admitted in self._private.admit(message):
+            self._follow_up(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))
 
     def _on_probe(self, message: Message) -> None:
         if self._one_broker.gives_away(message):
@@ -241,7 +237,7 @@ class MqttBridge(Service):
                 self.post(self._stand_down)
 
     def _on_remote(self, epoch: int, message: Message) -> None:
-        if epoch != self._remote_epoch:
+        if epoch != self._remote_epoch or self._private.is_known(message.topic):
             return
         self._follow_up(Side.REMOTE, message, self._forwarder.receive(Side.REMOTE, message))
 

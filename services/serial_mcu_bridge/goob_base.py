@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from pebble.errors import PayloadError
+from pebble.services.serial_mcu_bridge.chatter import printable
 
 SHORTEST_FLASH_S, LONGEST_FLASH_S = 0.05, 3600.0  # one full fade in and out
 
 _TOUCH_NAMES = ((b"a0", b"a1", b"a2"), (b"t0", b"t1", b"t2"))  # Goob's and Fred's spelling
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,6}\Z")  # an ADC has at most 16 bits
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,6}(?:\.[0-9]{0,9})?\Z")  # what printf("%.3f") makes; never nan or inf
-_CHATTER_LIMIT = 200  # characters
 _LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR}
 
 
@@ -67,8 +67,8 @@ def parse(line: bytes) -> list[Report]:
         fields = dict(token.split(b"=", 1) for token in rest if b"=" in token)
         reports = _touch(fields) if kind == b"T" else []
         reports += _charging(fields) + _level(fields)
-        return reports or [Chatter(logging.WARNING, f"not understood: {_printable(line)}")]
-    text = _printable(line)
+        return reports or [Chatter(logging.WARNING, f"not understood: {printable(line)}")]
+    text = printable(line)
     return [Chatter(_LEVELS.get(kind, logging.INFO), text)] if text else []
 
 
@@ -117,11 +117,6 @@ def _charging(fields: dict[bytes, bytes]) -> list[Report]:
 def _level(fields: dict[bytes, bytes]) -> list[Report]:
     raw = fields.get(b"v", b"")
     return [Level(float(raw))] if _DECIMAL.match(raw) else []
-
-
-def _printable(line: bytes) -> str:
-    text = line.strip()[: 4 * _CHATTER_LIMIT].decode("utf-8", "backslashreplace")[:_CHATTER_LIMIT]
-    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
 
 
 def _finite(*values: float) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""The serial line to a motor MCU: found again after an unplug, never blocking its user, stopped first and last."""
+"""The serial line to an MCU: found again after an unplug, never blocking its user, motors stopped first and last."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ class SerialLine:
     and only then what was handed over since the opening. Lines do not queue: see :class:`Outbox`.
 
     ``on_bytes(chunk)`` and ``on_state(state, problem)`` run on the line's thread and must only hand over.
-    ``stop`` is the line that halts the motors, ``drive_timeout_s`` the age at which a drive line is worth nothing.
+    ``stop`` is the line that halts the motors, empty where there are none; ``drive_timeout_s`` the age at which a drive
+    line is worth nothing. ``end`` is what ends a line, or a frame. ``retry_s`` is the longest wait between two looks
+    for a device that is not there.
     """
 
     def __init__(
@@ -53,12 +55,15 @@ class SerialLine:
         drive_timeout_s: float = 0.75,
         settle_s: float = 0.5,
         read_timeout_s: float = 0.1,
+        retry_s: float = _LAST_RETRY_S,
+        end: bytes = b"\n",
     ) -> None:
         self.path, self.baud = path, baud
         self.opened = 0  # how often the device was opened
         self.refused = 0  # lines handed over while there was no device
         self.outbox = Outbox(stop, drive_timeout_s)
         self._stop, self._settle, self._read_timeout = stop, settle_s, read_timeout_s
+        self._retry, self._end = retry_s, end
         self._on_bytes, self._on_state = on_bytes, on_state
         self._byte_s = _BITS_PER_BYTE / baud
         self._thread = threading.Thread(target=self._run, name=f"pebble-serial {path}", daemon=True)
@@ -148,7 +153,7 @@ class SerialLine:
             sent = self._port.write(self._sending)
             if not sent:
                 return
-            self._torn = not self._sending[:sent].endswith(b"\n")
+            self._torn = not self._sending[:sent].endswith(self._end)
             self._sending = self._sending[sent:]
             self._busy_until = max(now, self._busy_until) + sent * self._byte_s
             self._blocked_since = None
@@ -177,7 +182,7 @@ class SerialLine:
                         retry_s = _FIRST_RETRY_S
                     self._say(LineState.ABSENT, str(error))
                     self._pause(retry_s)
-                    retry_s = min(2 * retry_s, _LAST_RETRY_S)
+                    retry_s = min(2 * retry_s, self._retry)
         finally:
             self._say(LineState.CLOSED)
 
@@ -198,7 +203,7 @@ class SerialLine:
             port.forget_output()  # what a killed predecessor left in the kernel is old by now
             self._port, self._failure, self._blocked_since = port, None, None
             self.outbox.clear()
-            self._sending = (b"\n" if self._torn else b"") + self._stop
+            self._sending = (self._end if self._torn else b"") + self._stop
             self._pump(time.monotonic())
         self._say(LineState.SETTLING)
 
@@ -208,6 +213,8 @@ class SerialLine:
         poller.register(self._awake, select.POLLIN)
         now = time.monotonic()
         settled_at, look_at = now + self._settle, now + _PATH_CHECK_S
+        if self._settle <= 0:
+            self._settled()  # before the first byte is read: it counts
         while not self._closing:
             ready = {fd for fd, _ in poller.poll(1000 * self._patience(settled_at - now))}
             if self._awake in ready:
@@ -269,7 +276,7 @@ class SerialLine:
                     return
             time.sleep(_RETRY_WRITE_S)
         port.forget_output()
-        port.write(b"\n" + self._stop)
+        port.write(self._end + self._stop)
 
     def _say(self, state: LineState, problem: str = "") -> None:
         with self._lock:

@@ -1,4 +1,4 @@
-"""Cut a stream of bytes into lines of limited length."""
+"""Cut a stream of bytes into lines, or frames, of limited length."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ LINE_LIMIT = 256  # bytes; the longest line of any text protocol here is under 1
 
 
 class LineSplitter:
-    """Chunks in, complete lines out; what is longer than ``limit`` bytes is thrown away up to the next LF.
+    """Chunks in, complete lines out; what is longer than ``limit`` bytes is thrown away up to the next ``end``.
 
     ``discarded_lines`` and ``discarded_bytes`` count what was thrown away.
     """
 
-    def __init__(self, limit: int = LINE_LIMIT) -> None:
+    def __init__(self, limit: int = LINE_LIMIT, end: bytes = b"\n") -> None:
         self.discarded_lines = 0
         self.discarded_bytes = 0
-        self._limit = limit
+        self._limit, self._separator = limit, end
         self._tail = b""
         self._skipping = False
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """The lines that ``chunk`` completes, without their LF; a CR is left for the protocol to ignore."""
-        *complete, tail = chunk.split(b"\n")
+        """The lines that ``chunk`` completes, without their end; a CR is left for the protocol to ignore."""
+        *complete, tail = chunk.split(self._separator)
         lines = [line for part in complete if (line := self._end(part)) is not None]
         self._grow(tail)
         return lines

@@ -1,0 +1,317 @@
+"""A scripted self-describing MCU on a real pty, the bridge that serves it, and a robot's fabric for both."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import struct
+import threading
+import time
+import tty
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from pebble.config import Config, parse
+from pebble.errors import PebbleError
+from pebble.links import local_transport
+from pebble.process import view_of
+from pebble.service import Service
+from pebble.services.serial_mcu_bridge.bridges import bridge_of
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.services import mcu_wire as wire
+from tests.services.mcu_wire import Heard, M
+from tests.support import Broker, until
+from tests.transports.zenoh_net import HubProcess
+
+ROBOT = "rover"
+BASE = f"pebble/robots/{ROBOT}"
+STEP_S = 0.002
+
+
+class ScriptedMcu:
+    """Answers DESCRIBE_REQ and PING, accepts commands, and says what the test tells it to.
+
+    ``period_s`` makes it say its first interface's payload again and again, numbered from 1 at each plugging in.
+    """
+
+    def __init__(self, link: Path, manifest: M, *, greets: bool = False) -> None:
+        self.link, self.manifest, self.greets = link, manifest, greets
+        self.answers: Callable[[Heard], bytes] = lambda heard: wire.frame(
+            wire.ACK, b"", heard.interface, heard.sequence
+        )
+        self.after_describing = b""
+        self.silent = False
+        self.heard: list[tuple[float, Heard]] = []
+        self.plugged_at = 0.0
+        self.said = 0  # numbered samples since it was plugged in
+        self._stream: tuple[float, bytes, int] | None = None
+        self._next = 0.0
+        self._master = -1
+        self._host = False
+        self._rest = b""
+        self._lock = threading.Lock()
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def plug(self) -> None:
+        with self._lock:
+            self._master, slave = os.openpty()
+            tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            new = self.link.with_suffix(".new")
+            new.symlink_to(os.ttyname(slave))
+            os.close(slave)
+            self._rest, self._host, self.said = b"", False, 0
+            self.plugged_at = time.monotonic()
+            new.replace(self.link)
+
+    def unplug(self) -> None:
+        with self._lock:
+            self.link.unlink(missing_ok=True)
+            os.close(self._master)
+            self._master = -1
+
+    def say(self, *frames: bytes) -> None:
+        with self._lock:
+            self._write(b"".join(frames))
+
+    def pour(self, data: bytes) -> None:
+        """Say it as fast as the host takes it."""
+        poller = select.poll()
+        poller.register(self._master, select.POLLOUT)
+        while data:
+            assert poller.poll(5000), "the host does not read"
+            with self._lock, suppress(BlockingIOError):
+                data = data[os.write(self._master, data) :]
+
+    def stream(self, hertz: float, payload: bytes, kind: int = wire.SAMPLE) -> None:
+        with self._lock:
+            self._stream, self._next = (1 / hertz, payload, kind), time.monotonic()
+
+    def commands(self) -> list[Heard]:
+        return [heard for _, heard in list(self.heard) if heard.kind == wire.CMD]
+
+    def asked(self) -> int:
+        return sum(heard.kind == wire.DESCRIBE_REQ for _, heard in list(self.heard))
+
+    def close(self) -> None:
+        self._ending = True
+        self._thread.join(5)
+        if self._master >= 0:
+            self.unplug()
+
+    def __enter__(self) -> Self:
+        self.plug()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    # -- its thread
+
+    def _run(self) -> None:
+        while not self._ending:
+            time.sleep(STEP_S)
+            with self._lock, suppress(OSError):
+                if self._master >= 0:
+                    self._turn()
+
+    def _turn(self) -> None:
+        poller = select.poll()
+        poller.register(self._master, select.POLLIN)
+        events = poller.poll(0)
+        if not events or not events[0][1] & select.POLLHUP:
+            if not self._host and self.greets:
+                self._write(wire.frame(wire.HELLO, self.manifest.hello()))
+            self._host = True
+        if events and events[0][1] & select.POLLIN:
+            *frames, self._rest = (self._rest + os.read(self._master, 65536)).split(b"\0")
+            for stuffed in filter(None, frames):
+                self._hear(wire.heard(stuffed))
+        if self._host and self._stream is not None and not self.silent:
+            period_s, payload, kind = self._stream
+            while time.monotonic() >= self._next:
+                self._next += period_s
+                self.said += 1
+                self._write(wire.frame(kind, payload, 1, self.said, self.said * 10))
+
+    def _hear(self, heard: Heard) -> None:
+        self.heard.append((time.monotonic(), heard))
+        if self.silent:
+            return
+        if heard.kind == wire.DESCRIBE_REQ:
+            self._write(wire.frame(wire.DESCRIBE, self.manifest.describe()) + self.after_describing)
+        elif heard.kind == wire.PING:
+            self._write(wire.frame(wire.PONG))
+        elif heard.kind == wire.CMD:
+            self._write(self.answers(heard))
+
+    def _write(self, data: bytes) -> None:
+        if self._master >= 0 and data:
+            os.write(self._master, data)
+
+
+class Fabric:
+    """A robot's own fabric of one kind: ``memory``, ``mqtt`` (a real mosquitto) or ``zenoh`` (our hub)."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.kind, self._ends = kind, ExitStack()
+        self.transport: dict[str, Any] = {}
+        self.local_mqtt: dict[str, Any] = {}
+        if kind == "memory":
+            self._memory = MemoryHub()
+        elif kind == "mqtt":
+            broker = Broker(folder)
+            self._ends.callback(broker.stop)
+            self.local_mqtt = {"host": "127.0.0.1", "port": broker.port}
+            self._mqtt = MqttSettings(host="127.0.0.1", port=broker.port)
+        else:
+            self._run_dir = folder / "run"
+            hub = HubProcess(self._run_dir).start()
+            self._ends.callback(hub.kill)
+            self.transport = {"kind": "zenoh", "run_dir": str(self._run_dir)}
+
+    def config(self, folder: Path, serial: dict[str, Any], **services: Any) -> Config:
+        raw = {
+            "robot": {"id": ROBOT},
+            **({"transport": self.transport} if self.transport else {}),
+            "local_mqtt": self.local_mqtt,
+            "services": {"serial_mcu_bridge": serial, **services},
+        }
+        return parse(raw, folder=folder, env={})
+
+    def robots_transport(self, config: Config, name: str, *, as_published: bool = False) -> Transport:
+        """As a process of the robot would have it."""
+        if self.kind == "memory":
+            return MemoryTransport(name, self._memory)
+        return local_transport(config, name, as_published=as_published)
+
+    def client(self, name: str) -> Transport:
+        if self.kind == "memory":
+            return MemoryTransport(name, self._memory)
+        if self.kind == "mqtt":
+            return create("mqtt", name, self._mqtt)
+        return create("zenoh", name, ZenohSettings(run_dir=self._run_dir, client=True))
+
+    def close(self) -> None:
+        self._ends.close()
+
+
+class Listener:
+    """Somebody on the fabric who hears everything that goes out, and can command."""
+
+    def __init__(self, transport: Transport) -> None:
+        self.heard: list[Message] = []
+        self.at: list[float] = []
+        self.transport = transport.open(10)
+        assert transport.state is State.CONNECTED, transport.problem
+        transport.subscribe(f"{BASE}/outgoing/#", self._hear, direct=True)
+
+    def _hear(self, message: Message) -> None:
+        self.at.append(time.monotonic())
+        self.heard.append(message)
+
+    def on(self, metric: str) -> list[Message]:
+        return [message for message in list(self.heard) if message.topic == f"{BASE}/outgoing/{metric}"]
+
+    def said(self, metric: str) -> list[Any]:
+        return [msgspec.json.decode(message.payload) for message in self.on(metric) if message.payload]
+
+    def first(self, metric: str) -> float:
+        """When it was heard for the first time."""
+        pairs = zip(list(self.heard), list(self.at), strict=False)
+        return next(at for message, at in pairs if message.topic == f"{BASE}/outgoing/{metric}")
+
+    def kept(self, metric: str) -> list[bytes]:
+        """Of the newest message on a topic what would be kept: nothing once it was taken back."""
+        return [message.payload for message in self.on(metric)[-1:] if message.payload]
+
+    def command(self, metric: str, body: Any, *, retain: bool = False) -> None:
+        raw = body if isinstance(body, bytes) else json.dumps(body).encode()
+        assert self.transport.publish(f"{BASE}/incoming/{metric}", raw, qos=QoS.DELIVERED, retain=retain)
+
+
+class Running:
+    """A service on a thread of its own, as its process would run it; ``error`` is how it ended."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.error: PebbleError | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.service.run()
+        except PebbleError as error:
+            self.error = error
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def stop(self) -> None:
+        self.service.quit()
+        self._thread.join(10)
+        assert not self._thread.is_alive(), "the service does not end"
+
+
+class Rig:
+    """A fabric, somebody who listens, and any number of lines with an MCU each, by instance name."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.folder, self._ends = folder, ExitStack()
+        self.fabric = Fabric(kind, folder)
+        self._ends.callback(self.fabric.close)
+        self.world = self.listener("world")
+        self._config: Config | None = None
+        self.lines: dict[str, Running] = {}
+
+    def listener(self, name: str) -> Listener:
+        listener = Listener(self.fabric.client(name))
+        self._ends.callback(listener.transport.close)
+        return listener
+
+    def mcu(self, manifest: M, name: str = "one", *, plugged: bool = True, greets: bool = False) -> ScriptedMcu:
+        mcu = ScriptedMcu(self.folder / name, manifest, greets=greets)
+        self._ends.callback(mcu.close)
+        if plugged:
+            mcu.plug()
+        return mcu
+
+    def bridge(self, name: str = "one", protocol: str = "pebble_serial_v1", **section: Any) -> Running:
+        """Start the service for the MCU of that name; ``section`` is the rest of its config."""
+        line = {"enabled": True, "protocol": protocol, "serial": {"port": str(self.folder / name)}, **section}
+        config = view_of(self.fabric.config(self.folder, {"instances": {name: line}}), name)
+        transport = self.fabric.robots_transport(config, f"serial-{name}")
+        running = self.lines[name] = Running(bridge_of(config)(config, transport, instance=name))
+        self._ends.callback(running.stop)
+        return running
+
+    def claimed(self, name: str = "one") -> bool:
+        """Wait until the MCU is described and its aliases are in use, or found to be somebody else's."""
+        return until(lambda: self.lines[name].service._aliases.settled, 5)  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        self._ends.close()
+
+
+def motion(ax: int = 9807) -> bytes:
+    """A payload of the inertial sensor's first interface."""
+    return struct.pack("<9h", ax, -20, 3, 100, -100, 1, 2512, 33, -7)
+
+
+def summary() -> bytes:
+    return struct.pack("<H3hIIH", 1001, 5, -6, 7, 1000, 2, 200)
+
+
+def settled(listener: Listener, metric: str) -> bool:
+    return until(lambda: listener.said(metric), 5)

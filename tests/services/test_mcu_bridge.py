@@ -1,0 +1,436 @@
+"""The bridge of a self-describing MCU, on every transport and a real pty: topics, commands, coming and going."""
+
+from __future__ import annotations
+
+import logging
+import random
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.services.serial_mcu_bridge.pebble_serial import SILENCE_S
+from tests.services import mcu_wire as wire
+from tests.services.mcu_rig import BASE, Rig, motion, settled, summary
+from tests.services.mcu_wire import IMU, LAMP, STATION, F, I, M
+from tests.services.test_pebble_serial_hostile import ATTACKS
+from tests.support import until
+
+STATE = b"\1\0\1"
+
+
+@pytest.fixture(params=["memory", "mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig(request.param, tmp_path)
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig("memory", tmp_path)
+    yield rig
+    rig.close()
+
+
+@pytest.mark.alone
+def test_it_is_found_within_two_seconds_and_says_what_it_is(rig: Rig) -> None:
+    mcu = rig.mcu(IMU, plugged=False)
+    rig.bridge()
+    time.sleep(1)  # looked for in vain for a while
+    mcu.stream(100, motion())
+    mcu.plug()
+    assert settled(rig.world, "mcu/goob-imu-nano/describe")
+    assert settled(rig.world, "sensors/imu-fast")
+    assert rig.world.first("mcu/goob-imu-nano/describe") - mcu.plugged_at < 2
+    assert rig.world.first("mcu/goob-imu-nano/imu_fast") - mcu.plugged_at < 2
+    assert rig.world.first("sensors/imu-fast") - mcu.plugged_at < 2
+    (described,) = rig.world.said("mcu/goob-imu-nano/describe")
+    assert described["schema_hash"] == "goob-imu-v2"
+    assert rig.world.heard[0].topic == f"{BASE}/outgoing/mcu/goob-imu-nano/describe"
+    late = rig.listener("late")
+    assert until(lambda: late.on("mcu/goob-imu-nano/describe"))
+    assert late.on("mcu/goob-imu-nano/describe")[0].retain
+
+
+@pytest.mark.alone
+def test_a_hundred_samples_a_second_without_loss(rig: Rig) -> None:
+    mcu = rig.mcu(IMU)
+    rig.bridge()
+    assert settled(rig.world, "mcu/goob-imu-nano/describe")
+    assert rig.claimed()
+    mcu.stream(100, motion())
+    time.sleep(5)
+    mcu.silent = True
+    assert until(lambda: len(rig.world.on("sensors/imu-fast")) == mcu.said)
+    assert mcu.said >= 450
+    for metric in ("mcu/goob-imu-nano/imu_fast", "sensors/imu-fast"):
+        assert [body["seq"] for body in rig.world.said(metric)] == list(range(1, mcu.said + 1))
+
+
+def test_the_bodies_of_an_inertial_sensor(memory: Rig) -> None:
+    mcu = memory.mcu(IMU)
+    memory.bridge()
+    assert settled(memory.world, "mcu/goob-imu-nano/describe")
+    assert memory.claimed()
+    began = time.time_ns() // 1_000_000
+    mcu.say(wire.frame(wire.STATE, summary(), 2, 7, 700))  # nothing to sum up yet
+    mcu.say(wire.frame(wire.SAMPLE, motion(), 1, 8, 800), wire.frame(wire.STATE, summary(), 2, 9, 900))
+    assert settled(memory.world, "sensors/imu")
+    (fast,), (slow,) = memory.world.said("sensors/imu-fast"), memory.world.said("sensors/imu")
+    assert list(fast) == ["t", "seq", "mcu_ms", "value"]
+    assert (fast["seq"], fast["mcu_ms"]) == (8, 800)
+    assert 0 <= fast["t"] - began < 5000
+    fast_value = {
+        "accel_mps2": {"x": 9.807, "y": -0.02, "z": 0.003},
+        "gyro_dps": {"x": 1.0, "y": -1.0, "z": 0.01},
+        "temp_c": 25.12,
+        "orientation_deg": {"roll": 0.33, "pitch": -0.07},
+    }
+    assert fast["value"] == fast_value
+    assert slow["value"] == {
+        **fast_value,
+        "accel_norm_g": 1.001,
+        "gyro_bias_dps": {"x": 0.05, "y": -0.06, "z": 0.07},
+        "health": {
+            "device": str(memory.folder / "one"),
+            "protocol": "pebble_serial_v1",
+            "instance": "one",
+            "samples_ok": 1000,
+            "samples_error": 2,
+            "calibration_samples": 200,
+        },
+    }
+    first, second = memory.world.said("mcu/goob-imu-nano/imu")
+    assert (first["seq"], second["seq"]) == (7, 9)
+    generic = memory.world.said("mcu/goob-imu-nano/imu_fast")[0]
+    assert list(generic) == ["t", "seq", "mcu_ms", "device_uid", "interface", "profile", "value"]
+    assert (generic["device_uid"], generic["interface"], generic["profile"]) == (
+        "goob-imu-nano", "imu_fast", "imu.motion.v1",
+    )  # fmt: skip
+    assert generic["value"]["ax"] == 9.807
+    qos = {m.topic.removeprefix(f"{BASE}/outgoing/"): (int(m.qos), m.keep) for m in memory.world.heard}
+    assert qos["mcu/goob-imu-nano/imu_fast"] == qos["sensors/imu-fast"] == (0, False)
+    assert qos["mcu/goob-imu-nano/imu"] == qos["sensors/imu"] == (1, False)
+    assert qos["mcu/goob-imu-nano/describe"] == (1, True)
+
+
+def test_quality_and_keeping_follow_the_interface(rig: Rig) -> None:
+    mcu = rig.mcu(LAMP)
+    rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    assert rig.claimed()
+    mcu.say(wire.frame(wire.STATE, b"\x0b", 2), wire.frame(wire.STATE, b"\1", 3), wire.frame(wire.SAMPLE, bytes(4), 4))
+    assert settled(rig.world, "mcu/lamp-1/glow")
+    assert [body["value"] for body in rig.world.said("lights/lamp")] == [{"level": 5.5}]
+    late = rig.listener("late")
+    assert until(lambda: len(late.heard) >= 3)
+    time.sleep(0.2)
+    assert sorted(m.topic.removeprefix(f"{BASE}/outgoing/") for m in late.heard) == [
+        "lights/lamp", "mcu/lamp-1/describe", "mcu/lamp-1/lamp",
+    ]  # fmt: skip
+    assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/button") + rig.world.on("lights/lamp")} == {1}
+    assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/glow")} == {0}
+
+
+def test_a_state_that_is_said_only_once_is_not_lost(rig: Rig) -> None:
+    """Right after the manifest: nobody knows yet whether the uid and the alias are free."""
+    mcu = rig.mcu(LAMP, plugged=False)
+    mcu.after_describing = wire.frame(wire.STATE, b"\x0a", 2) + wire.frame(wire.STATE, b"\x0b", 2)
+    rig.bridge()
+    mcu.plug()
+    assert settled(rig.world, "lights/lamp")
+    for metric in ("mcu/lamp-1/lamp", "lights/lamp"):
+        assert [body["value"] for body in rig.world.said(metric)] == [{"level": 5.5}]
+
+
+# -- commands
+
+
+@pytest.mark.parametrize(
+    ("topic", "wrap"), [("mcu/lamp-1/lamp", lambda body: body), ("lights/lamp", lambda body: {"value": body})]
+)
+def test_a_command_reaches_the_mcu(rig: Rig, topic: str, wrap: Any) -> None:
+    mcu = rig.mcu(LAMP)
+    rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    assert rig.claimed()
+    rig.world.command(topic, wrap({"level": 40, "on": True}))
+    assert until(mcu.commands)
+    (command,) = mcu.commands()
+    assert (command.interface, command.payload) == (1, b"\x50\x01")
+    assert command.ms == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
+
+
+def test_what_does_not_fit_never_reaches_the_mcu(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    mcu = memory.mcu(LAMP)
+    running = memory.bridge()
+    assert settled(memory.world, "mcu/lamp-1/describe")
+    assert memory.claimed()
+    caplog.set_level(logging.WARNING)
+    bad = [{"level": 10}, {"level": 200, "on": True}, {"level": 1, "on": "false"}, {"level": 1, "on": 1},
+           {"level": "5", "on": True}, [], 5, None, True, b"\xff", b"{", b"[" * 40_000]  # fmt: skip
+    for body in bad:
+        memory.world.command("mcu/lamp-1/lamp", body)
+    memory.world.command("mcu/lamp-1/lamp", {"level": 0, "on": False})
+    assert until(mcu.commands)
+    assert [command.payload for command in mcu.commands()] == [b"\0\0"]
+    assert running.service.counters["refused"] == len(bad)
+    assert "lamp: on is missing" in caplog.text
+
+
+def test_a_kept_command_is_old_news(rig: Rig) -> None:
+    mcu = rig.mcu(LAMP)
+    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True}, retain=True)
+    rig.world.command("lights/lamp", {"level": 40, "on": True}, retain=True)
+    running = rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    assert until(lambda: running.service.counters["stale"] == 2)
+    rig.world.command("lights/lamp", {"level": 1, "on": False})
+    assert until(mcu.commands)
+    assert [command.payload for command in mcu.commands()] == [b"\2\0"]
+
+
+def test_answers_are_logged(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    mcu = memory.mcu(STATION)
+    memory.bridge()
+    assert settled(memory.world, "mcu/hs105-sta/describe")
+    memory.world.command("mcu/hs105-sta/o1_set", {"on": True})
+    assert until(lambda: "o1_set: command 2 accepted" in caplog.text)
+    mcu.answers = lambda heard: wire.frame(wire.NACK, b"slot_unconfigured", heard.interface, heard.sequence)
+    memory.world.command("mcu/hs105-sta/o4_set", {"on": True})
+    assert until(lambda: "o4_set: the MCU refuses command 3: slot_unconfigured" in caplog.text)
+    (warning,) = [record for record in caplog.records if "refuses" in record.getMessage()]
+    assert warning.levelno == logging.WARNING
+
+
+def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory: Rig) -> None:
+    mcu = memory.mcu(STATION)
+    memory.bridge()
+    assert settled(memory.world, "mcu/hs105-sta/describe")
+    for number in range(4):
+        memory.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": True})
+        memory.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": False})
+    assert until(lambda: len(mcu.commands()) == 8)
+    assert [(command.interface, command.payload) for command in mcu.commands()] == [
+        (interface, payload) for interface in (1, 3, 5, 7) for payload in (b"\1", b"\0")
+    ]
+
+
+# -- coming and going
+
+
+@pytest.mark.alone
+def test_an_unplugged_device_is_gone_and_a_replugged_one_is_asked_again(rig: Rig) -> None:
+    mcu = rig.mcu(LAMP)
+    running = rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    assert rig.claimed()
+    mcu.say(wire.frame(wire.STATE, b"\x0b", 2))
+    assert settled(rig.world, "lights/lamp")
+    mcu.unplug()
+    for metric in ("mcu/lamp-1/describe", "mcu/lamp-1/lamp", "lights/lamp"):
+        assert until(lambda metric=metric: rig.world.kept(metric) == [], 3), f"{metric} is still kept"
+    late = rig.listener("late")
+    time.sleep(0.3)
+    assert late.heard == []
+    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    assert until(lambda: running.service.counters["no_device"] == 1)
+    asked = mcu.asked()
+    mcu.plug()
+    assert until(lambda: rig.world.kept("mcu/lamp-1/describe"), 3)
+    assert rig.world.at[-1] - mcu.plugged_at < 2
+    assert mcu.asked() > asked
+    assert rig.claimed()
+    rig.world.command("lights/lamp", {"level": 40, "on": True})
+    assert until(mcu.commands)
+    assert len(mcu.commands()) == 1, "the one of before was dropped"
+
+
+@pytest.mark.alone
+def test_a_known_device_is_usable_as_soon_as_it_greets(memory: Rig) -> None:
+    mcu = memory.mcu(LAMP, greets=True)
+    memory.bridge()
+    assert settled(memory.world, "mcu/lamp-1/describe")
+    assert memory.world.first("mcu/lamp-1/describe") - mcu.plugged_at < 0.8, "asked 0.25 s after the greeting"
+    asked = mcu.asked()
+    mcu.unplug()
+    assert until(lambda: memory.world.kept("mcu/lamp-1/describe") == [])
+    mcu.plug()
+    assert until(lambda: memory.world.kept("mcu/lamp-1/describe"))
+    assert memory.world.at[-1] - mcu.plugged_at < 0.9
+    assert mcu.asked() == asked
+
+
+def test_another_device_at_the_same_line(memory: Rig) -> None:
+    mcu = memory.mcu(LAMP)
+    memory.bridge()
+    assert settled(memory.world, "mcu/lamp-1/describe")
+    mcu.unplug()
+    mcu.manifest = LAMP.but(uid="lamp-2", hash="other")
+    mcu.plug()
+    assert settled(memory.world, "mcu/lamp-2/describe")
+    assert memory.world.kept("mcu/lamp-1/describe") == []
+    memory.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    memory.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
+    assert until(mcu.commands)
+    assert [command.payload for command in mcu.commands()] == [b"\2\1"]
+
+
+def test_new_firmware_while_it_runs(rig: Rig) -> None:
+    mcu = rig.mcu(LAMP)
+    rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    assert rig.claimed()
+    mcu.say(wire.frame(wire.STATE, b"\x0b", 2))
+    assert settled(rig.world, "lights/lamp")
+    renumbered = tuple(I(**{**vars(one), "id": one.id + 10, "channel": ""}) for one in LAMP.interfaces)
+    mcu.manifest = LAMP.but(interfaces=renumbered, hash="h2")
+    mcu.say(wire.frame(wire.HELLO, mcu.manifest.hello()))
+    assert until(lambda: [body["schema_hash"] for body in rig.world.said("mcu/lamp-1/describe")] == ["h1", "h2"], 3)
+    assert until(lambda: rig.world.kept("lights/lamp") == [])
+    assert rig.claimed()
+    rig.world.command("lights/lamp", {"level": 40, "on": True})
+    rig.world.command("mcu/lamp-1/lamp", {"level": 1, "on": True})
+    assert until(mcu.commands)
+    assert [command.interface for command in mcu.commands()] == [11]
+    mcu.say(wire.frame(wire.STATE, b"\x0c", 2), wire.frame(wire.STATE, b"\x0d", 12))
+    assert until(lambda: len(rig.world.said("mcu/lamp-1/lamp")) == 2)
+    assert rig.world.said("mcu/lamp-1/lamp")[-1]["value"] == {"level": 6.5}
+
+
+def test_a_bridge_that_ends_takes_back_what_it_said(rig: Rig) -> None:
+    mcu = rig.mcu(LAMP)
+    running = rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    mcu.say(wire.frame(wire.STATE, b"\x0b", 2))
+    assert settled(rig.world, "mcu/lamp-1/lamp")
+    running.stop()
+    assert until(lambda: rig.world.kept("mcu/lamp-1/describe") == [])
+    assert until(lambda: rig.world.kept("mcu/lamp-1/lamp") == [])
+
+
+def test_what_a_killed_bridge_left_is_taken_back_by_its_successor(rig: Rig) -> None:
+    """The device was taken away while nobody looked."""
+    left = rig.fabric.client("killed").open(10)
+    manifest = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":0,"schema_hash":"h",' \
+               b'"device_uid":"ghost","firmware_version":"1","model":"m","interfaces":[]}'  # fmt: skip
+    left.publish(f"{BASE}/outgoing/mcu/ghost/describe", manifest, qos=1, retain=True)  # type: ignore[arg-type]
+    assert settled(rig.world, "mcu/ghost/describe")
+    left.close()
+    rig.mcu(LAMP)
+    rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    assert rig.world.kept("mcu/ghost/describe")
+    assert until(lambda: rig.world.kept("mcu/ghost/describe") == [], 8)
+    assert rig.world.kept("mcu/lamp-1/describe")
+
+
+def test_garbage_on_the_line_ends_nothing(memory: Rig) -> None:
+    mcu = memory.mcu(LAMP)
+    running = memory.bridge()
+    assert settled(memory.world, "mcu/lamp-1/describe")
+    mcu.say(b"Arduino says hello\r\n" * 50, b"\0", wire.frame(wire.HELLO, M(b"\xff").hello()))
+    mcu.say(wire.frame(wire.DESCRIBE, b"\xff" * 40), wire.frame(wire.STATE, b"\x0b", 2)[:-3], b"\0")
+    mcu.say(wire.frame(wire.STATE, b"\x0b", 2))
+    assert settled(memory.world, "mcu/lamp-1/lamp")
+    counters = running.service.counters
+    assert (counters["hello"], counters["describe"]) == (1, 1)
+    assert counters["stuffing"] + counters["crc"] >= 1
+
+
+def test_twenty_thousand_hostile_frames_end_nothing(memory: Rig) -> None:
+    mcu = memory.mcu(STATION)
+    running = memory.bridge()
+    assert settled(memory.world, "mcu/hs105-sta/describe")
+    chance = random.Random(8)
+    for _ in range(200):
+        mcu.pour(b"".join(chance.choice(ATTACKS)(chance) for _ in range(100)))
+    before = len(memory.world.on("mcu/hs105-sta/o1_state"))
+
+    def understood() -> bool:
+        mcu.pour(b"\0" + wire.frame(wire.DESCRIBE, STATION.describe()) + wire.frame(wire.STATE, b"\1\0\1", 2))
+        return len(memory.world.on("mcu/hs105-sta/o1_state")) > before
+
+    assert until(understood, 10, step=0.1)
+    assert running.alive
+    assert running.service.counters["crc"] > 100
+
+
+# -- health
+
+
+@pytest.mark.alone
+def test_an_inertial_sensor_that_says_nothing_ends_the_process(memory: Rig) -> None:
+    mcu = memory.mcu(IMU)
+    running = memory.bridge(health={"imu_sample_timeout_seconds": 1.0}, log_level="INFO")
+    mcu.stream(100, motion())
+    assert settled(memory.world, "sensors/imu-fast")
+    time.sleep(1.5)
+    assert running.alive
+    mcu.silent = True
+    stopped = time.monotonic()
+    assert until(lambda: not running.alive, 5)
+    assert 0.9 < time.monotonic() - stopped < 2.5
+    assert str(running.error) == "no sample for 1 s"
+    assert memory.world.kept("mcu/goob-imu-nano/describe") == []
+
+
+def test_others_may_be_silent(memory: Rig) -> None:
+    memory.mcu(STATION)
+    running = memory.bridge()
+    assert settled(memory.world, "mcu/hs105-sta/describe")
+    watchdog = running.service._watchdog  # type: ignore[attr-defined]
+    assert watchdog.timeout_s == 0
+    assert SILENCE_S > 5
+
+
+def test_an_inertial_sensor_is_given_five_seconds_unless_the_config_says_otherwise(memory: Rig) -> None:
+    memory.mcu(IMU)
+    running = memory.bridge()
+    assert settled(memory.world, "mcu/goob-imu-nano/describe")
+    assert running.service._watchdog.timeout_s == 5  # type: ignore[attr-defined]
+
+
+def test_an_absent_sensor_is_waited_for(memory: Rig) -> None:
+    mcu = memory.mcu(IMU)
+    running = memory.bridge(health={"imu_sample_timeout_seconds": 0.5})
+    mcu.stream(100, motion())
+    assert settled(memory.world, "sensors/imu-fast")
+    mcu.unplug()
+    time.sleep(1.5)
+    assert running.alive
+    mcu.plug()
+    assert until(lambda: memory.world.kept("mcu/goob-imu-nano/describe"), 3)
+
+
+def test_the_process_may_end_when_the_port_fails(memory: Rig) -> None:
+    mcu = memory.mcu(LAMP)
+    running = memory.bridge(health={"exit_on_serial_error": True})
+    assert settled(memory.world, "mcu/lamp-1/describe")
+    mcu.unplug()
+    assert until(lambda: not running.alive, 3)
+    assert running.error is not None
+    assert memory.world.kept("mcu/lamp-1/describe") == []
+
+
+def test_a_refused_alias_is_told_and_its_interface_lives_on(memory: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    rogue = M("rogue", (
+        I(1, "drive", wire.IN, wire.KIND_COMMAND, (F("x", wire.I8),), "drive-values"),
+        I(2, "reboot", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "online", "", wire.RETAIN),
+    ))  # fmt: skip
+    mcu = memory.mcu(rogue)
+    memory.bridge()
+    assert settled(memory.world, "mcu/rogue/describe")
+    assert memory.claimed()
+    mcu.say(wire.frame(wire.STATE, b"\1", 2))
+    assert settled(memory.world, "mcu/rogue/reboot")
+    memory.world.command("drive-values", {"x": 1, "z": 0})
+    memory.world.command("mcu/rogue/drive", {"x": 5})
+    assert until(mcu.commands)
+    assert [command.payload for command in mcu.commands()] == [b"\5"]
+    assert memory.world.on("online") == []
+    assert "rogue: no alias for drive: incoming/drive-values: the channel is the robot's own" in caplog.text
