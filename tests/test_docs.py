@@ -17,7 +17,7 @@ DOCUMENTS = [
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
 #: `folder/`, `folder/file.py` or `file.py`; what begins like a topic below a robot's identity is none
 CODE = re.compile(r"`((?!incoming/|outgoing/|flags/|sensors/|mcu/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`")
-OURS = ("pebble", "transports", "services")
+OURS = ("pebble", "transports", "services", "firmware")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -3,12 +3,12 @@
 import hashlib
 import json
 import sys
-import urllib.request
 from pathlib import Path
 from urllib.parse import urljoin
 
+from download import fetch
+
 INDEX = "https://pypi.org/pypi/pip/json"
-TIMEOUT_S = 30
 
 
 def main(folder: Path) -> None:
@@ -21,14 +21,6 @@ def main(folder: Path) -> None:
     target = folder / wheel["filename"]
     target.write_bytes(content)
     print(target)
-
-
-def fetch(url: str) -> bytes:
-    try:
-        with urllib.request.urlopen(url, timeout=TIMEOUT_S) as answer:  # noqa: S310 - https, by INDEX
-            return bytes(answer.read())
-    except OSError as error:
-        sys.exit(f"cannot fetch {url}: {error}")
 
 
 if __name__ == "__main__":

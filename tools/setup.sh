@@ -4,6 +4,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 extra=$1
+stubs_version=1.29.0.post1 # of micropython-*-stubs
 
 say() { printf 'pebble: %s\n' "$*"; }
 fail() {
@@ -56,5 +57,23 @@ say "installing Pebble and what it needs for '$extra' into .venv; the first time
     cat .venv/pip.log >&2
     fail "pip could not install what Pebble needs, see above"
 }
+
+# The real MicroPython for Node.js, and what type checkers need to know of each board's own modules. The ports' stubs
+# contradict each other, so each has a folder of its own.
+fetch_micropython() {
+    .venv/bin/python tools/fetch_micropython.py .venv/micropython || fail "without it the firmware cannot be tested"
+    for port in samd esp32 esp8266; do
+        stubs=.venv/stubs/$port
+        [ -d "$stubs/micropython_${port}_stubs-$stubs_version.dist-info" ] && continue
+        say "installing the type stubs of MicroPython's $port port"
+        rm -rf "$stubs"
+        .venv/bin/python -m pip install --disable-pip-version-check --target "$stubs" \
+            "micropython-$port-stubs==$stubs_version" "micropython-stdlib-stubs==1.29.0.post2" >.venv/pip.log 2>&1 || {
+            cat .venv/pip.log >&2
+            fail "pip could not install the stubs of MicroPython's $port port, see above"
+        }
+    done
+}
+[ "$extra" != dev ] || fetch_micropython
 touch ".venv/.ready-$extra"
 [ "$extra" != dev ] || touch .venv/.ready-demo # the one includes the other

@@ -1,0 +1,35 @@
+"""Finding the IPv4 address of a name (RFC 1035; one-shot mDNS, RFC 6762 section 5.1): bytes out, bytes in. Pure."""
+
+
+def query(host: str, ident: bytes) -> bytes:
+    """The question for ``host``; ``ident`` are two random bytes. ValueError: no name."""
+    # recursion wanted; one question
+    data = ident + b"\1\0\0\1\0\0\0\0\0\0"
+    for label in host.lower().encode().rstrip(b".").split(b"."):
+        if not 0 < len(label) < 64:
+            raise ValueError("not a host name: " + host)
+        data += bytes((len(label),)) + label
+    return data + b"\0\0\1\0\1"  # type address, class internet
+
+
+def answer(data: bytes, asked: bytes) -> str | None:
+    """The address in ``data``, "" if it says that there is none, None if it does not answer what was ``asked``."""
+    at = len(asked)
+    if len(data) < at or data[:2] != asked[:2] or data[12:at].lower() != asked[12:]:
+        return None
+    if data[2] & 0xF8 != 0x80 or data[4:6] != b"\0\1":  # not a response to a standard query of one question
+        return None
+    # Only the first address counts: aliases (CNAME) come before theirs. There is none if there is no such name, or if
+    # the server has trouble
+    for _ in range(data[6] << 8 | data[7]):
+        while at < len(data) and 0 < data[at] < 64:  # a name: labels, then 0 or, above 63, where the rest is
+            at += data[at] + 1
+        at += 1 if data[at : at + 1] == b"\0" else 2
+        if at + 10 > len(data):
+            break
+        length = data[at + 8] << 8 | data[at + 9]
+        # type address, class internet but for mDNS's own bit in it
+        if data[at : at + 2] == b"\0\1" and data[at + 2] & 127 == 0 and data[at + 3] == 1 and length == 4:
+            return "%d.%d.%d.%d" % tuple(data[at + 10 : at + 14]) if at + 14 <= len(data) else ""
+        at += 10 + length
+    return ""

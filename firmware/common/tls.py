@@ -1,0 +1,38 @@
+"""TLS around a connected socket, for boards whose MicroPython has it. A driver.
+
+The handshake is left to the reads and writes that follow, so nothing waits for the network. Its arithmetic still takes
+the processor for some hundred milliseconds: it is only done while the motors rest.
+"""
+
+import ssl
+import time
+
+import machine
+
+
+class Wrapper:
+    """``options``: true, or {"ca": a file in DER form on the board, "server_name": ...}. Called with a socket."""
+
+    def __init__(self, options: bool | dict, host: str) -> None:
+        self._ca = None if options is True else options.get("ca")  # type: ignore[union-attr]  # not False
+        self._name = host if options is True else options.get("server_name", host)  # type: ignore[union-attr]
+
+    def tell(self, epoch_ms: int) -> None:
+        """What time it is, if that is known: a certificate is good only in its time (docs, library/ssl).
+
+        A server that says 2065 or later is wrong, and gmtime of some ports fails from 2068 on.
+        """
+        if self._ca and 1_000_000_000_000 < epoch_ms < 3_000_000_000_000:
+            since = 946684800 if time.gmtime(0)[0] == 2000 else 0  # ports count from 2000 or from 1970
+            year, month, day, hour, minute, second, weekday, _ = time.gmtime(epoch_ms // 1000 - since)
+            machine.RTC().datetime((year, month, day, weekday, hour, minute, second, 0))
+
+    def __call__(self, plain):
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        if self._ca:
+            with open(self._ca, "rb") as file:
+                context.load_verify_locations(cadata=file.read())
+            context.verify_mode = ssl.CERT_REQUIRED  # type: ignore[attr-defined]  # not in the stub
+        else:
+            context.verify_mode = ssl.CERT_NONE  # type: ignore[attr-defined]
+        return context.wrap_socket(plain, server_hostname=self._name, do_handshake_on_connect=False)

@@ -1,0 +1,25 @@
+"""Fred's gears: a trimmed left wheel, a slow reverse, and no way back right after a way ahead. Pure."""
+
+from micropython import const
+
+from common.lines import clamp
+from common.ticks import diff
+
+_LEFT_TRIM = 0.93  # the right motor is the weaker one
+_REVERSE_TRIM = 0.7
+_BLOCK_MS = const(340)
+
+
+class Gears:
+    def __init__(self) -> None:
+        self._ahead_at: int | None = None
+
+    def spare(self, left: float, right: float, now: int) -> tuple[float, float]:
+        """What the motors get for wheel speeds -1..1. Turning stays possible while the way back is blocked."""
+        linear, turn = (left + right) / 2, (left - right) / 2
+        if linear > abs(turn):
+            self._ahead_at = now
+        elif linear < 0.0:
+            blocked = self._ahead_at is not None and 0 <= diff(now, self._ahead_at) < _BLOCK_MS
+            linear = 0.0 if blocked else linear * _REVERSE_TRIM
+        return clamp((linear + turn) * _LEFT_TRIM, -1.0), clamp(linear - turn, -1.0)

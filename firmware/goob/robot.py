@@ -1,0 +1,99 @@
+"""Goob's motor board: two motors, headlights, hall sensors, battery; the host commands it over USB, by goob_base_v1."""
+
+import time
+
+from machine import ADC, PWM, Pin
+from micropython import const
+
+from common.deadman import DeadMan
+from common.drv8833 import Motor
+from common.light import Light
+from common.lines import Lines, clamp
+from common.ticks import Grid
+from goob import pins
+
+try:
+    from common.usb import Port
+except ImportError:  # the official image of the board lacks select and sys.stdin.buffer
+    from common.console import Port  # type: ignore[assignment]
+
+_FAILSAFE_MS = const(1000)
+_SENSORS_MS = const(20)
+_BATTERY_MS = const(5000)
+_AT_ONCE = const(32)  # bytes from the host per turn: a flood must not keep the failsafe waiting
+_DRIVE = const(77)  # M
+_GLOW = const(76)  # L
+
+
+class Robot:
+    """``step`` often; every turn looks at the failsafe first."""
+
+    def __init__(self) -> None:
+        # before anything else the motors stand still; the order is that of pins.py
+        self._right = Motor(pins.RIGHT, pins.PWM_HZ)
+        self._led = PWM(Pin(pins.LED, Pin.OUT, value=0), freq=pins.PWM_HZ, duty_u16=0)
+        self._left = Motor(pins.LEFT, pins.PWM_HZ)
+        now = time.ticks_ms()
+        self.deadman = DeadMan(_FAILSAFE_MS)
+        self.light = Light(now)
+        self.lines = Lines(self._obey)
+        self.port = Port(self.lines)
+        self._sensors = [ADC(Pin(pin)) for pin in pins.SENSORS]
+        self._battery = ADC(Pin(pins.BATTERY))
+        self._full_mv = int(pins.BATTERY_FULL_V * 1000)
+        self._sensors_grid, self._battery_grid = Grid(_SENSORS_MS, now), Grid(_BATTERY_MS, now)
+        self._duty = 0
+        self.lines.say(b"Starting setup...")
+        self.lines.say(b"Done!")
+        self._tell_battery()
+
+    def step(self) -> None:
+        self._now = now = time.ticks_ms()
+        if self.deadman.expired(now):
+            self.stop()
+        port, lines = self.port, self.lines
+        for _ in range(_AT_ONCE):
+            byte = port.read()
+            if byte < 0:
+                break
+            lines.take(byte)
+            port.pump()
+        if self._sensors_grid.due(now):
+            a0, a1, a2 = self._sensors
+            lines.say(b"T a0=%d a1=%d a2=%d" % (a0.read_u16() >> 6, a1.read_u16() >> 6, a2.read_u16() >> 6))
+            self._shine(now)
+        if self._battery_grid.due(now):
+            self._tell_battery()
+        port.pump()
+
+    def stop(self) -> None:
+        self._left.stop()
+        self._right.stop()
+
+    def _obey(self, letter: int, numbers: list[float]) -> None:
+        if letter == _DRIVE:
+            self.deadman.feed(self._now)
+            self._left.set(clamp(numbers[0], -1.0))
+            self._right.set(-clamp(numbers[1], -1.0))
+            return
+        blue, green, red = clamp(numbers[0], 0.0), clamp(numbers[1], 0.0), clamp(numbers[2], 0.0)
+        if letter == _GLOW:
+            self.light.glow(blue, green, red)
+        else:
+            self.light.flash(blue, green, red, numbers[3], self._now)
+        self._shine(self._now)
+
+    def _shine(self, now: int) -> None:
+        """White headlights know brightness only: the brightest part of the colour."""
+        duty = int(max(self.light.colour) * 65535) * self.light.level(now) // 512
+        if duty != self._duty:
+            self._duty = duty
+            self._led.duty_u16(duty)
+
+    def _tell_battery(self) -> None:
+        millivolts = (self._battery.read_u16() * self._full_mv + 32767) // 65535
+        self.lines.say(b"C chg=-1 v=%d.%03d" % (millivolts // 1000, millivolts % 1000))
+
+
+def build(_settings: dict) -> Robot:
+    return Robot()

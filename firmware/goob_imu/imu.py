@@ -1,0 +1,142 @@
+"""From an MPU-6050's raw numbers to acceleration, turning and attitude; and what to do when it fails. Pure.
+
+x ahead, y to the left, z up. Roll is about x, pitch about y, both 0 when it lies flat.
+"""
+
+import struct
+from math import atan2, sqrt
+
+from micropython import const
+
+from common.ticks import add, diff
+
+_RETRY_MS = const(1000)
+_FAILURES = const(5)  # in a row
+_SETTLING = const(10)  # samples after power on that are not like the later ones
+_CALIBRATION = const(200)  # samples
+_STILL = const(500)  # 0.01 degrees/s around the first sample: more is no rest
+_ZERO = const(2500)  # 0.01 degrees/s: the data sheet allows +-20 degrees/s for what it says at rest
+_GRAVITY = 0.02  # share of its answer in a sample's attitude: 0.5 s at 100 Hz
+_GAP_MS = const(500)  # after a longer one nobody knows how it turned
+
+# the wire has 0.001 m/s2 and 0.01 degrees/s in 16 bits: +-3.3 g and +-327 degrees/s, so the next larger ranges are
+# set and what goes beyond is cut off. Factors are over 2**14, so that products are small integers.
+_MM_S2 = const(19613)  # 9806.65 / 8192 LSB per g
+_CENTI_DPS = const(25013)  # 100 / 65.5 LSB per degree/s
+_HALF = const(8192)
+_CENTI_DEG = 5729.578  # per radian
+_TURN = const(36_000)
+
+
+class Imu:
+    """``read`` at every sample's time. ``device``: see mpu6050.py; ``log(text)`` hears of its ups and downs.
+
+    ``values``: ax ay az in mm/s2, gx gy gz in 0.01 degrees/s without ``bias``, 0.01 degrees C, roll and pitch in 0.01
+    degrees. ``calibrated`` is how many samples of 200 went into the bias.
+    """
+
+    def __init__(self, device, log) -> None:
+        self.values = [0] * 9
+        self.bias = [0] * 3
+        self.good = self.failed = self.calibrated = 0
+        self._device, self._log = device, log
+        self._data = bytearray(14)
+        self._settled = 0
+        self._working = False
+        self._in_a_row = 0
+        self._retry_at: int | None = None
+        self._read_at: int | None = None
+        self._roll = self._pitch = 0.0
+
+    def read(self, now: int) -> bool:
+        """Whether there are new values."""
+        try:
+            if not self._working:
+                if self._retry_at is None or diff(now, self._retry_at) >= 0:
+                    self._start(now)
+                return False
+            self._device.read(self._data)
+            if not any(self._data):
+                raise OSError  # it sleeps, as after a dip of its supply
+        except OSError:
+            self._fail(now)
+            return False
+        self._in_a_row = 0
+        self.good += 1
+        self._take()
+        self._lean(_GAP_MS if self._read_at is None else diff(now, self._read_at))
+        self._read_at = now
+        return True
+
+    def _start(self, now: int) -> None:
+        self._retry_at = add(now, _RETRY_MS)
+        if not self._device.start():
+            raise OSError
+        self._log(b"imu_reinit" if self.good else b"imu_ready")
+        self._working = True
+
+    def _fail(self, now: int) -> None:
+        if not self._working:
+            self._log(b"imu_init_failed")
+            return
+        self.failed += 1
+        self._in_a_row += 1
+        if self._in_a_row == 1:
+            self._log(b"imu_read_failed")
+        elif self._in_a_row == _FAILURES:
+            self._in_a_row = 0
+            self._working = False
+            self._retry_at = add(now, _RETRY_MS)
+
+    def _take(self) -> None:
+        raw = struct.unpack(">7h", self._data)
+        values = self.values
+        learning = self.calibrated < _CALIBRATION
+        for axis in range(3):
+            values[axis] = max(-32768, min(32767, raw[axis] * _MM_S2 + _HALF >> 14))
+            turning = raw[axis + 4] * _CENTI_DPS + _HALF >> 14
+            values[axis + 3] = max(-32768, min(32767, turning - self.bias[axis]))
+        values[6] = raw[3] * 5 // 17 + 3653  # page 30: raw / 340 + 36.53 degrees C
+        if learning:
+            self._learn()
+
+    def _learn(self) -> None:
+        """The mean of 200 samples at rest is the bias. Motion begins the count anew."""
+        if self._settled < _SETTLING:
+            self._settled += 1
+            return
+        values = self.values
+        if not self.calibrated:
+            self._first = values[3:6]
+            self._sums = [0] * 3
+        for axis in range(3):
+            turning = values[axis + 3]
+            if abs(turning) > _ZERO or abs(turning - self._first[axis]) > _STILL:
+                self.calibrated = 0
+                return
+            self._sums[axis] += turning
+        self.calibrated += 1
+        if self.calibrated == _CALIBRATION:
+            for axis in range(3):
+                self.bias[axis] = (self._sums[axis] + _CALIBRATION // 2) // _CALIBRATION
+
+    def _lean(self, ms: int) -> None:
+        """A complementary filter: turning at once, gravity in the long run. ``ms`` after the sample before."""
+        values = self.values
+        ax, ay, az = values[0], values[1], values[2]
+        across = sqrt(ay * ay + az * az)
+        if not ax and not across:
+            return  # in free fall nobody knows up from down
+        roll, pitch = atan2(ay, az) * _CENTI_DEG, atan2(-ax, across) * _CENTI_DEG
+        if ms < _GAP_MS:
+            turned = self._roll + values[3] * ms / 1000
+            roll = turned + _around(roll - turned) * _GRAVITY
+            turned = self._pitch + values[4] * ms / 1000
+            pitch = turned + (pitch - turned) * _GRAVITY
+        self._roll, self._pitch = _around(roll), pitch
+        values[7], values[8] = int(self._roll), int(pitch)
+
+
+def _around(value: float) -> float:
+    """The same angle within half a turn."""
+    return value - _TURN if value > _TURN // 2 else value + _TURN if value < -_TURN // 2 else value

@@ -1,0 +1,6 @@
+"""Installed as /main.py. A robot on a serial line needs no settings."""
+
+from common.run import run
+from goob_imu.robot import build
+
+run(build, {})

@@ -1,0 +1,10 @@
+"""Where Goob's second XIAO SAMD21 is wired: an MPU-6050, and its link to the robot's computer.
+
+The link is the USB port where the board's MicroPython can use it for bytes, that is where it has select and
+sys.stdin.buffer. The official image has neither (1.29: MICROPY_HW_CODESIZE is 184 KB, so SAMD21_EXTRA_FEATURES is 0 in
+ports/samd/mcu/samd21/mpconfigmcu.h); there the link is the serial port on D6 and D7, see
+uart.py.
+"""
+
+SCL, SDA = "PA09", "PA08"  # D5, D4
+IMU = 0x68  # AD0 low

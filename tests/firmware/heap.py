@@ -1,0 +1,130 @@
+"""What each robot costs of its board's memory, measured in the real MicroPython."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from pebble.flash.boards import FIRMWARE, Firmware
+from pebble.flash.sources import main_file, modules
+from tests.firmware.micropython import SCRIPTS, compile_file, compile_module, run
+from tests.firmware.names import cost
+
+#: What the robots on a serial line find on their board: MicroPython's official image, or one with select in it.
+STOCK, FULL = "official image", "image with select"
+#: And on an ESP8266: the official image with a ROM file system, from which code runs in place, or the plain one.
+ROM, PLAIN = "image with ROMFS", "plain image"
+_UNUSED = {STOCK: ("usb",), FULL: ("console", "uart")}  # modules that are never loaded there
+_SCRIPTS = ("board", "net", "life_serial", "life_imu", "life_network", "heap")
+_HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage
+_SETTINGS = {
+    "wifi": {"ssid": "Lab", "password": "geheim123"},
+    "mqtt": {"host": "broker.lab", "port": 1883, "username": "ann", "password": "geheim", "tls": False},
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One robot on one kind of image."""
+
+    robot: str
+    image: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.robot}, {self.image}" if self.image else self.robot
+
+    @property
+    def firmware(self) -> Firmware:
+        return FIRMWARE[self.robot]
+
+
+SMALL, MIDDLE = 12 * 1024, 20 * 1024
+#: Bytes of heap that a robot may need at its worst, with all that its code takes; None: only told.
+LIMITS: dict[Case, int | None] = {
+    Case("minilamp"): None,  # its board has hundreds of kilobytes
+    Case("benjr", ROM): MIDDLE,
+    Case("benjr", PLAIN): None,
+    **{Case(robot, image): SMALL for robot in ("goob", "fred", "goob_imu") for image in (STOCK, FULL)},
+}
+CASES = tuple(LIMITS)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Bytes."""
+
+    files: int  # the .mpy files in flash
+    baseline: int  # what the stand-ins take, in none of the rest
+    names: int  # of the code, on the board: see names.py
+    imported: int  # heap once the code is loaded
+    built: int  # and the robot is made
+    starting: int  # the most until then, with the garbage of loading one module or of making the robot
+    live: int  # the most that was in use between two turns
+    peak: int  # and with all that one turn allocates
+    peak_at: str  # when that was
+    turns: int
+
+
+def measure(case: Case, folder: Path, *, heap: int = _HEAP, capped: bool = False) -> Cost:
+    """A minute of its life. AssertionError if the robot fails."""
+    folder = folder / re.sub(r"\W+", "-", str(case))
+    root, code = folder / "root", folder / ("rom" if case.image == ROM else "root")
+    files = modules(case.firmware)
+    if not folder.exists():
+        _fill(root, code, case, files)
+    done = run(root, root / "start.py", heap=heap, capped=capped, timeout_s=20.0 if capped else 60.0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads(done.stdout.splitlines()[-1])
+    loaded = [(code / file).with_suffix(".mpy") for file in _loaded(case, files)]
+    names = cost(loaded, case.firmware.board.port, in_place=case.image == ROM)
+    for figure in ("imported", "built", "starting", "live", "peak"):
+        figures[figure] += names - _names_here(done.stdout, in_place=case.image == ROM)
+    size = sum((code / file).with_suffix(".mpy").stat().st_size for file in files)
+    return Cost(files=size + main_file(case.firmware).stat().st_size, names=names, **figures)
+
+
+def _names_here(printed: str, *, in_place: bool) -> int:
+    """What the robot's names took in this interpreter, by micropython.qstr_info() before and after."""
+    found = re.findall(r"n_str_data_bytes=(\d+), n_total_bytes=(\d+)", printed)
+    (text_before, before), (text_after, after) = ((int(text), int(total)) for text, total in found)
+    return after - before - (text_after - text_before if in_place else 0)
+
+
+def smallest(case: Case, folder: Path) -> int:
+    """The least heap in which it lives its minute, in bytes; boards need less, for they collect in the midst of it."""
+    below, enough, baseline = 0, 2 * _HEAP, 0
+    while enough - below > 512:
+        middle = (below + enough) // 2
+        try:
+            baseline = measure(case, folder, heap=middle, capped=True).baseline
+            enough = middle
+        except (AssertionError, subprocess.TimeoutExpired):  # without memory the interpreter may stand still
+            below = middle
+    return enough - baseline
+
+
+def _loaded(case: Case, files: list[Path]) -> list[Path]:
+    return [file for file in files if file.stem not in _UNUSED.get(case.image, ())]
+
+
+def _fill(root: Path, code: Path, case: Case, files: list[Path]) -> None:
+    root.mkdir(parents=True)
+    for file in files:
+        compile_module(case.firmware, file, code)
+    if code != root:
+        build = [sys.executable, "-m", "mpremote", "romfs", "--output", str(root / "rom.romfs"), "build", str(code)]
+        subprocess.run(build, check=True, stdout=subprocess.DEVNULL)
+    for name in _SCRIPTS:  # compiled, so that no compiler needs memory at the start
+        compile_file(SCRIPTS / f"{name}.py", root / f"{name}.mpy")
+    # with a ROM file system, that is the working folder
+    (root / "start.py").write_text("import sys\nsys.path.append('/')\nfrom heap import turn\n")
+    life = "life_imu" if case.robot == "goob_imu" else "life_serial" if case.firmware.is_report else "life_network"
+    settings = {} if case.firmware.is_report else {**_SETTINGS, "robot": {"id": case.robot}}
+    names = [".".join(file.with_suffix("").parts) for file in _loaded(case, files)]
+    names.sort(key=lambda name: name == f"{case.robot}.robot")  # last: it needs all others
+    told = {"modules": names, "robot": case.robot, "life": life, "stock": case.image == STOCK, "settings": settings}
+    (root / "case.json").write_text(json.dumps(told))

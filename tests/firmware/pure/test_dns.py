@@ -1,0 +1,88 @@
+"""Names to addresses, and answers that lie."""
+
+import random
+
+from common.dns import answer, query
+
+HOST = "Broker.Example.org"
+ASKED = query(HOST, b"\x12\x34")
+NAME = b"\xc0\x0c"  # where the question has it
+
+
+def reply(*records: bytes, flags: bytes = b"\x81\x80", count: int = -1) -> bytes:
+    count = len(records) if count < 0 else count
+    return ASKED[:2] + flags + b"\0\1" + bytes((count >> 8, count & 255)) + bytes(4) + ASKED[12:] + b"".join(records)
+
+
+def record(kind: int, data: bytes, name: bytes = NAME, group: bytes = b"\0\1") -> bytes:
+    return name + bytes((0, kind)) + group + b"\0\0\0\x3c" + bytes((len(data) >> 8, len(data) & 255)) + data
+
+
+def test_the_question() -> None:
+    assert ASKED == b"\x12\x34\1\0\0\1\0\0\0\0\0\0\6broker\7example\3org\0\0\1\0\1"
+    assert query("a.local.", b"ab")[12:] == b"\1a\5local\0\0\1\0\1"
+
+
+def test_what_is_no_name() -> None:
+    for host in ("", ".", "a..b", "x" * 64 + ".org"):
+        try:
+            query(host, b"ab")
+        except ValueError:
+            continue
+        raise AssertionError(host)
+
+
+def test_an_address() -> None:
+    assert answer(reply(record(1, b"\x0a\0\0\2")), ASKED) == "10.0.0.2"
+
+
+def test_behind_aliases() -> None:
+    alias = record(5, b"\5other\xc0\x13")
+    owner = b"\5other\7example\3org\0"
+    assert answer(reply(alias, record(1, b"\xc0\xa8\1\xfe", owner)), ASKED) == "192.168.1.254"
+
+
+def test_of_mdns_with_its_bit_in_the_class() -> None:
+    assert answer(reply(record(1, b"\1\2\3\4", group=b"\x80\1"), flags=b"\x84\0"), ASKED) == "1.2.3.4"
+
+
+def test_the_case_of_letters_does_not_matter() -> None:
+    data = reply(record(1, b"\1\2\3\4"))
+    assert answer(data[:12] + data[12 : len(ASKED)].upper() + data[len(ASKED) :], ASKED) == "1.2.3.4"
+
+
+def test_no_such_name() -> None:
+    assert answer(reply(flags=b"\x81\x83"), ASKED) == ""
+    assert answer(reply(), ASKED) == ""
+    assert answer(reply(record(28, bytes(16))), ASKED) == ""
+
+
+def test_what_does_not_answer_us() -> None:
+    good = reply(record(1, b"\x0a\0\0\2"))
+    assert answer(b"", ASKED) is None
+    assert answer(b"\0\0" + good[2:], ASKED) is None
+    assert answer(ASKED, ASKED) is None  # a question
+    assert answer(good[:13] + b"x" + good[14:], ASKED) is None
+    assert answer(good[:5] + b"\2" + good[6:], ASKED) is None
+
+
+def test_cut_short_anywhere() -> None:
+    whole = reply(record(5, b"\5other\xc0\x13"), record(1, b"\x0a\0\0\2"))
+    for length in range(len(whole)):
+        assert answer(whole[:length], ASKED) in (None, ""), length
+    assert answer(whole, ASKED) == "10.0.0.2"
+
+
+def test_names_that_point_to_themselves_or_nowhere() -> None:
+    assert answer(reply(record(1, b"\1\2\3\4", b"\xc0\xff")), ASKED) == "1.2.3.4"  # where to is not looked at
+    assert answer(reply(record(1, b"\1\2\3\4", b"\x3f")), ASKED) == ""
+    assert answer(reply(count=65535), ASKED) == ""
+
+
+def test_noise_does_no_harm() -> None:
+    random.seed(3)
+    for _ in range(300):
+        tail = bytes([random.getrandbits(8) for _ in range(random.getrandbits(6))])
+        found = answer(reply(tail, count=random.getrandbits(16)), ASKED)
+        assert found is not None
+        assert found == "" or found.count(".") == 3

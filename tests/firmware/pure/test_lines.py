@@ -1,0 +1,161 @@
+"""goob_base_v1 on the board's side."""
+
+from common.lines import Lines, clamp, number
+
+
+class Told:
+    """What the robot was told, and what the host hears."""
+
+    def __init__(self):
+        self.commands = []
+        self.lines = Lines(self.obey)
+
+    def obey(self, letter, numbers):
+        self.commands.append((chr(letter), list(numbers)))
+
+    def give(self, data):
+        for byte in data:
+            self.lines.take(byte)
+        return self.heard()
+
+    def heard(self):
+        lines = self.lines
+        size = len(lines.ring)
+        said = bytes([lines.ring[(lines.first + index) % size] for index in range(lines.used)])
+        lines.first = (lines.first + lines.used) % size
+        lines.used = 0
+        return said
+
+
+def obeyed(data):
+    told = Told()
+    answer = told.give(data)
+    return answer, [(letter, numbers[: {"M": 2, "L": 3, "F": 4}[letter]]) for letter, numbers in told.commands]
+
+
+def test_each_command():
+    assert obeyed(b"M 0.5 -0.25\n") == (b"OK M\r\n", [("M", [0.5, -0.25])])
+    assert obeyed(b"L 1 0.5 0\n") == (b"OK L\r\n", [("L", [1.0, 0.5, 0.0])])
+    assert obeyed(b"F 0.25 0.5 1 1.5\n") == (b"OK F\r\n", [("F", [0.25, 0.5, 1.0, 1.5])])
+
+
+def test_the_first_letter_decides_in_either_case():
+    assert obeyed(b"m 1 1\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
+    assert obeyed(b"Motor 1 1\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
+    assert obeyed(b"lamp 1 1 1\n") == (b"OK L\r\n", [("L", [1.0, 1.0, 1.0])])
+
+
+def test_cr_and_blanks_do_not_matter():
+    assert obeyed(b"M 1 1\r\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
+    assert obeyed(b" \tM\t 1   1  \r\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
+    assert obeyed(b"\n\r\n \n\t\n") == (b"", [])
+
+
+def test_spare_tokens_are_not_looked_at():
+    assert obeyed(b"M 1 1 spare tokens are ignored here\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
+
+
+def test_missing_numbers_are_told():
+    assert obeyed(b"M 1\n") == (b"ERR M needs 2 values\r\n", [])
+    assert obeyed(b"m\n") == (b"ERR M needs 2 values\r\n", [])
+    assert obeyed(b"L 1 1\n") == (b"ERR L needs 3 values\r\n", [])
+    assert obeyed(b"F 1 1 1\n") == (b"ERR F needs 4 values\r\n", [])
+
+
+def test_unknown_commands_are_told():
+    assert obeyed(b"X 1 1\n") == (b"ERR unknown command\r\n", [])
+    assert obeyed(b"\xffM 1 1\n") == (b"ERR unknown command\r\n", [])
+    assert obeyed(b"\x03M 1 1\n") == (b"ERR unknown command\r\n", [])
+
+
+def test_nothing_happens_before_the_line_ends():
+    told = Told()
+    assert told.give(b"M 1 1") == b""
+    assert told.commands == []
+    assert told.give(b"\nL 0 0 0\nF") == b"OK M\r\nOK L\r\n"
+    assert len(told.commands) == 2
+
+
+def test_a_line_too_long_is_thrown_away_and_told_once():
+    told = Told()
+    assert told.give(b"M 1 1 " + b"x" * 1000) == b"WARN line too long\r\n"
+    assert told.give(b"M 1 1\nM 0.5 0.5\n") == b"OK M\r\n"
+    assert told.commands == [("M", [0.5, 0.5, 0.0, 0.0, 0.0])]
+
+
+def test_256_bytes_are_not_too_long():
+    assert obeyed(b"M 1 1 " + b"x" * 250 + b"\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
+    assert obeyed(b"M 1 1 " + b"x" * 251 + b"\n") == (b"WARN line too long\r\n", [])
+
+
+def read(text):
+    return number(text, 0, len(text))
+
+
+def test_numbers():
+    assert read(b"0.5") == 0.5
+    assert read(b"-.25") == -0.25
+    assert read(b"+1.") == 1.0
+    assert read(b"0.930") == 0.93
+    assert read(b"12.125") == 12.125
+
+
+def test_what_follows_a_number_does_not_count():
+    assert read(b"0.5y") == 0.5
+    assert read(b"1.2.3") == 1.2
+    assert read(b"1e3") == 1.0
+    assert read(b"1,5") == 1.0
+
+
+def test_what_is_no_number_is_0():
+    for text in (b"nan", b"-nan", b"inf", b"-inf", b"Infinity", b"x", b"-", b"+", b".", b"--1", b"\xff\x00", b"NAN"):
+        assert read(text) == 0.0, text
+
+
+def test_long_numbers():
+    assert clamp(read(b"9" * 200), -1.0) == 1.0
+    assert clamp(read(b"-" + b"9" * 200), -1.0) == -1.0
+    assert abs(read(b"0." + b"3" * 200) - 1 / 3) < 1e-6
+    assert abs(read(b"0" * 200 + b"1")) == 1.0
+    assert read(b"0." + b"0" * 200 + b"1") < 1e-6
+
+
+def test_clamp():
+    assert clamp(2.0, -1.0) == 1.0
+    assert clamp(-2.0, -1.0) == -1.0
+    assert clamp(-2.0, 0.0) == 0.0
+    assert clamp(0.25, 0.0) == 0.25
+
+
+def test_a_host_that_does_not_read_loses_whole_lines():
+    told = Told()
+    lines = told.lines
+    for _ in range(20):
+        lines.say(b"T a0=512 a1=512 a2=512")
+    assert told.heard() == b"T a0=512 a1=512 a2=512\r\n" * 5
+    told.give(b"M 1 1\n")
+    assert told.commands, "it is obeyed all the same"
+
+
+def test_lines_go_around_the_end_of_the_ring():
+    told = Told()
+    for index in range(200):
+        told.lines.say(b"%d" % index)
+        assert told.heard() == b"%d\r\n" % index
+
+
+def test_noise():
+    told = Told()
+    value = 1
+    known = 0
+    for _ in range(20_000):
+        for _ in range(8):
+            value = (value * 1103515245 + 12345) & 0x3FFFFFFF
+            told.lines.take(value >> 16 & 0xFF)
+        told.lines.first = told.lines.used = 0
+        for letter, numbers in told.commands:
+            known += letter in "MLF"
+            assert all(-1e9 <= one <= 1e9 for one in numbers)
+        told.commands = []
+    assert told.give(b"\nM 0.5 0.5\n")[-6:] == b"OK M\r\n"
+    assert known < 20_000

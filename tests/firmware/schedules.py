@@ -1,0 +1,203 @@
+"""Random schedules for a drill: an operator in his moods, and what goes wrong around the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from pebble.simulation.micropython.virtual_network import Answers
+from tests.firmware.drill import DRIVE, LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
+
+FAULTS: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "quiet", "flood", "i2c", "kept", "stale", "mute")
+ACT_S: Final = 8.0  # so long an operator drives and things go wrong
+STABLE_S: Final = 1.0  # a connection that lasts so long is none that is just about to be given up
+BACK_S: Final = 30.0  # a back-off of 10 s, and Wi-Fi that nobody rejoins for 15 s, are the longest waits
+
+HOSTILE: Final = (
+    b'{"x": 0, "z": NaN}',
+    b'{"x": 0, "z": Infinity}',
+    b'{"x": 0, "z": -1e999}',
+    b'{"x": "nan", "z": "inf"}',
+    b'{"z": 1, "x": true}',
+    b'{"z": [1], "x": 0}',
+    b'{"z": null}',
+    b'{"z": 1',
+    b'{"z": 1}}',
+    b"[1, 1]",
+    b"1",
+    b"",
+    b"\xff\xfe\x00",
+    b'{"x": 0, "z": 1, "n": "\xff"}',
+    b'{"a":' * 60 + b"1" + b"}" * 60,
+    b"[" * 500,
+    b'{"z": 1, "pad": "' + b"x" * 1100 + b'"}',
+    b'{"z": 1, "pad": "' + b"y" * 5000 + b'"}',
+)
+
+
+def perform(drill: Drill, faults: tuple[str, ...] | None = None) -> None:
+    """One whole schedule: act, come back, obey once more and stop. Raises ViolatedError."""
+    act(drill, faults or tuple(drill.random.choice(FAULTS) for _ in range(drill.random.randint(1, 4))))
+    _come_back(drill)
+    _obey_again(drill)
+    if drill.broker.violations or drill.board.resets:
+        raise ViolatedError(f"{drill.broker.violations}, {drill.board.resets} resets")
+
+
+def act(drill: Drill, faults: tuple[str, ...]) -> None:
+    """The operator drives for ACT_S, while these things go wrong."""
+    random = drill.random
+    drill.lossy = True
+    _drive(drill, 1.0, ACT_S)
+    for fault in faults:
+        start = random.uniform(1.0, ACT_S - 1.0)
+        length = min(ACT_S - start, random.choice((0.1, 0.5, 1.0, 1.7, 1.95, 2.5, 5.0)) * random.uniform(0.9, 1.1))
+        _EVENTS[fault](drill, start, length)
+    drill.run(ACT_S + 0.01)
+
+
+def _drive(drill: Drill, start: float, end: float) -> None:
+    """Bouts of driving at a steady pace; some end with a stop, some in silence."""
+    random, at = drill.random, start
+    while at < end:
+        bout_end = min(end, at + random.uniform(0.2, 3.0))
+        period, qos = 1 / random.uniform(4, 20), random.choice((0, 1, 1))
+        held = (_wish(drill), _wish(drill), _wish(drill))
+        steady = random.random() < 0.5
+        while at < bout_end:
+            drill.at(at, _command(drill, held if steady else (_wish(drill), _wish(drill), _wish(drill)), qos))
+            at += period
+        if random.random() < 0.4:
+            drill.at(at, _command(drill, (0.0, 0.0, 0.0), qos))
+        at += random.choice((0.0, 0.3, 1.2, 2.0))
+
+
+def _wish(drill: Drill) -> float:
+    return round(drill.random.uniform(-1.2, 1.2), 2)
+
+
+def _command(drill: Drill, axes: tuple[float, float, float], qos: int) -> Callable[[], None]:
+    return lambda: drill.quiet or drill.command(*axes, qos=qos)
+
+
+def _come_back(drill: Drill) -> None:
+    """Online within a bounded time, and telling so."""
+    drill.clear_sky()
+    since = drill.seconds
+    online = since + 0.001
+    while drill.seconds < online + STABLE_S or len(drill.heard(ONLINE, online)) < 2 or drill.broker.queued:
+        drill.turn(0.04)
+        if drill.robot.link.state != "online":
+            online = drill.seconds + 0.001  # what is still under way from an old connection does not count
+        if drill.seconds > since + BACK_S:
+            raise ViolatedError(f"not online {BACK_S:.0f} s after the last fault: {drill.robot.link.reason}")
+    drill.seen.back = drill.seconds - since
+
+
+def _obey_again(drill: Drill) -> None:
+    """It still does what it is told, and stops by itself."""
+    drill.run(drill.seconds + LIMIT_S)
+    start, moves = drill.seconds, drill.seen.moves
+    for number in range(5):
+        drill.at(start + 0.1 * number, _command(drill, (0.0, 0.5 if number % 2 else -0.5, 0.0), 1))
+    drill.run(start + 0.5 + 3 * RESENT_S)
+    if drill.seen.moves == moves:
+        raise ViolatedError("it does not obey any more")
+    drill.run(start + 2.5 + RESENT_S)
+    if any(drill.outputs()):
+        raise ViolatedError("it does not stop")
+
+
+# -- faults: what happens to the drill, when, for how long
+
+
+def _wifi(drill: Drill, start: float, length: float) -> None:
+    drill.at(start, drill.network.radio.lose)
+    drill.at(start + length, drill.network.radio.restore)
+
+
+def _broker(drill: Drill, start: float, length: float) -> None:
+    drill.at(start, drill.broker.kill)
+    drill.at(start + length, drill.broker.start)
+
+
+def _hole(drill: Drill, start: float, length: float) -> None:
+    drill.at(start, lambda: setattr(drill.network.weather, "hole", True))
+    drill.at(start + length, lambda: setattr(drill.network.weather, "hole", False))
+
+
+def _dns(drill: Drill, start: float, length: float) -> None:
+    """A broken name server matters to who has to connect again."""
+    how = drill.random.choice(("silent", "nonsense", "no such name"))
+    drill.at(start, lambda: setattr(drill.network.weather, "dns", how))
+    drill.at(start + 0.1, drill.broker.kill)
+    drill.at(start + 0.3, drill.broker.start)
+    drill.at(start + length, lambda: setattr(drill.network.weather, "dns", "answers"))
+
+
+def _ntp(drill: Drill, start: float, _length: float) -> None:
+    how: Answers = drill.random.choice(("silent", "nonsense"))
+    drill.at(0.0, lambda: setattr(drill.network.weather, "ntp", how))
+    drill.at(start + 5.0, lambda: setattr(drill.network.weather, "ntp", "answers"))
+
+
+def _frozen(drill: Drill, start: float, length: float) -> None:
+    drill.at(start, drill.broker.freeze)
+    drill.at(start + length, drill.broker.thaw)
+
+
+def _quiet(drill: Drill, start: float, length: float) -> None:
+    """Nothing comes from the broker but answers to pings."""
+    drill.at(start, lambda: setattr(drill, "quiet", True))
+    drill.at(start + length, lambda: setattr(drill, "quiet", False))
+
+
+def _flood(drill: Drill, start: float, length: float) -> None:
+    """500 messages a second, most of them commands, some of them nonsense."""
+    random = drill.random
+    for number in range(int(500 * min(length, 2.0))):
+        at = start + number / 500
+        if random.random() < 0.3:
+            drill.at(at, lambda: drill.nonsense(random.choice(HOSTILE), qos=random.choice((0, 1))))
+        else:
+            drill.at(at, _command(drill, (_wish(drill), _wish(drill), _wish(drill)), random.choice((0, 1))))
+
+
+def _i2c(drill: Drill, start: float, length: float) -> None:
+    drill.at(start, lambda: drill.failing_i2c(min(length, 0.5)))
+
+
+def _kept(drill: Drill, start: float, length: float) -> None:
+    """Somebody has the broker keep a command, and the robot connects anew while it is there."""
+    payload = b'{"x": 0, "z": 0.77, "y": 1}'
+    drill.at(0.0, lambda: drill.nonsense(payload, retain=True))
+    drill.at(start, drill.drop_robot)
+    drill.at(start + length, lambda: drill.broker.publish(DRIVE, b"", retain=True))
+
+
+def _stale(drill: Drill, start: float, length: float) -> None:
+    """The last commands before the operator lets go are held up on their way, or in the broker, for a while."""
+    _quiet(drill, start + 0.2, ACT_S)
+    (_hole if drill.random.random() < 0.7 else _frozen)(drill, start, max(length, drill.random.uniform(1.5, 4.0)))
+
+
+def _mute(drill: Drill, start: float, length: float) -> None:
+    """The robot hears and is not heard."""
+    drill.at(start, lambda: setattr(drill.network.weather, "mute", True))
+    drill.at(start + length, lambda: setattr(drill.network.weather, "mute", False))
+
+
+_EVENTS: Final = {
+    "wifi": _wifi,
+    "broker": _broker,
+    "hole": _hole,
+    "dns": _dns,
+    "ntp": _ntp,
+    "frozen": _frozen,
+    "quiet": _quiet,
+    "flood": _flood,
+    "i2c": _i2c,
+    "kept": _kept,
+    "stale": _stale,
+    "mute": _mute,
+}

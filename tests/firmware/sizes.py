@@ -1,0 +1,59 @@
+"""Prints what the firmware costs of each board: `make firmware`. The table in docs/firmware.md is from here."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from pebble.flash.boards import FIRMWARE
+from pebble.flash.sources import modules
+from tests.firmware.heap import CASES, LIMITS, Case, Cost, measure, smallest
+from tests.firmware.micropython import compile_module
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
+        print(*module_sizes(Path(folder, "modules")), sep="\n")
+        print()
+        costs = pool.map(lambda case: measure(case, Path(folder)), CASES)
+        print(*heap_table(dict(zip(CASES, costs, strict=True))), sep="\n")
+        if "--smallest" in sys.argv:
+            print()
+            sizes = pool.map(lambda case: smallest(case, Path(folder)), CASES)
+            print(*(f"{case}: lives in {size} bytes" for case, size in zip(CASES, sizes, strict=True)), sep="\n")
+
+
+def module_sizes(folder: Path) -> list[str]:
+    """Bytes of each compiled module, per robot."""
+    names = list(FIRMWARE)
+    sizes: dict[str, dict[str, int]] = {}
+    for robot, firmware in FIRMWARE.items():
+        for module in modules(firmware):
+            compiled = compile_module(firmware, module, folder / robot)
+            sizes.setdefault(module.with_suffix("").as_posix(), {})[robot] = compiled.stat().st_size
+    rows = [
+        f"| {module} | {' | '.join(str(of.get(name, '')) for name in names)} |" for module, of in sorted(sizes.items())
+    ]
+    totals = [sum(of.get(name, 0) for of in sizes.values()) for name in names]
+    return [
+        f"| .mpy, bytes | {' | '.join(names)} |",
+        f"|---|{'--:|' * len(names)}",
+        *rows,
+        f"| all | {' | '.join(map(str, totals))} |",
+    ]
+
+
+def heap_table(costs: dict[Case, Cost]) -> list[str]:
+    """Bytes of heap, per robot and image."""
+    rows = []
+    for case, cost in costs.items():
+        sizes = (cost.files, cost.names, cost.imported, cost.starting, cost.built, cost.live, cost.peak)
+        rows.append(f"| {case} | {' | '.join(map(str, sizes))} | {cost.peak_at} | {LIMITS[case] or ''} |")
+    head = "| robot | files | names | code loaded | starting | robot made | in use, most | peak | during | limit |"
+    return [head, "|---|--:|--:|--:|--:|--:|--:|--:|---|--:|", *rows]
+
+
+if __name__ == "__main__":
+    main()

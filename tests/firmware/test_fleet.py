@@ -1,0 +1,171 @@
+"""Many robots in one process: who they are, that each obeys its own operator only, and what a fleet is measured by."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Self
+
+import pytest
+from rich.console import Console
+
+from pebble import cli
+from pebble.bench.fleet import Figures, Plan, latencies_ms, measure, run
+from pebble.bench.fleet_operator import STEPS
+from pebble.errors import ConfigError, PebbleError
+from pebble.simulation.fleet import MOST, Moved, members
+from tests.support import ROOT, Broker, die_with_parent, free_port, until
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path)
+    yield broker
+    broker.kill()
+
+
+class TestMembers:
+    def test_kinds_take_turns_and_are_counted(self) -> None:
+        assert [(kind, identity.id) for kind, identity in members(3)] == [
+            ("minilamp", "minilamp-001"),
+            ("benjr", "benjr-001"),
+            ("minilamp", "minilamp-002"),
+        ]
+        assert [identity.base for _, identity in members(2, ["benjr"])] == [
+            "pebble/robots/benjr-001",
+            "pebble/robots/benjr-002",
+        ]
+
+    @pytest.mark.parametrize(
+        ("count", "kinds", "named"), [(0, ["benjr"], "0"), (MOST + 1, ["benjr"], str(MOST)), (1, ["goob"], "goob")]
+    )
+    def test_what_makes_no_sense_is_named(self, count: int, kinds: list[str], named: str) -> None:
+        with pytest.raises(ConfigError, match=named):
+            list(members(count, kinds))
+
+
+SENT = [number * 100_000_000 for number in range(20)]  # 10 Hz
+
+
+class TestLatencies:
+    def moves(self, late_ns: int, without: int = -1) -> list[Moved]:
+        return [
+            Moved(at + late_ns, "r", tuple(map(float, STEPS[number % len(STEPS)])))
+            for number, at in enumerate(SENT)
+            if number != without
+        ]
+
+    def test_every_command_is_told_apart(self) -> None:
+        assert latencies_ms({"r": SENT}, {"r": self.moves(3_000_000)}) == [3.0] * 20
+
+    def test_also_when_it_is_slower_than_the_next_one_is_sent(self) -> None:
+        assert latencies_ms({"r": SENT}, {"r": self.moves(250_000_000)}) == [250.0] * 20
+
+    def test_a_lost_one_is_missing_and_no_other_takes_its_place(self) -> None:
+        assert latencies_ms({"r": SENT}, {"r": self.moves(3_000_000, without=7)}) == [3.0] * 19
+
+    def test_a_robot_that_does_not_move_has_none(self) -> None:
+        assert latencies_ms({"r": SENT}, {}) == []
+
+    def test_no_two_commands_in_a_row_ask_for_the_same(self) -> None:
+        assert len(set(STEPS)) == len(STEPS)
+
+
+def test_a_small_fleet_is_measured() -> None:
+    """Whole: a broker, ten robots, an operator; with bounds that hold on a busy machine too."""
+    figures = measure(Plan(robots=10, seconds=5.0))
+    assert figures.online == 10
+    assert figures.sent == 500
+    assert figures.lost <= 5
+    assert len(figures.beats_hz) == 10
+    assert all(rate == pytest.approx(4.0, rel=0.25) for rate in figures.beats_hz)
+    row = figures.as_json()
+    assert row["p50_ms"] < 200
+    assert set(figures.cpu) == {"broker", "fleet", "operator"}
+    assert 0 < row["mb_per_robot"] < 20
+
+
+def test_what_cannot_be_measured_is_named(tmp_path: Path) -> None:
+    for plan in (Plan(robots=MOST + 1), Plan(seconds=0.0), Plan(rate_hz=100.0), Plan(json=tmp_path / "no" / "file")):
+        with pytest.raises(PebbleError):
+            run(plan)
+
+
+def test_figures_are_shown_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = Figures(robots=2, seconds=1.0, online=2, sent=3, late=0, latencies_ms=[1.0, 9.0], beats_hz=[4.0, 4.1])
+    monkeypatch.setattr("pebble.bench.fleet.measure", lambda *_: figures)
+    out = StringIO()
+    assert run(Plan(robots=2, json=tmp_path / "fleet.json"), Console(file=out, width=100)) == 0
+    assert "3 / 2 / 1" in out.getvalue()  # sent, obeyed, lost
+    assert '"p99_ms": 9.0' in (tmp_path / "fleet.json").read_text()
+
+
+class Command:
+    """One ``pebble sim`` as a process; what it writes, it writes into a file."""
+
+    def __init__(self, file: Path, *arguments: str) -> None:
+        self._file = file
+        command = [sys.executable, "-m", "pebble.cli", "sim", *arguments]
+        with file.open("wb") as out:
+            self.process = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=out, preexec_fn=die_with_parent)
+
+    @property
+    def said(self) -> str:
+        return self._file.read_text()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+def test_the_program_shows_how_its_robots_fare_and_ends_in_order(broker: Broker, tmp_path: Path) -> None:
+    with Command(tmp_path / "out", "fleet", "-n", "3", "--broker", f"mqtt://127.0.0.1:{broker.port}") as command:
+        assert until(lambda: "3 robots: connected" in command.said, 20), command.said
+        command.process.send_signal(signal.SIGTERM)
+        began = time.monotonic()
+        assert command.process.wait(10) == 0
+        assert time.monotonic() - began < 2.0
+        assert "3 of 3 online" in command.said
+        assert "Traceback" not in command.said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("fleet", "--broker", "http://x"), "--broker must be mqtt://"),
+        (("minilamp", "--broker", "mqtt://ann:secret@x"), "holds a password"),
+        (("minilamp", "--broker", "zenoh:/tmp"), "MQTT only"),
+        (("benjr", "--broker", "nowhere.json"), "nowhere.json"),
+        (("fleet", "-n", "1001", "--broker", "mqtt://127.0.0.1"), "1000"),
+        (("fleet", "--kind", "goob", "--broker", "mqtt://127.0.0.1"), "goob"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], named: str
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pebble", "sim", *arguments])
+    assert cli.main() != 0
+    err = capsys.readouterr().err
+    assert named in err
+    assert err.count("\n") == 1
+    assert "secret" not in err
+
+
+def test_a_config_names_broker_and_robot(tmp_path: Path) -> None:
+    port = free_port()
+    config = tmp_path / "lamp.json"
+    config.write_text(
+        f'{{"robot": {{"id": "lamp", "type": "towers"}}, "local_mqtt": {{"host": "127.0.0.1", "port": {port}}}}}'
+    )
+    with Command(tmp_path / "out", "minilamp", "--broker", str(config)) as command:
+        assert until(lambda: "cannot reach" in command.said, 15), command.said
+        assert f"pebble/towers/lamp is on its way to the broker at 127.0.0.1:{port}" in command.said
+        assert "Connection refused" in command.said

@@ -1,0 +1,146 @@
+"""The lines of Goob's and Fred's boards, byte for byte, and what the host reads out of them.
+
+A golden file is a transcript: milliseconds since the firmware was loaded, a sign, and what happened.
+``=`` volts at a pin, or high or low; ``>`` a line from the host; ``<`` a line from the board; ``!`` what the motors do
+from then on, left and right, + = forward; ``.`` the end. What the world did is played again, and all of it must come
+out as it stands there. ``python -m tests.firmware.test_golden`` writes the files anew.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pebble.services.serial_mcu_bridge.goob_base import Charging, Level, Touch, parse
+from pebble.simulation.bodies import body_of
+from pebble.simulation.micropython.board import Board
+from pebble.simulation.micropython.clock import VirtualClock
+
+GOLDEN = Path(__file__).parent / "golden"
+ROBOTS = ("goob", "fred")
+_ADC_V = 1.65  # at 65535
+_BATTERY_V = 9.9  # where its pin has 1.65 V: goob/pins.py
+
+
+@dataclass(frozen=True)
+class Entry:
+    ms: int
+    sign: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.ms:5d} {self.sign} {self.what}".rstrip()
+
+
+def entries(robot: str) -> list[Entry]:
+    lines = (GOLDEN / f"{robot}.txt").read_text().splitlines()
+    return [Entry(int(line[:5]), line[6], line[8:]) for line in lines]
+
+
+def play(robot: str, script: list[Entry]) -> list[Entry]:
+    """Everything that happens, if that is what the world does. The board has a turn every millisecond."""
+    transcript: list[Entry] = []
+    clock = VirtualClock()
+    board = Board(clock)
+    body = body_of(robot, board)
+    body.on_motors = lambda now, motors: transcript.append(
+        Entry(round(now * 1000), "!", f"{motors[0]:.3f} {motors[1]:.3f}")
+    )
+    for entry in script:
+        if entry.ms == 0 and entry.sign == "=":
+            wire(board, entry.what)  # before it is switched on
+    firmware = board.load(robot, {})
+    for now in range(script[-1].ms + 1):
+        clock.until(now / 1000)
+        for entry in script:
+            if entry.ms == now:
+                transcript.append(entry)
+                act(board, entry)
+        firmware.step()
+        body.settle()
+        transcript += [Entry(now, "<", line.decode()) for line in board.said().split(b"\r\n")[:-1]]
+    return transcript
+
+
+def act(board: Board, entry: Entry) -> None:
+    if entry.sign == "=":
+        wire(board, entry.what)
+    elif entry.sign == ">":
+        board.type(entry.what.encode() + b"\n")
+
+
+def wire(board: Board, what: str) -> None:
+    pin, value = what.split()
+    if value in ("high", "low"):
+        board.set_pin(pin, value == "high")
+    else:
+        board.set_volts(pin, float(value))
+
+
+def text(transcript: list[Entry]) -> str:
+    return "".join(f"{entry}\n" for entry in transcript)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_board_says_exactly_this(robot: str) -> None:
+    script = [entry for entry in entries(robot) if entry.sign in "=>."]
+    assert text(play(robot, script)) == (GOLDEN / f"{robot}.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("robot", "names", "pins"), [("goob", "a0 a1 a2", "PA02 PB09 PA11"), ("fred", "t0 t1 t2", "PA02 PB08 PB09")]
+)
+def test_the_host_reads_the_sensors_that_there_are(robot: str, names: str, pins: str) -> None:
+    world: dict[str, str] = {}
+    compared = 0
+    for entry in entries(robot):
+        if entry.sign == "=":
+            world.update([entry.what.split()])
+        if entry.sign == "<" and entry.what.startswith("T "):
+            wanted = [round(float(world[pin]) / _ADC_V * 65535) >> 6 for pin in pins.split()]
+            assert entry.what.startswith("T " + " ".join(map("{}={}".format, names.split(), wanted)))
+            assert parse(entry.what.encode() + b"\r\n")[0] == Touch(*wanted)
+            compared += 1
+    assert compared > 5
+
+
+def test_the_host_reads_goobs_battery() -> None:
+    world: dict[str, str] = {}
+    compared = 0
+    for entry in entries("goob"):
+        if entry.sign == "=":
+            world.update([entry.what.split()])
+        if entry.sign == "<" and entry.what.startswith("C "):
+            charging, level = parse(entry.what.encode() + b"\r\n")
+            assert charging == Charging(None)
+            assert isinstance(level, Level)
+            assert level.volts == pytest.approx(float(world["PB08"]) / _ADC_V * _BATTERY_V, abs=0.0015)
+            compared += 1
+    assert compared == 3
+
+
+def test_the_host_reads_freds_charger() -> None:
+    world: dict[str, str] = {}
+    heard = []
+    for entry in entries("fred"):
+        if entry.sign == "=":
+            world.update([entry.what.split()])
+        if entry.sign == "<" and entry.what.startswith("T "):
+            (charging,) = parse(entry.what.encode() + b"\r\n")[1:]
+            assert charging == Charging(world["PA07"] == "high")
+            heard.append(charging)
+    assert Charging(True) in heard
+    assert Charging(False) in heard
+
+
+def main() -> None:
+    for robot in ROBOTS:
+        script = [entry for entry in entries(robot) if entry.sign in "=>."]
+        (GOLDEN / f"{robot}.txt").write_text(text(play(robot, script)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,17 @@
+"""A minute of every robot's life in the real MicroPython stays within the memory of its board."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.firmware.heap import CASES, LIMITS, Case, measure
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_heap(case: Case, tmp_path: Path) -> None:
+    cost = measure(case, tmp_path)
+    limit = LIMITS[case]
+    assert limit is None or cost.peak <= limit, f"{case}: {cost}"
+    assert cost.imported < cost.built <= cost.live <= cost.peak, cost  # else something was not measured

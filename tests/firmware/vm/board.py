@@ -1,0 +1,256 @@
+"""A board's hardware for the interpreter in Node.js, written so that it costs the robot under test next to nothing.
+
+Whatever a real board keeps outside MicroPython's heap (network buffers, what came over USB) lies in buffers made
+here, before anything is measured. Time is virtual: `now` is milliseconds.
+"""
+
+import sys
+import time as _time
+
+modules = sys.modules
+now = 0
+
+
+class Time:
+    ticks_diff = staticmethod(_time.ticks_diff)
+    ticks_add = staticmethod(_time.ticks_add)
+
+    @staticmethod
+    def ticks_ms():
+        return now
+
+    @staticmethod
+    def ticks_us():
+        return now * 1000
+
+    @staticmethod
+    def sleep_ms(ms):
+        global now
+        now += ms
+
+
+class Ring:
+    """Bytes under way, outside the heap of a real board."""
+
+    def __init__(self, size):
+        self._bytes = bytearray(size)
+        self._view = memoryview(self._bytes)
+        self.clear()
+
+    def clear(self):
+        self._first = self.used = 0
+
+    def put(self, data):
+        if self.used + len(data) > len(self._bytes):
+            return False
+        if self._first + self.used + len(data) > len(self._bytes):
+            self._view[: self.used] = self._view[self._first : self._first + self.used]
+            self._first = 0
+        start = self._first + self.used
+        self._view[start : start + len(data)] = data
+        self.used += len(data)
+        return True
+
+    def readinto(self, buffer):
+        """None when there is nothing: it would block."""
+        count = min(len(buffer), self.used)
+        if not count:
+            return None
+        for index in range(count):
+            buffer[index] = self._bytes[self._first + index]
+        self._first += count
+        self.used -= count
+        return count
+
+    def take(self, data, first, count):
+        """A stream's write(data), write(data, count) or write(data, first, count), byte by byte: no garbage.
+
+        None when there is no room at all: it would block (py/stream.c).
+        """
+        if count is None:
+            first, count = 0, len(data) if first is None else first
+        size = len(self._bytes)
+        if self.used == 0:
+            self._first = 0
+        count = min(count, size - self._first - self.used)
+        start = self._first + self.used
+        for index in range(count):
+            self._bytes[start + index] = data[first + index]
+        self.used += count
+        return count or None
+
+    def all(self):
+        data = bytes(self._view[self._first : self._first + self.used])
+        self.clear()
+        return data
+
+
+to_board, from_board = Ring(8192), Ring(16384)
+
+
+class Stdin:
+    def readinto(self, buffer):
+        return to_board.readinto(buffer)
+
+    def any(self):
+        return to_board.used
+
+
+class Stdout:
+    def write(self, data, first=None, count=None):
+        return from_board.take(data, first, count) or 0
+
+
+class Uart(Stdin, Stdout):
+    def __init__(self, *_, **__):
+        pass
+
+
+class Sys:
+    platform = "standin"
+    implementation = sys.implementation
+    print_exception = sys.print_exception
+    stdin, stdout = Stdin(), Stdout()
+
+
+Stdin.buffer, Stdout.buffer = Sys.stdin, Sys.stdout
+
+
+class Pin:
+    IN, OUT, PULL_UP, PULL_DOWN = 0, 1, 1, 2
+
+    def __init__(self, *_, **__):
+        pass
+
+    def value(self, *_):
+        return 0
+
+    __call__ = on = off = value
+
+
+class PWM:
+    def __init__(self, *_, **__):
+        pass
+
+    def duty_u16(self, duty=0):
+        assert 0 <= duty <= 65535
+        return duty
+
+    freq = deinit = init = duty_u16
+
+
+class ADC:
+    ATTN_11DB = 3
+
+    def __init__(self, *_, **__):
+        pass
+
+    def read_u16(self):
+        return now * 37 & 0xFFFF
+
+
+class I2C:
+    """With an MPU-6050 on it that lies still, and a motor shield that takes everything."""
+
+    def __init__(self, *_, **__):
+        pass
+
+    def writeto(self, address, data):
+        return len(data)
+
+    def writeto_mem(self, address, register, data):
+        pass
+
+    def readfrom_mem(self, address, register, count):
+        return b"\x68" * count
+
+    def readfrom_mem_into(self, address, register, buffer):
+        for index in range(len(buffer)):
+            buffer[index] = 0
+        buffer[4] = 0x20  # 1 g upwards
+
+    def readfrom(self, address, count):
+        return b"\0" * count
+
+
+class Timer:
+    ONE_SHOT, PERIODIC = 0, 1
+
+    def __init__(self, *_, **__):
+        pass
+
+    def init(self, *_, **__):
+        pass
+
+
+class WDT:
+    def __init__(self, *_, **__):
+        pass
+
+    def feed(self):
+        pass
+
+
+class Machine:
+    Pin, PWM, ADC, WDT, UART, Timer = Pin, PWM, ADC, WDT, Uart, Timer
+    I2C = SoftI2C = I2C
+
+    @staticmethod
+    def unique_id():
+        return b"\x01\x02\x03\x04\x05\x06"
+
+    @staticmethod
+    def reset():
+        raise SystemExit("machine.reset()")
+
+
+class Poll:
+    """Of one stream; as in C, asking makes no garbage but the answer."""
+
+    def register(self, stream, mask):
+        self._stream = stream
+        self._answer = ((stream, mask),)
+        self._mask = mask
+
+    def unregister(self, stream):
+        self._stream = None
+
+    def ready(self):
+        if self._stream is Sys.stdin:
+            return to_board.used > 0
+        if self._stream is Sys.stdout:
+            return True
+        return self._stream.ready(self._mask)
+
+    def ipoll(self, timeout=-1):
+        return self._answer if self.ready() else ()
+
+    def poll(self, timeout=-1):
+        return [self._answer[0]] if self.ready() else []
+
+
+class Select:
+    POLLIN, POLLOUT, POLLERR, POLLHUP = 1, 4, 8, 16
+    poll = Poll
+
+
+class Errno:
+    EINPROGRESS, EAGAIN, ECONNRESET, ETIMEDOUT = 115, 11, 104, 110
+
+
+class Os:
+    @staticmethod
+    def urandom(count):
+        return bytes([index * 73 + now & 0xFF for index in range(count)])
+
+
+class Nothing:
+    """A module that this board does not have: `from select import poll` is an ImportError."""
+
+
+modules["time"] = Time
+modules["machine"] = Machine
+modules["select"] = Select
+modules["errno"] = Errno
+modules["os"] = Os
+modules["sys"] = Sys

@@ -1,0 +1,69 @@
+"""What `make test` fetches is checked, and fetched once."""
+
+from __future__ import annotations
+
+import http.server
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support import ROOT, free_port
+
+PATH = "/@micropython/micropython-webassembly-pyscript/-/micropython-webassembly-pyscript-1.29.0-6.tgz"
+
+
+class Registry(http.server.BaseHTTPRequestHandler):
+    """Has something else under every name."""
+
+    asked: list[str]
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b"something else")
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def registry() -> Iterator[tuple[str, list[str]]]:
+    Registry.asked = []
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Registry)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}", Registry.asked
+    server.shutdown()
+    server.server_close()
+
+
+def fetch(folder: Path, registry: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "NPM_CONFIG_REGISTRY": registry, "no_proxy": "127.0.0.1"}
+    environment.pop("npm_config_registry", None)
+    command = [sys.executable, ROOT / "tools" / "fetch_micropython.py", folder]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_a_micropython_that_is_another_one_is_refused(tmp_path: Path, registry: tuple[str, list[str]]) -> None:
+    url, asked = registry
+    done = fetch(tmp_path / "there", url)
+    assert done.returncode == 1
+    assert done.stderr == f"{url}{PATH} is not what it was when this project chose it\n"
+    assert asked == [PATH]
+    assert not list(tmp_path.rglob("*.wasm"))
+
+
+def test_one_that_is_there_is_not_fetched_again() -> None:
+    assert fetch(ROOT / ".venv" / "micropython", f"http://127.0.0.1:{free_port()}").returncode == 0
+
+
+def test_no_registry_is_one_line(tmp_path: Path) -> None:
+    done = fetch(tmp_path, f"http://127.0.0.1:{free_port()}")
+    assert done.returncode == 1
+    assert done.stderr.startswith("cannot fetch http://127.0.0.1:")
+    assert done.stderr.count("\n") == 1
