@@ -15,6 +15,7 @@ import pytest
 from tests.support import ROOT
 
 LINKED = ("configs", "firmware", "services", "transports")
+FOR_BOARDS = "pebble/firmware/"  # boards import these, we do not
 NOT_SOURCES = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "tests", "docs")
 
 
@@ -58,7 +59,8 @@ def test_the_wheel_holds_every_source_and_nothing_else(wheel: zipfile.ZipFile) -
 
 def test_every_module_of_the_wheel_imports_without_the_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     wheel.extractall(tmp_path)
-    names = [name.removesuffix(".py").removesuffix("/__init__") for name in wheel.namelist() if name.endswith(".py")]
+    host_files = [name for name in wheel.namelist() if name.endswith(".py") and not name.startswith(FOR_BOARDS)]
+    names = [name.removesuffix(".py").removesuffix("/__init__") for name in host_files]
     modules = [name.replace("/", ".") for name in names if not name.endswith("__main__")]
     code = "import importlib, sys\nfor name in sys.argv[1:]: print(importlib.import_module(name).__file__)"
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
@@ -73,6 +75,20 @@ def test_every_module_of_the_wheel_imports_without_the_checkout(wheel: zipfile.Z
     assert imported.returncode == 0, imported.stderr
     assert all(line.startswith(str(tmp_path)) for line in imported.stdout.splitlines())
     assert len(imported.stdout.splitlines()) == len(modules)
+
+
+def test_the_firmware_of_the_wheel_runs_on_a_simulated_board(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    wheel.extractall(tmp_path)
+    code = """
+from pebble.simulation.board import SimulatedMcu
+mcu = SimulatedMcu("goob", 0.0)
+print(mcu.board.firmware.module("goob.robot").__file__)
+print(mcu.receive(b"M 1 1\\n", 0.0))
+"""
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", code]
+    ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert ran.stdout.splitlines() == [str(tmp_path / "pebble/firmware/goob/robot.py"), r"b'OK M\r\n'"], ran.stderr
 
 
 @pytest.mark.parametrize("name", ["transports", "services"])

@@ -11,7 +11,7 @@ import typer
 
 from pebble.version import __version__
 
-COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo", "watch", "snapshot", "bench")
+COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo", "watch", "snapshot", "flash", "bench")
 
 _HELP = """Runs Pebble robots, and looks at them.
 
@@ -21,6 +21,7 @@ _HELP = """Runs Pebble robots, and looks at them.
     pebble doctor goob.json    is this machine ready for it?
     pebble up goob.json        run the robot
     pebble watch goob.json     see its camera and hear its microphone
+    pebble flash lamp.json     put a robot's firmware onto its board
 """
 
 
@@ -32,7 +33,7 @@ def run(arguments: list[str]) -> int:
     app.callback(help=_HELP)(_options)
     for name in wanted or COMMANDS:
         import_module(f"pebble.commands.{name}").register(app)
-    line = [*arguments, "--help"] if arguments in ([], ["topic"], ["bench"]) else arguments
+    line = [*arguments, "--help"] if arguments in ([], ["topic"], ["bench"], ["sim"]) else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:

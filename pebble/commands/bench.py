@@ -12,6 +12,7 @@ _GROUP_HELP = """Comparisons, side by side in one run on this machine.
 \b
     pebble bench frames
     pebble bench control --with-media
+    pebble bench fleet --robots 200
 """
 _Json = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.", metavar="FILE")]
 
@@ -94,8 +95,27 @@ def sound(json: _Json = None) -> int:
     return run(json)
 
 
+def fleet(
+    robots: Annotated[int, typer.Option(min=1, help="How many robots with Wi-Fi.")] = 200,
+    seconds: Annotated[float, typer.Option(min=1, help="How long they are driven.")] = 60.0,
+    rate: Annotated[float, typer.Option(min=0.1, help="Commands a second to each of them.")] = 10.0,
+    json: _Json = None,
+) -> int:
+    """MCU robots by the hundred on one broker: hearts, command latency, cost.
+
+    The real firmware files on simulated pins, real TCP; one operator drives all of them. Needs mosquitto.
+
+    \b
+        pebble bench fleet
+        pebble bench fleet --robots 20 --seconds 10 --json fleet.json
+    """
+    from pebble.bench.fleet import Plan, run
+
+    return run(Plan(robots=robots, seconds=seconds, rate_hz=rate, json=json))
+
+
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (frames, control, video, sound):
+    for command in (frames, control, fleet, video, sound):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")

@@ -55,7 +55,7 @@ def _resolve(target: Target) -> tuple[str, Any, Names, str]:
     url = str(target.url)
     if target.remote:
         raise PebbleError("--remote belongs to --config; with --url name the remote broker itself")
-    kind, settings = settings_of(url, password=_password(target.password_file), ca_cert=target.ca_cert)
+    kind, settings = settings_of(url, password=password(target.password_file), ca_cert=target.ca_cert)
     return kind, settings, Names(ANY_ROBOT if target.robot is None else base_of(target.robot)), url
 
 
@@ -82,7 +82,8 @@ def _remote(config: Config) -> tuple[str, Any]:
     return "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
 
 
-def _password(file: Path | None) -> str | None:
+def password(file: Path | None) -> str | None:
+    """What the file holds, else what the environment does. Raises PebbleError."""
     if file is None:
         return os.environ.get(PASSWORD)
     try:

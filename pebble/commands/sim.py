@@ -1,46 +1,178 @@
-"""``pebble sim``: a simulated MCU in the foreground, where a serial port is expected."""
+"""``pebble sim``: the real firmware of a robot's MCU on simulated pins, in the foreground."""
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+if TYPE_CHECKING:
+    from pebble.identity import Identity
+    from pebble.simulation.wireless import BrokerAddress
 
-class Board(StrEnum):
-    GOOB = "goob"
-    FRED = "fred"
+_GROUP_HELP = """The real firmware of a robot's MCU on simulated pins.
+
+Goob and Fred have theirs on a serial port, MiniLAMP and BenJr on Wi-Fi.
+
+\b
+    pebble sim goob --link /tmp/goob
+    pebble sim minilamp --broker mqtt://127.0.0.1
+    pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
+"""
+_BROKER_HELP = "mqtt://[USER@]HOST[:PORT], mqtts://… or a robot's config file."
+
+_Link = Annotated[
+    Path | None,
+    typer.Option("--link", help="Where the serial port shall appear. [default: /tmp/pebble-…]", metavar="PATH"),
+]
+_Charging = Annotated[bool, typer.Option("--charging", help="Start on the charger.")]
+_Broker = Annotated[str, typer.Option("--broker", "-b", help=_BROKER_HELP, metavar="URL", show_default=False)]
+_PasswordFile = Annotated[
+    Path | None, typer.Option(help="File with the password of USER; else $PEBBLE_PASSWORD.", metavar="FILE")
+]
+_CaCert = Annotated[Path | None, typer.Option(help="Authority to trust with mqtts://.", metavar="FILE")]
+_Id = Annotated[str | None, typer.Option("--id", help="The robot's id. [default: its kind]", metavar="ID")]
 
 
-def sim(
-    board: Annotated[Board, typer.Argument(help="Whose motor MCU.", show_default=False)],
-    link: Annotated[
-        Path | None,
-        typer.Option(help="Where the serial port shall appear. [default: /tmp/pebble-BOARD]", metavar="PATH"),
-    ] = None,
-    charging: Annotated[bool, typer.Option("--charging", help="Start on the charger.")] = False,
-) -> int:
-    """A simulated motor MCU on a pseudo terminal, until Ctrl-C.
+def goob(link: _Link = None, charging: _Charging = False) -> int:
+    """Goob's motor MCU on a pseudo terminal, until Ctrl-C.
 
     Write the path of its link into serial.port of the robot's config.
 
     \b
         pebble sim goob --link /tmp/goob
     """
-    from pebble.simulation.mcu import main
-
-    path = _default_link(board) if link is None else link
-    typer.echo(f"{board} answers at {path}; Ctrl-C ends it")
-    return main(["--kind", board.value, "--link", str(path), *(["--charging"] if charging else [])])
+    return _serial("goob", link, charging)
 
 
-def _default_link(board: Board) -> Path:
+def fred(link: _Link = None, charging: _Charging = False) -> int:
+    """Fred's motor MCU on a pseudo terminal, until Ctrl-C.
+
+    Write the path of its link into serial.port of the robot's config.
+
+    \b
+        pebble sim fred --link /tmp/fred
+    """
+    return _serial("fred", link, charging)
+
+
+def goob_imu(link: _Link = None) -> int:
+    """Goob's IMU board on a pseudo terminal, until Ctrl-C.
+
+    Write the path of its link into serial.port of an instance in the config.
+
+    \b
+        pebble sim goob_imu --link /tmp/goob-imu
+    """
+    return _serial("goob_imu", link, False)
+
+
+def minilamp(broker: _Broker, id_: _Id = None, password_file: _PasswordFile = None, ca_cert: _CaCert = None) -> int:
+    """A whole MiniLAMP on a real broker, until Ctrl-C.
+
+    \b
+        pebble sim minilamp --broker mqtt://127.0.0.1
+        pebble sim minilamp --broker minilamp.json
+    """
+    return _wireless("minilamp", id_, broker, password_file, ca_cert)
+
+
+def benjr(broker: _Broker, id_: _Id = None, password_file: _PasswordFile = None) -> int:
+    """A whole BenJr on a real broker, until Ctrl-C.
+
+    \b
+        pebble sim benjr --broker mqtt://127.0.0.1 --id benjr-2
+    """
+    return _wireless("benjr", id_, broker, password_file, None)
+
+
+def fleet(
+    broker: _Broker,
+    robots: Annotated[int, typer.Option("--robots", "-n", min=1, help="How many.")] = 10,
+    kind: Annotated[
+        list[str] | None, typer.Option(help="May be given several times. [default: minilamp, benjr]")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=1, help="End after so long.")] = None,
+    password_file: _PasswordFile = None,
+    ca_cert: _CaCert = None,
+) -> int:
+    """Many whole robots on a real broker, until Ctrl-C.
+
+    They are called minilamp-001, benjr-001, minilamp-002 and so on. With --seconds it exits 0 only if all
+    were online at the end.
+
+    \b
+        pebble sim fleet --robots 200 --broker mqtt://127.0.0.1:1883
+        pebble sim fleet -n 3 --kind benjr --broker mqtts://broker.lan --seconds 60
+    """
+    from pebble.simulation.fleet_program import Plan, run
+    from pebble.simulation.wireless import KINDS
+
+    address = _address(broker, password_file, ca_cert)[0]
+    return run(Plan(robots=robots, broker=address, kinds=kind or KINDS, seconds=seconds))
+
+
+def _serial(kind: str, link: Path | None, charging: bool) -> int:
     import tempfile
 
-    return Path(tempfile.gettempdir(), f"pebble-{board}")
+    from pebble.simulation.mcu import main
+
+    path = Path(tempfile.gettempdir(), f"pebble-{kind}") if link is None else link
+    typer.echo(f"{kind} answers at {path}; Ctrl-C ends it")
+    return main(["--kind", kind, "--link", str(path), *(["--charging"] if charging else [])])
+
+
+def _wireless(kind: str, id_: str | None, broker: str, password_file: Path | None, ca_cert: Path | None) -> int:
+    from pebble.identity import Identity
+    from pebble.simulation.networked import run
+
+    address, named = _address(broker, password_file, ca_cert)
+    identity = named or Identity("pebble", "robots", id_ or kind)
+    if named is not None and id_ is not None:
+        identity = Identity(named.system, named.type, id_)
+    typer.echo(f"{identity} is on its way to the broker at {address}; Ctrl-C ends it")
+    return run(kind, identity, address)
+
+
+def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Identity | None]:
+    """The broker that a URL or a config file names, and the robot of the config. Raises PebbleError."""
+    from pebble.commands.connection import password
+    from pebble.commands.url import UrlError, settings_of
+    from pebble.config import load
+    from pebble.errors import PebbleError
+    from pebble.links import LOCAL_RECONNECT_S, mqtt_settings
+    from pebble.simulation.wireless import BrokerAddress
+    from pebble.transports import MqttSettings, ZenohSettings
+
+    settings: MqttSettings | ZenohSettings
+    named = None
+    if "://" not in broker and not broker.startswith("zenoh:"):
+        config = load(Path(broker))
+        settings, named = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S), config.identity
+    else:
+        try:
+            _, settings = settings_of(broker, password=password(password_file), ca_cert=ca_cert)
+        except UrlError as error:
+            raise UrlError(str(error).replace("--url", "--broker")) from None
+    if not isinstance(settings, MqttSettings):
+        raise PebbleError("--broker: robots with Wi-Fi speak MQTT only, use mqtt://HOST[:PORT]")
+    tls = settings.tls
+    return (
+        BrokerAddress(
+            host=settings.host,
+            port=settings.port,
+            username=settings.username,
+            password=settings.password,
+            tls=tls is not None,
+            ca=None if tls is None else tls.ca_cert,
+        ),
+        named,
+    )
 
 
 def register(app: typer.Typer) -> None:
-    app.command("sim")(sim)
+    group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
+    for command in (goob, fred, goob_imu, minilamp, benjr, fleet):
+        group.command(command.__name__)(command)
+    app.add_typer(group, name="sim")

@@ -1,227 +1,182 @@
-"""The motor MCUs of Goob and Fred without hardware: bytes in, bytes out, a clock passed in.
+"""The serial MCUs of Goob and Fred without hardware: bytes in, bytes out, a clock passed in.
 
-Behaves as their firmware does on the line: forgiving about input, an answer to every command, sensor reports at a
-fixed rate, and motors that stop by themselves when nobody commands them.
+They run the firmware of the real boards (``firmware/``) on simulated pins, and move a body by what it puts out there.
 """
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from pebble.errors import ConfigError
-from pebble.services.serial_mcu_bridge.splitter import LineSplitter
-from pebble.simulation.motion import Pose, RobotMotion
-from pebble.simulation.sensors import Battery, hall
+from pebble.simulation.bodies import Pair, body_of
+from pebble.simulation.micropython.board import UID, Board
+from pebble.simulation.micropython.clock import VirtualClock
+from pebble.simulation.micropython.runner import Runner
+from pebble.simulation.state import BoardState, Light
 
-FAILSAFE_S = 1.0  # the original's firmware waits 5 s
+__all__ = ["KINDS", "BoardState", "Kind", "Light", "SimulatedMcu"]
 
-_TOKENS = 6  # the rest of a line is not looked at
-_NUMBER = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)")
-_LEFT_TRIM, _REVERSE_TRIM = 0.93, 0.7  # Fred's
-_REVERSE_BLOCK_S = 0.34  # Fred's: its gears do not like a reversal at speed
-_SHORTEST_FLASH_S = 0.05
+_REPLAYED_S = 0.5  # a pause up to this is made up for turn by turn; after a longer one only what is due now is said
+_TOKENS = 6  # of a line; the rest is not looked at
+_LONGEST_LINE = 300  # bytes; more than the firmware takes
+_DEADLINES_S = 2.0  # but whatever the firmware does by itself in silence is done after this
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What tells one board from another on the line."""
+    """How to look after a board: ``turn_s`` is how fine its firmware's loop turns, ``tick_s`` how often to tick."""
 
-    baud: int
-    sensor_names: tuple[str, str, str]
-    sensor_period_s: float
-    battery_period_s: float | None  # None: no voltage reports, the charger is told with the sensors
-    right_motor_sign: int  # −1: mounted the other way round, so its output is inverted
-    spares_gears: bool  # trims and blocks the reverse
+    turn_s: float
+    tick_s: float
+    is_text: bool = True  # it speaks goob_base_v1
 
 
 KINDS: Final = {
-    "goob": Kind(460800, ("a0", "a1", "a2"), 0.02, 5.0, -1, False),
-    "fred": Kind(115200, ("t0", "t1", "t2"), 0.5, None, 1, True),
+    "goob": Kind(0.005, 0.02),
+    "fred": Kind(0.005, 0.02),
+    "goob_imu": Kind(0.0025, 0.005, is_text=False),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Light:
-    """What the LED does; parts 0..1. It glows steadily, or fades in and out once per ``period_s``."""
-
-    blue: float
-    green: float
-    red: float
-    period_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class BoardState:
-    """A look at the robot: wheel speeds in mm/s, ``drive`` −1..1 as commanded, ``motors`` as the pins show."""
-
-    kind: str
-    pose: Pose
-    left_mm_s: float
-    right_mm_s: float
-    drive: tuple[float, float]
-    motors: tuple[float, float]
-    light: Light
-    volts: float
-    charging: bool
-    commands: int
-    last_command: str
 
 
 class SimulatedMcu:
     """One board. ``receive`` what the host sends, ``tick`` often, and send what both return to the host.
 
-    ``now`` is any monotonic clock in seconds; it only has to be the same in all calls.
+    ``now`` is any monotonic clock in seconds; it only has to be the same in all calls. ``failsafe_s`` replaces the
+    firmware's own limit; ``uid`` is what the MCU's maker wrote into it. ``on_motors(now, (left, right))`` hears each
+    change of the motors, + = forward.
     """
 
-    def __init__(self, kind: str, now: float, *, failsafe_s: float = FAILSAFE_S, charging: bool = False) -> None:
+    def __init__(
+        self,
+        kind: str,
+        now: float,
+        *,
+        failsafe_s: float | None = None,
+        charging: bool = False,
+        uid: bytes = UID,
+        on_motors: Callable[[float, Pair], None] | None = None,
+    ) -> None:
         if kind not in KINDS:
             raise ConfigError(f"there is no simulated MCU {kind!r}, only {' and '.join(KINDS)}")
+        if failsafe_s is not None and not KINDS[kind].is_text:
+            raise ConfigError(f"{kind} has no motors and no failsafe")
         self.kind, self.failsafe_s = kind, failsafe_s
-        self.motion = RobotMotion()
-        self.battery = Battery(charging=charging)
-        self._board = KINDS[kind]
-        self._commands: dict[int, tuple[int, Callable[[list[float], float], None]]] = {
-            ord("M"): (2, self._drive),
-            ord("L"): (3, self._glow),
-            ord("F"): (4, self._flash),
-        }
-        self.boot(now)
+        self.profile = KINDS[kind]
+        self._clock = VirtualClock(now)
+        self.board = Board(self._clock, uid=uid)
+        self.body = body_of(kind, self.board)
+        self.body.on_motors = on_motors or self.body.on_motors
+        self.motion, self.battery = self.body.motion, self.body.battery
+        self.battery.charging = charging
+        self._first_words = self._line = self._last = self._driven = b""
+        self._commands = self._trips = 0
+        self._runner = Runner(self.board, kind, on_boot=self._booted)
+        self._start()
+
+    @property
+    def resets(self) -> int:
+        """How often the board started anew by itself."""
+        return self.board.resets
 
     def boot(self, now: float) -> None:
-        """Power on: the pose and the battery are the world's, everything else starts anew."""
-        self._splitter = LineSplitter()
-        self._now = self._driven_at = now
-        self._forward_at = float("-inf")
-        self._wheels = self._commanded = (0.0, 0.0)
-        self._light = Light(0.0, 0.0, 1.0, 2.0)
-        self._count, self._last = 0, ""
-        self._sensors_due = now + self._board.sensor_period_s
-        self._battery_due = now + (self._board.battery_period_s or math.inf)
-        self._waiting = [b"Starting setup...", b"Done!"]
-        if self._board.battery_period_s is not None:
-            self._waiting.append(self._battery_line())
+        """Press the button: the pose and the battery are the world's, everything else starts anew."""
+        self._clock.until(now)
+        self._runner.boot()
+        self._start()
+
+    def disturb(self, on: bool) -> None:
+        """Make every device on its I2C bus fail, or work again."""
+        self.board.bus.disturbed = on
 
     def receive(self, data: bytes, now: float) -> bytes:
-        """Obey ``data``, which may end in the middle of a line. Returns the answers."""
-        self._advance(now)
-        skipped = self._splitter.discarded_lines
-        answers = [answer for line in self._splitter.feed(data) if (answer := self._obey(line.split(), now))]
-        answers += [b"WARN line too long"] * (self._splitter.discarded_lines - skipped)
-        return _lines(answers)
+        """Obey ``data``, which may end in the middle of a line. Returns what the board answers and says."""
+        said = self._advance(now, self.profile.tick_s)
+        if not self.profile.is_text:
+            return said + self._take(data, now)
+        *lines, rest = data.split(b"\n")
+        for line in lines:
+            answer = self._take(line + b"\n", now)
+            self._note(self._line + line, answer)
+            self._line = b""
+            said += answer
+        if rest:
+            self._line = (self._line + rest)[:_LONGEST_LINE]
+            said += self._take(rest, now)
+        return said
 
     def tick(self, now: float) -> bytes:
-        """Let time pass until ``now``. Returns the reports that are due."""
-        self._advance(now)
-        reports, self._waiting = self._waiting, []
-        if now >= self._sensors_due:
-            self._sensors_due = _next(self._sensors_due, self._board.sensor_period_s, now)
-            reports.append(self._sensor_line())
-        if self._board.battery_period_s is not None and now >= self._battery_due:
-            self._battery_due = _next(self._battery_due, self._board.battery_period_s, now)
-            reports.append(self._battery_line())
-        return _lines(reports)
+        """Let time pass until ``now``. Returns what the board said meanwhile."""
+        first, self._first_words = self._first_words, b""
+        return first + self._advance(now, self.profile.turn_s) + self._turn(now)
 
     def state(self) -> BoardState:
-        left, right = self._wheels
-        return BoardState(
-            kind=self.kind,
-            pose=self.motion.pose,
-            left_mm_s=self.motion.left_mm_s,
-            right_mm_s=self.motion.right_mm_s,
-            drive=self._commanded,
-            motors=(left, right * self._board.right_motor_sign),
-            light=self._light,
-            volts=self.battery.volts,
-            charging=self.battery.charging,
-            commands=self._count,
-            last_command=self._last,
-        )
+        return self.body.state(self._drive(), self._commands, self._last.decode("ascii", "replace"))
 
-    def _advance(self, now: float) -> None:
-        """Move on to ``now``; the failsafe stops the motors at its own time, however late this is called."""
-        failsafe_at = self._driven_at + self.failsafe_s
-        if self._wheels != (0.0, 0.0) and now >= failsafe_at:
-            self._roll_until(failsafe_at)
-            self._wheels = self._commanded = (0.0, 0.0)
-        self._roll_until(now)
+    # -- time
 
-    def _roll_until(self, moment: float) -> None:
-        seconds = max(0.0, moment - self._now)
-        self._now = max(self._now, moment)
-        self.motion.advance(*self._wheels, seconds)
-        self.battery.advance(self.motion, seconds)
+    def _advance(self, now: float, turn_s: float) -> bytes:
+        """Turn the loop up to just before ``now``, at least every ``turn_s``. Returns what the board said."""
+        said = b""
+        behind = now - self._clock.now()
+        if behind <= turn_s:
+            return said
+        replayed = behind <= _REPLAYED_S
+        until = now if replayed else self._clock.now() + _DEADLINES_S
+        while (moment := self._clock.now() + turn_s) < min(now, until):
+            turned = self._turn(moment)
+            said += turned if replayed else b""
+        return said
 
-    # -- commands
-
-    def _obey(self, tokens: list[bytes], now: float) -> bytes:
-        """The first letter decides; missing numbers are an error, spare ones are ignored."""
-        if not tokens:
+    def _turn(self, now: float) -> bytes:
+        """One turn of the firmware's loop at ``now``, unless something still holds it up."""
+        if self._clock.now() > now:
             return b""
-        letter = tokens[0][:1].upper()
-        if letter[0] not in self._commands:
-            return b"ERR unknown command"
-        wanted, action = self._commands[letter[0]]
-        numbers = [_number(token) for token in tokens[1:_TOKENS]]
-        if len(numbers) < wanted:
-            return b"ERR %s needs %d values" % (letter, wanted)
-        action(numbers, now)
-        self._count += 1
-        self._last = b" ".join(tokens[:_TOKENS]).decode("ascii", "replace")
-        return b"OK " + letter
+        self._clock.until(now)
+        self._runner.step()
+        self.body.settle()
+        return self.board.said()
 
-    def _drive(self, numbers: list[float], now: float) -> None:
-        self._driven_at = now
-        self._commanded = _clamp(numbers[0], -1.0), _clamp(numbers[1], -1.0)
-        self._wheels = self._spare_the_gears(*self._commanded, now) if self._board.spares_gears else self._commanded
+    def _take(self, data: bytes, now: float) -> bytes:
+        self.board.type(data)
+        said = self._turn(now)
+        while (unread := self.board.unread) and self._clock.now() <= now:
+            said += self._turn(now)
+            if self.board.unread == unread:  # it does not want any now
+                break
+        return said
 
-    def _spare_the_gears(self, left: float, right: float, now: float) -> tuple[float, float]:
-        """Fred: no way back right after a way ahead (turning stays), a slow reverse, a trimmed left wheel."""
-        linear, turn = (left + right) / 2, (left - right) / 2
-        if linear > abs(turn):
-            self._forward_at = now
-        elif linear < 0.0:
-            linear *= 0.0 if now - self._forward_at < _REVERSE_BLOCK_S else _REVERSE_TRIM
-        return _clamp((linear + turn) * _LEFT_TRIM, -1.0), _clamp(linear - turn, -1.0)
+    def _start(self) -> None:
+        """The first turn belongs to the boot; what is said in it is nobody's answer."""
+        self._runner.step()
+        self._first_words = self.board.said()
 
-    def _glow(self, numbers: list[float], _now: float) -> None:
-        self._light = Light(*(_clamp(part, 0.0) for part in numbers[:3]))
+    # -- what it was told
 
-    def _flash(self, numbers: list[float], _now: float) -> None:
-        blue, green, red = (_clamp(part, 0.0) for part in numbers[:3])
-        self._light = Light(blue, green, red, max(_SHORTEST_FLASH_S, numbers[3]))
+    def _booted(self, robot: Any) -> None:
+        if self.failsafe_s is not None:
+            robot.deadman.limit_ms = round(self.failsafe_s * 1000)
+        self._robot = robot
+        self._line = self._last = self._driven = b""
+        self._commands = self._trips = 0
 
-    # -- reports
+    def _note(self, line: bytes, answer: bytes) -> None:
+        """Count ``line`` if the firmware said OK to it."""
+        at = answer.find(b"OK ")
+        if at < 0:
+            return
+        self._commands += 1
+        self._last = b" ".join(line.split()[:_TOKENS])
+        if answer[at + 3 : at + 4] == b"M":
+            self._driven, self._trips = self._last, self._robot.deadman.trips
 
-    def _sensor_line(self) -> bytes:
-        values = zip(self._board.sensor_names, hall(self.motion), strict=True)
-        line = "T " + " ".join(f"{name}={value}" for name, value in values)
-        if self._board.battery_period_s is None:
-            line += f" chg={int(self.battery.charging)}"
-        return line.encode()
-
-    def _battery_line(self) -> bytes:
-        return b"C chg=-1 v=%.3f" % self.battery.volts
-
-
-def _number(token: bytes) -> float:
-    """As the firmware reads it: the digits in front count, anything else (nan and inf too) is 0."""
-    match = _NUMBER.match(token)
-    value = float(match[0]) if match else 0.0
-    return value if math.isfinite(value) else 0.0
-
-
-def _clamp(value: float, lowest: float) -> float:
-    return max(lowest, min(1.0, value))
-
-
-def _next(due: float, period: float, now: float) -> float:
-    """The next time after ``now`` on the grid of ``period``: what a pause missed is not made up for."""
-    return due + period * (math.floor((now - due) / period) + 1)
-
-
-def _lines(texts: list[bytes]) -> bytes:
-    return b"".join(text + b"\r\n" for text in texts)
+    def _drive(self) -> Pair | None:
+        """The wheel speeds of the last drive command, as the firmware reads them; 0 once its failsafe has struck."""
+        if not self.profile.is_text:
+            return None
+        if not self._driven or self._robot.deadman.trips != self._trips:
+            return 0.0, 0.0
+        read = self.board.firmware.module("common.lines")
+        left, right = (read.clamp(read.number(token, 0, len(token)), -1.0) for token in self._driven.split()[1:3])
+        return left, right

@@ -1,4 +1,4 @@
-"""A simulated Goob or Fred MCU as a program: ``python -m pebble.simulation.mcu --kind goob --link /tmp/goob``."""
+"""A simulated serial MCU as a program: ``python -m pebble.simulation.mcu --kind goob --link /tmp/goob``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from pathlib import Path
 
 import msgspec
 
-from pebble.simulation.board import FAILSAFE_S, KINDS, BoardState
+from pebble.simulation.board import KINDS, BoardState
+from pebble.simulation.micropython.board import UID
 from pebble.simulation.pty import PtyMcu
 
 _REPORT_PERIOD_S = 0.1
@@ -36,7 +37,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # in all threads to come: they are waited for below
     with PtyMcu(
-        options.kind, options.link, trace=options.trace, failsafe_s=options.failsafe, charging=options.charging
+        options.kind,
+        options.link,
+        trace=options.trace,
+        failsafe_s=options.failsafe,
+        charging=options.charging,
+        uid=options.uid,
     ) as mcu:
         if options.control:
             threading.Thread(target=_obey, args=(mcu,), name="pebble-sim control", daemon=True).start()
@@ -62,6 +68,8 @@ def _obey(mcu: PtyMcu) -> None:
         "reset": mcu.reset,
         "charge": lambda: mcu.charge(True),
         "discharge": lambda: mcu.charge(False),
+        "disturb": lambda: mcu.disturb(True),
+        "undisturb": lambda: mcu.disturb(False),
     }
     for line in sys.stdin:
         action = actions.get(line.strip())
@@ -77,11 +85,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--link", type=Path, required=True, help="symlink to make: the path of the serial port")
     parser.add_argument("--trace", type=Path, help="file to append every received line to, with its time")
-    parser.add_argument("--failsafe", type=float, default=FAILSAFE_S, metavar="S", help="stop after this silence")
+    parser.add_argument(
+        "--failsafe", type=float, metavar="S", help="stop after this silence, instead of the firmware's own"
+    )
     parser.add_argument("--charging", action="store_true", help="start on the charger")
+    parser.add_argument("--uid", type=bytes.fromhex, default=UID, metavar="HEX", help="the MCU's unique id")
     parser.add_argument("--report", action="store_true", help="write the state to standard output at 10 Hz")
     parser.add_argument(
-        "--control", action="store_true", help="read unplug, replug, reset, charge, discharge from stdin"
+        "--control",
+        action="store_true",
+        help="read unplug, replug, reset, charge, discharge, disturb, undisturb (the I2C bus) from standard input",
     )
     return parser
 

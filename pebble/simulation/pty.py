@@ -18,12 +18,13 @@ from typing import Any, Self, TypeVar
 
 from pebble.errors import LinkError
 from pebble.services.serial_mcu_bridge.splitter import LineSplitter
-from pebble.simulation.board import FAILSAFE_S, BoardState, SimulatedMcu
-from pebble.simulation.trace import Entry, Event, Trace
+from pebble.simulation.board import BoardState, SimulatedMcu
+from pebble.simulation.bodies import Pair
+from pebble.simulation.micropython.board import UID
+from pebble.simulation.trace import Entry, Event, Trace, motors_entry
 
 log = logging.getLogger(__name__)
 
-_TICK_S = 0.02
 _NO_HOST_S = 0.005  # a master whose slave is closed is always "ready", so it has to be asked now and then
 _ANSWER_S = 5.0
 _CHUNK = 65_536
@@ -45,14 +46,18 @@ class PtyMcu:
         link: Path,
         *,
         trace: Path | None = None,
-        failsafe_s: float = FAILSAFE_S,
+        failsafe_s: float | None = None,
         charging: bool = False,
+        uid: bytes = UID,
     ) -> None:
         self.link = link
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host took
-        self._mcu = SimulatedMcu(kind, time.monotonic(), failsafe_s=failsafe_s, charging=charging)
-        self._splitter = LineSplitter(_TRACED_LINE)
+        self._mcu = SimulatedMcu(
+            kind, time.monotonic(), failsafe_s=failsafe_s, charging=charging, uid=uid, on_motors=self._moved
+        )
+        self._tick_s = self._mcu.profile.tick_s
+        self._splitter = LineSplitter(_TRACED_LINE) if self._mcu.profile.is_text else None
         self._master: int | None = None
         self._host = False
         self._ending = False
@@ -99,6 +104,10 @@ class PtyMcu:
         """Put the robot on its charger, or take it off."""
         self._ask(lambda: setattr(self._mcu.battery, "charging", on))
 
+    def disturb(self, on: bool) -> None:
+        """Make the devices on the board's I2C bus fail, or work again."""
+        self._ask(lambda: self._mcu.disturb(on))
+
     def state(self) -> BoardState:
         return self._ask(self._mcu.state)
 
@@ -135,7 +144,8 @@ class PtyMcu:
         watched = [self._awake]
         if self._host and self._master is not None:
             watched.append(self._master)
-        ready, _, _ = select.select(watched, [], [], _TICK_S if self._host or self._master is None else _NO_HOST_S)
+        unasked = self._master is not None and not self._host
+        ready, _, _ = select.select(watched, [], [], min(self._tick_s, _NO_HOST_S) if unasked else self._tick_s)
         if self._awake in ready:
             with suppress(BlockingIOError):
                 os.read(self._awake, _CHUNK)
@@ -161,7 +171,7 @@ class PtyMcu:
         except OSError:  # hung up in this very moment
             return
         arrived = time.monotonic_ns()
-        for line in self._splitter.feed(data):
+        for line in self._splitter.feed(data) if self._splitter is not None else ():
             if text := line.strip().decode("utf-8", "backslashreplace"):  # blank lines say nothing to an MCU
                 self.trace.add(Entry(arrived, "line", text))
         self._transmit(self._mcu.receive(data, arrived / 1e9))
@@ -209,6 +219,9 @@ class PtyMcu:
 
     def _end(self) -> None:
         self._ending = True
+
+    def _moved(self, now: float, motors: Pair) -> None:
+        self.trace.add(motors_entry(round(now * 1e9), motors))
 
     def _note(self, event: Event) -> None:
         self.trace.add(Entry(time.monotonic_ns(), event))

@@ -1,4 +1,4 @@
-"""A record of what the host sent to a simulated MCU, and when."""
+"""A record of what reached a simulated MCU, what it did to its motors, and when."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ import msgspec
 
 _KEPT = 100_000  # entries in memory; a file keeps all
 
-Event = Literal["plugged", "opened", "line", "closed", "unplugged"]
+Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors"]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line from the host, or a change of the link. ``ns`` is time.monotonic_ns() when its last byte arrived."""
+    """One line from the host, a change of the link or of the motors.
+
+    ``ns`` is time.monotonic_ns() when the line's last byte arrived, or when the outputs changed. The line of ``motors``
+    is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot, however its motors are mounted.
+    """
 
     ns: int
     event: Event
@@ -26,12 +30,27 @@ class Entry:
     def drive(self) -> tuple[float, float] | None:
         """Left and right speed, if this is a well-formed drive line."""
         tokens = self.line.split(" ")
-        if len(tokens) != 3 or tokens[0] != "M":
-            return None
-        try:
-            return float(tokens[1]), float(tokens[2])
-        except ValueError:
-            return None
+        return _pair(tokens[1:]) if tokens[0] == "M" else None
+
+    @property
+    def motors(self) -> tuple[float, float] | None:
+        """What the motors do from now on: left and right, -1..1."""
+        return _pair(self.line.split(" ")) if self.event == "motors" else None
+
+
+def _pair(tokens: list[str]) -> tuple[float, float] | None:
+    if len(tokens) != 2:
+        return None
+    try:
+        return float(tokens[0]), float(tokens[1])
+    except ValueError:
+        return None
+
+
+def motors_entry(ns: int, motors: tuple[float, float]) -> Entry:
+    """The entry for motors that do this from now on."""
+    left, right = (round(speed, 3) + 0.0 for speed in motors)  # + 0.0: no "-0.000"
+    return Entry(ns, "motors", f"{left:.3f} {right:.3f}")
 
 
 class Trace:

@@ -1,4 +1,4 @@
-"""The simulated firmware, without a clock or a pty."""
+"""The firmware of Goob and Fred on simulated boards, without a real clock or a pty."""
 
 import math
 import random
@@ -49,7 +49,6 @@ def test_commands_as_the_firmware_takes_them(line: bytes, answer: bytes, drive: 
 
 def test_lights() -> None:
     mcu = SimulatedMcu("fred", 0.0)
-    assert mcu.state().light == Light(0.0, 0.0, 1.0, 2.0)
     assert mcu.receive(b"L 2 0.5 -1\nF 0 1 0 0.01\nL 1 1\nF 1 1 1\n", 0.0).split(b"\r\n") == [
         b"OK L",
         b"OK F",
@@ -57,9 +56,30 @@ def test_lights() -> None:
         b"ERR F needs 4 values",
         b"",
     ]
-    assert mcu.state().light == Light(0.0, 1.0, 0.0, 0.05)
     mcu.receive(b"L 2 0.5 -1\n", 0.0)
     assert mcu.state().light == Light(1.0, 0.5, 0.0)
+
+
+def test_a_light_fades_up_and_down() -> None:
+    mcu = SimulatedMcu("fred", 0.0)
+    run(mcu, 0.0, 1.0)
+    assert mcu.state().light == Light(0.0, 0.0, 1.0), "red for two seconds is what it shows by itself"
+    run(mcu, 1.0, 1.0)
+    assert mcu.state().light == Light(0.0, 0.0, 0.0)
+    mcu.receive(b"F 0 1 0 0.4\n", 2.0)
+    shown = []
+    for step in range(20):
+        run(mcu, 2.0 + step * 0.02, 0.02)
+        shown.append(mcu.state().light.green)
+    assert shown[:10] == sorted(shown[:10])
+    assert shown[9:] == sorted(shown[9:], reverse=True)
+    assert max(shown) == 1.0
+
+
+def test_goobs_headlights_are_white() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.receive(b"L 0 0.5 0\n", 0.0)
+    assert mcu.state().light == Light(0.5, 0.5, 0.5)
 
 
 def test_a_command_may_arrive_in_pieces() -> None:
@@ -151,6 +171,51 @@ def test_the_failsafe_stops_at_its_time_even_if_nobody_ticks() -> None:
     mcu.receive(b"M 1 1\n", 0.0)
     mcu.tick(100.0)
     assert mcu.state().pose.x_mm < 1.1 * FULL_SPEED_MM_S
+
+
+def test_each_change_of_the_motors_is_told_with_its_time() -> None:
+    told = []
+    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: told.append((now, motors)))
+    mcu.receive(b"M 0.5 -0.25\n", 0.1)
+    mcu.receive(b"M 0.5 -0.25\n", 0.2)
+    mcu.tick(5.0)
+    assert told == [(0.1, (0.5, -0.25)), (pytest.approx(1.2, abs=0.005), (0.0, 0.0))], "+ is ahead on both sides"
+
+
+def test_a_command_after_a_long_pause_is_obeyed_at_once() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    assert mcu.receive(b"M 1 1\n", 1000.0).startswith(b"OK M\r\n")
+    assert mcu.state().drive == (1.0, 1.0)
+
+
+def test_commands_that_arrive_together_are_obeyed_in_turn() -> None:
+    told = []
+    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: told.append(motors))
+    assert mcu.receive(b"M 1 1\nM 0 0\nM 0.5 0.5\nM 0", 0.0) == b"OK M\r\n" * 3
+    assert told == [(1.0, 1.0), (0.0, 0.0), (0.5, 0.5)]
+    assert mcu.state().commands == 3
+
+
+def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.receive(b"M 1 1\n", 0.0)
+    monkeypatch.setattr(mcu._robot.port, "read", lambda: 1 / 0)
+    assert mcu.tick(0.1).startswith(b"Starting setup...")
+    assert mcu.state().motors == (0.0, 0.0)
+    assert mcu.resets == 1
+    assert (mcu.state().commands, mcu.state().drive) == (0, (0.0, 0.0))
+    assert b"OK M\r\n" in mcu.receive(b"M 1 1\n", 0.3)
+    assert mcu.state().motors == (1.0, -1.0)
+
+
+def test_firmware_that_fails_at_every_turn_keeps_starting(monkeypatch: pytest.MonkeyPatch) -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    monkeypatch.setattr(type(mcu._robot), "step", lambda _robot: 1 / 0)
+    for turn in range(5):
+        mcu.tick(turn * 0.001)
+        monkeypatch.setattr(type(mcu._robot), "step", lambda _robot: 1 / 0)  # each boot has classes of its own
+    assert mcu.resets == 5
+    assert mcu.state().motors == (0.0, 0.0)
 
 
 def test_lights_do_not_keep_the_wheels_turning() -> None:

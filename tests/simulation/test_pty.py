@@ -13,7 +13,7 @@ import serial
 
 from pebble.errors import LinkError
 from pebble.simulation.pty import PtyMcu
-from pebble.simulation.trace import Entry, read_trace
+from pebble.simulation.trace import Entry, motors_entry, read_trace
 from tests.support import until
 
 
@@ -29,10 +29,14 @@ def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> 
         assert until(lambda: not mcu.host)
         after = time.monotonic_ns()
         entries = mcu.trace.entries()
-    assert [entry.event for entry in entries] == ["plugged", "opened", "line", "line", "closed"]
     assert all(before <= entry.ns <= after for entry in entries[1:])
-    assert entries[2].drive == (0.5, 0.25)
-    assert entries[3].drive is None
+    moved = [entry for entry in entries if entry.event == "motors"]
+    assert moved[0].motors == (0.5, 0.25)
+    others = [entry for entry in entries if entry.event != "motors"]
+    assert [entry.event for entry in others] == ["plugged", "opened", "line", "line", "closed"]
+    assert others[2].drive == (0.5, 0.25)
+    assert others[2].motors is None
+    assert others[3].drive is None
     assert read_trace(tmp_path / "trace") == [*entries, mcu.trace.entries()[-1]]
 
 
@@ -79,7 +83,7 @@ def test_unplug_and_replug(tmp_path: Path) -> None:
             again.write(b"M 0.5 0.5\n")
             assert until(lambda: mcu.state().drive == (0.5, 0.5))
         assert until(lambda: not mcu.host)
-    events = [entry.event for entry in mcu.trace.entries() if entry.event != "line"]
+    events = [entry.event for entry in mcu.trace.entries() if entry.event not in ("line", "motors")]
     assert events == ["plugged", "opened", "unplugged", "plugged", "opened", "closed", "unplugged"]
     assert not link.is_symlink()
 
@@ -106,6 +110,14 @@ def test_after_its_end_it_says_so(tmp_path: Path) -> None:
 def test_a_drive_entry_must_be_well_formed() -> None:
     assert Entry(0, "line", "M 0.1 -0.2").drive == (0.1, -0.2)
     assert [Entry(0, "line", text).drive for text in ("M a b", "M 1", "L 1 1 1", "")] == [None] * 4
+
+
+def test_a_motors_entry_has_three_decimals_and_no_minus_zero() -> None:
+    entry = motors_entry(5, (-0.0001, 0.12345))
+    assert entry == Entry(5, "motors", "0.000 0.123")
+    assert entry.motors == (0.0, 0.123)
+    assert entry.drive is None
+    assert Entry(5, "line", "0.5 0.5").motors is None
 
 
 def test_the_program(tmp_path: Path) -> None:

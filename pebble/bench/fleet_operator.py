@@ -1,0 +1,114 @@
+"""The operator of a fleet, as a process: drives every robot at a steady pace and listens to all their hearts.
+
+``python -m pebble.bench.fleet_operator PORT SECONDS RATE_HZ ID…`` writes JSON lines: one when every robot is online,
+then, when it has driven for so long, the figures. It ends with its standard input.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+import threading
+import time
+from array import array
+from collections.abc import Sequence
+from typing import Any, Final
+
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pebble.contract import DRIVE, ONLINE
+from pebble.identity import Identity
+
+#: What the wheels do, left and right, one after the other: no robot is told the same twice within eight commands.
+STEPS: Final = ((1, 1), (-1, -1), (1, 0), (-1, 0), (1, -1), (0, 1), (-1, 1), (0, -1))
+
+_ONLINE_S = 60.0
+_LOOK_S = 0.05
+
+
+class FleetOperator:
+    """One MQTT connection. Commands go out evenly spread: robot after robot, never all at once."""
+
+    def __init__(self, port: int, ids: Sequence[str]) -> None:
+        bases = [Identity("pebble", "robots", name).base for name in ids]
+        self._drives = [DRIVE.topic(base) for base in bases]
+        self._index = {ONLINE.topic(base): number for number, base in enumerate(bases)}
+        self.beats = [array("q") for _ in ids]  # CLOCK_MONOTONIC, ns
+        self.late = 0  # commands that could not go out in time
+        self._client = Client(CallbackAPIVersion.VERSION2)
+        self._client.max_inflight_messages_set(65_535)
+        self._client.on_socket_open = _send_at_once
+        self._client.on_connect = self._subscribe
+        self._client.on_message = self._hear
+        self._client.connect("127.0.0.1", port)
+        self._client.loop_start()
+
+    def wait_until_online(self) -> int:
+        """How many robots are, at best all."""
+        end = time.monotonic() + _ONLINE_S
+        while not all(self.beats) and time.monotonic() < end:
+            time.sleep(_LOOK_S)
+        return sum(map(bool, self.beats))
+
+    def drive(self, seconds: float, rate_hz: float) -> list[list[int]]:
+        """When (CLOCK_MONOTONIC, ns) each robot's commands were handed to the client; command n is STEPS[n % 8]."""
+        sent: list[list[int]] = [[] for _ in self._drives]
+        gap = 1 / rate_hz / len(self._drives)
+        bodies = [json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}) for left, right in STEPS]
+        began = time.monotonic()
+        for number in range(round(seconds * rate_hz) * len(self._drives)):
+            step, robot = divmod(number, len(self._drives))
+            left = began + number * gap - time.monotonic()
+            if left > 0:
+                time.sleep(left)
+            elif left < -1 / rate_hz:
+                self.late += 1
+            sent[robot].append(time.monotonic_ns())
+            self._client.publish(self._drives[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
+        return sent
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _subscribe(self, client: Client, *_: Any) -> None:
+        client.subscribe([(topic, 0) for topic in self._index])
+
+    def _hear(self, _client: Client, _data: Any, message: Any) -> None:
+        if not message.retain and b"true" in message.payload:
+            self.beats[self._index[message.topic]].append(time.monotonic_ns())
+
+
+def main(arguments: list[str]) -> int:
+    port, seconds, rate_hz, *ids = arguments
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    operator = FleetOperator(int(port), ids)
+    _say({"online": operator.wait_until_online()})
+    began, cpu = time.monotonic_ns(), time.process_time()
+    sent = operator.drive(float(seconds), float(rate_hz))
+    ended, cpu = time.monotonic_ns(), time.process_time() - cpu
+    beats = [[beat for beat in robot if began <= beat <= ended] for robot in operator.beats]
+    _say({"began": began, "ended": ended, "cpu_s": cpu, "late": operator.late, "sent": sent, "beats": beats})
+    operator.close()
+    return 0
+
+
+def _say(what: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
+
+
+def _end_with_input() -> None:
+    sys.stdin.read()
+    os._exit(0)
+
+
+def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

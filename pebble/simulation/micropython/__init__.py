@@ -1,0 +1,1 @@
+"""MicroPython boards on this machine: they run the real firmware files against simulated pins."""

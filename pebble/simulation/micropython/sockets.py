@@ -1,0 +1,219 @@
+"""The network of a simulated board on this machine's own: real TCP and UDP, never waiting, behind a simulated Wi-Fi."""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+from pebble.simulation.micropython.clock import Clock
+from pebble.simulation.micropython.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream, failure
+from pebble.simulation.micropython.tls import ssl_module
+from pebble.simulation.micropython.wlan import Platform, Radio, network_module
+
+Place = tuple[str, int]
+
+MOST_SOCKETS = 5  # TCP connections of the ESP8266's lwIP; the ESP32 has a few more
+RESOLVE_S = 5.0  # how long getaddrinfo holds a board up that asks for a name
+
+_CONSTANTS = {
+    name: int(getattr(socket, name))
+    for name in ("AF_INET", "SOCK_STREAM", "SOCK_DGRAM", "SOL_SOCKET", "SO_REUSEADDR", "IPPROTO_TCP", "TCP_NODELAY")
+}
+
+
+class HostNetwork:
+    """The network of one board. What it sends to a place in ``routes`` goes to the place named there instead.
+
+    The loop that gives the board its turns reads ``fresh``, sockets to watch from now on, and ``unread``, whether
+    more can be read at once.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        platform: Platform = "esp32",
+        routes: Mapping[Place, Place] | None = None,
+        uid: bytes = b"",
+    ) -> None:
+        self.clock = clock
+        self.radio = Radio(clock.now, platform)
+        self.fresh: list[socket.socket] = []
+        self.unread = False
+        self.trouble = ""  # of the last connection, in words
+        self.open: list[HostTcp | HostUdp] = []
+        self._uid = uid
+        self._to = dict(routes or {})
+        self._from = {there: here for here, there in self._to.items()}
+
+    def modules(self) -> dict[str, Any]:
+        """For a board that has just started."""
+        self.power_off()
+        return {
+            "network": network_module(self.radio, self._uid),
+            "socket": socket_module(self.clock, self._socket),
+            "ssl": ssl_module(),
+        }
+
+    def power_off(self) -> None:
+        """No socket is open any more, and the radio is off."""
+        for sock in list(self.open):
+            sock.close()
+        self.radio.activate(False)
+
+    def route(self, place: Place) -> Place:
+        return self._to.get(place, place)
+
+    def named(self, place: Place) -> Place:
+        """What the board calls this place."""
+        return self._from.get(place, place)
+
+    def _socket(self, kind: int) -> HostTcp | HostUdp:
+        if len(self.open) >= MOST_SOCKETS:
+            raise OSError(errno.ENFILE, "too many sockets: one is not closed")
+        made = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
+        self.open.append(made)
+        return made
+
+
+def socket_module(clock: Clock, make: Any) -> SimpleNamespace:
+    """The module ``socket`` of one board; ``make`` opens a socket of the given type."""
+
+    def open_socket(_family: int = socket.AF_INET, kind: int = socket.SOCK_STREAM, _protocol: int = 0) -> Any:
+        return make(kind)
+
+    def getaddrinfo(host: str, port: int, *_more: Any) -> list[tuple[int, int, int, str, Place]]:
+        """Numbers are answered at once; a name holds the whole board up, as it does on real ones."""
+        if not _is_numeric(host):
+            clock.sleep(RESOLVE_S)
+            raise OSError(-2, "EAI_NONAME")
+        return [(socket.AF_INET, socket.SOCK_STREAM, 0, host, (host, port))]
+
+    return SimpleNamespace(socket=open_socket, getaddrinfo=getaddrinfo, **_CONSTANTS)
+
+
+def numeric(place: Place) -> Place:
+    """``place``, if no resolver is needed for it: here nothing else is asked for."""
+    if not _is_numeric(place[0]):
+        raise OSError(-2, f"{place[0]} is no address")
+    return place
+
+
+def _is_numeric(host: str) -> bool:
+    try:
+        socket.inet_pton(socket.AF_INET, host)
+    except OSError:
+        return False
+    return True
+
+
+class _Host:
+    """What both kinds of socket share: they block never, and hear nothing while Wi-Fi is away."""
+
+    def __init__(self, network: HostNetwork, kind: socket.SocketKind) -> None:
+        self._network = network
+        self._sock = socket.socket(socket.AF_INET, kind)
+        self._sock.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(self._sock, 0)
+        network.fresh.append(self._sock)
+
+    def setblocking(self, blocking: bool) -> None:
+        if blocking:
+            raise NotImplementedError("this board never waits for a socket")
+
+    def setsockopt(self, level: int, option: int, value: Any) -> None:
+        self._sock.setsockopt(level, option, value)
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        if self in self._network.open:
+            self._network.open.remove(self)
+        self._sock.close()
+
+    def ready(self, mask: int) -> int:
+        """What poll() of the board reports."""
+        if self._sock.fileno() < 0:
+            return 32  # POLLNVAL
+        if not self._network.radio.connected:
+            return 0
+        self._poll.modify(self._sock, mask & (POLLIN | POLLOUT))
+        events = self._poll.poll(0)
+        return events[0][1] & (mask | POLLERR | POLLHUP) if events else 0
+
+    def _need_wifi(self) -> None:
+        if not self._network.radio.connected:
+            raise failure(errno.EHOSTUNREACH)
+
+
+class HostTcp(_Host, Stream):
+    """A TCP connection of the board."""
+
+    def __init__(self, network: HostNetwork) -> None:
+        super().__init__(network, socket.SOCK_STREAM)
+        self._established = False
+
+    def connect(self, place: Place) -> None:
+        """Always raises: EINPROGRESS if it goes well."""
+        self._need_wifi()
+        code = self._sock.connect_ex(self._network.route(numeric(place)))
+        raise failure(code or errno.EINPROGRESS)
+
+    def _receive(self, size: int) -> bytes | None:
+        if not self._network.radio.connected:
+            return None
+        try:
+            got = self._sock.recv(size)
+            self._network.trouble = "" if got else "the broker closed the connection"
+        except BlockingIOError:
+            got = None
+        except OSError as error:
+            self._network.trouble = error.strerror or str(error)
+            raise
+        self._network.unread = got is not None and len(got) == size
+        return got
+
+    def _send(self, data: bytes) -> int | None:
+        if not self._network.radio.connected:
+            return None
+        if not self._established and not self.ready(POLLOUT):
+            if self._network.radio.platform == "esp32":  # the ESP8266's lwIP takes early bytes, this one refuses them
+                raise failure(errno.EINPROGRESS)
+            return None
+        self._established = True
+        try:
+            return self._sock.send(data)
+        except BlockingIOError:
+            return None
+
+
+class HostUdp(_Host):
+    """A UDP socket of the board."""
+
+    def __init__(self, network: HostNetwork) -> None:
+        super().__init__(network, socket.SOCK_DGRAM)
+
+    def bind(self, _place: Place) -> None:
+        """Nothing to do: answers come back to the port that asked."""
+
+    def connect(self, place: Place) -> None:
+        self._sock.connect(self._network.route(numeric(place)))
+
+    def sendto(self, data: bytes, place: Place) -> int:
+        self._need_wifi()
+        return self._sock.sendto(data, self._network.route(numeric(place)))
+
+    def recvfrom(self, size: int) -> tuple[bytes, Place]:
+        if not self._network.radio.connected:
+            raise failure(errno.EAGAIN)
+        try:
+            data, place = self._sock.recvfrom(size)
+        except BlockingIOError:
+            raise failure(errno.EAGAIN) from None
+        return data, self._network.named(place)
