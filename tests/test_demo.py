@@ -95,11 +95,11 @@ def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None 
 
 
 @pytest.mark.parametrize(("broker", "seconds"), [("MOSQUITTO", MEDIA_ROUND_S + 3.0), ("EMBEDDED", ROUND_S + 1.0)])
-def test_both_robots_do_what_they_are_told(demos: list[Demo], temporary: Path, broker: str, seconds: float) -> None:
+def test_all_robots_do_what_they_are_told(demos: list[Demo], temporary: Path, broker: str, seconds: float) -> None:
     demo = start(demos, temporary, f"{seconds}, broker=BrokerKind.{broker}")
     assert demo.process.wait(START_S + seconds + END_S) == 0, demo.said
     seen_and_heard, _, driven = demo.said.partition("Seen by the MCUs")
-    assert driven.count("ok ") == 8, demo.said  # four steps, two robots
+    assert driven.count("ok ") == 16, demo.said  # four steps, four robots
     looks = {"MOSQUITTO": 12, "EMBEDDED": 6}[broker]  # two robots; four encodings of pictures, two of sound
     assert seen_and_heard.partition("Seen and heard")[2].count("ok ") >= looks, demo.said
     assert " zenoh " in demo.said
@@ -144,7 +144,7 @@ def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demo
 def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Path) -> None:
     demo = start(demos, temporary, "")
     assert until(lambda: "forward, stop" in demo.said, START_S), demo.said
-    assert len(demo.leftovers()) >= 10  # the demo, two brokers, two MCUs, two launchers and what they launched
+    assert len(demo.leftovers()) >= 12  # the demo, two brokers, four MCUs, two launchers and what they launched
     demo.process.kill()
     demo.process.wait(10)
     assert until(lambda: demo.leftovers() == [], END_S), demo.leftovers()
@@ -156,7 +156,7 @@ import sys
 import pebble.demo.main as main
 import pebble.demo.robot as robot
 main._DISCOVERY_S = 1.0
-robot.SimulatedRobot.start = lambda self, ending: None
+robot.LinuxRobot.start = lambda self, ending: None
 sys.exit(main.run(10))
 """
     demos.append(Demo(temporary, code))

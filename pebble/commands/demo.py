@@ -1,4 +1,4 @@
-"""``pebble demo``: two simulated robots, on MQTT and on Zenoh, driven through one broker."""
+"""``pebble demo``: four simulated robots, on Zenoh, on MQTT and on MCUs, driven through one broker."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ def demo(
         typer.Option("--seconds", "-s", min=1, help="Stop after this long of driving.", show_default=False),
     ] = None,
 ) -> int:
-    """Two simulated robots, driven by a scripted operator.
+    """Four simulated robots, driven by a scripted operator who cannot tell which is which.
 
-    Goob on Zenoh and Fred on MQTT, without hardware, until Ctrl-C.
+    Goob on Zenoh, Fred on MQTT, MiniLAMP and BenJr on MCUs with their own firmware, without hardware, until Ctrl-C.
     With --seconds it exits 0 only if every robot moved and stopped as commanded.
 
     \b

@@ -1,1 +1,1 @@
-"""The demo: two simulated robots on different transports, a scripted operator, and a judge of what they did."""
+"""The demo: four simulated robots of different kinds, a scripted operator, and a judge of what they did."""

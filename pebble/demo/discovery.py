@@ -10,6 +10,7 @@ from pebble.contract import (
     CAPABILITIES,
     CHARGING_LEVEL,
     CHARGING_STATUS,
+    IMU,
     ONLINE,
     OUTGOING,
     Channel,
@@ -17,6 +18,7 @@ from pebble.contract import (
 )
 from pebble.errors import PayloadError
 from pebble.identity import parse_topic
+from pebble.payloads import Orientation
 from pebble.transports import Message
 
 EVERYBODY = f"+/+/+/{OUTGOING}/#"
@@ -67,6 +69,7 @@ class Sighting:
         self.capabilities: dict[str, Any] = {}
         self.volts: float | None = None
         self.charging: bool | None = None
+        self.attitude: Orientation | None = None  # of the newest sample of its inertial sensor
 
     @property
     def transport(self) -> str:
@@ -79,6 +82,10 @@ class Sighting:
 
     def lights_topic(self, *, flash: bool) -> str | None:
         return self._topic("lights", "flash_topic" if flash else "solid_topic")
+
+    def offers(self, section: str) -> bool:
+        """Whether that part of its capabilities can be asked for: ``video``."""
+        return self.capabilities.get(section, {}).get("controls") is True
 
     def ready(self, now: float) -> bool:
         """Alive, and it said how to drive it."""
@@ -121,8 +128,10 @@ class Discovery:
             sighting.capabilities = payload.value
         elif channel is CHARGING_LEVEL:
             sighting.volts = payload.value
+        elif channel is IMU:
+            sighting.attitude = payload.value.orientation_deg
         else:
             sighting.charging = payload.value
 
 
-_LEARN = (ONLINE, CAPABILITIES, CHARGING_LEVEL, CHARGING_STATUS)
+_LEARN = (ONLINE, CAPABILITIES, CHARGING_LEVEL, CHARGING_STATUS, IMU)

@@ -13,7 +13,6 @@ from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from pebble.simulation.trace import Entry
 
 REACTION_S = 1.0  # from the first command until the wheels turn
-STOP_S = 0.85  # from the last command until the wheels are told to stand: 0.75 s watchdog, and its grain
 _TURNING_MM_S = 20.0
 _ENOUGH = 0.4  # of the ideal way: motors lag, Fred's are trimmed
 
@@ -38,21 +37,24 @@ class Verdict:
         return self.done.step.name
 
 
-def judge(done: Done, looks: Iterable[Look], lines: Iterable[Entry]) -> Verdict:
-    """Compare a finished step with its MCU's reports and with the lines that reached it."""
+def judge(done: Done, looks: Iterable[Look], entries: Iterable[Entry], *, stop_s: float, has_lights: bool) -> Verdict:
+    """Compare a finished step with its MCU's reports, with what reached it and with what its motors did.
+
+    ``stop_s``: how long after the operator's last act the motors may run.
+    """
     seen = [look for look in looks if done.began <= look.ns / 1e9 <= done.ended]
-    sent = [line for line in lines if done.began <= line.ns / 1e9 <= done.ended]
-    reaction, stop = _reaction(done, seen), _stop(done, sent)
+    traced = [entry for entry in entries if done.began <= entry.ns / 1e9 <= done.ended]
+    reaction, stop = _reaction(done, seen), _stop(done, traced)
     ahead, turned = _way(seen)
     wrong = [
         *_too_late("the wheels turned", reaction, REACTION_S),
-        *_too_late("the wheels were told to stop", stop, STOP_S),
+        *_too_late("the motors stopped", stop, stop_s),
         *_too_short("ahead", ahead, done.step.drive.z * FULL_SPEED_MM_S * done.step.drive_s, "mm"),
         *_too_short(
             "to the left", turned, -done.step.drive.x * 2 * FULL_SPEED_MM_S / TRACK_MM * done.step.drive_s, "rad"
         ),
         *_still_rolling(seen),
-        *_dark(sent),
+        *(_dark(traced) if has_lights else ()),
     ]
     return Verdict(done, reaction, stop, ahead, turned, tuple(wrong))
 
@@ -67,11 +69,11 @@ def _reaction(done: Done, seen: Sequence[Look]) -> float:
     return math.inf
 
 
-def _stop(done: Done, sent: Sequence[Entry]) -> float:
-    """Seconds from the operator's last act until the last drive line, if that was a stop; infinite if not."""
-    drives = [(line.ns / 1e9, line.drive) for line in sent if line.drive is not None]
-    moving = [index for index, (_, drive) in enumerate(drives) if drive != (0.0, 0.0)]
-    after = drives[moving[-1] + 1 :] if moving else []
+def _stop(done: Done, traced: Sequence[Entry]) -> float:
+    """Seconds from the operator's last act until the motors were off for good; infinite if they never were."""
+    motors = [(entry.ns / 1e9, entry.motors) for entry in traced if entry.motors is not None]
+    running = [index for index, (_, speeds) in enumerate(motors) if speeds != (0.0, 0.0)]
+    after = motors[running[-1] + 1 :] if running else []
     return max(0.0, after[0][0] - done.released) if after else math.inf
 
 
@@ -105,5 +107,5 @@ def _still_rolling(seen: Sequence[Look]) -> list[str]:
     return ["the wheels still turned at the end"]
 
 
-def _dark(sent: Sequence[Entry]) -> list[str]:
-    return [] if any(line.line[:2] in ("L ", "F ") for line in sent) else ["no light was switched"]
+def _dark(traced: Sequence[Entry]) -> list[str]:
+    return [] if any(entry.line[:2] in ("L ", "F ") for entry in traced) else ["no light was switched"]

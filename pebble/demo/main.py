@@ -1,4 +1,4 @@
-"""Two simulated robots, one on Zenoh and one on MQTT, driven through a broker by an operator who cannot tell which."""
+"""Four simulated robots, on Zenoh, on MQTT and on MCUs, driven by an operator who cannot tell which is which."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
@@ -24,7 +24,7 @@ from pebble.demo.stage import ROBOTS, Stage
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
 
-_DISCOVERY_S = 30.0  # until both robots can be driven, on the smallest machine
+_DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _LOOK_S = 0.1
 _SETTLED_S = 0.3  # an MCU reports ten times a second: how a step ended is known a little later
@@ -44,14 +44,15 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
     kind = broker or best_kind()
     with _ending_on_signals() as ending, Stage(ending) as stage:
         verdicts, media, problems = _play(stage, kind, seconds, ending, console)
+        with_media = [robot.name for robot in stage.robots if robot.has_media]
         if seconds is not None:
             problems += _not_driven(verdicts)
         if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
-            problems += _not_seen(media)
+            problems += _not_seen(with_media, media)
         problems += [f"{verdict.robot}, {verdict.step}: {wrong}" for verdict in verdicts for wrong in verdict.wrong]
         problems += [f"{verdict.robot}: {wrong}" for verdict in media for wrong in verdict.wrong]
         stage.keep = bool(problems)
-        show_media_results(console, ROBOTS, media)
+        show_media_results(console, with_media, media)
         show_results(console, ROBOTS, verdicts, problems)
         if problems:
             console.print(f"Logs, configs and traces: {stage.folder}", soft_wrap=True)
@@ -64,7 +65,9 @@ def _play(
     """Set up, drive and watch. Returns what the steps and the media came to, and what went wrong besides."""
     console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
     stage.start_brokers(kind)
-    console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU, camera and microphone.")
+    console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU, camera and microphone;")
+    console.print("Goob also with an inertial sensor that describes itself.")
+    console.print("MiniLAMP and BenJr are MCUs that speak MQTT themselves: their firmware, on simulated pins.")
     stage.start_robots()
     operator = Operator(stage.remote_port)
     operator.connect()
@@ -74,9 +77,10 @@ def _play(
             if not _discovered(operator, view, ending):
                 return [], [], [] if ending.is_set() else [*_unseen(operator), *stage.fallen()]
             operator.begin()
-            show.begin(list(operator.discovery.sightings.values()))
+            show.begin([seen for seen in operator.discovery.sightings.values() if seen.offers("video")])
             verdicts = _watch(stage, operator, view, math.inf if seconds is None else seconds, ending)
-        return verdicts, list(show.verdicts), stage.fallen()
+        unfelt = [] if ending.is_set() else _unfelt(stage, operator)  # who ends it early has not seen everything
+        return verdicts, list(show.verdicts), [*stage.fallen(), *unfelt]
     finally:
         show.end()
         operator.end()
@@ -97,6 +101,12 @@ def _unseen(operator: Operator) -> list[str]:
     return [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in ROBOTS if name not in ready]
 
 
+def _unfelt(stage: Stage, operator: Operator) -> list[str]:
+    heard = {seen.name for seen in operator.discovery.sightings.values() if seen.attitude is not None}
+    wanted = [robot.name for robot in stage.robots if robot.has_imu]
+    return [f"{name}: nothing came of its inertial sensor" for name in wanted if name not in heard]
+
+
 def _watch(stage: Stage, operator: Operator, view: View, seconds: float, ending: threading.Event) -> list[Verdict]:
     """Judge each step once its traces are complete."""
     verdicts: deque[Verdict] = deque(maxlen=_REMEMBERED)
@@ -112,12 +122,14 @@ def _watch(stage: Stage, operator: Operator, view: View, seconds: float, ending:
 
 def _judge_settled(stage: Stage, operator: Operator, verdicts: deque[Verdict], until: float) -> None:
     while operator.done and operator.done[0].ended < until:
-        verdicts.append(_judge(stage, operator.done.popleft()))
+        verdicts.append(_judge(stage, operator, operator.done.popleft()))
 
 
-def _judge(stage: Stage, done: Done) -> Verdict:
+def _judge(stage: Stage, operator: Operator, done: Done) -> Verdict:
     robot = next(robot for robot in stage.robots if robot.name == done.robot)
-    return judge(done, list(robot.looks), robot.lines())
+    seen = next(seen for seen in operator.discovery.sightings.values() if seen.name == done.robot)
+    has_lights = seen.lights_topic(flash=False) is not None
+    return judge(done, list(robot.looks), robot.entries(), stop_s=robot.stop_s, has_lights=has_lights)
 
 
 def _not_driven(verdicts: list[Verdict]) -> list[str]:
@@ -125,13 +137,10 @@ def _not_driven(verdicts: list[Verdict]) -> list[str]:
     return [f"{name}, {step.name}: not done" for name in ROBOTS for step in SCRIPT if (name, step.name) not in driven]
 
 
-def _not_seen(media: list[MediaVerdict]) -> list[str]:
+def _not_seen(names: Sequence[str], media: list[MediaVerdict]) -> list[str]:
     judged = {(verdict.robot, verdict.encoding) for verdict in media}
     return [
-        f"{name}: no {encoding} was looked at"
-        for name in ROBOTS
-        for encoding in VIDEO
-        if (name, encoding) not in judged
+        f"{name}: no {encoding} was looked at" for name in names for encoding in VIDEO if (name, encoding) not in judged
     ]
 
 

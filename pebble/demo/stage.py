@@ -12,15 +12,18 @@ from typing import Self
 
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.programs import Program, end_all
-from pebble.demo.robot import SimulatedRobot
+from pebble.demo.robot import LinuxRobot, McuRobot, SimulatedRobot
 
-ROBOTS = ("goob", "fred")
-_ROBOTS_END_S, _REST_END_S = 3.0, 1.0  # with the operator's goodbye: everything is gone within five seconds
+ROBOTS = ("goob", "fred", "minilamp", "benjr")
+_ROBOTS_END_S, _REST_END_S = 2.5, 1.0  # with the operator's goodbye: everything is gone within five seconds
 _LONGEST_FOLDER = 40  # characters: unix sockets live below, and their paths end at 108 bytes
 
 
 class Stage:
-    """Two brokers, two MCUs, two robots. ``keep`` says whether the folder with the logs outlives the demo."""
+    """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU.
+
+    ``keep`` says whether the folder with the logs outlives the demo.
+    """
 
     def __init__(self, ending: threading.Event) -> None:
         self.keep = True
@@ -36,7 +39,8 @@ class Stage:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         """Robots first, while those they say their last words to are still there."""
         end_all((robot.launcher for robot in self.robots if robot.launcher is not None), _ROBOTS_END_S)
-        end_all([*self._brokers, *(robot.mcu for robot in self.robots if robot.mcu is not None)], _REST_END_S)
+        end_all((mcu for robot in self.robots for mcu in robot.mcus), _REST_END_S)
+        end_all(self._brokers, _REST_END_S)
         if not self.keep:
             shutil.rmtree(self.folder)
 
@@ -47,19 +51,22 @@ class Stage:
         for broker in (remote, local):
             broker.wait(self._ending)
         self.remote_port = remote.port
-        self.robots = [SimulatedRobot(name, self.folder, local.port, remote.port) for name in ROBOTS]
+        self.robots = [
+            LinuxRobot("goob", self.folder, local.port, remote.port, has_imu=True),
+            LinuxRobot("fred", self.folder, local.port, remote.port),
+            McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
+            McuRobot("benjr", self.folder, "ESP8266", remote.port),
+        ]
 
     def start_robots(self) -> None:
-        """Raises PebbleError if a simulated MCU fails; a robot that fails is seen by the operator, or rather not."""
+        """Raises PebbleError if a simulated MCU fails; any other failure the operator sees, or rather does not."""
         for robot in self.robots:
             robot.start(self._ending)
 
     def fallen(self) -> list[str]:
         """What should still run and does not."""
-        programs = [*self._brokers, *(program for robot in self.robots for program in (robot.mcu, robot.launcher))]
-        return [
-            f"{program.name} ended by itself: see {program.log}" for program in programs if program and program.ended
-        ]
+        programs = [*self._brokers, *(program for robot in self.robots for program in robot.programs)]
+        return [f"{program.name} ended by itself: see {program.log}" for program in programs if program.ended]
 
 
 def _temporary_folder() -> str:

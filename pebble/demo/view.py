@@ -6,9 +6,9 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -24,7 +24,11 @@ from pebble.demo.robot import SimulatedRobot
 
 _LINE_PERIOD_S = 1.0
 _RATE_WINDOW = 20  # looks at a counter
-_COLUMN_WIDTH = 26  # characters, of the longest usual cell: a table that does not twitch, in a terminal of 80 columns
+_COLUMN_WIDTH = 26  # characters, of the longest usual cell: a table that does not twitch
+_COLUMN_EDGE = 3  # a line, and a space on each side
+_LABEL_WIDTH = 20  # the first column, with its edges
+
+T = TypeVar("T")
 
 
 class Rate:
@@ -76,7 +80,8 @@ class View:
         rows = [self._row(robot, now) for robot in self._robots]
         doing = f"{now - self._began:5.1f} s  operator: {self._operator.doing}"
         if self._live is not None:
-            self._live.update(Group(_table(rows), Text(doing), Text("Ctrl-C ends it", style="dim")), refresh=True)
+            tables = [_table(some) for some in _side_by_side(rows, self._console)]
+            self._live.update(Group(*tables, Text.assemble(doing, ("   Ctrl-C ends it", "dim"))), refresh=True)
         elif now - self._said_at >= _LINE_PERIOD_S:
             self._said_at = now
             for line in (doing, *("  ".join(["       ", *row.values()]) for row in rows)):
@@ -89,16 +94,19 @@ class View:
 
     def _row(self, robot: SimulatedRobot, now: float) -> dict[str, str]:
         sighting = self._sighting(robot.name)
-        row = {"robot": robot.name}
+        row = {"robot": f"{robot.name} ({robot.runs_on})"}
         if sighting is None:
             return row | {"transport": "not seen yet"}
         row |= {"transport": sighting.transport, "heartbeat": _heartbeat(sighting, now)}
         row["last command"] = self._command(sighting, now)
         row |= _truth(robot)
         row["battery"] = _battery(sighting)
-        watched = self._show.watched.get(robot.name)
-        row["video"] = "" if watched is None else watched.summary("video", now)
-        row["audio"] = "" if watched is None else watched.summary("audio", now)
+        if robot.has_imu:
+            row["attitude"] = _attitude(sighting)
+        if robot.has_media:
+            watched = self._show.watched.get(robot.name)
+            row["video"] = "" if watched is None else watched.summary("video", now)
+            row["audio"] = "" if watched is None else watched.summary("audio", now)
         row["messages"] = f"{self._rates[robot.name].of(sighting.messages, now):3.0f}/s"
         return row
 
@@ -114,13 +122,14 @@ class View:
 
 def show_results(console: Console, robots: Sequence[str], verdicts: Sequence[Verdict], problems: Sequence[str]) -> None:
     """One row per step, one column per robot, of several rounds the worst; then every problem in words."""
-    table = Table(title="Seen by the MCUs: the way, and the time until the stop", title_justify="left")
-    table.add_column("step")
-    for name in robots:
-        table.add_column(name)
-    for step in dict.fromkeys(verdict.step for verdict in verdicts):
-        table.add_row(step, *(_cell(step, name, verdicts) for name in robots))
-    if verdicts:
+    steps = list(dict.fromkeys(verdict.step for verdict in verdicts))
+    for some in _side_by_side(robots, console) if verdicts else ():
+        table = Table(title="Seen by the MCUs: the way, and the time until the stop", title_justify="left")
+        table.add_column("step")
+        for name in some:
+            table.add_column(name)
+        for step in steps:
+            table.add_row(step, *(_cell(step, name, verdicts) for name in some))
         console.print(table)
     for problem in problems:
         console.print(problem, style="red", highlight=False, markup=False, soft_wrap=True)
@@ -158,14 +167,22 @@ def _cell(step: str, name: str, verdicts: Sequence[Verdict]) -> str:
     return f"{'FAILED' if worst.wrong else 'ok'}  {way}, {worst.stop_s * 1000:.0f} ms"
 
 
+def _side_by_side(columns: Sequence[T], console: Console) -> Iterator[Sequence[T]]:
+    """As many columns at a time as the terminal is wide for; two fit into 80 characters."""
+    fitting = max(1, (console.width - _LABEL_WIDTH) // (_COLUMN_WIDTH + _COLUMN_EDGE))
+    for first in range(0, len(columns), fitting):
+        yield columns[first : first + fitting]
+
+
 def _table(columns: Sequence[dict[str, str]]) -> Table:
-    """One column per robot: narrow enough for any terminal."""
-    table = Table(show_header=False)
-    table.add_column()
+    """One column per robot, without lines: two such tables fit into a terminal of 24 rows."""
+    table = Table(show_header=False, box=None, padding=(0, 1))
+    table.add_column(style="dim")
     for _ in columns:
         table.add_column(min_width=_COLUMN_WIDTH)
     for label in max(columns, key=len):
-        table.add_row(label, *(column.get(label, "") for column in columns))
+        table.add_row(label, *(column.get(label, "") for column in columns), style="bold" if label == "robot" else "")
+    table.add_row()
     return table
 
 
@@ -184,6 +201,11 @@ def _truth(robot: SimulatedRobot) -> dict[str, str]:
     wheels = f"{board.left_mm_s:+4.0f} {board.right_mm_s:+4.0f} mm/s"
     degrees = math.degrees(board.pose.heading_rad)
     return {"wheels": wheels, "pose": f"{board.pose.x_mm:+5.0f} {board.pose.y_mm:+5.0f} mm {degrees:+4.0f}°"}
+
+
+def _attitude(sighting: Sighting) -> str:
+    attitude = sighting.attitude
+    return "unknown" if attitude is None else f"roll {attitude.roll:+.1f}° pitch {attitude.pitch:+.1f}°"
 
 
 def _battery(sighting: Sighting) -> str:

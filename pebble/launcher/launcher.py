@@ -48,8 +48,8 @@ class Launcher:
     def __init__(self, config: Config, *, table: Sequence[Program] | None = None) -> None:
         if config.robot.platform != "linux":
             raise ConfigError(
-                f"robot.platform: {config.robot.platform} runs on its own MCU, there is nothing to start here"
-                " (`pebble flash` and its simulation arrive in a later release)"
+                f"robot.platform: {config.robot.platform} runs on its own MCU, there is nothing to start here:"
+                " `pebble flash` brings its firmware onto it, `pebble sim` runs it without one"
             )
         if config.path is None:
             raise ConfigError("the robot's processes read its config from a file, and this one has none")

@@ -303,13 +303,12 @@ class TestSerialInstances:
         raw = {"enabled": True, "instances": {"rear": {"serial": {"port": "/dev/b"}}}}
         assert list(read(at("services.serial_mcu_bridge", raw)).serial_instances()) == ["rear"]
 
-    def test_a_line_of_a_later_protocol_is_checked_and_skipped(self) -> None:
+    def test_a_line_may_speak_another_protocol(self) -> None:
         config = self.with_(imu={"protocol": "imu_mpu6050_v1", "serial": {"port": "/dev/i"}})
-        assert list(config.serial_instances()) == [""]
-        assert (
-            "services.serial_mcu_bridge.instances.imu: protocol imu_mpu6050_v1 arrives in a later release; skipped"
-            in config.warnings
-        )
+        assert {name: line.protocol for name, line in config.serial_instances().items()} == {
+            "": "goob_base_v1",
+            "imu": "imu_mpu6050_v1",
+        }
 
     @pytest.mark.parametrize(
         ("instances", "expected"),
@@ -626,7 +625,7 @@ class TestResolved:
         assert resolved(again)["services"] == shown["services"]
         assert derived["base"] == config.base
         assert derived["run_dir"] == str(config.run_dir())
-        assert derived["serial_instances"] == [""]
+        assert derived["serial_instances"] == ["", "imu"]
 
 
 def test_reading_a_config_imports_no_client_library_and_no_cli() -> None:

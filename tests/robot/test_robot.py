@@ -18,9 +18,10 @@ DRIVE = "incoming/drive-values"
 
 
 def settle(seat: Seat) -> None:
-    """Stand still and wait until the wheels do."""
+    """Stand still and wait until the wheels were told: a serial line that was just opened takes half a second."""
+    began = time.monotonic()
     seat.operator.send(DRIVE, {"x": 0, "z": 0})
-    assert until(lambda: not seat.rig.mcu.moving(), 3)
+    assert until(lambda: seat.rig.mcu.drives(began) and not seat.rig.mcu.moving(), 3)
 
 
 def first_motion(seat: Seat, since: float) -> tuple[float, tuple[float, float]]:
