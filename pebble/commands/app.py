@@ -16,7 +16,7 @@ COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo", "watch", 
 _HELP = """Runs Pebble robots, and looks at them.
 
 \b
-    pebble demo                two simulated robots, nothing else needed
+    pebble demo                four simulated robots, nothing else needed
     pebble check goob.json     is this config right, and what does it come to?
     pebble doctor goob.json    is this machine ready for it?
     pebble up goob.json        run the robot

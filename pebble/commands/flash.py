@@ -84,6 +84,8 @@ def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
         kind = firmware_named(firmware or robot)
         shipped = Path(str(files("pebble")), "configs", f"{robot}.json")
         return kind, None if kind.is_report else load(shipped)
+    if not Path(robot).exists():
+        raise PebbleError(f"{robot}: neither a file nor one of {', '.join(FIRMWARE)}")
     config = load(Path(robot))
     if firmware is not None:
         return firmware_named(firmware), config
