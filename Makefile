@@ -11,7 +11,7 @@ help:
 	@echo "make demo SECONDS=20  the same, ending by itself; succeeds only if every robot moved and stopped as commanded"
 	@echo "make test             all checks and tests"
 	@echo "make check            lint, types and imports only"
-	@echo "make firmware         what the firmware costs of each board: code and memory, measured in the real MicroPython"
+	@echo "make firmware         what the firmware costs of each board, measured in the real MicroPython; into docs/firmware.md"
 	@echo "make footprint        what a robot costs and how fast it is: memory, CPU, start, latency; mqtt beside zenoh"
 	@echo "make clean            remove what the other targets made"
 

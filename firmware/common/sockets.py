@@ -50,7 +50,7 @@ class Stream:
         """How many bytes came; at the end of the stream an OSError."""
         count = self.socket.readinto(data)
         if count == 0:
-            raise OSError(errno.ECONNRESET)
+            raise OSError("closed by the broker")
         return count or 0
 
     def write(self, data: memoryview, count: int) -> int:

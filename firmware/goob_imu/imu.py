@@ -26,6 +26,7 @@ _CENTI_DPS = const(25013)  # 100 / 65.5 LSB per degree/s
 _HALF = const(8192)
 _CENTI_DEG = 5729.578  # per radian
 _TURN = const(36_000)
+_UPRIGHT = const(9000)
 
 
 class Imu:
@@ -132,7 +133,7 @@ class Imu:
             turned = self._roll + values[3] * ms / 1000
             roll = turned + _around(roll - turned) * _GRAVITY
             turned = self._pitch + values[4] * ms / 1000
-            pitch = turned + (pitch - turned) * _GRAVITY
+            pitch = max(-_UPRIGHT, min(_UPRIGHT, turned + (pitch - turned) * _GRAVITY))
         self._roll, self._pitch = _around(roll), pitch
         values[7], values[8] = int(self._roll), int(pitch)
 

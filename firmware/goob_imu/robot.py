@@ -51,6 +51,7 @@ class Robot:
     def __init__(self) -> None:
         self._now = now = time.ticks_ms()
         self.out = Sender(_RING)
+        self.out.used = 1  # a zero: it ends what was on the line before a reset
         self.port = Port(self.out)
         self.port.piece = _PIECE
         self.door = _DOOR  # a DESCRIBE_REQ begins with 3, which is Ctrl-C: see common/run.py

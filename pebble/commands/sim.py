@@ -104,7 +104,7 @@ def fleet(
 
     \b
         pebble sim fleet --robots 200 --broker mqtt://127.0.0.1:1883
-        pebble sim fleet -n 3 --kind benjr --broker mqtts://broker.lan --seconds 60
+        pebble sim fleet -n 3 --kind minilamp --broker mqtts://broker.lan --seconds 60
     """
     from pebble.simulation.fleet_program import Plan, run
     from pebble.simulation.wireless import KINDS

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pebble.config import Config
+from pebble.contract import ONLINE
 from pebble.flash import images, on_board, ports, uf2, verify
 from pebble.flash.boards import Firmware
 from pebble.flash.private import CA_FILE, FILE, Private
@@ -245,7 +246,7 @@ class Steps:
         broker = config.local_mqtt
         return Step(
             title=f"its heartbeat reaches {broker.host}:{broker.port}",
-            lines=(f"wait for a live message on {config.base}/outgoing/online",),
+            lines=(f"wait for a live message on {ONLINE.topic(config.base)}",),
             act=lambda: verify.at_broker(config),
         )
 

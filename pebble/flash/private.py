@@ -42,6 +42,9 @@ def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_passwor
         raise PebbleError(f"--wifi: a network's name has 1 to {_WIFI_NAME} bytes")
     if wifi_password and len(wifi_password.encode()) not in _WIFI_PASSWORD:
         raise PebbleError("the Wi-Fi password has 8 to 63 characters, or none for an open network")
+    for key, name in (("system", config.robot.system), ("type", config.robot.type), ("id", config.robot.id)):
+        if '"' in name or "\\" in name:  # boards write their JSON by hand: firmware/common/topics.py
+            raise ConfigError(f'robot.{key}: a board takes no " and no \\ in its name')
     broker = config.local_mqtt
     tls, ca = _tls(broker, firmware)
     return Private(
@@ -91,8 +94,9 @@ def _tls(broker: Mqtt, firmware: Firmware) -> tuple[Any, bytes | None]:
         if tls.insecure:
             return True, None  # encrypted, to whoever answers
         raise ConfigError("local_mqtt.tls.ca_cert: a board knows no authorities by itself; name the broker's")
-    named = {} if tls.insecure else {"server_name": broker.host}
-    return {"ca": f"/{CA_FILE}", **named}, _der(tls.ca_cert)
+    if tls.insecure:
+        raise ConfigError("local_mqtt.tls.insecure: a board that is given ca_cert checks the name too; leave out one")
+    return {"ca": f"/{CA_FILE}", "server_name": broker.host}, _der(tls.ca_cert)
 
 
 def _der(path: Path) -> bytes:

@@ -14,12 +14,13 @@ from pathlib import Path
 
 import msgspec
 
+from pebble.errors import PebbleError
 from pebble.simulation.board import KINDS, BoardState
 from pebble.simulation.micropython.board import UID
 from pebble.simulation.pty import PtyMcu
 
 _REPORT_PERIOD_S = 0.1
-_SIGNALS = {signal.SIGTERM, signal.SIGINT}
+_SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +34,17 @@ class Look:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run until SIGTERM or SIGINT, or with ``--control`` until standard input ends."""
+    """Run until a signal, or with ``--control`` until standard input ends."""
     options = _parser().parse_args(arguments)
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # in all threads to come: they are waited for below
+    try:
+        return _run(options)
+    except PebbleError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+
+
+def _run(options: argparse.Namespace) -> int:
     with PtyMcu(
         options.kind,
         options.link,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import queue
@@ -36,8 +37,9 @@ T = TypeVar("T")
 class PtyMcu:
     """A SimulatedMcu, its pty, the thread they live on, and a stable ``link`` to the pty as the path of the port.
 
-    The symlink's folder must exist. Unplugging takes the link to the host away, not the MCU's power: its motors stop by
-    failsafe, as on a robot whose MCU hangs on the battery. Each replug makes a new pty behind the same symlink.
+    The symlink's folder must exist; only a symlink is replaced. Unplugging takes the link to the host away, not the
+    MCU's power: its motors stop by failsafe, as on a robot whose MCU hangs on the battery. Each replug makes a new pty
+    behind the same symlink.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class PtyMcu:
         self._tick_s = self._mcu.profile.tick_s
         self._splitter = LineSplitter(_TRACED_LINE) if self._mcu.profile.is_text else None
         self._master: int | None = None
+        self._tty = ""
         self._host = False
         self._ending = False
         self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
@@ -67,9 +70,13 @@ class PtyMcu:
         self._thread = threading.Thread(target=self._run, name=f"pebble-sim {kind}", daemon=True)
 
     def open(self) -> Self:
-        """Power on and plug in; the port exists when this returns."""
+        """Power on and plug in; the port exists when this returns. Raises LinkError if it cannot be put there."""
         self._thread.start()
-        self.replug()
+        try:
+            self.replug()
+        except OSError as error:
+            self.close()
+            raise LinkError(f"there can be no serial port at {self.link}: {error.strerror}") from None
         return self
 
     def close(self) -> None:
@@ -198,21 +205,24 @@ class PtyMcu:
     def _replug(self) -> None:
         if self._master is not None:
             return
+        if self.link.exists() and not self.link.is_symlink():
+            raise FileExistsError(errno.EEXIST, "there is something else")
+        new = self.link.with_name(self.link.name + ".new")
+        new.unlink(missing_ok=True)
         master, slave = os.openpty()
         tty.setraw(slave)  # before anybody reads: the terminal's echo would command the MCU with its own reports
         os.set_blocking(master, False)
-        new = self.link.with_name(self.link.name + ".new")
-        new.unlink(missing_ok=True)
-        new.symlink_to(os.ttyname(slave))
+        self._master, self._tty = master, os.ttyname(slave)
         os.close(slave)
-        self._master = master
+        new.symlink_to(self._tty)
         self._note("plugged")
         new.replace(self.link)
 
     def _unplug(self) -> None:
         if self._master is None:
             return
-        self.link.unlink(missing_ok=True)
+        if self.link.is_symlink() and self.link.readlink() == Path(self._tty):  # else another simulation took it over
+            self.link.unlink()
         os.close(self._master)
         self._master, self._host = None, False
         self._note("unplugged")

@@ -18,6 +18,7 @@ from pebble.transports import Message
 
 _DEVICES = 256  # remembered; a robot has a handful
 _WAITING = 256  # kept values that wait for a manifest
+_QUESTION = "/" + MCU_DESCRIBE.metric.rpartition("/")[2]
 _MARK = b'"device_uid"'  # what a value under an alias carries: it says whose it is
 
 
@@ -31,13 +32,19 @@ class PrivateTopics:
         self._private: dict[str, frozenset[str]] = {}  # topics that may not, by uid; remembered
         self._waiting: dict[str, Message] = {}  # by topic
         self._values = f"{base}/{OUTGOING}/{MCU_VALUE.metric.partition('{')[0]}"
+        self._commands = f"{base}/{INCOMING}/{MCU_COMMAND.metric.partition('{')[0]}"
 
     def is_known(self, topic: str) -> bool:
-        """Does a manifest call this topic private?"""
+        """Does a manifest call this topic private? So is the question whose a uid is: only lines settle that."""
+        if topic.startswith(self._commands) and topic.endswith(_QUESTION):
+            return True
         return any(topic in topics for topics in list(self._private.values()))
 
     def admit(self, message: Message) -> list[Message]:
         """What may pass now: ``message`` or nothing; with a manifest, after it the kept values that waited for it."""
+        if not message.payload:
+            with self._lock:
+                self._waiting.pop(message.topic, None)  # taken back: not to be told any more
         if not message.topic.startswith(self._values) and _MARK not in message.payload:
             return [] if self.is_known(message.topic) else [message]
         with self._lock:
@@ -86,12 +93,14 @@ class PrivateTopics:
         return sample.interface in self._public.get(sample.device_uid, ())
 
     def _hold(self, message: Message) -> list[Message]:
-        if (message.retain or message.keep) and (message.topic in self._waiting or len(self._waiting) < _WAITING):
+        kept = (message.retain or message.keep) and not self.is_known(message.topic)
+        if kept and (message.topic in self._waiting or len(self._waiting) < _WAITING):
             self._waiting[message.topic] = message
         return []
 
     def _released(self) -> list[Message]:
-        released = [message for message in self._waiting.values() if self._may_pass(message)]
-        for message in released:
-            del self._waiting[message.topic]
+        waiting, self._waiting = self._waiting, {}
+        released = []
+        for message in waiting.values():
+            released += [message] if self._may_pass(message) else self._hold(message)
         return released

@@ -66,6 +66,8 @@ def _why_not(claim: str, interface: Mapping[str, Any], lookup: Lookup) -> str:
     profile = _OPEN.get(channel.suffix)
     if profile is None:
         return "the channel is the robot's own"
+    if profile and channel.remote and interface.get("local_only"):
+        return "it may leave the robot, where its body does not say whose it is"
     if profile and (interface.get("profile") != profile or not imu.fits(profile, _field_names(interface))):
         return f"it needs the profile {profile} and its fields"
     return ""

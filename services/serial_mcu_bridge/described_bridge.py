@@ -179,22 +179,31 @@ class DescribedBridge(SerialService):
         candidate, device = self._candidate, self._device
         match move:
             case Move.ASK if candidate is not None:
-                self._ask(candidate.uid)
+                self._ask(candidate.uid, self._uid.token)
+            case Move.INSIST if candidate is not None:
+                self._ask(candidate.uid, self._uid.token, has=True)
             case Move.ANSWER if device is not None:
                 self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
             case Move.HOLD if candidate is not None:
                 self._introduce(candidate)
-            case Move.YIELD if candidate is not None and not self._uid_is_taken:
-                self._uid_is_taken = True
-                text = "%s: another device has this uid already; this one is not used until that one leaves"
-                self.log.warning(text, candidate.uid)
+            case Move.YIELD if candidate is not None:
+                self._yield(candidate.uid)
 
-    def _ask(self, uid: str) -> None:
-        self.publish(MCU_COMMAND, {"from": self._uid.token}, uid=uid, name=RESERVED)
+    def _yield(self, uid: str) -> None:
+        self._withdraw("is given up")  # while the fabric was away both may have had it
+        if not self._uid_is_taken:
+            self._uid_is_taken = True
+            text = "%s: another device has this uid already; this one is not used until that one leaves"
+            self.log.warning(text, uid)
+
+    def _ask(self, uid: str, token: str = "", *, has: bool = False) -> None:
+        """Who has this uid? Without a ``token`` only out of curiosity: nobody yields to that."""
+        self.publish(MCU_COMMAND, {"from": token, "has": has}, uid=uid, name=RESERVED)
 
     @on(_QUESTION)
     def hear_question(self, question: dict[str, Any], uid: str) -> None:
-        self._do(self._uid.hear_question(uid, str(question.get("from", "")), time.monotonic()))
+        token, has = str(question.get("from", "")), question.get("has") is True
+        self._do(self._uid.hear_question(uid, token, time.monotonic(), has=has))
         self._arm()
 
     def _introduce(self, manifest: Manifest) -> None:
@@ -226,6 +235,9 @@ class DescribedBridge(SerialService):
         self._candidate, self._uid_is_taken = None, False
         self._states_said.clear()
         self._uid.release()
+        self._withdraw(why)
+
+    def _withdraw(self, why: str) -> None:
         device, self._device = self._device, None
         if device is None:
             return
@@ -270,8 +282,11 @@ class DescribedBridge(SerialService):
         return None
 
     def _end_alias(self, alias: Alias) -> None:
+        address = self.addresses[alias.channel]
         if alias.channel.kind is Kind.STATE:
             self.retract(alias.channel)
+        elif address.retain:  # the config wants a stream kept
+            self._send(alias.channel, address.topic, b"")
 
     # -- the other devices of this robot
 
@@ -294,6 +309,10 @@ class DescribedBridge(SerialService):
     def _hear_of(self, uid: str, manifest: McuManifest | None, kept: bool) -> None:
         now = time.monotonic()
         if self._device is not None and uid == self._device.uid:
+            if manifest is None:
+                self._republish()  # somebody gave it up: what was taken back is ours
+            else:
+                self._do(self._uid.hear_manifest(uid, now))
             return
         if manifest is None:
             self._neighbours.forget(uid)

@@ -121,6 +121,7 @@ class Session:
         self._by_id: dict[int, Interface] = {}
         self._known: OrderedDict[Hello, Manifest] = OrderedDict()
         self._commands: OrderedDict[int, _Command] = OrderedDict()
+        self._slots: dict[int, int] = {}  # of the newest command, by interface
         self._sequence = 0
         self._ask_at: float | None = None
         self._heard_at = self._pinged_at = self._asked_at = float("-inf")
@@ -180,7 +181,8 @@ class Session:
         self._commands[self._sequence] = _Command(interface.name, now + ANSWER_S)
         if len(self._commands) > _OPEN_COMMANDS:
             self._commands.popitem(last=False)
-        return Send(f"command {interface.id}/{self._sequence % _WAITING}", data)
+        slot = self._slots[interface.id] = (self._slots.get(interface.id, 0) + 1) % _WAITING
+        return Send(f"command {interface.id}/{slot}", data)
 
     # -- what frames say
 
@@ -237,6 +239,7 @@ class Session:
         self._ask_at = None
         self.manifest = described.manifest
         self._by_id = {one.id: one for one in described.manifest.interfaces}
+        self._slots.clear()
         yield described
 
     def _reading(self, frame: Frame, now: float) -> Iterator[Event]:

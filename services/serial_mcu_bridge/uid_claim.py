@@ -1,7 +1,8 @@
 """Two devices with one uid would speak over one another: the first one has it, the other waits. Pure.
 
 Whoever wants a uid asks for it; whoever has it answers with its manifest. Of two who ask at once the one with the
-greater token wins.
+greater token wins. So it is of two who both have it, because they could not hear one another when they asked. What a
+line says may come back to itself: only the token tells its own words from another's.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ class Move(Enum):
     NOTHING = "nothing"
     ASK = "publish the question"
     ANSWER = "publish the manifest"
+    INSIST = "publish the question, and that it is ours"
     HOLD = "it is ours: begin"
     YIELD = "it is somebody else's: wait"
 
@@ -58,19 +60,21 @@ class UidClaim:
         self._state, self._due = _State.HELD, None
         return Move.HOLD
 
-    def hear_question(self, uid: str, token: str, now: float) -> Move:
-        """Somebody asks who has ``uid``; our own question may come back to us."""
-        if uid != self._uid or token == self.token:
+    def hear_question(self, uid: str, token: str, now: float, *, has: bool = False) -> Move:
+        """Somebody asks who has ``uid``, perhaps having it himself; our own question may come back to us."""
+        if uid != self._uid or token == self.token or self._state not in (_State.ASKING, _State.HELD):
             return Move.NOTHING
         if self._state is _State.HELD:
-            return Move.ANSWER
-        if self._state is not _State.ASKING:
-            return Move.NOTHING
+            if not has:
+                return Move.ANSWER
+            return self._yield(now) if token > self.token else Move.INSIST
         # the weaker one may have begun to listen after we had asked
-        return self._yield(now) if token > self.token else Move.ASK
+        return self._yield(now) if has or token > self.token else Move.ASK
 
     def hear_manifest(self, uid: str, now: float) -> Move:
-        """Somebody has just said the manifest of ``uid``; no kept copy."""
+        """Somebody has just said the manifest of ``uid``: us, or somebody who has it too. Kept copies: only if held."""
+        if uid == self._uid and self._state is _State.HELD:
+            return Move.INSIST
         return self._yield(now) if uid == self._uid and self._state is _State.ASKING else Move.NOTHING
 
     def hear_leaving(self, uid: str, now: float) -> Move:

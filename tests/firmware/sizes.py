@@ -1,4 +1,4 @@
-"""Prints what the firmware costs of each board: `make firmware`. The table in docs/firmware.md is from here."""
+"""Prints what the firmware costs of each board, and puts it into docs/firmware.md: `make firmware`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from pebble.flash.boards import FIRMWARE
 from pebble.flash.sources import modules
 from tests.firmware.heap import CASES, LIMITS, Case, Cost, measure, smallest
 from tests.firmware.micropython import compile_module
+from tests.support import ROOT
+
+DOCS = ROOT / "docs" / "firmware.md"
+_HEAD = "| robot | files | names | code loaded | starting | robot made | in use, most | peak | during | limit |"
 
 
 def main() -> None:
@@ -18,11 +22,29 @@ def main() -> None:
         print(*module_sizes(Path(folder, "modules")), sep="\n")
         print()
         costs = pool.map(lambda case: measure(case, Path(folder)), CASES)
-        print(*heap_table(dict(zip(CASES, costs, strict=True))), sep="\n")
+        table = heap_table(dict(zip(CASES, costs, strict=True)))
+        print(*table, sep="\n")
+        _write(table)
         if "--smallest" in sys.argv:
             print()
             sizes = pool.map(lambda case: smallest(case, Path(folder)), CASES)
             print(*(f"{case}: lives in {size} bytes" for case, size in zip(CASES, sizes, strict=True)), sep="\n")
+
+
+def documented() -> dict[str, list[str]]:
+    """The cells of the table in docs/firmware.md, by its first column."""
+    rows = [line.strip("| ").split(" | ") for line in _table(DOCS.read_text()).splitlines()]
+    return {row[0]: row for row in rows}
+
+
+def _write(table: list[str]) -> None:
+    text = DOCS.read_text()
+    DOCS.write_text(text.replace(_table(text), "\n".join(table)))
+
+
+def _table(text: str) -> str:
+    start = text.index(_HEAD)
+    return text[start : text.index("\n\n", start)]
 
 
 def module_sizes(folder: Path) -> list[str]:
@@ -51,8 +73,7 @@ def heap_table(costs: dict[Case, Cost]) -> list[str]:
     for case, cost in costs.items():
         sizes = (cost.files, cost.names, cost.imported, cost.starting, cost.built, cost.live, cost.peak)
         rows.append(f"| {case} | {' | '.join(map(str, sizes))} | {cost.peak_at} | {LIMITS[case] or ''} |")
-    head = "| robot | files | names | code loaded | starting | robot made | in use, most | peak | during | limit |"
-    return [head, "|---|--:|--:|--:|--:|--:|--:|--:|---|--:|", *rows]
+    return [_HEAD, "|---|--:|--:|--:|--:|--:|--:|--:|---|--:|", *rows]
 
 
 if __name__ == "__main__":

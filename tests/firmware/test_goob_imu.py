@@ -64,6 +64,15 @@ def test_it_says_hello_when_it_boots() -> None:
     assert hello.sequence == 1
 
 
+def test_half_a_frame_from_before_a_reset_does_not_swallow_its_hello() -> None:
+    """On a serial port without USB nobody else would tell the host that the firmware is another one now."""
+    board = Board(VirtualClock())
+    body_of("goob_imu", board)
+    board.load("goob_imu", {}).step()
+    frames = (encode(Frame(Type.SAMPLE, b"\1" * 18, 1))[:20] + board.said()).split(b"\0")
+    assert Type.HELLO in [decode(one).type for one in frames[1:] if one]
+
+
 def test_it_describes_itself_when_asked() -> None:
     bench = Bench()
     bench.run(0.5)

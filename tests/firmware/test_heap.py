@@ -7,6 +7,9 @@ from pathlib import Path
 import pytest
 
 from tests.firmware.heap import CASES, LIMITS, Case, measure
+from tests.firmware.sizes import documented
+
+_PEAK = 7  # column of the table
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
@@ -14,4 +17,6 @@ def test_heap(case: Case, tmp_path: Path) -> None:
     cost = measure(case, tmp_path)
     limit = LIMITS[case]
     assert limit is None or cost.peak <= limit, f"{case}: {cost}"
+    told = int(documented()[str(case)][_PEAK])
+    assert abs(told - cost.peak) <= 0.02 * cost.peak, f"docs/firmware.md says {told}, it is {cost.peak}: make firmware"
     assert cost.imported < cost.built <= cost.live <= cost.peak, cost  # else something was not measured

@@ -231,6 +231,15 @@ def test_only_who_was_asked_may_answer(asked: str, answers: str, heard: bytes) -
     assert question.step(0) == heard
 
 
+def test_the_end_of_a_connection_is_said_in_words() -> None:
+    from common.sockets import Stream
+
+    stream = Stream.__new__(Stream)
+    stream.socket = SimpleNamespace(readinto=lambda _: 0)
+    with pytest.raises(OSError, match="closed by the broker"):
+        stream.read(memoryview(bytearray(1)))
+
+
 def test_what_tls_could_not_send_comes_again_as_it_was() -> None:
     from common.sockets import Stream
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, parse
-from pebble.errors import PebbleError
+from pebble.errors import ConfigError, PebbleError
 from pebble.flash.boards import FIRMWARE
 from pebble.flash.private import check_broker, private_files
 from tests.support import ROOT
@@ -31,6 +31,13 @@ def test_a_board_learns_who_it_is_and_where_its_broker_is() -> None:
         "mqtt": {"host": "broker.lab", "port": 1884, "tls": False},
     }
     assert private.ca is None
+
+
+def test_names_that_the_firmware_refuses_never_get_to_a_board() -> None:
+    for name in ('la"mp', "la\\mp"):
+        named = parse({"robot": {"id": name}, "local_mqtt": {"host": "broker.lab"}}, folder=Path("/"), env={})
+        with pytest.raises(ConfigError, match=r"robot\.id: a board takes no"):
+            private_files(named, C6, ssid="Lab", wifi_password="")
 
 
 def test_the_brokers_password_comes_from_where_the_config_says(tmp_path: Path) -> None:
@@ -58,6 +65,12 @@ def test_encryption_without_checks_has_to_be_asked_for() -> None:
     assert private_files(config(tls=tls), C6, ssid="Lab", wifi_password="").settings["mqtt"]["tls"] is True
     with pytest.raises(PebbleError, match=r"tls\.ca_cert: a board knows no authorities"):
         private_files(config(tls={"enabled": True}), C6, ssid="Lab", wifi_password="")
+
+
+def test_an_authority_whose_broker_may_have_any_name_is_refused() -> None:
+    tls = {"enabled": True, "insecure": True, "ca_cert": str(CA)}
+    with pytest.raises(PebbleError, match=r"tls\.insecure: a board that is given ca_cert checks the name too"):
+        private_files(config(tls=tls), C6, ssid="Lab", wifi_password="")
 
 
 def test_what_a_board_cannot_do_is_refused(tmp_path: Path) -> None:

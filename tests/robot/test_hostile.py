@@ -26,7 +26,7 @@ from tests.robot.rig import Rig
 from tests.support import until
 
 MESSAGES = 100_000
-CHUNK = 2_000  # messages sent before waiting for a sign that the robot has read them
+CHUNK = 800  # messages before waiting for a sign that the robot has read them: less than any queue on the way holds
 LINES = 800  # the same for lines: together fewer bytes than may wait unread
 
 

@@ -9,8 +9,8 @@ import struct
 import threading
 import time
 import tty
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -169,7 +169,7 @@ class Fabric:
         if kind == "memory":
             self._memory = MemoryHub()
         elif kind == "mqtt":
-            broker = Broker(folder)
+            broker = self._broker = Broker(folder)
             self._ends.callback(broker.stop)
             self.local_mqtt = {"host": "127.0.0.1", "port": broker.port}
             self._mqtt = MqttSettings(host="127.0.0.1", port=broker.port)
@@ -200,6 +200,13 @@ class Fabric:
         if self.kind == "mqtt":
             return create("mqtt", name, self._mqtt)
         return create("zenoh", name, ZenohSettings(run_dir=self._run_dir, client=True))
+
+    @contextmanager
+    def outage(self) -> Iterator[None]:
+        """The broker is dead meanwhile. (Processes on Zenoh hear one another without a hub.)"""
+        self._broker.kill()
+        yield
+        self._broker.start()
 
     def close(self) -> None:
         self._ends.close()
@@ -274,6 +281,7 @@ class Rig:
         self.world = self.listener("world")
         self._config: Config | None = None
         self.lines: dict[str, Running] = {}
+        self.mcus: dict[str, ScriptedMcu] = {}
 
     def listener(self, name: str) -> Listener:
         listener = Listener(self.fabric.client(name))
@@ -281,7 +289,7 @@ class Rig:
         return listener
 
     def mcu(self, manifest: M, name: str = "one", *, plugged: bool = True, greets: bool = False) -> ScriptedMcu:
-        mcu = ScriptedMcu(self.folder / name, manifest, greets=greets)
+        mcu = self.mcus[name] = ScriptedMcu(self.folder / name, manifest, greets=greets)
         self._ends.callback(mcu.close)
         if plugged:
             mcu.plug()

@@ -39,7 +39,8 @@ YES, NO = Want(on=True), Want(on=False)
 
 class TestDecision:
     def test_every_program_has_a_row(self) -> None:
-        assert tuple(name for row in MEDIA for name in row.programs) == ALL
+        programs = [name for row in MEDIA for name in row.programs]
+        assert programs == ["camera_publisher", "video_stream", "audio_publisher", "audio_receiver"]
 
     def test_the_encodings_are_those_a_config_may_name(self) -> None:
         for row, section in zip(MEDIA, (VideoPublisher, AudioPublisher), strict=True):

@@ -302,6 +302,18 @@ def test_new_firmware_while_it_runs(rig: Rig) -> None:
     assert rig.world.said("mcu/lamp-1/lamp")[-1]["value"] == {"level": 6.5}
 
 
+def test_an_inertial_channel_that_the_config_wants_kept_is_taken_back(memory: Rig) -> None:
+    mcu = memory.mcu(IMU)
+    memory.bridge(publish={"low_rate_retain": True})
+    assert settled(memory.world, "mcu/goob-imu-nano/describe")
+    assert memory.claimed()
+    mcu.say(wire.frame(wire.SAMPLE, motion(), 1), wire.frame(wire.STATE, summary(), 2))
+    assert settled(memory.world, "sensors/imu")
+    assert memory.world.on("sensors/imu")[0].keep
+    mcu.unplug()
+    assert until(lambda: memory.world.kept("sensors/imu") == [])
+
+
 def test_a_bridge_that_ends_takes_back_what_it_said(rig: Rig) -> None:
     mcu = rig.mcu(LAMP)
     running = rig.bridge()

@@ -5,10 +5,14 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from pebble.services.serial_mcu_bridge.manifest import parse_describe
+from pebble.transports import QoS, State
 from tests.services import mcu_wire as wire
 from tests.services.mcu_rig import BASE, Rig, motion, settled
 from tests.services.mcu_wire import IMU, LAMP, M
@@ -109,6 +113,53 @@ def test_one_uid_twice_is_the_first_ones(rig: Rig, caplog: pytest.LogCaptureFixt
     (one if heard == {1.0} else two).unplug()
     other = {1.0, 2.0} - heard
     assert until(lambda: other <= {body["value"]["accel_mps2"]["x"] for body in rig.world.said("sensors/imu-fast")}, 3)
+
+
+def test_one_uid_twice_while_nobody_hears_anybody(tmp_path: Path) -> None:
+    """Without a broker each finds nobody who objects. Afterwards one gives it up; what is kept is the other's."""
+    with closing(Rig("mqtt", tmp_path)) as rig:
+        lines = {}
+        for name, level in (("one", b"\x0a"), ("two", b"\x14")):
+            rig.mcu(LAMP, name, plugged=False).after_describing = wire.frame(wire.STATE, level, 2)
+            lines[level[0] / 2] = rig.bridge(name).service
+
+        def holders() -> list[float]:
+            return [level for level, service in lines.items() if service._device is not None]  # type: ignore[attr-defined]
+
+        def kept(metric: str) -> list[float]:
+            return [msgspec.json.decode(raw)["value"]["level"] for raw in rig.world.kept(metric)]
+
+        assert until(lambda: all(service.transport.state is State.CONNECTED for service in lines.values()))
+        with rig.fabric.outage():
+            for name in ("one", "two"):
+                rig.mcus[name].plug()
+            assert until(lambda: len(holders()) == 2)
+        assert until(lambda: len(holders()) == 1, 15)
+        assert until(lambda: rig.world.kept("mcu/lamp-1/describe"), 10)
+        assert until(lambda: kept("mcu/lamp-1/lamp") == kept("lights/lamp") == holders(), 10)
+
+
+def test_a_manifest_that_somebody_else_takes_back_is_said_again(rig: Rig) -> None:
+    rig.mcu(LAMP)
+    rig.bridge()
+    assert settled(rig.world, "mcu/lamp-1/describe")
+    other = rig.listener("other").transport
+    other.publish(f"{BASE}/outgoing/mcu/lamp-1/describe", b"", qos=QoS.DELIVERED, retain=True)
+    assert until(lambda: len(rig.world.said("mcu/lamp-1/describe")) >= 2)
+    assert settled(rig.listener("late"), "mcu/lamp-1/describe")
+
+
+def test_whoever_only_doubts_a_manifest_does_not_want_its_uid(memory: Rig) -> None:
+    """Its question must not make a device wait that is being plugged in just now."""
+    asked: list[bytes] = []
+    memory.world.transport.subscribe(f"{BASE}/incoming/mcu/+/describe", lambda message: asked.append(message.payload))
+    ghost = parse_describe(LAMP.but(uid="ghost").describe()).payload()
+    body = msgspec.json.encode(ghost)
+    memory.world.transport.publish(f"{BASE}/outgoing/mcu/ghost/describe", body, qos=QoS.DELIVERED, retain=True)
+    memory.mcu(LAMP, plugged=False)
+    memory.bridge()
+    assert until(lambda: asked)
+    assert [msgspec.json.decode(question)["from"] for question in asked] == [""]
 
 
 def test_a_line_that_renames_its_channels_leaves_them_to_the_other(memory: Rig) -> None:

@@ -88,6 +88,29 @@ def test_a_kept_value_waits_for_its_manifest(topics: PrivateTopics, more: dict[s
     assert passed(topics, described()) == ["mcu/spy-1/describe"]
 
 
+def test_a_kept_value_that_is_taken_back_waits_no_longer(topics: PrivateTopics) -> None:
+    for metric in ("mcu/spy-1/slow", "lab/slow"):
+        assert passed(topics, value(metric, "slow", retain=True)) == []
+        assert passed(topics, Message(f"{OUT}/{metric}", b"", keep=True)) == [metric]
+    assert passed(topics, described()) == ["mcu/spy-1/describe"]
+
+
+@pytest.mark.parametrize("first", ["the manifest", "the value"])
+def test_what_was_said_in_private_is_not_told_when_new_firmware_is_open(topics: PrivateTopics, first: str) -> None:
+    secret = value("mcu/spy-1/secret", "secret", keep=True)
+    for message in (described(), secret) if first == "the manifest" else (secret, described()):
+        topics.admit(message)
+    opened = SPY.but(interfaces=tuple(I(**{**vars(one), "flags": wire.RETAIN}) for one in SPY.interfaces))
+    assert passed(topics, described(opened)) == ["mcu/spy-1/describe"]
+    assert passed(topics, secret) == ["mcu/spy-1/secret"]
+
+
+def test_whose_a_uid_is_nobody_outside_asks(topics: PrivateTopics) -> None:
+    assert topics.is_known(f"{BASE}/incoming/mcu/spy-1/describe")
+    assert not topics.is_known(f"{BASE}/incoming/mcu/spy-1/set")
+    assert not topics.is_known(f"{BASE}/outgoing/mcu/spy-1/describe")
+
+
 def test_new_firmware_may_hide_what_was_public(topics: PrivateTopics) -> None:
     passed(topics, described())
     hidden = SPY.but(interfaces=(SPY.interfaces[0], I(**{**vars(SPY.interfaces[1]), "flags": wire.LOCAL_ONLY})))

@@ -28,7 +28,23 @@ def test_who_asks_and_hears_nothing_has_it() -> None:
     assert claim.hear_question("u", "b", 1.0) is Move.ANSWER
     assert claim.hear_question("other", "b", 1.0) is Move.NOTHING
     assert claim.hear_question("u", "a", 1.0) is Move.NOTHING, "our own question, come back"
-    assert claim.hear_manifest("u", 1.0) is Move.NOTHING, "our own manifest, come back"
+    assert claim.hear_manifest("u", 1.0) is Move.INSIST, "ours come back, or somebody has it too"
+
+
+def test_of_two_who_both_have_it_the_weaker_gives_it_up() -> None:
+    weak, strong = UidClaim("a"), UidClaim("b")
+    for claim in (weak, strong):
+        claim.want("u", 0.0)
+        assert claim.tick(ASK_S) is Move.HOLD
+    assert strong.hear_question("u", "a", 1.0, has=True) is Move.INSIST
+    assert weak.hear_question("u", "b", 1.0, has=True) is Move.YIELD
+    assert weak.due == 1.0 + AGAIN_S
+
+
+def test_who_asks_yields_to_who_has_it_whatever_the_tokens() -> None:
+    claim = UidClaim("z")
+    claim.want("u", 0.0)
+    assert claim.hear_question("u", "a", 0.1, has=True) is Move.YIELD
 
 
 def test_who_is_answered_waits_and_asks_again() -> None:
@@ -159,6 +175,14 @@ def test_an_inertial_channel_needs_its_profile_and_fields(channel: str) -> None:
     for profile in ("", "imu.motion.v1", "imu.summary.v1"):
         refused = claims(published(M("u", (state("a", channel, profile=profile),)))).refused
         assert "it needs the profile imu." in refused["a"]
+
+
+def test_what_stays_on_the_robot_gets_no_channel_that_leaves_it_without_a_name() -> None:
+    """The bridge tells by `device_uid`, which the body of sensors/imu has not."""
+    hidden = IMU.but(interfaces=tuple(I(**{**vars(one), "flags": wire.LOCAL_ONLY}) for one in IMU.interfaces))
+    hidden_claims = claims(published(hidden))
+    assert hidden_claims.granted == {"outgoing/sensors/imu-fast": "imu_fast"}
+    assert "it may leave the robot" in hidden_claims.refused["imu"]
 
 
 def test_a_channel_that_the_config_renames_is_the_robots_own_too() -> None:

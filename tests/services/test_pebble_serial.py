@@ -315,6 +315,15 @@ def test_a_thousand_commands_without_an_answer_are_not_remembered_for_ever(host:
     assert len({event.kind for event in host.of(Send)}) <= 9, "and few may wait for the wire"
 
 
+def test_eight_commands_of_each_interface_may_wait_whatever_is_said_to_others(host: Host) -> None:
+    host.describe()
+    for _ in range(8):
+        for name in ("o1_set", "o2_set", "o3_set", "o4_set"):
+            host.command(name, {"on": True})
+    kinds = [event.kind for event in host.of(Send) if event.kind.startswith("command 1/")]
+    assert len(set(kinds)) == len(kinds) == 8
+
+
 # -- silence
 
 

@@ -45,7 +45,7 @@ def test_two_boards_know_nothing_of_each_other_nor_of_the_host(root: Path) -> No
     one, other = world(root, "one").module("toy.robot"), world(root, "other").module("toy.robot")
     assert [one.step(), one.step(), other.step()] == [(1, "one"), (2, "one"), (1, "other")]
     assert (set(sys.modules), list(sys.path)) == before
-    assert "common" not in sys.modules
+    assert "toy" not in sys.modules
 
 
 def test_a_module_is_executed_once_per_board(root: Path) -> None:

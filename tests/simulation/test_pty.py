@@ -145,7 +145,30 @@ def test_the_program(tmp_path: Path) -> None:
     assert not link.is_symlink()
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_it_never_takes_a_file_away(tmp_path: Path) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("precious")
+    with pytest.raises(LinkError, match=r"notes\.txt: there is something else"):
+        PtyMcu("goob", notes).open()
+    assert notes.read_text() == "precious"
+
+
+def test_who_takes_over_a_link_keeps_it(tmp_path: Path) -> None:
+    first = PtyMcu("goob", tmp_path / "port").open()
+    with PtyMcu("goob", tmp_path / "port") as second:
+        first.close()
+        with serial.Serial(str(second.link), 460800):
+            assert until(lambda: second.host)
+
+
+def test_the_program_says_in_one_line_where_no_port_can_be(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", str(tmp_path / "no" / "port")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=20)
+    assert done.returncode == 1
+    assert done.stderr == f"there can be no serial port at {tmp_path}/no/port: No such file or directory\n"
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_the_program_ends_on_a_signal_and_takes_its_link_along(tmp_path: Path, how: signal.Signals) -> None:
     link = tmp_path / "port"
     with subprocess.Popen([sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", link]) as program:

@@ -223,3 +223,14 @@ def test_the_ticks_may_wrap():
     bench.device.raw[4] = int(100 * DPS)
     bench.sample(1)
     assert 90 < bench.imu.values[7] <= 100
+
+
+def test_pitch_ends_upright_however_it_turns():
+    bench = Bench()
+    bench.device.raw = [0, 0, G, 0, 0, 30_000, 0]
+    bench.imu.calibrated = 200
+    for gap in (10, 490):
+        for _ in range(100):
+            bench.now += gap
+            bench.imu.read(bench.now)
+        assert -9000 <= bench.imu.values[8] <= 9000
