@@ -21,7 +21,7 @@ from pebble.simulation.wireless import KINDS
 from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, START_S, Drill, ViolatedError
 from tests.firmware.schedules import FAULTS, act, perform
 
-MIXED, SINGLE = 500, 30  # schedules per robot; of each fault alone
+MIXED, SINGLE = 700, 30  # schedules per robot; of each fault alone
 
 
 @dataclass(frozen=True)

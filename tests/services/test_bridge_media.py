@@ -302,6 +302,9 @@ RENAMED = {
 }
 
 
+SILENCE_S = 10.0  # a machine that does too much at once is not a broker that stopped answering
+
+
 class Robot:
     """A real launcher with a real bridge between real brokers, and a camera publisher that misbehaves."""
 
@@ -338,13 +341,17 @@ class Robot:
         return {
             "robot": {"id": "rover"},
             "transport": {"kind": "mqtt", "run_dir": str(folder / "run")},
-            "local_mqtt": {"host": "localhost", "port": self._brokers[0].port},
+            "local_mqtt": {"host": "localhost", "port": self._brokers[0].port, "silence_seconds": SILENCE_S},
             "services": {
                 "launcher": {"shutdown_timeout_seconds": 1.0},
                 "av_daemon": DEVICES,
                 "mqtt_bridge": {
                     "enabled": True,
-                    "remote_mqtt": {"host": "127.0.0.1", "port": self._brokers[-1].port},
+                    "remote_mqtt": {
+                        "host": "127.0.0.1",
+                        "port": self._brokers[-1].port,
+                        "silence_seconds": SILENCE_S,
+                    },
                 },
             },
         }
@@ -377,7 +384,7 @@ class TestWholeWay:
         try:
             robot.remote.say(VIDEO_FLAG, TRUE, retain=True)
             robot.remote.say(VIDEO, ON)
-            assert until(lambda: robot.pids("ready"), 20)
+            assert until(lambda: robot.pids("ready"), 20), robot.errors.read_text()
             delays = drive(robot, seconds=4.0, rate_hz=50)
             assert until(lambda: "camera_publisher did not stop within 3 s: killed" in robot.errors.read_text())
             assert max(delays) < 0.5, "seconds; in fact some milliseconds"
@@ -389,7 +396,7 @@ class TestWholeWay:
         try:
             robot.remote.say(VIDEO_FLAG, TRUE, retain=True)
             robot.remote.say(VIDEO, ON)
-            assert until(lambda: robot.pids("ready"), 20)
+            assert until(lambda: robot.pids("ready"), 20), robot.errors.read_text()
             os.kill(robot.bridge_pid(), signal.SIGKILL)
             assert not until(lambda: robot.pids("stop"), 5.5, step=0.05), "asked for once is enough"
             assert len(robot.pids("start")) == 1
