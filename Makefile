@@ -21,9 +21,9 @@ demo: .venv/.ready-demo
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs
 	@echo "pebble: tests"
-	@$(VENV) -m pytest --numprocesses 4 --dist loadscope -m "not alone"
-	@echo "pebble: whole robots and lines, one at a time because their deadlines are checked"
-	@$(VENV) -m pytest -m alone tests/robot tests/services
+	@$(VENV) -m pytest --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone"
+	@echo "pebble: whole robots and lines, two at a time because their deadlines are checked"
+	@$(VENV) -m pytest --numprocesses 2 --dist loadscope -m alone tests/robot tests/services
 
 firmware: .venv/.ready-dev
 	@sh tools/debian-packages.sh node=nodejs

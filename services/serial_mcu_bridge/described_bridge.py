@@ -218,13 +218,10 @@ class DescribedBridge(SerialService):
         if any(route.interface.profile.startswith(FAMILY) for route in device.routes.values()):
             self._watchdog.found_imu()
         self._neighbours.forget(device.uid)
-        self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)  # first: whoever forwards must know what is private
         self._close_generic()
-        self._generic = [
-            self.listen(route.generic, partial(self._command, device, route))
-            for route in device.routes.values()
-            if route.interface.direction is Direction.IN
-        ]
+        self._listen_generic(device, private=False)  # whoever reads the manifest may command at once
+        self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)  # then whoever forwards knows what is private
+        self._listen_generic(device, private=True)
         for reading, said_ms in self._states_said.values():  # while we asked: states may be said only once
             self.publish(device.routes[reading.interface.id].generic, device.sample(reading, said_ms))
         self._aliases.introduce(device)
@@ -247,6 +244,13 @@ class DescribedBridge(SerialService):
             if route.generic.kind is Kind.STATE:
                 self.retract(route.generic)
         self.retract(MCU_DESCRIBE, uid=device.uid)
+
+    def _listen_generic(self, device: Device, *, private: bool) -> None:
+        self._generic += [
+            self.listen(route.generic, partial(self._command, device, route))
+            for route in device.routes.values()
+            if route.interface.direction is Direction.IN and route.interface.local_only is private
+        ]
 
     def _close_generic(self) -> None:
         subscriptions, self._generic = self._generic, []
