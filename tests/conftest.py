@@ -1,8 +1,11 @@
 """What holds for every test."""
 
 import signal
+import time
 
 import pytest
+
+from pebble.transports import segments
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -18,3 +21,10 @@ _LONG = (
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: not item.path.as_posix().endswith(_LONG))
+
+
+def pytest_sessionfinish() -> None:
+    """Zenoh leaves files of shared memory behind, however its processes end."""
+    if any(segments.SHM.glob("*.zenoh")):
+        time.sleep(segments.YOUNG_S)
+        segments.sweep()

@@ -102,6 +102,9 @@ class Discovery:
     def __init__(self) -> None:
         self.sightings: dict[str, Sighting] = {}
 
+    def everybody(self) -> list[Sighting]:
+        return list(self.sightings.values())  # a copy: more may appear meanwhile
+
     def hear(self, message: Message, now: float, wall: float) -> None:
         """Learn from one message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
         address = parse_topic(message.topic)

@@ -77,7 +77,7 @@ def _play(
             if not _discovered(operator, view, ending):
                 return [], [], [] if ending.is_set() else [*_unseen(operator), *stage.fallen()]
             operator.begin()
-            show.begin([seen for seen in operator.discovery.sightings.values() if seen.offers("video")])
+            show.begin([seen for seen in operator.discovery.everybody() if seen.offers("video")])
             verdicts = _watch(stage, operator, view, math.inf if seconds is None else seconds, ending)
         unfelt = [] if ending.is_set() else _unfelt(stage, operator)  # who ends it early has not seen everything
         return verdicts, list(show.verdicts), [*stage.fallen(), *unfelt]
@@ -97,12 +97,12 @@ def _discovered(operator: Operator, view: View, ending: threading.Event) -> bool
 
 def _unseen(operator: Operator) -> list[str]:
     now = time.monotonic()
-    ready = [seen.name for seen in operator.discovery.sightings.values() if seen.ready(now)]
+    ready = [seen.name for seen in operator.discovery.everybody() if seen.ready(now)]
     return [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in ROBOTS if name not in ready]
 
 
 def _unfelt(stage: Stage, operator: Operator) -> list[str]:
-    heard = {seen.name for seen in operator.discovery.sightings.values() if seen.attitude is not None}
+    heard = {seen.name for seen in operator.discovery.everybody() if seen.attitude is not None}
     wanted = [robot.name for robot in stage.robots if robot.has_imu]
     return [f"{name}: nothing came of its inertial sensor" for name in wanted if name not in heard]
 
@@ -127,7 +127,7 @@ def _judge_settled(stage: Stage, operator: Operator, verdicts: deque[Verdict], u
 
 def _judge(stage: Stage, operator: Operator, done: Done) -> Verdict:
     robot = next(robot for robot in stage.robots if robot.name == done.robot)
-    seen = next(seen for seen in operator.discovery.sightings.values() if seen.name == done.robot)
+    seen = next(seen for seen in operator.discovery.everybody() if seen.name == done.robot)
     has_lights = seen.lights_topic(flash=False) is not None
     return judge(done, list(robot.looks), robot.entries(), stop_s=robot.stop_s, has_lights=has_lights)
 

@@ -38,7 +38,7 @@ class Operator:
     def ready(self, wanted: int) -> bool:
         """Are that many robots alive and willing to be driven?"""
         now = time.monotonic()
-        return sum(sighting.ready(now) for sighting in self.discovery.sightings.values()) >= wanted
+        return sum(sighting.ready(now) for sighting in self.discovery.everybody()) >= wanted
 
     def begin(self) -> None:
         """Drive everybody found so far, round after round."""
@@ -57,7 +57,7 @@ class Operator:
     # -- the operator's thread
 
     def _drive(self) -> None:
-        robots = list(self.discovery.sightings.values())
+        robots = self.discovery.everybody()
         while not self._enough.is_set():
             for step in SCRIPT:
                 self._do(step, robots)

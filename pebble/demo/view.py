@@ -111,7 +111,7 @@ class View:
         return row
 
     def _sighting(self, name: str) -> Sighting | None:
-        return next((seen for seen in list(self._operator.discovery.sightings.values()) if seen.name == name), None)
+        return next((seen for seen in self._operator.discovery.everybody() if seen.name == name), None)
 
     def _command(self, sighting: Sighting, now: float) -> str:
         if sighting.base not in self._operator.commands:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from pebble.media.figures import WINDOW_S, Figures
@@ -30,3 +32,21 @@ def test_one_message_makes_no_rate() -> None:
     figures = Figures()
     figures.add(0.0, 10, None)
     assert figures.rate(0.0) == 0
+
+
+def test_one_thread_may_tell_while_another_looks() -> None:
+    figures, ending = Figures(), threading.Event()
+
+    def tell() -> None:
+        while not ending.is_set():
+            figures.add(1.0, 1000, 0.01)
+
+    telling = threading.Thread(target=tell)
+    telling.start()
+    try:
+        for _ in range(2000):
+            figures.rate(1.0)
+            figures.age_s(1.0)
+    finally:
+        ending.set()
+        telling.join()
