@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from pebble.bench.fleet import Figures, Plan, latencies_ms, measure, run
 from pebble.bench.fleet_operator import STEPS
 from pebble.errors import ConfigError, PebbleError
 from pebble.simulation.fleet import MOST, Moved, members
-from tests.support import ROOT, Broker, die_with_parent, free_port, until
+from tests.support import ROOT, Broker, Child, free_port, until
 
 
 @pytest.fixture
@@ -112,7 +111,7 @@ class Command:
         self._file = file
         command = [sys.executable, "-m", "pebble.cli", "sim", *arguments]
         with file.open("wb") as out:
-            self.process = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=out, preexec_fn=die_with_parent)
+            self.process = Child(command, cwd=ROOT, stdout=out, stderr=out)
 
     @property
     def said(self) -> str:

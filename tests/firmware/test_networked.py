@@ -19,7 +19,7 @@ from pebble.simulation.mcu import Look
 from pebble.simulation.trace import read_trace
 from pebble.simulation.wireless import KINDS
 from tests.firmware.wireless_rig import Pilot, Robots
-from tests.support import ROOT, Broker, die_with_parent, free_port, until
+from tests.support import ROOT, Broker, Child, free_port, until
 
 TLS = ROOT / "tests" / "data" / "tls"
 END_S = 1.0
@@ -33,13 +33,12 @@ class Program:
         out, err = (path.open("wb") for path in self._files)
         command = [sys.executable, "-m", "pebble.simulation.networked", "--kind", kind, "--broker", broker, *options]
         with out, err:
-            self.process = subprocess.Popen(
+            self.process = Child(
                 command,
                 cwd=ROOT,
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,
-                preexec_fn=die_with_parent,
                 env={**os.environ, **environment},
             )
 

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from tests.firmware.micropython import SCRIPTS, VM
-from tests.support import die_with_parent
+from tests.support import Child
 
 
 class NodeBoard:
@@ -24,12 +24,11 @@ class NodeBoard:
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
-        self._process = subprocess.Popen(
+        self._process = Child(
             ["node", str(SCRIPTS / "repl.mjs"), str(VM), *self._options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             bufsize=0,
-            preexec_fn=die_with_parent,
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None

@@ -18,7 +18,7 @@ from pebble.config import Config, load
 from pebble.links import hub_settings, local_transport
 from pebble.payloads import MediaReport
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
-from tests.support import ROOT, die_with_parent, until
+from tests.support import ROOT, Child, until
 
 BASE = "pebble/robots/rover"
 _SILENCE_S = 10.0  # a machine that does too much at once is not a broker that stopped answering
@@ -79,7 +79,7 @@ class MediaProgram:
         self.reports.append(msgspec.json.decode(message.payload, type=MediaReport))
 
     def _start(self, module: str, argument: str) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen([sys.executable, "-m", module, argument], cwd=ROOT, preexec_fn=die_with_parent)
+        process = Child([sys.executable, "-m", module, argument], cwd=ROOT)
         self._ends.callback(process.wait, 10)
         self._ends.callback(process.terminate)
         return process

@@ -25,7 +25,7 @@ from pebble.transports import Message
 from pebble.transports.frames import FrameReader
 from tests.fakes.installed import Installed
 from tests.services.av_rig import is_speech
-from tests.support import ROOT, Broker, die_with_parent, until
+from tests.support import ROOT, Broker, Child, until
 
 SYNTHETIC = {"video": {"backend": "synthetic", "fps": 30}, "audio": {"source": "synthetic"}}
 DEAF = {"video": {"backend": "libcamera", "fps": 30}, "audio": {"enabled": False}}
@@ -81,9 +81,7 @@ class Robot:
 
     def _start(self, name: str, module: str, argument: str) -> subprocess.Popen[bytes]:
         with (self._folder / f"{name}.log").open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", module, argument], cwd=ROOT, stderr=log, preexec_fn=die_with_parent
-            )
+            process = Child([sys.executable, "-m", module, argument], cwd=ROOT, stderr=log)
         self._fabric.append(process)
         return process
 

@@ -17,7 +17,7 @@ from pebble.contract import MQTT_VIDEO, VIDEO_CONTROL
 from pebble.launched import Want
 from pebble.payloads import MediaRequest
 from pebble.services.mqtt_bridge.media import Media
-from tests.support import die_with_parent, until
+from tests.support import Child, until
 
 #: Leaves its number and that of a child of its own, and says something.
 STREAMER = """
@@ -43,9 +43,9 @@ class Stream:
         }
         config = folder / "pitcam.json"
         config.write_text(json.dumps(raw))
-        self.process = subprocess.Popen(
+        self.process = Child(
             [sys.executable, "-m", "pebble.services.video_stream", str(config)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=die_with_parent,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
 
     def pids(self) -> list[int]:

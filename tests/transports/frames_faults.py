@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import random
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -16,7 +15,7 @@ from typing import Any
 import msgspec
 
 from pebble.transports import segments
-from tests.support import die_with_parent, until
+from tests.support import Child, until
 from tests.transports.frames_net import FramesNet, Peer
 
 VGA = 640 * 480 * 3
@@ -114,7 +113,7 @@ class Faults:
 
 def under_load(hogs: int, work: Callable[[], Figures]) -> Figures:
     command = [sys.executable, "-c", "while True: pass"]
-    running = [subprocess.Popen(command, preexec_fn=die_with_parent) for _ in range(hogs)]
+    running = [Child(command) for _ in range(hogs)]
     try:
         return work()
     finally:

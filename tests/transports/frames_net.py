@@ -15,8 +15,9 @@ from typing import Any
 
 import msgspec
 
+from pebble.launched import end_with_parent as die_with_parent
 from pebble.transports.segments import SHM
-from tests.support import ROOT, die_with_parent, until
+from tests.support import ROOT, until
 from tests.transports.frames_peer import Options
 
 

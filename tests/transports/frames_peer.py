@@ -18,9 +18,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from pebble.launched import end_with_parent as die_with_parent
 from pebble.transports import segments, views
 from pebble.transports.frames import Frame, FrameInfo, FrameReader, FrameWriter
-from tests.support import die_with_parent
 
 FORMAT = "bgr24"
 _PR_SET_DUMPABLE = 4

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
 from pebble.transports import Message, QoS, State, Transport, create
-from tests.support import ROOT, die_with_parent
+from tests.support import ROOT, Child
 
 
 class Peer(Protocol):
@@ -120,13 +120,12 @@ class ProcessPeer:
 
     def __init__(self, kind: str, name: str, settings: Any, will: Message | None) -> None:
         recipe = base64.b64encode(pickle.dumps((kind, name, settings, will))).decode()
-        self._process = subprocess.Popen(
+        self._process = Child(
             [sys.executable, "-m", "tests.transports.peer", recipe],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            preexec_fn=die_with_parent,
         )
         assert self._answer() is True, "the peer did not connect"
 

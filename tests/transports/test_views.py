@@ -18,7 +18,7 @@ import zenoh.shm
 from pebble.errors import TransportError
 from pebble.transports import views
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
-from tests.support import ROOT, die_with_parent, until
+from tests.support import ROOT, TIED, Child, until
 
 LARGE = 500_000  # bytes: the allocator's margin holds no such frame
 
@@ -171,13 +171,12 @@ with FrameReader(Path(sys.argv[1]), "camera", views=True) as reader:
 def test_a_frame_that_was_held_too_long_says_so(tmp_path: Path) -> None:
     """Its process is stopped, so that the writer takes the memory back; afterwards it looks at its frame again."""
     with FrameWriter(tmp_path, "camera", capacity=LARGE, slots=2) as writer:
-        holder = subprocess.Popen(
+        holder = Child(
             [sys.executable, "-X", "dev", "-c", HOLDER, str(tmp_path)],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            preexec_fn=die_with_parent,
         )
         try:
             assert until(lambda: writer.wanted)
@@ -235,10 +234,8 @@ with FrameWriter(folder, "camera", capacity=20_000, slots=16) as writer:
 
 def soak(folder: Path, frames: int, *options: str) -> tuple[int, int, int]:
     """Writer and reader with views in one process; returns wrong frames, lost ones, and growth in kB."""
-    command = [sys.executable, *options, "-c", SOAK, str(folder), str(frames)]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=100_000, check=False, preexec_fn=die_with_parent
-    )
+    command = [*TIED, sys.executable, *options, "-c", SOAK, str(folder), str(frames)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100_000, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     wrong, lost, growth = map(int, done.stdout.split())
     return wrong, lost, growth
