@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from typing import ClassVar
 
 from pebble.config import SerialBridge
@@ -14,7 +15,7 @@ from pebble.services.serial_mcu_bridge.line import LineState, SerialLine
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
 
 
-class SerialService(Service):
+class SerialService(Service, ABC):
     """A subclass opens the line in ``start`` and understands what comes up it. Without a ``stop`` nothing moves."""
 
     name = "serial_mcu_bridge"
@@ -64,9 +65,9 @@ class SerialService(Service):
 
     # -- to override
 
+    @abstractmethod
     def on_input(self, chunk: bytes) -> None:
         """Bytes came up the line."""
-        raise NotImplementedError
 
     def on_line(self, state: LineState) -> None:
         """The line was opened, is ready, or has gone."""

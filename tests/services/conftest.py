@@ -1,4 +1,4 @@
-"""The two brokers around a program under test."""
+"""What surrounds a program under test: two brokers, or a fabric with MCUs on serial lines."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.services.mcu_rig import Rig
 from tests.support import Broker
 
 
@@ -24,3 +25,18 @@ def remote(tmp_path: Path) -> Iterator[Broker]:
     broker = Broker(tmp_path)
     yield broker
     broker.stop()
+
+
+@pytest.fixture(params=["memory", "mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+    """MCUs and their bridges, on each transport."""
+    rig = Rig(request.param, tmp_path)
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig("memory", tmp_path)
+    yield rig
+    rig.close()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 import random
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,20 +17,6 @@ from tests.services.test_pebble_serial_hostile import ATTACKS
 from tests.support import until
 
 STATE = b"\1\0\1"
-
-
-@pytest.fixture(params=["memory", "mqtt", "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(request.param, tmp_path)
-    yield rig
-    rig.close()
-
-
-@pytest.fixture
-def memory(tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig("memory", tmp_path)
-    yield rig
-    rig.close()
 
 
 @pytest.mark.alone

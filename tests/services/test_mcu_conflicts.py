@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -17,20 +16,6 @@ from tests.services import mcu_wire as wire
 from tests.services.mcu_rig import BASE, Rig, motion, settled
 from tests.services.mcu_wire import IMU, LAMP, M
 from tests.support import until
-
-
-@pytest.fixture(params=["memory", "mqtt", "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(request.param, tmp_path)
-    yield rig
-    rig.close()
-
-
-@pytest.fixture
-def memory(tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig("memory", tmp_path)
-    yield rig
-    rig.close()
 
 
 def imu(uid: str) -> M:

@@ -9,18 +9,8 @@ import pytest
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.micropython.faults import WouldHang
-from pebble.simulation.micropython.ports import ESP32_C6, SAMD21_OFFICIAL
+from pebble.simulation.micropython.ports import SAMD21_OFFICIAL
 from pebble.simulation.micropython.watchdog import BoardReset
-
-
-@pytest.fixture
-def clock() -> VirtualClock:
-    return VirtualClock(1000.0)
-
-
-@pytest.fixture
-def board(clock: VirtualClock) -> Board:
-    return Board(clock, port=ESP32_C6)
 
 
 def machine(board: Board) -> Any:

@@ -14,16 +14,6 @@ from pebble.simulation.micropython.ports import ESP32_C6, ESP8266, SAMD21
 from pebble.simulation.micropython.watchdog import BoardReset
 
 
-@pytest.fixture
-def clock() -> VirtualClock:
-    return VirtualClock(1000.0)
-
-
-@pytest.fixture
-def board(clock: VirtualClock) -> Board:
-    return Board(clock, port=ESP32_C6)
-
-
 def machine(board: Board) -> Any:
     return board.firmware.module("machine")
 

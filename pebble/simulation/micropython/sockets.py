@@ -10,7 +10,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from pebble.simulation.micropython.clock import Clock
-from pebble.simulation.micropython.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream, failure
+from pebble.simulation.micropython.faults import WouldHang, failure
+from pebble.simulation.micropython.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
 from pebble.simulation.micropython.tls import ssl_module
 from pebble.simulation.micropython.wlan import Platform, Radio, network_module
 
@@ -124,7 +125,7 @@ class _Host:
 
     def setblocking(self, blocking: bool) -> None:
         if blocking:
-            raise NotImplementedError("this board never waits for a socket")
+            raise WouldHang("a socket that waits: setblocking(False)")
 
     def setsockopt(self, level: int, option: int, value: Any) -> None:
         self._sock.setsockopt(level, option, value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import errno
+from abc import ABC, abstractmethod
 from typing import Any
 
 POLLIN, POLLOUT, POLLERR, POLLHUP = 1, 4, 8, 16
@@ -10,21 +10,16 @@ POLLIN, POLLOUT, POLLERR, POLLHUP = 1, 4, 8, 16
 _PIECE = 1024
 
 
-def failure(code: int) -> OSError:
-    """As a board raises it: ``errno`` is set, which in CPython takes two arguments."""
-    return OSError(code, errno.errorcode.get(code, "error"))
-
-
-class Stream:
+class Stream(ABC):
     """``_receive`` and ``_send`` do one step of the work; the methods above them are those of MicroPython's streams."""
 
+    @abstractmethod
     def _receive(self, size: int) -> bytes | None:
         """At most ``size`` bytes; None: nothing there now; b"": the other end has finished. Raises OSError."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _send(self, data: bytes) -> int | None:
         """How many bytes were taken; None: none can be taken now. Raises OSError."""
-        raise NotImplementedError
 
     def read(self, size: int = -1) -> bytes | None:
         """As many as there are; None if there are none, b"" at the end."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from pebble.simulation.micropython.faults import WouldHang
 from pebble.simulation.micropython.streams import POLLIN, Stream
 
 _CHUNK = 4096
@@ -118,7 +119,7 @@ class Context:
         server_hostname: str | None = None,
     ) -> TlsStream:
         if server_side or do_handshake_on_connect:
-            raise NotImplementedError("this board never waits for a handshake")
+            raise WouldHang("a TLS handshake that waits: wrap_socket(…, do_handshake_on_connect=False)")
         self._context.check_hostname = server_hostname is not None and self.verify_mode != ssl.CERT_NONE
         self._context.verify_mode = ssl.VerifyMode(self.verify_mode)
         return TlsStream(sock, self._context, server_hostname)

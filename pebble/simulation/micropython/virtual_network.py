@@ -11,8 +11,9 @@ from typing import Any, Final, Literal
 
 from pebble.simulation.micropython.answers import name_answer, time_answer
 from pebble.simulation.micropython.clock import Clock
+from pebble.simulation.micropython.faults import WouldHang, failure
 from pebble.simulation.micropython.sockets import MOST_SOCKETS, Place, numeric, socket_module
-from pebble.simulation.micropython.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream, failure
+from pebble.simulation.micropython.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
 from pebble.simulation.micropython.tls import ssl_module
 from pebble.simulation.micropython.virtual_broker import Command, VirtualBroker
 from pebble.simulation.micropython.virtual_wire import State, Wire
@@ -135,7 +136,7 @@ class _Virtual:
 
     def setblocking(self, blocking: bool) -> None:
         if blocking:
-            raise NotImplementedError("this board never waits for a socket")
+            raise WouldHang("a socket that waits: setblocking(False)")
 
     def setsockopt(self, _level: int, _option: int, _value: Any) -> None:
         """Nothing here depends on one."""
