@@ -27,7 +27,7 @@ from tests.support import until
 
 MESSAGES = 100_000
 CHUNK = 800  # messages before waiting for a sign that the robot has read them: less than any queue on the way holds
-LINES = 800  # the same for lines: together fewer bytes than may wait unread
+LINES = 400  # the same for lines: together fewer bytes than may wait unread
 
 
 # -- an oracle of its own: what the contract accepts, written with nothing but the standard library
