@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import logging
 import os
+import shutil
 import signal
 import sys
+from collections.abc import Sequence
 from typing import NamedTuple
 
 NOTIFY_FD = "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, and "WANT …"
@@ -16,7 +19,6 @@ LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 ALIVE_PERIOD_S = 1.0
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
 _PR_SET_PDEATHSIG = 1
-_libc = ctypes.CDLL(None)  # now: a child between fork and exec had better not load anything
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +39,19 @@ def die_with_launcher() -> None:
 
 
 def end_with_parent(number: int = signal.SIGKILL) -> None:
-    """In a child, before its program runs: the kernel sends it ``number`` when the thread that started it is gone."""
-    _libc.prctl(_PR_SET_PDEATHSIG, number)
+    """The kernel sends this process ``number`` when the thread that started it is gone."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+
+
+def tied(command: Sequence[str], number: signal.Signals = signal.SIGKILL) -> list[str]:
+    """``command``, to be started so that it gets ``number`` when the thread that starts it is gone.
+
+    Raises FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2
+    may wait for ever for a lock that a thread of Zenoh held.
+    """
+    if shutil.which(command[0]) is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
+    return ["setpriv", "--pdeathsig", number.name.removeprefix("SIG"), "--", *command]
 
 
 class Want(NamedTuple):

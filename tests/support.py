@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-#: What a command begins with so that the kernel ends it with us (util-linux).
-TIED = ("setpriv", "--pdeathsig", "KILL")
+from pebble.launched import tied
+
 #: The checkout: tests that start programs of ours start them here.
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -37,13 +37,10 @@ def free_port() -> int:
 
 
 class Child(subprocess.Popen[Any]):
-    """A program that a killed pytest leaves not behind.
-
-    Not by preexec_fn: between fork and exec, Python 3.11.2 may wait for ever for a lock that a thread of Zenoh held.
-    """
+    """A program that a killed pytest leaves not behind."""
 
     def __init__(self, command: Sequence[str], **options: Any) -> None:
-        super().__init__([*TIED, *command], **options)
+        super().__init__(tied(command), **options)
 
 
 def listening(port: int) -> bool:
@@ -150,7 +147,7 @@ class AmqttBroker:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "tests.amqtt_broker", str(self.port)]
+        command = [sys.executable, "-m", "pebble.demo.embedded_broker", str(self.port)]
         self._process = Child(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         assert until(lambda: listening(self.port), 20), "amqtt did not start"
 

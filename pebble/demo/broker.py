@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import socket
@@ -29,9 +28,7 @@ class Broker:
 
     def __init__(self, name: str, kind: BrokerKind, folder: Path) -> None:
         self.port = _free_port()
-        command = (
-            _mosquitto(self.port, folder / name) if kind is BrokerKind.MOSQUITTO else _amqtt(self.port, folder / name)
-        )
+        command = _mosquitto(self.port, folder / name) if kind is BrokerKind.MOSQUITTO else _amqtt(self.port)
         self.program = Program(name, command, folder / f"{name}.log")
 
     def wait(self, ending: threading.Event) -> None:
@@ -73,17 +70,8 @@ def _mosquitto(port: int, stem: Path) -> list[str]:
     return [path, "-c", str(config)]
 
 
-def _amqtt(port: int, stem: Path) -> list[str]:
-    config = stem.with_suffix(".yaml")
-    config.write_text(  # JSON is YAML too
-        json.dumps(
-            {
-                "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
-                "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
-            }
-        )
-    )
-    return [sys.executable, "-m", "amqtt.scripts.broker_script", "-c", str(config)]
+def _amqtt(port: int) -> list[str]:
+    return [sys.executable, "-m", "pebble.demo.embedded_broker", str(port)]
 
 
 def _free_port() -> int:

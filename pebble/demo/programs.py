@@ -8,12 +8,11 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import IO
 
 from pebble.errors import PebbleError
-from pebble.launched import end_with_parent
+from pebble.launched import tied
 
 _STEP_S = 0.01
 
@@ -28,12 +27,11 @@ class Program:
         self.name, self.log = name, log
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
-                command,
+                tied(command, signal.SIGTERM),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE if reports else errors,
                 stderr=errors,
                 start_new_session=True,
-                preexec_fn=partial(end_with_parent, signal.SIGTERM),
             )
 
     @property

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, cast
 
 from pebble.errors import LinkError
-from pebble.launched import end_with_parent
+from pebble.launched import tied
 
 SILENCE_S = 3.0  # a device that says nothing for so long hangs
 _FIRST_SILENCE_S = 10.0  # it may take its time to start
@@ -32,9 +32,8 @@ class Child:
         self._silence_s = _FIRST_SILENCE_S
         try:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                preexec_fn=end_with_parent, bufsize=0,
-            )  # fmt: skip
+                tied(command), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0
+            )
         except (OSError, subprocess.SubprocessError) as error:
             raise LinkError(f"cannot start {self.name}: {error}") from error
         self._pipes = cast(tuple[IO[bytes], IO[bytes]], (self._process.stdout, self._process.stderr))

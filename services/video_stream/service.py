@@ -8,7 +8,7 @@ import subprocess
 from contextlib import suppress
 
 from pebble.errors import ConfigError, LinkError
-from pebble.launched import end_with_parent
+from pebble.launched import tied
 from pebble.service import Service, every
 
 _STOP_S = 2.0  # for it to end politely; a service has to be gone after three
@@ -25,12 +25,11 @@ class VideoStream(Service):
             raise ConfigError("services.video_stream.command: is missing, write the program that streams the video")
         try:
             self._program = subprocess.Popen(
-                options.command,
+                tied(options.command),
                 cwd=options.cwd,
                 env={**os.environ, **options.env},
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # what it starts ends with it
-                preexec_fn=end_with_parent,
             )
         except (OSError, subprocess.SubprocessError) as error:
             raise LinkError(f"cannot start {options.command[0]}: {error}") from error

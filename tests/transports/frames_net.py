@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -15,9 +14,8 @@ from typing import Any
 
 import msgspec
 
-from pebble.launched import end_with_parent as die_with_parent
 from pebble.transports.segments import SHM
-from tests.support import ROOT, until
+from tests.support import ROOT, Child, until
 from tests.transports.frames_peer import Options
 
 
@@ -25,14 +23,13 @@ class Peer:
     """One process; `ask` for its numbers."""
 
     def __init__(self, role: str, folder: Path, options: Options) -> None:
-        self._process = subprocess.Popen(
+        self._process = Child(
             [sys.executable, "-m", "tests.transports.frames_peer", role, str(folder), msgspec.json.encode(options)],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            preexec_fn=lambda: _become(options),
         )
         assert self._line() == "up"
 
@@ -132,9 +129,3 @@ class FramesNet:
             if peer.running:
                 peer.signal(signal.SIGCONT)
                 peer.kill()
-
-
-def _become(options: Options) -> None:
-    die_with_parent()
-    if options.memlock is not None:
-        resource.setrlimit(resource.RLIMIT_MEMLOCK, (options.memlock, options.memlock))

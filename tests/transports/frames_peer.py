@@ -9,6 +9,7 @@ import ctypes
 import json
 import mmap
 import os
+import resource
 import sys
 import threading
 import time
@@ -44,6 +45,8 @@ def main(role: str, folder: str, options: str) -> None:
     chosen = msgspec.json.decode(options, type=Options)
     if chosen.without_views:
         views.KNOWN_VERSIONS = frozenset({"0.0.0"})
+    if chosen.memlock is not None:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (chosen.memlock, chosen.memlock))
     if chosen.user not in (None, os.geteuid()):
         become(chosen.user)
     peer = {"writer": Writer, "reader": Reader}[role](Path(folder), chosen)

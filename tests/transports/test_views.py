@@ -16,9 +16,10 @@ import zenoh
 import zenoh.shm
 
 from pebble.errors import TransportError
+from pebble.launched import tied
 from pebble.transports import views
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
-from tests.support import ROOT, TIED, Child, until
+from tests.support import ROOT, Child, until
 
 LARGE = 500_000  # bytes: the allocator's margin holds no such frame
 
@@ -234,7 +235,7 @@ with FrameWriter(folder, "camera", capacity=20_000, slots=16) as writer:
 
 def soak(folder: Path, frames: int, *options: str) -> tuple[int, int, int]:
     """Writer and reader with views in one process; returns wrong frames, lost ones, and growth in kB."""
-    command = [*TIED, sys.executable, *options, "-c", SOAK, str(folder), str(frames)]
+    command = tied([sys.executable, *options, "-c", SOAK, str(folder), str(frames)])
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100_000, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     wrong, lost, growth = map(int, done.stdout.split())
