@@ -11,7 +11,7 @@ import typer
 
 from pebble.version import __version__
 
-COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo", "watch", "snapshot", "flash", "bench")
+COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo", "watch", "snapshot", "flash", "bench", "impair")
 
 _HELP = """Runs Pebble robots, and looks at them.
 
@@ -22,6 +22,8 @@ _HELP = """Runs Pebble robots, and looks at them.
     pebble up goob.json        run the robot
     pebble watch goob.json     see its camera and hear its microphone
     pebble flash lamp.json     put a robot's firmware onto its board
+    pebble bench control       compare MQTT and Zenoh on this machine
+    pebble impair              a robot behind a bad link
 """
 
 

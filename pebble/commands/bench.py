@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from pebble.commands import bench_bridge, bench_compare, bench_control, bench_report, bench_robot
+
 _GROUP_HELP = """Comparisons, side by side in one run on this machine.
 
 \b
@@ -118,4 +120,6 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
     for command in (frames, control, fleet, video, sound):
         group.command(command.__name__)(command)
+    for more in (bench_control, bench_bridge, bench_robot, bench_compare, bench_report):
+        more.register(group)
     app.add_typer(group, name="bench")

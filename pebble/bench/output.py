@@ -1,0 +1,36 @@
+"""The end of every comparison: the verdict, the file of results, the pictures."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from rich.console import Console
+
+from pebble.bench.results import Results
+from pebble.errors import PebbleError
+
+FOLDER = Path("bench-results")
+
+
+def check_folder(folder: Path) -> None:
+    """Raises PebbleError where no folder can be made: before an hour of measuring, not after it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PebbleError(f"{folder}: {error.strerror}") from None
+
+
+def finish(results: Results, folder: Path, console: Console) -> None:
+    """Print the verdict, write ``<bench>.json`` and, where matplotlib is installed, the plots."""
+    for line in results.verdict:
+        console.print(line, highlight=False, soft_wrap=True)
+    written = [folder / f"{results.bench}.json"]
+    results.save(written[0])
+    if find_spec("matplotlib") is None:
+        console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
+    else:
+        from pebble.bench.plots import draw
+
+        written += draw(results, folder)
+    console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)

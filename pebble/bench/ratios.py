@@ -1,0 +1,103 @@
+"""Is one thing faster than another, and by how much, given how much the machine's mood moves both? Pure.
+
+Samples of one round are no independent witnesses: they share processes, a place in memory and a moment of the machine.
+So a round counts as one witness, and chance is what resampling the rounds shows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+
+from pebble.bench.figures import percentile
+
+LEVEL = 0.99
+#: Fewer rounds than this cannot carry an interval of 99 %: it is shown, and means little.
+LEAST_ROUNDS = 8
+_RESAMPLES = 20_000
+_SEED = 1  # the same samples give the same interval
+
+_Floats = np.ndarray[Any, np.dtype[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A ratio, and where it lies with a certainty of ``level``; NaN where nothing was measured."""
+
+    ratio: float
+    low: float
+    high: float
+    level: float = LEVEL
+
+    def __str__(self) -> str:
+        if math.isnan(self.ratio):
+            return "–"
+        return f"{self.ratio:.2f} ({self.low:.2f} to {self.high:.2f})"
+
+    @property
+    def equal(self) -> bool:
+        """Cannot be told from 1."""
+        return self.low <= 1.0 <= self.high
+
+    def words(self, ours: str, theirs: str, *, what: str = "slower", less: str = "faster") -> str:
+        """``zenoh is faster than mqtt: 0.55 (0.51 to 0.58) of its time``, or that they are equal within noise."""
+        if math.isnan(self.ratio):
+            return f"{ours} and {theirs}: nothing was measured"
+        if self.equal:
+            return f"{ours} and {theirs} are equal within noise: {self}"
+        return f"{ours} is {less if self.high < 1 else what} than {theirs}: {self} of its figure"
+
+
+def paired(
+    ours: Sequence[Sequence[float]],
+    theirs: Sequence[Sequence[float]],
+    percent: float = 50,
+    level: float = LEVEL,
+) -> Interval:
+    """The median, over rounds run in turn, of the ratio of their percentiles. Rounds without samples do not count."""
+    ratios = [
+        percentile(a, percent) / percentile(b, percent)
+        for a, b in zip(ours, theirs, strict=False)
+        if a and b and percentile(b, percent) > 0
+    ]
+    if not ratios:
+        return Interval(math.nan, math.nan, math.nan, level)
+    logs = np.log(ratios)
+    picked = _generator().integers(0, len(logs), (_RESAMPLES, len(logs)))
+    return _interval(float(np.median(logs)), np.median(logs[picked], axis=1), len(logs), level)
+
+
+def unpaired(
+    ours: Sequence[Sequence[float]],
+    theirs: Sequence[Sequence[float]],
+    percent: float = 50,
+    level: float = LEVEL,
+) -> Interval:
+    """The same for two runs at different times: the ratio of the medians of their rounds' percentiles."""
+    a, b = (
+        np.log([value for one in rounds if one and (value := percentile(one, percent)) > 0])
+        for rounds in (ours, theirs)
+    )
+    if not len(a) or not len(b):
+        return Interval(math.nan, math.nan, math.nan, level)
+    generator = _generator()
+    resampled = [np.median(logs[generator.integers(0, len(logs), (_RESAMPLES, len(logs)))], axis=1) for logs in (a, b)]
+    return _interval(float(np.median(a) - np.median(b)), resampled[0] - resampled[1], min(len(a), len(b)), level)
+
+
+def _interval(ratio: float, resampled: _Floats, rounds: int, level: float) -> Interval:
+    """Few rounds tell little of their own spread: the interval is widened as Student's is against the normal one."""
+    tail = (1 - level) / 2
+    z, freedom = NormalDist().inv_cdf(1 - tail), max(1, rounds - 1)
+    wider = 1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
+    low, high = (ratio + wider * (end - ratio) for end in np.quantile(resampled, [tail, 1 - tail]))
+    return Interval(math.exp(ratio), math.exp(low), math.exp(high), level)
+
+
+def _generator() -> np.random.Generator:
+    return np.random.default_rng(_SEED)
