@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes .venv and installs this checkout into it, with the extra named by the argument (demo or dev).
+# Makes .venv and installs this checkout into it, with the extra named by the argument (demo, bench or dev).
 # Needs no root and no compiler. make calls it whenever pyproject.toml is newer than what it left behind.
 set -eu
 cd "$(dirname "$0")/.."
@@ -76,4 +76,4 @@ fetch_micropython() {
 }
 [ "$extra" != dev ] || fetch_micropython
 touch ".venv/.ready-$extra"
-[ "$extra" != dev ] || touch .venv/.ready-demo # the one includes the other
+[ "$extra" != dev ] || touch .venv/.ready-demo .venv/.ready-bench # it includes the others

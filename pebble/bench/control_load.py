@@ -1,71 +1,118 @@
-"""What media cost a robot that is driven: somebody on it who reads every frame, and operators who watch and listen.
+"""What else happens while commands are measured, as a process that is switched on and off by its standard input.
 
-As a process: ``python -m pebble.bench.control_load frames RUN_DIR`` or ``media PORT BASE``. Every line on its standard
-input is answered by the counts so far; it ends with its standard input.
+``python -m pebble.bench.control_load hog|writer|reader [mqtt|zenoh WHERE]``: a busy loop, or one end of a stream of raw
+640x480 pictures at 30 Hz, made and read as in ``pebble bench frames``. A line ``1`` has it work, ``0`` rest, ``?``
+nothing; each is answered by the pictures so far. It ends with its standard input.
 """
 
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import threading
-from collections import Counter
+import time
 from pathlib import Path
-from typing import Any
 
-from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion
+import numpy as np
 
-from pebble.contract import AUDIO, CAMERA
-from pebble.transports.frames import FrameReader
+from pebble.bench.frames_loop import RATE_HZ, Reader, Writer
+from pebble.bench.frames_worker import MqttReader, MqttWriter, ZenohReader, ZenohWriter
 
-_LOOK_S = 0.2
-_EVERY = 16  # bytes: a look at every so many of a picture's
+SIZE = 640 * 480 * 3
+_READ_S = 0.2
+_EVERY = 64  # bytes: a look at every cache line
+_REST_S = 1.0  # between two signs of life to a broker
+
+
+class Switch:
+    """On or off, as standard input says; and the count that it is answered with."""
+
+    def __init__(self) -> None:
+        self.pictures = 0
+        self.on = False
+        self.ended = False
+        self._changed = threading.Condition()
+        threading.Thread(target=self._listen, name="switch", daemon=True).start()
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Until it is on or everything ends."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.on or self.ended, timeout)
+
+    def say(self) -> None:
+        sys.stdout.write(json.dumps({"pictures": self.pictures}) + "\n")
+        sys.stdout.flush()
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            if line.strip() in ("0", "1"):
+                self._set(on=line.strip() == "1")
+            self.say()
+        self._set(on=False, ended=True)
+
+    def _set(self, *, on: bool, ended: bool = False) -> None:
+        with self._changed:
+            self.on, self.ended = on, ended
+            self._changed.notify_all()
 
 
 def main(arguments: list[str]) -> int:
-    what, *where = arguments
-    counts: Counter[str] = Counter()
-    ended = threading.Event()
-    threading.Thread(target=_answer, args=(counts, ended), name="answers", daemon=True).start()
-    if what == "frames":
-        _read_frames(Path(where[0]), counts, ended)
+    role, *where = arguments
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if role == "hog":
+        _hog(Switch())
+    elif role == "writer":
+        _write(_writer(*where), Switch())
     else:
-        _watch(int(where[0]), where[1], counts, ended)
+        _read(_reader(*where), Switch())
     return 0
 
 
-def _answer(counts: Counter[str], ended: threading.Event) -> None:
-    for _ in sys.stdin:
-        sys.stdout.write(json.dumps(dict(counts)) + "\n")
-        sys.stdout.flush()
-    ended.set()
+def _hog(switch: Switch) -> None:
+    switch.say()
+    while not switch.ended:
+        switch.wait()
+        while switch.on:
+            pass
 
 
-def _read_frames(run_dir: Path, counts: Counter[str], ended: threading.Event) -> None:
-    with FrameReader(run_dir, "camera", views=True) as reader:
-        while not ended.is_set():
-            frame = reader.read(_LOOK_S)
+def _write(writer: Writer, switch: Switch) -> None:
+    picture = np.random.default_rng(1).integers(0, 256, SIZE, dtype=np.uint8)
+    switch.say()
+    while not switch.ended:
+        switch.wait()
+        due = time.monotonic()
+        while switch.on:
+            frame = writer.begin()
             if frame is not None:
-                counts["frames"] += bool(frame.data[::_EVERY].any())
-                frame.release()
+                np.copyto(frame, picture)
+                writer.send()
+                switch.pictures += 1
+            del frame
+            due += 1 / RATE_HZ
+            time.sleep(max(0.0, due - time.monotonic()))
+    writer.close()
 
 
-def _watch(port: int, base: str, counts: Counter[str], ended: threading.Event) -> None:
-    names = {CAMERA.topic(base): "video", AUDIO.topic(base): "audio"}
+def _read(reader: Reader, switch: Switch) -> None:
+    switch.say()
+    while not switch.ended:
+        switch.wait(_REST_S)
+        frame = reader.read(_READ_S if switch.on else 0.0)
+        if frame is not None:
+            switch.pictures += bool(frame[::_EVERY].any())
+            del frame
+            reader.done()
+    reader.close()
 
-    def count(_client: Client, _data: Any, message: Any) -> None:
-        name = names[message.topic]
-        counts[name] += 1
-        counts[f"{name}_bytes"] += len(message.payload)
 
-    client = Client(CallbackAPIVersion.VERSION2)
-    client.on_message = count
-    client.on_connect = lambda connected, *_: connected.subscribe([(topic, 0) for topic in names])
-    client.connect("127.0.0.1", port)
-    while not ended.is_set():
-        client.loop(_LOOK_S)
-    client.disconnect()
+def _writer(kind: str, where: str) -> Writer:
+    return MqttWriter(int(where), SIZE) if kind == "mqtt" else ZenohWriter(Path(where), SIZE, born=True, shared=True)
+
+
+def _reader(kind: str, where: str) -> Reader:
+    return MqttReader(int(where)) if kind == "mqtt" else ZenohReader(Path(where), views=True, shared=True)
 
 
 if __name__ == "__main__":

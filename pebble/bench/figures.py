@@ -21,7 +21,3 @@ def rounded(figure: float | int | None, digits: int) -> float | int | None:
     if figure is None or not math.isfinite(figure):
         return None
     return figure if isinstance(figure, int) else round(figure, digits)
-
-
-def ratio(ours: float, theirs: float) -> str:
-    return f"{ours / theirs:.2f}" if theirs else "–"

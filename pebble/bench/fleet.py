@@ -7,7 +7,6 @@ command's latency is from the operator's publish call to the change of the pins 
 from __future__ import annotations
 
 import itertools
-import json
 import sys
 import tempfile
 import threading
@@ -18,13 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from pebble.bench import output
 from pebble.bench.figures import LONGEST_S, percentile, rounded
 from pebble.bench.fleet_operator import STEPS
 from pebble.bench.frames_process import Worker, end_workers
+from pebble.bench.results import Cell, Stopwatch, Value
+from pebble.bench.tables import plain_table
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.programs import Program, end_all
@@ -46,14 +47,22 @@ class Plan:
     seconds: float = 60.0
     rate_hz: float = 10.0
     kinds: Sequence[str] = KINDS
-    json: Path | None = None
+    output: Path = output.FOLDER
 
     def check(self) -> None:
         """Raises PebbleError naming what makes no sense."""
         if not 1 <= self.robots <= MOST or not 0 < self.seconds <= LONGEST_S or not 0 < self.rate_hz <= 20:
             raise PebbleError(f"robots must be 1 to {MOST}, seconds at most {LONGEST_S:.0f}, rate at most 20 Hz")
-        if self.json is not None and not self.json.resolve().parent.is_dir():
-            raise PebbleError(f"{self.json}: there is no such folder")
+        output.check_folder(self.output)
+
+    def options(self) -> dict[str, Value | list[Value]]:
+        """What figures depend on."""
+        return {"robots": self.robots, "seconds": self.seconds, "rate_hz": self.rate_hz, "kinds": list(self.kinds)}
+
+    def command(self) -> list[str]:
+        """The command line that repeats it."""
+        words = ["pebble", "bench", "fleet", "--robots", str(self.robots)]
+        return [*words, "--seconds", f"{self.seconds:g}", "--rate", f"{self.rate_hz:g}"]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -75,17 +84,33 @@ class Figures:
     def lost(self) -> int:
         return self.sent - len(self.latencies_ms)
 
-    def as_json(self) -> dict[str, Any]:
-        percents = {f"p{percent}_ms": rounded(percentile(self.latencies_ms, percent), 3) for percent in (50, 95, 99)}
+    def cell(self, rate_hz: float) -> Cell:
+        """A single round: one fleet, started once."""
+        return Cell(
+            variant="mqtt",
+            params={"robots": self.robots, "rate": f"{rate_hz:g} Hz"},
+            measure="command to pins",
+            unit="ms",
+            rounds=[self.latencies_ms],
+            figures=self._figures(),
+        )
+
+    def verdict(self) -> list[str]:
+        """For people who think of a fleet."""
+        half, most = (percentile(self.latencies_ms, percent) for percent in (50, 99))
+        return [
+            f"{self.online} of {self.robots} robots were online; of {self.sent} commands {self.lost} were overtaken or"
+            " lost",
+            f"wheels obeyed within {half:.1f} ms in half of all cases, within {most:.1f} ms in 99 of 100",
+            f"no robot's heart paused for longer than {self.longest_gap_s:.2f} s",
+        ]
+
+    def _figures(self) -> dict[str, Value]:
         beats = {f"beats_{n}_hz": rounded(percentile(self.beats_hz, p), 3) for n, p in _SPREAD.items()}
         return {
-            "params": {"robots": self.robots, "seconds": self.seconds},
+            "sent": self.sent,
             "online": self.online,
-            "n": len(self.latencies_ms),
-            "lost": self.lost,
             "late": self.late,
-            **percents,
-            "max_ms": rounded(percentile(self.latencies_ms, 100), 3),
             **beats,
             "longest_gap_s": rounded(self.longest_gap_s, 3),
             **{f"cpu_{name}": rounded(share, 1) for name, share in self.cpu.items()},
@@ -101,12 +126,11 @@ def run(plan: Plan, console: Console | None = None) -> int:
     """Measure and show; 0 if every robot was online and could be driven. Raises PebbleError."""
     console = console or Console()
     plan.check()
+    watch = Stopwatch("fleet", plan.command(), plan.options())
     with interrupted_by_signals(), console.status("starting") as status:
         figures = measure(plan, status.update)
     console.print(_table(figures))
-    if plan.json is not None:
-        plan.json.write_text(json.dumps({"rows": [figures.as_json()]}, indent=1) + "\n")
-        console.print(f"Written to {plan.json}", soft_wrap=True)
+    output.finish(watch.results([figures.cell(plan.rate_hz)], figures.verdict()), plan.output, console)
     return 0 if figures.online == plan.robots and figures.latencies_ms else 1
 
 
@@ -202,14 +226,7 @@ def _longest_gap_s(robots: list[list[int]]) -> float:
 
 
 def _table(figures: Figures) -> Table:
-    table = Table(
-        title=f"{figures.robots} MCU robots on one broker, {figures.seconds:.0f} s",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("what")
-    table.add_column("figures", justify="right")
+    table = plain_table(f"{figures.robots} MCU robots on one broker, {figures.seconds:.0f} s", ("what", "figures"))
     beats = [f"{percentile(figures.beats_hz, percent):.2f}" for percent in _SPREAD.values()]
     times = [f"{percentile(figures.latencies_ms, percent):.1f}" for percent in (50, 95, 99, 100)]
     rows = {

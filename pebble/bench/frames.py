@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import json
+import itertools
 import statistics
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from pebble.bench import output
 from pebble.bench.figures import LONGEST_S
 from pebble.bench.frames_process import Worker, end_workers
-from pebble.bench.frames_report import Round, as_json, legend, ratios, row_of, tables
+from pebble.bench.frames_report import Round, cell_of, legend, tables, verdict
 from pebble.bench.frames_variants import VARIANTS, Case, missing, parse_size
+from pebble.bench.ratios import LEAST_ROUNDS
+from pebble.bench.results import Cell, Stopwatch, Value
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.programs import end_all
@@ -28,32 +32,64 @@ from pebble.transports.segments import sweep
 
 SIZES = ("640x480", "1920x1080")
 READERS = (1, 3)
+_LEAST_ROUNDS = 2  # one says nothing of chance
 _READY_S = 20.0
-_AROUND_S = 2.2  # starting and ending the processes of a case, for the estimate
-_SETTLE_S = 0.3  # from “everybody is ready” to the first frame that counts
+_AROUND_S = 1.15  # starting and ending the processes of a case, for the estimate
+_SETTLE_S = 0.1  # from “everybody is ready” to the first frame that counts
 _ANSWER_S = 10.0
+
+Measured = Mapping[Case, list[Round | None]]  # None: a round that failed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What to compare. One round runs every case once, for ``seconds``; figures are medians over the rounds."""
+    """What to compare. One round runs every case once, for ``seconds``, with processes of its own."""
 
-    seconds: float = 3.0
-    rounds: int = 3
+    seconds: float = 0.5
+    rounds: int = LEAST_ROUNDS
     sizes: Sequence[str] = SIZES
     readers: Sequence[int] = READERS
     variants: Sequence[str] = VARIANTS
-    json: Path | None = None
+    output: Path = output.FOLDER
+    quick: bool = False  # the results are marked so
 
     def check(self) -> None:
         """Raises PebbleError naming what makes no sense."""
         unknown = [name for name in self.variants if name not in VARIANTS]
-        if unknown:
+        if unknown or not self.variants:
             raise PebbleError(f"unknown variant {', '.join(unknown)}: there are {', '.join(VARIANTS)}")
-        if not 0 < self.seconds <= LONGEST_S or self.rounds < 1 or min(self.readers, default=0) < 1:
-            raise PebbleError(f"seconds, rounds and readers must be positive, and seconds at most {LONGEST_S:.0f}")
-        if self.json is not None and not self.json.resolve().parent.is_dir():
-            raise PebbleError(f"{self.json}: there is no such folder")
+        if not 0 < self.seconds <= LONGEST_S:
+            raise PebbleError(f"seconds must be positive, and at most {LONGEST_S:.0f}")
+        if self.rounds < _LEAST_ROUNDS or min(self.readers, default=0) < 1:
+            raise PebbleError(f"there must be {_LEAST_ROUNDS} rounds at least, and a reader")
+        if any(len(set(some)) < len(some) for some in (self.variants, self.sizes, self.readers)):
+            raise PebbleError("a variant, size or number of readers is named twice")
+        for size in self.sizes:
+            parse_size(size)
+        output.check_folder(self.output)
+
+    def options(self) -> dict[str, Value | list[Value]]:
+        """What figures depend on."""
+        return {
+            "seconds": self.seconds,
+            "rounds": self.rounds,
+            "sizes": list(self.sizes),
+            "readers": list(self.readers),
+            "variants": list(self.variants),
+        }
+
+    def command(self) -> list[str]:
+        """The command line that repeats it."""
+        words = ["pebble", "bench", "frames", "--seconds", f"{self.seconds:g}", "--rounds", str(self.rounds)]
+        words += itertools.chain(*(("--size", size) for size in self.sizes))
+        words += itertools.chain(*(("--readers", str(count)) for count in self.readers))
+        return [*words, "--variants", ",".join(self.variants), *(["--quick"] if self.quick else [])]
+
+
+def plan(*, quick: bool = False, **given: Any) -> Plan:
+    """The usual plan, or the one for the impatient, except for what is given."""
+    usual = {"rounds": 2, "seconds": 0.5, "sizes": SIZES[:1], "readers": READERS[:1]} if quick else {}
+    return Plan(quick=quick, **{**usual, **given})
 
 
 def run(plan: Plan, console: Console | None = None) -> int:
@@ -63,27 +99,20 @@ def run(plan: Plan, console: Console | None = None) -> int:
     """
     console = console or Console()
     plan.check()
-    sizes = [parse_size(size) for size in plan.sizes]
+    watch = Stopwatch("frames", plan.command(), plan.options())
     variants = _installed(plan.variants, console)
-    cases = [Case(name, size, readers) for size in sizes for readers in plan.readers for name in variants]
-    minutes = plan.rounds * len(cases) * (plan.seconds + _AROUND_S) / 60
-    console.print(f"{len(cases)} cases, {plan.rounds} rounds of {plan.seconds:g} s: about {minutes:.1f} min")
-    with interrupted_by_signals():
-        try:
-            measured = _measure(cases, plan, console)
-        finally:
-            sweep()  # Zenoh leaves a file behind even when it ends politely
-    rows = [row_of(case, rounds) for case, rounds in measured.items() if rounds]
+    cases = [
+        Case(name, parse_size(size), readers) for size in plan.sizes for readers in plan.readers for name in variants
+    ]
+    if not cases:
+        return 1
+    cells = cells_of(measure(cases, plan, console))
     for line in legend(variants):
         console.print(line, style="dim", highlight=False)
-    for figures in tables(rows):
+    for figures in tables(cells):
         console.print(figures)
-    for line in ratios(rows):
-        console.print(line, highlight=False)
-    if plan.json is not None:
-        plan.json.write_text(json.dumps(as_json(rows), indent=1) + "\n")
-        console.print(f"Written to {plan.json}", soft_wrap=True)
-    return 0 if rows and all(row.n for row in rows) and len(rows) == len(cases) else 1
+    output.finish(watch.results(cells, verdict(cells), quick=plan.quick), plan.output, console)
+    return 0 if all(cell.samples for cell in cells) else 1
 
 
 def _installed(variants: Sequence[str], console: Console) -> list[str]:
@@ -94,24 +123,52 @@ def _installed(variants: Sequence[str], console: Console) -> list[str]:
     return [name for name in variants if reasons[name] is None]
 
 
-def _measure(cases: Sequence[Case], plan: Plan, console: Console) -> dict[Case, list[Round]]:
-    """Every case in every round: what disturbs the machine for a while disturbs all of them."""
-    measured: dict[Case, list[Round]] = {case: [] for case in cases}
+def cells_of(measured: Measured) -> list[Cell]:
+    return [cell_of(case, rounds) for case, rounds in measured.items()]
+
+
+def measure(
+    cases: Sequence[Case],
+    plan: Plan,
+    console: Console,
+    slower_us: Callable[[Case, Measured], float] = lambda _case, _so_far: 0.0,
+) -> Measured:
+    """Every case in every round: what disturbs the machine for a while disturbs all of them.
+
+    ``slower_us`` says, from what has been measured so far, for how long a case's writer holds each frame up.
+    """
+    minutes = plan.rounds * len(cases) * (plan.seconds + _AROUND_S) / 60
+    console.print(f"{len(cases)} cases, {plan.rounds} rounds of {plan.seconds:g} s: about {minutes:.1f} min")
+    measured: dict[Case, list[Round | None]] = {case: [] for case in cases}
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console,
         transient=True,
     )  # fmt: skip
-    with progress:
+    with interrupted_by_signals(), _swept(), progress:
         bar = progress.add_task("frames", total=plan.rounds * len(cases))
         for number in range(plan.rounds):
             for case in cases[:: -1 if number % 2 else 1]:
                 progress.update(bar, description=f"round {number + 1}: {case}")
-                try:
-                    measured[case].append(run_case(case, plan.seconds))
-                except PebbleError as error:
-                    console.print(f"{case}: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+                held_up = replace(case, slower_us=slower_us(case, measured))
+                measured[case].append(_try_case(held_up, plan.seconds, console))
                 progress.advance(bar)
     return measured
+
+
+@contextmanager
+def _swept() -> Iterator[None]:
+    try:
+        yield
+    finally:
+        sweep()  # Zenoh leaves a file behind even when it ends politely
+
+
+def _try_case(case: Case, seconds: float, console: Console) -> Round | None:
+    try:
+        return run_case(case, seconds)
+    except PebbleError as error:
+        console.print(f"{case}: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        return None
 
 
 def run_case(case: Case, seconds: float) -> Round:
@@ -119,15 +176,14 @@ def run_case(case: Case, seconds: float) -> Round:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
         broker = stack.enter_context(_broker(folder)) if case.needs_broker else None
-        port = broker.port if broker is not None else 0
         workers: list[Worker] = []
         stack.callback(lambda: end_workers(workers))
-        workers.append(Worker(f"{case}: writer", case.command("writer", folder, port), folder / "writer.log"))
-        workers[0].answer(_READY_S)
-        for number in range(case.readers):
-            name = f"reader {number + 1}"
-            workers.append(Worker(f"{case}: {name}", case.command("reader", folder, port), folder / f"{name}.log"))
-        for worker in workers[1:]:
+        for name in ("writer", *(f"reader {number + 1}" for number in range(case.readers))):
+            command = case.command(name.partition(" ")[0], folder, broker.port if broker is not None else 0)
+            workers.append(Worker(f"{case}: {name}", command, folder / f"{name}.log"))
+            if name == "writer" and case.needs_writer_first:
+                workers[0].answer(_READY_S)
+        for worker in workers[1 if case.needs_writer_first else 0 :]:
             worker.answer(_READY_S)
         return _observe(case, workers, broker, seconds)
 

@@ -1,8 +1,8 @@
 """Frames through GStreamer's shmsink and shmsrc: a program for the system's Python, where gi and Gst are installed.
 
-``python3 frames_gstreamer.py writer|reader SOCKET WIDTH HEIGHT``. As the original Pebble uses it: the pipeline writes
-the picture into the shared segment itself, so the writer makes no copy; the reader maps the newest buffer and copies it
-out into an array of its own.
+``python3 frames_gstreamer.py writer|reader SOCKET WIDTH HEIGHT SLOWER_US``. As the original Pebble uses it: the
+pipeline writes the picture into the shared segment itself, so the writer makes no copy; the reader maps the newest
+buffer and copies it out into an array of its own.
 """
 
 from __future__ import annotations
@@ -92,13 +92,13 @@ class GstReader:
 
 
 def main(arguments: list[str]) -> None:
-    role, socket, width, height = arguments
+    role, socket, width, height, slower_us = arguments
     _load_gst()
     Gst.init(None)
     caps, size = f"video/x-raw,format=BGR,width={width},height={height},framerate=30/1", int(width) * int(height) * 3
     orders = frames_loop.Orders()
     if role == "writer":
-        frames_loop.write(GstWriter(socket, caps, size), size, orders)
+        frames_loop.write(GstWriter(socket, caps, size), size, orders, slower_us=float(slower_us))
     else:
         frames_loop.read(GstReader(socket, caps), orders)
 

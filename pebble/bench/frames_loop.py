@@ -20,9 +20,9 @@ import numpy as np
 
 RATE_HZ = 30.0
 SMALLEST = 24  # bytes: two stamps and a number
-_WARM_UP = 15  # frames: pools are made and caches are filled with the first ones
+_WARM_UP = 8  # frames: pools are made and caches are filled with the first ones
 _READ_S = 0.2
-_LATE_NS = 250_000_000  # how long after the window its last frames are waited for
+_LATE_NS = 150_000_000  # how long after the window its last frames are waited for
 _GAP_S = 0.010  # from a frame to the bare copy after it
 
 
@@ -90,8 +90,11 @@ class Cpu:
             self.percent = 100 * (time.process_time_ns() - self._begin[1]) / (now - self._begin[0])
 
 
-def write(writer: Writer, size: int, orders: Orders) -> None:
-    """Write a frame of ``size`` bytes 30 times a second until the orders end; the answer says CPU and frames sent."""
+def write(writer: Writer, size: int, orders: Orders, *, slower_us: float = 0.0) -> None:
+    """Write a frame of ``size`` bytes 30 times a second until the orders end; the answer says CPU and frames sent.
+
+    Between its time stamp and its sending each frame is held up for ``slower_us``, busily.
+    """
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
     cpu, number, sent, refused, due = Cpu(), 0, 0, 0, time.monotonic()
     reported = False
@@ -100,14 +103,14 @@ def write(writer: Writer, size: int, orders: Orders) -> None:
         due += 1 / RATE_HZ
         orders.ended.wait(max(0.0, due - time.monotonic()))
         frame = writer.begin()
-        begun = _measuring(orders.window)
         if frame is not None:
             number += 1
-            _fill(frame, picture, number)
+            stamp = _fill(frame, picture, number)
+            _spin(slower_us)
             writer.send()
-            sent += begun
+            sent += _within(orders.window, stamp)
         else:
-            refused += begun
+            refused += _within(orders.window, time.monotonic_ns())
         cpu.look(orders.window, time.monotonic_ns())
         if cpu.percent is not None and not reported:
             reported = True
@@ -115,16 +118,25 @@ def write(writer: Writer, size: int, orders: Orders) -> None:
     writer.close()
 
 
-def _measuring(window: tuple[int, int] | None) -> bool:
-    return window is not None and window[0] <= time.monotonic_ns() < window[1]
+def _within(window: tuple[int, int] | None, at: int) -> bool:
+    return window is not None and window[0] <= at < window[1]
 
 
-def _fill(frame: np.ndarray, picture: np.ndarray, number: int) -> None:
-    """What a camera does: fresh pixels, and then the time."""
+def _fill(frame: np.ndarray, picture: np.ndarray, number: int) -> int:
+    """What a camera does: fresh pixels, and then the time, which is returned."""
     np.copyto(frame, picture)
     ends = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
     frame[8:16] = frame[-8:] = ends
-    frame[:8] = np.frombuffer(time.monotonic_ns().to_bytes(8, "little"), np.uint8)
+    stamp = time.monotonic_ns()
+    frame[:8] = np.frombuffer(stamp.to_bytes(8, "little"), np.uint8)
+    return stamp
+
+
+def _spin(us: float) -> None:
+    """As pebble.bench.null.spin, which the other Python cannot import."""
+    end = time.perf_counter_ns() + int(1000 * us)
+    while time.perf_counter_ns() < end:
+        pass
 
 
 def read(reader: Reader, orders: Orders, *, bare_copy: int = 0) -> None:
@@ -145,7 +157,7 @@ def read(reader: Reader, orders: Orders, *, bare_copy: int = 0) -> None:
             torn += number != int.from_bytes(frame[-8:].tobytes(), "little")
             reader.done()
             del frame
-            if orders.window is not None and orders.window[0] <= stamp < orders.window[1]:
+            if _within(orders.window, stamp):
                 latencies.append((now - stamp) / 1000)
                 if copier is not None:
                     copier.copy(orders.ended)

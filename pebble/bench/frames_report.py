@@ -1,19 +1,23 @@
-"""Figures of a comparison of frames: rounds become rows, rows become JSON, a table and ratios. Pure."""
+"""Figures of a comparison of frames: rounds become cells, cells become a table and plain words. Pure."""
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
 
-from rich import box
 from rich.table import Table
 
-from pebble.bench.figures import percentile, ratio, rounded
-from pebble.bench.frames_variants import ABOUT, VARIANTS, Case
+from pebble.bench.figures import rounded
+from pebble.bench.frames_variants import ABOUT, VARIANTS, Case, parse_size, readers
+from pebble.bench.null import variant_of
+from pebble.bench.ratios import LEAST_ROUNDS, paired
+from pebble.bench.results import Cell, Value
+from pebble.bench.tables import figure, plain_table
+
+MEASURE = "frame"
+OURS = "zenoh-shm"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,93 +35,64 @@ class Round:
     memory_reader_mb: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """A case over all its rounds: medians of the rounds' figures, except ``n`` (sum) and ``max_us`` (the worst)."""
-
-    case: Case
-    n: int
-    p50_us: float
-    p99_us: float
-    max_us: float
-    cpu_writer: float
-    cpu_reader: float
-    more: dict[str, float | int | None] = field(default_factory=dict)
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "variant": self.case.variant,
-            "params": {"size": str(self.case.size), "readers": self.case.readers},
-            "n": self.n,
-            **{name: rounded(getattr(self, name), 1) for name in ("p50_us", "p99_us", "max_us")},
-            **{name: rounded(getattr(self, name), 2) for name in ("cpu_writer", "cpu_reader")},
-            **{name: rounded(value, 2) for name, value in self.more.items()},
-        }
+_MEDIANS = ("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb")
+_SUMS = ("torn", "fallbacks")
 
 
-def row_of(case: Case, rounds: Sequence[Round]) -> Row:
-    """``rounds`` must not be empty; rounds in which nothing arrived count only as lost frames."""
-    heard = [one for one in rounds if one.latencies_us]
-    brokers = [one.cpu_broker for one in rounds if one.cpu_broker is not None]
-    expected = sum(one.sent for one in rounds) * case.readers
-    arrived = sum(len(one.latencies_us) for one in rounds)
-    return Row(
-        case=case,
-        n=arrived,
-        p50_us=_median([percentile(one.latencies_us, 50) for one in heard]),
-        p99_us=_median([percentile(one.latencies_us, 99) for one in heard]),
-        max_us=max((max(one.latencies_us) for one in heard), default=math.nan),
-        cpu_writer=_median([one.cpu_writer for one in rounds]),
-        cpu_reader=_median([one.cpu_reader for one in rounds]),
-        more={
-            "cpu_broker": _median(brokers) if brokers else None,
-            "memory_writer_mb": _median([one.memory_writer_mb for one in rounds]),
-            "memory_reader_mb": _median([one.memory_reader_mb for one in rounds]),
-            "lost_percent": max(0.0, 100 * (1 - arrived / expected)) if expected else None,
-            "torn": sum(one.torn for one in rounds),
-            "fallbacks": sum(one.fallbacks for one in rounds),
-            "rounds": len(rounds),
-        },
+def cell_of(case: Case, rounds: Sequence[Round | None]) -> Cell:
+    """A case over all its rounds; None: a round that failed. CPU and memory are medians of the rounds."""
+    ran = [one for one in rounds if one is not None]
+    cell = Cell(
+        variant=case.name,
+        params={"size": str(case.size), "readers": case.readers},
+        measure=MEASURE,
+        unit="us",
+        rounds=[[] if one is None else list(one.latencies_us) for one in rounds],
+        figures={name: _median([getattr(one, name) for one in ran]) for name in _MEDIANS},
     )
+    cell.figures |= {name: sum(getattr(one, name) for one in ran) for name in _SUMS}
+    if case.variant != "memcpy":  # it times copies, and nobody counts those that were due
+        cell.figures["sent"] = sum(one.sent for one in ran) * case.readers  # to be read, by each
+    return cell
 
 
-def as_json(rows: Sequence[Row]) -> dict[str, Any]:
-    return {"rows": [row.as_json() for row in rows]}
+def verdict(cells: Sequence[Cell]) -> list[str]:
+    """Frames without copies against each other way, a line each: latency, and what a reader pays."""
+    lines, judged = [], all(len(cell.rounds) >= LEAST_ROUNDS for cell in cells)
+    for ours in (cell for cell in cells if cell.variant == OURS):
+        for theirs in cells:
+            if theirs is not ours and theirs.params == ours.params:
+                ratio = paired(ours.rounds, theirs.rounds)
+                words = ratio.words(OURS, theirs.variant) if judged else f"{OURS} / {theirs.variant} = {ratio}"
+                lines.append(f"{', '.join(_conditions(ours))}: {words}{_reader_cpu(ours, theirs)}")
+    if lines and not judged:
+        lines.append(f"Nothing is judged: that takes {LEAST_ROUNDS} rounds.")
+    return [*lines, *(line for cell in cells for line in _faults(cell))]
 
 
-def ratios(rows: Sequence[Row]) -> list[str]:
-    """zenoh-shm against GStreamer and a bare copy, one line per size and number of readers."""
-    by_case = {(row.case.variant, row.case.size, row.case.readers): row for row in rows}
-    lines = []
-    for row in rows:
-        if row.case.variant != "zenoh-shm":
-            continue
-        for other in ("gstreamer-shm", "zenoh-copy", "mqtt"):
-            against = by_case.get((other, row.case.size, row.case.readers))
-            if against is not None:
-                latency, cpu = ratio(row.p50_us, against.p50_us), ratio(row.cpu_reader, against.cpu_reader)
-                what = f"{row.case.size}, readers: {row.case.readers}"
-                lines.append(f"zenoh-shm / {other}, {what}: p50 {latency}, reader's CPU {cpu}")
-    return lines
+def _faults(cell: Cell) -> list[str]:
+    faults = {"torn": "frames arrived torn", "fallbacks": "frames could not go through shared memory"}
+    where = f"{', '.join(_conditions(cell))}, {cell.variant}"
+    return [f"{where}: {cell.figures[name]} {words}" for name, words in faults.items() if cell.figures.get(name)]
 
 
-def tables(rows: Sequence[Row]) -> Iterator[Table]:
+def _reader_cpu(ours: Cell, theirs: Cell) -> str:
+    one, other = (cell.figures.get("cpu_reader") for cell in (ours, theirs))
+    if theirs.variant == "memcpy" or not isinstance(one, (int, float)) or not isinstance(other, (int, float)):
+        return ""
+    return f"; a reader's CPU {figure(one)} % against {figure(other)} %"
+
+
+def tables(cells: Sequence[Cell]) -> Iterator[Table]:
     """One table for each size and number of readers."""
-    for key, some in groupby(sorted(rows, key=_order), key=lambda row: _order(row)[:2]):
+    for _, some in groupby(sorted(cells, key=_order), key=lambda cell: _order(cell)[:2]):
         group = list(some)
-        who = "one reader" if key[1] == 1 else f"{key[1]} readers"
-        title = f"{group[0].case.size} BGR at 30 Hz, {who}"
-        figures = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        figures.add_column("variant", no_wrap=True)
-        for name in ("p50 µs", "p99 µs", "max µs", "CPU %", "PSS MB", "lost %", "n"):
-            figures.add_column(name, justify="right", no_wrap=True)
-        for row in group:
-            figures.add_row(row.case.variant, *_cells(row))
-        yield figures
-
-
-def _order(row: Row) -> tuple[int, int, int]:
-    return row.case.size.bytes, row.case.readers, VARIANTS.index(row.case.variant)
+        names = ("variant", "p50 µs", "p99 µs", "max µs", "CPU %", "PSS MB", "lost", "n")
+        size, who = _conditions(group[0])
+        shown = plain_table(f"{size} BGR at 30 Hz, {who}", names)
+        for cell in group:
+            shown.add_row(cell.variant, *_columns(cell))
+        yield shown
 
 
 def legend(variants: Sequence[str]) -> list[str]:
@@ -128,21 +103,29 @@ def legend(variants: Sequence[str]) -> list[str]:
     ]
 
 
-def _cells(row: Row) -> list[str]:
-    broker, lost = row.more["cpu_broker"], row.more["lost_percent"]
-    times = [f"{figure:,.0f}" for figure in (row.p50_us, row.p99_us, row.max_us)]
-    if row.case.variant == "memcpy":
-        return [*times, f"{row.cpu_reader:.1f}", "", "", str(row.n)]
-    cpu = [row.cpu_writer, row.cpu_reader, *([] if broker is None else [broker])]
-    memory = [row.more["memory_writer_mb"], row.more["memory_reader_mb"]]
-    return [
-        *times,
-        " / ".join(f"{figure:.1f}" for figure in cpu),
-        " / ".join(f"{figure:.0f}" for figure in memory),
-        "" if lost is None else f"{lost:.1f}",
-        str(row.n),
-    ]
+def _conditions(cell: Cell) -> tuple[str, str]:
+    return str(cell.params["size"]), readers(int(cell.params["readers"] or 0))
 
 
-def _median(figures: Sequence[float]) -> float:
-    return statistics.median(figures) if figures else math.nan
+def _order(cell: Cell) -> tuple[int, int, int]:
+    size, count = parse_size(str(cell.params["size"])), int(cell.params["readers"] or 0)
+    return size.bytes, count, VARIANTS.index(variant_of(cell.variant))
+
+
+def _columns(cell: Cell) -> list[str]:
+    times, n = [figure(cell.percentile(percent)) for percent in (50, 99, 100)], str(len(cell.samples))
+    if cell.variant == "memcpy":
+        return [*times, _figure(cell.figures["cpu_reader"]), "", "", n]
+    broker = cell.figures["cpu_broker"]
+    cpu = [cell.figures["cpu_writer"], cell.figures["cpu_reader"], *([] if broker is None else [broker])]
+    memory = [cell.figures["memory_writer_mb"], cell.figures["memory_reader_mb"]]
+    return [*times, " / ".join(map(_figure, cpu)), " / ".join(map(_figure, memory)), str(cell.lost), n]
+
+
+def _figure(value: Value) -> str:
+    return "–" if not isinstance(value, (int, float)) else f"{value:.0f}" if value >= 20 else f"{value:.1f}"
+
+
+def _median(figures: Sequence[float | None]) -> float | None:
+    known = [one for one in figures if one is not None]
+    return rounded(statistics.median(known), 2) if known else None

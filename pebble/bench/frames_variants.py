@@ -71,22 +71,38 @@ class Case:
     variant: str
     size: Size
     readers: int
+    role: str = ""  # what it is called in place of its variant, where one variant plays several
+    slower_us: float = 0.0  # what the writer holds each frame up for
 
     def __str__(self) -> str:
-        return f"{self.variant} {self.size}, {self.readers} {'reader' if self.readers == 1 else 'readers'}"
+        return f"{self.name} {self.size}, {readers(self.readers)}"
+
+    @property
+    def name(self) -> str:
+        return self.role or self.variant
 
     @property
     def needs_broker(self) -> bool:
         return self.variant == "mqtt"
+
+    @property
+    def needs_writer_first(self) -> bool:
+        """shmsrc gives up where nobody listens; the others wait."""
+        return self.variant == "gstreamer-shm"
 
     def command(self, role: str, folder: Path, port: int) -> list[str]:
         """The process for ``role`` (writer or reader); sockets go into ``folder``, the broker listens on ``port``."""
         if self.variant == "gstreamer-shm":
             program = str(Path(__file__).with_name("frames_gstreamer.py"))
             where = [str(folder / "gst.sock"), str(self.size.width), str(self.size.height)]
-            return [_SYSTEM_PYTHON, program, role, *where]
+            return [_SYSTEM_PYTHON, program, role, *where, str(self.slower_us)]
         where = [str(port) if self.needs_broker else str(folder), str(self.size)]
-        return [sys.executable, "-m", "pebble.bench.frames_worker", self.variant, role, *where]
+        return [sys.executable, "-m", "pebble.bench.frames_worker", self.variant, role, *where, str(self.slower_us)]
+
+
+def readers(count: int) -> str:
+    """For people."""
+    return "one reader" if count == 1 else f"{count} readers"
 
 
 def missing(variant: str) -> str | None:

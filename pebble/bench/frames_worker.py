@@ -1,6 +1,7 @@
-"""One end of one way of sending frames, as a process: ``python -m pebble.bench.frames_worker VARIANT ROLE WHERE SIZE``.
+"""One end of one way of sending frames, as a process.
 
-``WHERE`` is a folder for sockets, or a broker's port; ``SIZE`` is ``640x480``.
+``python -m pebble.bench.frames_worker VARIANT ROLE WHERE SIZE SLOWER_US``: ``WHERE`` is a folder for sockets, or a
+broker's port; ``SIZE`` is ``640x480``; a writer holds each frame up for ``SLOWER_US``.
 """
 
 from __future__ import annotations
@@ -144,7 +145,7 @@ def _mqtt(port: int, on_message: Any) -> Any:
 
 
 def main(arguments: list[str]) -> int:
-    variant, role, where, size_ = arguments
+    variant, role, where, size_, slower_us = arguments
     width, _, height = size_.partition("x")
     size = int(width) * int(height) * 3
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -152,7 +153,7 @@ def main(arguments: list[str]) -> int:
         memlock.lockable = lambda size: False  # noqa: ARG005
     orders = frames_loop.Orders()
     if role == "writer":
-        frames_loop.write(_writer(variant, where, size), size, orders)
+        frames_loop.write(_writer(variant, where, size), size, orders, slower_us=float(slower_us))
     else:
         frames_loop.read(_reader(variant, where), orders, bare_copy=size if variant == "memcpy" else 0)
     return 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from pebble.bench.ratios import Interval, paired
+from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell
 
 AGAIN, SLOWED = " again", " +20 %"
@@ -50,8 +50,20 @@ def intervals(cells: Sequence[Cell]) -> list[tuple[Cell, Interval]]:
 
 
 def verdict(cells: Sequence[Cell]) -> list[str]:
-    """A line for each; ``MISSED`` where the comparison was fooled."""
-    return [_line(cell, interval) for cell, interval in intervals(cells)]
+    """A line for each, ``MISSED`` where it was fooled, and the aim. With too few rounds nobody is judged."""
+    found = intervals(cells)
+    if any(interval.few for _, interval in found):
+        return [*(_ratio(cell, interval) for cell, interval in found), f"Not judged: that takes {LEAST_ROUNDS} rounds."]
+    outcome = "met" if passed(cells) else "missed"
+    told = ", ".join(f"{cell.variant} {interval}" for cell, interval in found)
+    lines = [_line(cell, interval) for cell, interval in found]
+    return [*lines, f"aim: no difference seen where none is, and the planted 20 % seen: {outcome} ({told})"]
+
+
+def judged(cells: Sequence[Cell]) -> bool:
+    """Passed, or too few rounds to say so; False where nothing was measured."""
+    found = intervals(cells)
+    return bool(found) and (passed(cells) or any(interval.few for _, interval in found))
 
 
 def passed(cells: Sequence[Cell]) -> bool:
@@ -66,5 +78,8 @@ def _as_it_is(cell: Cell, interval: Interval) -> bool:
 
 def _line(cell: Cell, interval: Interval) -> str:
     expected = "the planted 20 % were seen" if is_slowed(cell.variant) else "equal, as they are"
-    what = f"{cell.measure}, {cell.conditions()}: {cell.variant} / {variant_of(cell.variant)} = {interval}"
-    return f"{what}: {expected if _as_it_is(cell, interval) else 'MISSED'}"
+    return f"{_ratio(cell, interval)}: {expected if _as_it_is(cell, interval) else 'MISSED'}"
+
+
+def _ratio(cell: Cell, interval: Interval) -> str:
+    return f"{cell.measure}, {cell.conditions()}: {cell.variant} / {variant_of(cell.variant)} = {interval}"

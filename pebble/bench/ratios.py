@@ -27,17 +27,28 @@ _Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A ratio, and where it lies with a certainty of ``level``; NaN where nothing was measured."""
+    """A ratio, and where it lies with a certainty of ``level``; NaN where nothing was measured.
+
+    With fewer than ``LEAST_ROUNDS`` nobody knows where it lies.
+    """
 
     ratio: float
     low: float
     high: float
     level: float = LEVEL
+    rounds: int = LEAST_ROUNDS
 
     def __str__(self) -> str:
         if math.isnan(self.ratio):
             return "–"
-        return f"{self.ratio:.2f} ({self.low:.2f} to {self.high:.2f})"
+        if self.few:
+            return _digits(self.ratio)
+        return f"{_digits(self.ratio)} ({_digits(self.low)} to {_digits(self.high)})"
+
+    @property
+    def few(self) -> bool:
+        """Are there too few rounds to tell?"""
+        return self.rounds < LEAST_ROUNDS
 
     @property
     def equal(self) -> bool:
@@ -48,6 +59,8 @@ class Interval:
         """``zenoh is faster than mqtt: 0.55 (0.51 to 0.58) of its time``, or that they are equal within noise."""
         if math.isnan(self.ratio):
             return f"{ours} and {theirs}: nothing was measured"
+        if self.few:
+            return f"{ours} / {theirs} = {self}, of {self.rounds} rounds: too few to tell"
         if self.equal:
             return f"{ours} and {theirs} are equal within noise: {self}"
         return f"{ours} is {less if self.high < 1 else what} than {theirs}: {self} of its figure"
@@ -66,7 +79,7 @@ def paired(
         if a and b and percentile(b, percent) > 0
     ]
     if not ratios:
-        return Interval(math.nan, math.nan, math.nan, level)
+        return Interval(math.nan, math.nan, math.nan, level, 0)
     logs = np.log(ratios)
     picked = _generator().integers(0, len(logs), (_RESAMPLES, len(logs)))
     return _interval(float(np.median(logs)), np.median(logs[picked], axis=1), len(logs), level)
@@ -84,7 +97,7 @@ def unpaired(
         for rounds in (ours, theirs)
     )
     if not len(a) or not len(b):
-        return Interval(math.nan, math.nan, math.nan, level)
+        return Interval(math.nan, math.nan, math.nan, level, 0)
     generator = _generator()
     resampled = [np.median(logs[generator.integers(0, len(logs), (_RESAMPLES, len(logs)))], axis=1) for logs in (a, b)]
     return _interval(float(np.median(a) - np.median(b)), resampled[0] - resampled[1], min(len(a), len(b)), level)
@@ -92,11 +105,17 @@ def unpaired(
 
 def _interval(ratio: float, resampled: _Floats, rounds: int, level: float) -> Interval:
     """Few rounds tell little of their own spread: the interval is widened as Student's is against the normal one."""
+    if rounds < 2:
+        return Interval(math.exp(ratio), 0.0, math.inf, level, rounds)
     tail = (1 - level) / 2
     z, freedom = NormalDist().inv_cdf(1 - tail), max(1, rounds - 1)
     wider = 1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(resampled, [tail, 1 - tail]))
-    return Interval(math.exp(ratio), math.exp(low), math.exp(high), level)
+    return Interval(math.exp(ratio), math.exp(low), math.exp(high), level, rounds)
+
+
+def _digits(ratio: float) -> str:
+    return f"{ratio:.2f}" if ratio >= 0.1 else f"{ratio:.2g}"
 
 
 def _generator() -> np.random.Generator:

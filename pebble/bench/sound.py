@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
+from pebble.bench import output
+from pebble.bench.results import Cell, Stopwatch
+from pebble.bench.tables import plain_table
 from pebble.contract import AUDIO
 from pebble.errors import PebbleError
 from pebble.media.opus import BUNDLE_LIMIT
@@ -27,6 +28,7 @@ _IP, _TCP = 20, 32  # bytes; version 4 without options, TCP with time stamps as 
 _CHUNK_MS = 20
 _DELAY_S = 0.02  # at most, of codec and resampler, when both sounds are compared
 _STEP_S = 0.02  # of an envelope
+_FIGURES = ("packets_per_s", "payload_kbits", "ratio", "likeness", "encode_cpu", "decode_cpu")
 
 Wave = npt.NDArray[np.float64]
 
@@ -55,7 +57,7 @@ def wire_bytes(payload: int, topic: str = TOPIC) -> int:
 
 
 def run(
-    json_file: Path | None = None,
+    folder: Path = output.FOLDER,
     seconds: float = 10.0,
     *,
     rate: int = 16_000,
@@ -67,12 +69,16 @@ def run(
         raise PebbleError("Opus needs PyAV, which is not installed: pip install 'pebble-robot[media]'")
     if seconds < 1:
         raise PebbleError("seconds must be 1 at least")
+    console = console or Console()
+    output.check_folder(folder)
+    watch = Stopwatch("sound", ["pebble", "bench", "sound"], {"seconds": seconds, "rate": rate})
     rows = list(measure(seconds, rate, bitrates))
-    (console or Console()).print(table(rows, rate))
-    if json_file is not None:
-        json_file.write_text(json.dumps({"rows": [_as_json(row, rate) for row in rows]}, indent=1) + "\n")
-    usual = [row.ratio for row in rows if row.encoding == "opus" and row.bundle > 1]
-    return 0 if max(usual) <= AIM else 1
+    console.print(table(rows, rate))
+    most = max(row.ratio for row in rows if row.encoding == "opus" and row.bundle > 1)
+    met = "met" if most <= AIM else "missed"
+    verdict = [f"aim: Opus with several parts in a packet takes at most {AIM} of PCM's bytes: {most:.3f}, {met}"]
+    output.finish(watch.results([_cell(row) for row in rows], verdict), folder, console)
+    return 0 if most <= AIM else 1
 
 
 def measure(seconds: float, rate: int, bitrates: Sequence[int]) -> Iterator[Row]:
@@ -139,18 +145,9 @@ def _envelope(wave: Wave, rate: int) -> Wave:
 
 
 def table(rows: Sequence[Row], rate: int) -> Table:
-    shown = Table(title=f"Sound of {rate / 1000:g} kHz mono on the wire, chunks of {_CHUNK_MS} ms, topic {TOPIC}")
-    for heading in (
-        "encoding",
-        "parts",
-        "packets/s",
-        "payload kbit/s",
-        "wire kbit/s",
-        "× PCM",
-        "likeness",
-        "CPU enc/dec",
-    ):
-        shown.add_column(heading, justify="left" if heading == "encoding" else "right")
+    title = f"Sound of {rate / 1000:g} kHz mono on the wire, chunks of {_CHUNK_MS} ms"
+    heads = ("encoding", "parts", "packets/s", "payload", "wire", "× PCM", "likeness", "CPU %")
+    shown = plain_table(title, heads)
     for row in rows:
         shown.add_row(
             row.encoding + (f" {row.bitrate // 1000} kbit/s" if row.bitrate else ""),
@@ -160,17 +157,25 @@ def table(rows: Sequence[Row], rate: int) -> Table:
             f"{row.wire_kbits:.1f}",
             f"{row.ratio:.3f}",
             f"{row.likeness:.3f}",
-            f"{100 * row.encode_cpu:.1f} / {100 * row.decode_cpu:.1f} %",
+            f"{100 * row.encode_cpu:.1f} / {100 * row.decode_cpu:.1f}",
         )
-    shown.caption = "likeness: correlation of the samples for pcm, of the envelopes in steps of 20 ms for opus"
+    shown.caption = (
+        f"payload, wire: kbit/s, topic {TOPIC}; CPU: encoder / decoder\n"
+        "likeness: correlation of samples for pcm, of envelopes in steps of 20 ms for opus"
+    )
+    shown.caption_justify = "left"
     return shown
 
 
-def _as_json(row: Row, rate: int) -> dict[str, Any]:
-    values = asdict(row)
-    names = ("bitrate", "bundle")
-    return {
-        "variant": values.pop("encoding"),
-        "params": {"rate": rate, **{name: values.pop(name) for name in names}},
-        **values,
-    }
+def _cell(row: Row) -> Cell:
+    """Bytes are the same in every run with the same programs: one figure is all there is to know."""
+    parts = "1 part" if row.bundle == 1 else f"{row.bundle} parts"
+    figures = asdict(row)
+    return Cell(
+        variant=figures.pop("encoding"),
+        params={"bitrate": f"{row.bitrate // 1000} kbit/s", "packet": parts} if row.bitrate else {},
+        measure="wire",
+        unit="kbit/s",
+        rounds=[[figures.pop("wire_kbits")]],
+        figures={name: round(figures[name], 4) for name in _FIGURES},
+    )

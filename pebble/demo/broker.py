@@ -7,6 +7,7 @@ import shutil
 import socket
 import sys
 import threading
+from collections.abc import Sequence
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,9 +27,10 @@ class BrokerKind(StrEnum):
 class Broker:
     """A running broker; ``program`` is to be ended by whoever made it."""
 
-    def __init__(self, name: str, kind: BrokerKind, folder: Path) -> None:
+    def __init__(self, name: str, kind: BrokerKind, folder: Path, extra: Sequence[str] = ()) -> None:
+        """``extra``: more lines for mosquitto's configuration; amqtt has none."""
         self.port = _free_port()
-        command = _mosquitto(self.port, folder / name) if kind is BrokerKind.MOSQUITTO else _amqtt(self.port)
+        command = _mosquitto(self.port, folder / name, extra) if kind is BrokerKind.MOSQUITTO else _amqtt(self.port)
         self.program = Program(name, command, folder / f"{name}.log")
 
     def wait(self, ending: threading.Event) -> None:
@@ -58,12 +60,12 @@ def _mosquitto_path() -> str | None:
     return shutil.which("mosquitto") or shutil.which("mosquitto", path=_SBIN)
 
 
-def _mosquitto(port: int, stem: Path) -> list[str]:
+def _mosquitto(port: int, stem: Path, extra: Sequence[str]) -> list[str]:
     path = _mosquitto_path()
     if path is None:
         raise PebbleError("mosquitto is not installed: apt install mosquitto")
     config = stem.with_suffix(".conf")
-    lines = [f"listener {port} 127.0.0.1", "allow_anonymous true", "log_dest stderr"]
+    lines = [f"listener {port} 127.0.0.1", "allow_anonymous true", "log_dest stderr", *extra]
     if os.geteuid() == 0:
         lines.append("user root")  # a change of user would undo the tie to our life that Program made
     config.write_text("\n".join(lines) + "\n")

@@ -49,6 +49,7 @@ def _run(options: argparse.Namespace) -> int:
         options.kind,
         options.link,
         trace=options.trace,
+        trace_said=options.trace_said,
         failsafe_s=options.failsafe,
         charging=options.charging,
         uid=options.uid,
@@ -94,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--link", type=Path, required=True, help="symlink to make: the path of the serial port")
     parser.add_argument("--trace", type=Path, help="file to append every received line to, with its time")
+    parser.add_argument("--trace-said", action="store_true", help="also every line of the MCU that the host took")
     parser.add_argument(
         "--failsafe", type=float, metavar="S", help="stop after this silence, instead of the firmware's own"
     )

@@ -39,7 +39,7 @@ class PtyMcu:
 
     The symlink's folder must exist; only a symlink is replaced. Unplugging takes the link to the host away, not the
     MCU's power: its motors stop by failsafe, as on a robot whose MCU hangs on the battery. Each replug makes a new pty
-    behind the same symlink.
+    behind the same symlink. With ``trace_said`` the trace also has what the host took of the MCU's own lines.
     """
 
     def __init__(
@@ -48,6 +48,7 @@ class PtyMcu:
         link: Path,
         *,
         trace: Path | None = None,
+        trace_said: bool = False,
         failsafe_s: float | None = None,
         charging: bool = False,
         uid: bytes = UID,
@@ -59,7 +60,9 @@ class PtyMcu:
             kind, time.monotonic(), failsafe_s=failsafe_s, charging=charging, uid=uid, on_motors=self._moved
         )
         self._tick_s = self._mcu.profile.tick_s
-        self._splitter = LineSplitter(_TRACED_LINE) if self._mcu.profile.is_text else None
+        is_text = self._mcu.profile.is_text
+        self._splitter = LineSplitter(_TRACED_LINE) if is_text else None
+        self._said = LineSplitter(_TRACED_LINE) if is_text and trace_said else None
         self._master: int | None = None
         self._tty = ""
         self._host = False
@@ -178,20 +181,23 @@ class PtyMcu:
         except OSError:  # hung up in this very moment
             return
         arrived = time.monotonic_ns()
-        for line in self._splitter.feed(data) if self._splitter is not None else ():
-            if text := line.strip().decode("utf-8", "backslashreplace"):  # blank lines say nothing to an MCU
-                self.trace.add(Entry(arrived, "line", text))
+        if self._splitter is not None:
+            self._record(arrived, "line", self._splitter.feed(data))
         self._transmit(self._mcu.receive(data, arrived / 1e9))
 
     def _transmit(self, data: bytes) -> None:
         """As a USB device does: what no host takes is lost."""
         if not data:
             return
-        sent = 0
+        sent, began = 0, time.monotonic_ns()
         if self._host and self._master is not None:
             with suppress(OSError):  # the host's buffer is full, or it has just closed
                 sent = os.write(self._master, data)
         self.dropped += len(data) - sent
+        if self._said is not None:
+            self._record(began, "said", self._said.feed(data[:sent]))
+            if sent < len(data):
+                self._said.reset()  # the host never gets the rest of this line
 
     def _answer(self) -> None:
         with suppress(queue.Empty):
@@ -232,6 +238,11 @@ class PtyMcu:
 
     def _moved(self, now: float, motors: Pair) -> None:
         self.trace.add(motors_entry(round(now * 1e9), motors))
+
+    def _record(self, ns: int, event: Event, lines: list[bytes]) -> None:
+        for line in lines:
+            if text := line.strip().decode("utf-8", "backslashreplace"):  # blank lines say nothing
+                self.trace.add(Entry(ns, event, text))
 
     def _note(self, event: Event) -> None:
         self.trace.add(Entry(time.monotonic_ns(), event))

@@ -1,4 +1,4 @@
-"""A record of what reached a simulated MCU, what it did to its motors, and when."""
+"""A record of what reached a simulated MCU, what it did to its motors, what it said, and when."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ import msgspec
 
 _KEPT = 100_000  # entries in memory; a file keeps all
 
-Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors"]
+Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "said"]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line from the host, a change of the link or of the motors.
+    """One line from the host or (``said``) to it, a change of the link or of the motors.
 
-    ``ns`` is time.monotonic_ns() when the line's last byte arrived, or when the outputs changed. The line of ``motors``
-    is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot, however its motors are mounted.
+    ``ns`` is time.monotonic_ns() when the line's last byte arrived, just before it was written, or when the outputs
+    changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot, however
+    its motors are mounted.
     """
 
     ns: int

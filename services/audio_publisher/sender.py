@@ -16,7 +16,7 @@ from pebble.transports.frames import FrameInfo
 
 log = logging.getLogger(__name__)
 
-WAITING_LIMIT_S: Final = 0.2  # of the oldest packet on the link, beyond a round trip: then the newest are dropped
+WAITING_LIMIT_S: Final = 0.5  # of the oldest packet on the link, beyond a round trip: then the newest are dropped
 
 
 class Sender:

@@ -1,73 +1,201 @@
-"""Driving a whole robot for a moment, and what is told of it."""
+"""Short real runs of the control comparison: real processes, brokers and hubs, and nothing of them afterwards."""
 
 import io
-import json
 import math
 import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import control
-from pebble.bench.control import LOADED, UNLOADED, Plan, Row, ratios
-from pebble.bench.control_operator import wheels
+from pebble.bench import control, control_far, output
+from pebble.bench.control_cast import Cast
+from pebble.bench.control_ends import Order
+from pebble.bench.control_far import BACK, THERE, FarPlan
+from pebble.bench.control_plan import Plan
+from pebble.bench.control_report import ONE_WAY, ROUND_TRIP
+from pebble.bench.control_variants import VARIANTS
+from pebble.bench.results import load
 from pebble.bench.usage import children
 from pebble.errors import PebbleError
+from pebble.transports import MqttSettings
+from tests.support import ROOT, Broker, Child, until
+
+SHIFT_NS = 1_500_000_000
+ECHO = f"""
+import sys
+from pebble.bench.control_far import serve, wall_clock
+from pebble.transports import MqttSettings
+wall = wall_clock()
+serve(MqttSettings(host="127.0.0.1", port=int(sys.argv[1])), lambda: wall() + {SHIFT_NS})
+"""
 
 
-def test_no_two_commands_are_alike_within_hours() -> None:
-    assert len({wheels(number) for number in range(100_000)}) == 100_000
+def command(*options: str) -> list[str]:
+    return [sys.executable, "-m", "pebble.cli", "bench", "control", *options]
 
 
-def test_every_command_makes_both_wheels_turn_and_none_too_fast() -> None:
-    assert all(0.1 <= side < 0.9 for number in range(0, 640_000, 997) for side in wheels(number))
+@pytest.fixture
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have tests of their own."""
+    monkeypatch.setattr(output, "find_spec", lambda _name: None)
 
 
-def test_json_has_the_figures_of_a_row() -> None:
-    row = Row(kind="zenoh", load=LOADED, latencies_ms=[1.0, 2.0, 30.0], sent=4, cpu=[20.0], flowed={"frames": 29.97})
-    assert row.as_json() == {
-        "variant": "zenoh",
-        "params": {"load": "media"},
-        "n": 3,
-        "lost": 1,
-        "p50_ms": 2.0,
-        "p99_ms": 30.0,
-        "max_ms": 30.0,
-        "cpu": 20.0,
-        "frames_per_s": 30.0,
-    }
+@pytest.fixture
+def temporary(tmp_path: Path) -> Path:
+    """Where the bench makes its folders; short, because of unix sockets."""
+    folder = tmp_path / "t"
+    folder.mkdir()
+    return folder
 
 
-def test_a_row_in_which_nothing_arrived_is_json_too() -> None:
-    assert json.dumps(Row(kind="mqtt", load=UNLOADED).as_json(), allow_nan=False)
-    assert math.isnan(Row(kind="mqtt", load=UNLOADED).percentile(50))
+def test_all_variants_alone_and_beside_a_busy_process(temporary: Path, tmp_path: Path) -> None:
+    options = ("--sizes", "40", "--rates", "200", "--loads", "none,hog", "--seconds", "0.1", "--rounds", "1")
+    ended = subprocess.run(
+        command(*options, "--output", str(tmp_path / "out")),
+        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, capture_output=True, text=True, timeout=100,
+        check=False,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    results = load(tmp_path / "out" / "control.json")
+    conditions = [(measure, load_) for measure in (ONE_WAY, ROUND_TRIP) for load_ in ("none", "hog")]
+    measured = [(cell.measure, cell.params["load"], cell.variant) for cell in results.cells]
+    assert measured == [(*condition, variant) for condition in conditions for variant in VARIANTS]
+    assert all(0 < len(cell.samples) <= 20 and min(cell.samples) > 0 for cell in results.cells)
+    assert results.command[3:] == list(options)
+    assert list(temporary.iterdir()) == []
 
 
-def test_the_ratio_needs_both_loads() -> None:
-    slow, fast = (
-        Row(kind="zenoh", load=LOADED, latencies_ms=[3.0]),
-        Row(kind="zenoh", load=UNLOADED, latencies_ms=[2.0]),
-    )
-    assert ratios([fast, slow]) == ["zenoh: p99 with media / without: 1.50"]
-    assert ratios([fast]) == []
+@pytest.mark.usefixtures("no_plots")
+def test_pictures_flow_beside_the_messages_and_replies_take_longer_than_the_way_there(tmp_path: Path) -> None:
+    plan = Plan.of(
+        variants=["mqtt", "zenoh-p2p"], sizes=[1024], rates=[100.0], loads=["media"], seconds=0.1, rounds=1,
+        output=tmp_path,
+    )  # fmt: skip
+    assert control.run(plan, Console(file=io.StringIO())) == 0
+    cells = load(tmp_path / "control.json").cells
+    assert [cell.variant for cell in cells] == ["mqtt", "zenoh-p2p"] * 2
+    assert all(cell.figures["pictures_hz"] is not None for cell in cells)
+    for there, back in zip(cells[:2], cells[2:], strict=True):
+        assert all(a < b for a, b in zip(there.samples, back.samples, strict=True))
+
+
+def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
+    options = ("--seconds", "60", "--variants", "mqtt,zenoh-p2p", "--loads", "media", "--output", str(tmp_path / "out"))
+    bench = subprocess.Popen(
+        command(*options), env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        assert until(lambda: len(children(bench.pid)) == 10, 30)
+        started = children(bench.pid)
+        bench.send_signal(signal.SIGINT)
+        assert bench.wait(30) == 130
+    finally:
+        bench.kill()
+        bench.wait()
+    assert until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started), 10)
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_process_that_dies_is_named() -> None:
+    with Cast(["mqtt"], ["none"]) as cast:
+        lines = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in children(os.getpid())}
+        os.kill(next(pid for pid, line in lines.items() if "\0sender\0" in line), signal.SIGKILL)
+        with pytest.raises(PebbleError, match="mqtt: sender ended with code -9"):
+            cast.run("mqtt", Order(size=40, rate=100.0, seconds=0.1), "none")
+
+
+# -- another machine
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path)
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def settings(broker: Broker) -> MqttSettings:
+    return MqttSettings(host="127.0.0.1", port=broker.port)
+
+
+@pytest.fixture
+def echo(broker: Broker) -> Iterator[Child]:
+    """A process whose clock is ahead."""
+    child = Child([sys.executable, "-c", ECHO, str(broker.port)], cwd=ROOT, stdout=subprocess.PIPE)
+    assert b"until Ctrl-C" in child.stdout.readline()
+    yield child
+    child.kill()
+    child.communicate()
+
+
+@pytest.mark.usefixtures("echo", "no_plots")
+def test_a_far_clock_is_found_within_its_error(settings: MqttSettings, tmp_path: Path) -> None:
+    said = io.StringIO()
+    plan = FarPlan.of(sizes=[40], rates=[200.0], seconds=0.3, rounds=2, output=tmp_path)
+    assert control_far.measure(plan, settings, Console(file=said, width=80)) == 0
+    round_trip, there, back = load(tmp_path / "control-far.json").cells
+    assert [cell.measure for cell in (round_trip, there, back)] == [ROUND_TRIP, THERE, BACK]
+    offset, error = there.figures["clock_offset_ms"], there.figures["clock_error_ms"]
+    assert isinstance(offset, float)
+    assert isinstance(error, float)
+    assert abs(offset - SHIFT_NS / 1e6) <= error + 0.001
+    assert str(there.params["clocks"]).startswith("± ")
+    assert "the far clock is +1" in said.getvalue()
+
+
+def test_the_echo_ends_with_ctrl_c(broker: Broker) -> None:
+    line = [sys.executable, "-m", "pebble.cli", "bench", "echo", f"mqtt://127.0.0.1:{broker.port}"]
+    with Child(line, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as echo:
+        assert b"until Ctrl-C" in echo.stdout.readline()
+        echo.send_signal(signal.SIGINT)
+        assert echo.wait(20) == 130
+        assert b"Traceback" not in echo.stderr.read()
+
+
+def test_a_far_echo_that_is_not_there_is_said(
+    settings: MqttSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_far, "_ANSWER_S", 0.3)
+    with pytest.raises(PebbleError, match="run `pebble bench echo URL` on the other machine"):
+        control_far.measure(FarPlan.of(output=tmp_path), settings, Console(file=io.StringIO()))
+
+
+def test_one_way_times_that_the_clocks_error_hides_are_unknown() -> None:
+    way = control_far.Way(40, 20.0)
+    way.sent, way.rounds, way.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [control_far.Offset(0, 10)]
+    round_trip, there, back = control_far.cells_of(way)
+    assert round_trip.samples == [2e-5]
+    assert there.samples == back.samples == []
+    assert any("one-way there: unknown" in line for line in control_far.verdict([way]))
+
+
+def test_clocks_that_could_not_be_compared_leave_the_round_trips() -> None:
+    way = control_far.Way(40, 20.0)
+    way.sent, way.rounds, way.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [None]
+    assert math.isnan(way.error_ms)
+    assert [len(cell.samples) for cell in control_far.cells_of(way)] == [1, 0, 0]
+    assert "one-way times are unknown" in control_far.verdict([way])[-1]
 
 
 @pytest.mark.parametrize(
-    "plan", [Plan(kinds=["carrier-pigeon"]), Plan(kinds=[]), Plan(seconds=0.0), Plan(rounds=0), Plan(seconds=math.inf)]
+    "options",
+    [
+        ("--far", "zenoh:/tmp"),
+        ("--far", "mqtt://user:secret@127.0.0.1"),
+        ("--far", "mqtt://127.0.0.1", "--loads", "media"),
+        ("--sizes", "big"),
+        ("--variants", "nats"),
+    ],
 )
-def test_nonsense_is_refused_before_anything_starts(plan: Plan) -> None:
-    with pytest.raises(PebbleError):
-        control.run(plan, Console(file=io.StringIO()))
-
-
-def test_a_whole_robot_is_driven_and_leaves_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(control, "_SETTLE_S", 0.5)
-    file, said = tmp_path / "control.json", io.StringIO()
-    plan = Plan(seconds=1.0, rounds=1, kinds=["zenoh"], json=file)
-    assert control.run(plan, Console(file=said, width=100)) == 0
-    (row,) = json.loads(file.read_text())["rows"]
-    assert (row["variant"], row["params"], row["n"] + row["lost"]) == ("zenoh", {"load": "none"}, 20)
-    assert 0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
-    assert "zenoh" in said.getvalue()
-    assert children(os.getpid()) == []
+def test_options_that_make_no_sense_are_refused(options: tuple[str, ...]) -> None:
+    ended = subprocess.run(command(*options), cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
+    assert ended.returncode == 1
+    assert "secret" not in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pebble.bench.figures import percentile, ratio, rounded
+from pebble.bench.figures import percentile, rounded
 
 
 @pytest.mark.parametrize(
@@ -31,8 +31,3 @@ def test_json_gets_no_nan() -> None:
     assert rounded(None, 1) is None
     assert rounded(1.26, 1) == 1.3
     assert rounded(7, 1) == 7
-
-
-def test_nothing_is_no_divisor() -> None:
-    assert ratio(1.0, 2.0) == "0.50"
-    assert ratio(1.0, 0.0) == "–"

@@ -1,7 +1,6 @@
 """Short real comparisons: real processes, real brokers, and nothing of them afterwards."""
 
 import io
-import json
 import os
 import signal
 import subprocess
@@ -15,11 +14,10 @@ from rich.console import Console
 from pebble.bench import frames, frames_variants
 from pebble.bench.frames import Plan
 from pebble.bench.frames_variants import Case, Size, parse_size
+from pebble.bench.results import load
 from pebble.bench.usage import children
 from pebble.errors import PebbleError
 from tests.support import ROOT, until
-
-KEYS = {"variant", "params", "n", "p50_us", "p99_us", "max_us", "cpu_writer", "cpu_reader"}
 
 
 def command(*options: str) -> list[str]:
@@ -48,26 +46,29 @@ def temporary(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_short_run_of_everything_that_needs_no_gstreamer(temporary: Path, tmp_path: Path) -> None:
-    file = tmp_path / "frames.json"
-    options = ("--seconds", "1", "--rounds", "1", "--size", "64x48", "--readers", "1", "--json", str(file))
-    names = ["zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt"]
+def test_a_short_run_leaves_results_and_nothing_else(temporary: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    options = ("--seconds", "0.3", "--rounds", "2", "--size", "64x48", "--readers", "1", "--output", str(folder))
+    names = ["zenoh-shm", "zenoh-net", "mqtt"]
     ended = subprocess.run(
         command(*options, "--variants", ",".join(names)),
-        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
+        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert ended.returncode == 0, ended.stdout + ended.stderr
-    rows = json.loads(file.read_text())["rows"]
-    assert [row["variant"] for row in rows] == names
-    assert all(row.keys() >= KEYS for row in rows)
-    assert all(row["params"] == {"size": "64x48", "readers": 1} for row in rows)
-    assert all(row["n"] > 10 and 0 < row["p50_us"] <= row["p99_us"] <= row["max_us"] for row in rows)
-    assert "zenoh-shm" in ended.stdout
+    results = load(folder / "frames.json")
+    assert [cell.variant for cell in results.cells] == names
+    assert all(cell.params == {"size": "64x48", "readers": 1} for cell in results.cells)
+    assert all([len(samples) > 3 for samples in cell.rounds] == [True, True] for cell in results.cells)
+    assert all(min(cell.samples) > 0 and cell.lost is not None and cell.lost >= 0 for cell in results.cells)
+    assert len(results.verdict) == 3  # against two others, and that two rounds are few
+    assert all(line in ended.stdout for line in results.verdict)
+    assert results.command[:3] == ["pebble", "bench", "frames"]
     assert list(temporary.iterdir()) == []
 
 
-def test_frames_in_shared_memory_arrive_whole_at_every_reader() -> None:
-    round_ = frames.run_case(Case("zenoh-shm", Size(320, 240), 2), 0.5)
+@pytest.mark.parametrize("variant", ["zenoh-shm", "zenoh-copy"])
+def test_frames_in_shared_memory_arrive_whole_at_every_reader(variant: str) -> None:
+    round_ = frames.run_case(Case(variant, Size(320, 240), 2), 0.5)
     assert len(round_.latencies_us) > 10
     assert (round_.torn, round_.fallbacks) == (0, 0)
     assert round_.memory_reader_mb > 0
@@ -82,7 +83,7 @@ def test_the_bare_copy_is_nobody_s_cpu_but_the_copier_s() -> None:
 
 def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
     bench = subprocess.Popen(
-        command("--seconds", "30", "--size", "160x120", "--variants", "zenoh-copy"),
+        command("--output", str(temporary.parent), "--seconds", "30", "--size", "160x120", "--variants", "zenoh-copy"),
         env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
@@ -103,7 +104,7 @@ def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
 
 def test_workers_end_with_a_killed_bench(temporary: Path) -> None:
     bench = subprocess.Popen(
-        command("--seconds", "30", "--size", "160x120", "--variants", "zenoh-net"),
+        command("--output", str(temporary.parent), "--seconds", "30", "--size", "160x120", "--variants", "zenoh-net"),
         env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
@@ -135,12 +136,14 @@ def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(
         Plan(variants=["zenoh"]),
         Plan(seconds=0.0),
         Plan(seconds=float("nan")),
-        Plan(rounds=0),
+        Plan(rounds=1),
         Plan(readers=[0]),
         Plan(sizes=["big"]),
         Plan(sizes=["1x1"]),
         Plan(sizes=["30x30"]),
-        Plan(json=Path("/nowhere/x.json")),
+        Plan(variants=[]),
+        Plan(variants=["mqtt", "mqtt"]),
+        Plan(output=Path("/dev/null/x")),
     ],
 )
 def test_nonsense_is_refused_before_anything_starts(plan: Plan) -> None:
@@ -150,3 +153,10 @@ def test_nonsense_is_refused_before_anything_starts(plan: Plan) -> None:
 
 def test_sizes_are_written_with_either_sign() -> None:
     assert parse_size("640×480") == parse_size("640x480") == Size(640, 480)
+
+
+def test_the_command_line_of_results_repeats_them(tmp_path: Path) -> None:
+    plan = frames.plan(quick=True, variants=["mqtt"], output=tmp_path)
+    assert " ".join(plan.command()) == (
+        "pebble bench frames --seconds 0.5 --rounds 2 --size 640x480 --readers 1 --variants mqtt --quick"
+    )

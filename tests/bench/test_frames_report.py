@@ -1,10 +1,12 @@
-"""Rounds become rows, rows become JSON, tables and ratios."""
+"""Rounds become cells, cells become tables and plain words."""
 
-import json
 from typing import Any
 
-from pebble.bench.frames_report import Round, as_json, legend, ratios, row_of, tables
+import pytest
+
+from pebble.bench.frames_report import Round, cell_of, legend, tables, verdict
 from pebble.bench.frames_variants import VARIANTS, Case, Size
+from pebble.bench.results import Cell
 
 HD = Size(1920, 1080)
 
@@ -21,61 +23,82 @@ def a_round(*latencies_us: float, **more: Any) -> Round:
     return Round(latencies_us=latencies_us, **{**figures, **more})
 
 
-def test_figures_are_medians_over_the_rounds_and_the_worst_of_all() -> None:
-    row = row_of(Case("zenoh-shm", HD, 1), [a_round(1, 2, 3), a_round(10, 20, 30), a_round(4, 5, 600)])
-    assert (row.n, row.p50_us, row.p99_us, row.max_us) == (9, 5, 30, 600)
+def eight_rounds(variant: str, latency_us: float, **more: Any) -> Cell:
+    return cell_of(Case(variant, HD, 1), [a_round(latency_us + number, **more) for number in range(8)])
 
 
-def test_json_has_the_shape_that_others_read() -> None:
-    row = row_of(Case("zenoh-shm", HD, 3), [a_round(100.04, 200, sent=1)])
-    assert as_json([row]) == {
-        "rows": [
-            {
-                "variant": "zenoh-shm",
-                "params": {"size": "1920x1080", "readers": 3},
-                "n": 2,
-                "p50_us": 100.0,
-                "p99_us": 200,
-                "max_us": 200,
-                "cpu_writer": 2.0,
-                "cpu_reader": 1.0,
-                "cpu_broker": None,
-                "memory_writer_mb": 30.0,
-                "memory_reader_mb": 20.0,
-                "lost_percent": 33.33,
-                "torn": 0,
-                "fallbacks": 0,
-                "rounds": 1,
-            }
-        ]
-    }
+def test_every_round_keeps_its_place_and_its_samples() -> None:
+    cell = cell_of(Case("zenoh-shm", HD, 3), [a_round(1, 2), None, a_round(30)])
+    assert (cell.variant, cell.params) == ("zenoh-shm", {"size": "1920x1080", "readers": 3})
+    assert cell.rounds == [[1, 2], [], [30]]
 
 
-def test_a_case_in_which_nothing_arrived_is_told_as_such() -> None:
-    row = row_of(Case("mqtt", HD, 1), [a_round(sent=30)])
-    said = json.loads(json.dumps(as_json([row])))["rows"][0]
-    assert (said["n"], said["p50_us"], said["lost_percent"]) == (0, None, 100.0)
+def test_cpu_and_memory_are_medians_and_faults_are_counted() -> None:
+    cell = cell_of(
+        Case("mqtt", HD, 1),
+        [
+            a_round(1, cpu_writer=1.0, cpu_broker=7.0, torn=1),
+            a_round(1, cpu_writer=9.0, fallbacks=2),
+            a_round(1, cpu_writer=2.0, cpu_broker=9.0, torn=1),
+        ],
+    )
+    names = ("cpu_writer", "cpu_broker", "memory_reader_mb", "torn", "fallbacks")
+    assert [cell.figures[name] for name in names] == [2.0, 8.0, 20.0, 2, 2]
 
 
-def test_rounds_in_which_something_arrived_are_not_spoiled_by_one_without() -> None:
-    assert row_of(Case("mqtt", HD, 1), [a_round(sent=30), a_round(7.0)]).p50_us == 7.0
+def test_each_reader_is_to_read_each_frame() -> None:
+    cell = cell_of(Case("mqtt", HD, 3), [a_round(1, 1, 1, 1, sent=2), a_round(sent=1)])
+    assert cell.lost == 5
 
 
-def test_ratios_compare_like_with_like() -> None:
-    rows = [
-        row_of(Case("zenoh-shm", HD, 1), [a_round(50, cpu_reader=0.5)]),
-        row_of(Case("gstreamer-shm", HD, 1), [a_round(100)]),
-        row_of(Case("gstreamer-shm", HD, 3), [a_round(1)]),
+def test_a_case_that_never_ran_is_there_and_empty() -> None:
+    cell = cell_of(Case("mqtt", HD, 1), [None] * 8)
+    assert (cell.samples, cell.figures["cpu_reader"], cell.lost) == ([], None, 0)
+    [table] = tables([cell])
+    assert table.row_count == 1
+    assert verdict([eight_rounds("zenoh-shm", 5.0), cell])[0].endswith("nothing was measured")
+
+
+def test_a_role_goes_by_its_own_name() -> None:
+    cell = cell_of(Case("mqtt", HD, 1, role="mqtt again"), [a_round(1)])
+    assert cell.variant == "mqtt again"
+    assert len(list(tables([cell]))) == 1
+
+
+def test_words_compare_like_with_like() -> None:
+    cells = [
+        eight_rounds("zenoh-shm", 500, cpu_reader=0.5),
+        eight_rounds("gstreamer-shm", 1000),
+        eight_rounds("memcpy", 500),
+        cell_of(Case("gstreamer-shm", HD, 3), [a_round(1)] * 8),
     ]
-    assert ratios(rows) == ["zenoh-shm / gstreamer-shm, 1920x1080, readers: 1: p50 0.50, reader's CPU 0.50"]
+    against, memcpy = verdict(cells)
+    assert against.startswith("1920x1080, one reader: zenoh-shm is faster than gstreamer-shm: 0.50 (")
+    assert against.endswith("; a reader's CPU 0.50 % against 1.00 %")
+    assert memcpy.startswith("1920x1080, one reader: zenoh-shm and memcpy are equal within noise: 1.00 (")
+
+
+@pytest.mark.parametrize(("rounds", "lines"), [(7, 2), (8, 1)])
+def test_few_rounds_are_shown_and_not_judged(rounds: int, lines: int) -> None:
+    cells = [cell_of(Case(name, HD, 1), [a_round(5.0)] * rounds) for name in ("zenoh-shm", "mqtt")]
+    assert len(verdict(cells)) == lines
+    assert ("equal within noise" in verdict(cells)[0]) == (lines == 1)
+
+
+def test_frames_that_arrived_otherwise_than_they_should_are_told() -> None:
+    cell = cell_of(Case("zenoh-copy", HD, 3), [a_round(1, torn=2), a_round(1, fallbacks=5)])
+    assert verdict([cell]) == [
+        "1920x1080, 3 readers, zenoh-copy: 2 frames arrived torn",
+        "1920x1080, 3 readers, zenoh-copy: 5 frames could not go through shared memory",
+    ]
 
 
 def test_one_table_for_each_size_and_number_of_readers() -> None:
     small = Size(64, 48)
-    rows = [row_of(Case(name, size, n), [a_round(1)]) for name in VARIANTS for size in (HD, small) for n in (3, 1)]
-    titles = [str(table.title) for table in tables(rows)]
+    cells = [cell_of(Case(name, size, n), [a_round(1)]) for name in VARIANTS for size in (HD, small) for n in (3, 1)]
+    titles = [str(table.title) for table in tables(cells)]
     assert titles == [f"{size} BGR at 30 Hz, {who}" for size in (small, HD) for who in ("one reader", "3 readers")]
-    assert [table.row_count for table in tables(rows)] == [len(VARIANTS)] * 4
+    assert [table.row_count for table in tables(cells)] == [len(VARIANTS)] * 4
 
 
 def test_every_variant_is_explained() -> None:

@@ -16,6 +16,7 @@ from rich.console import Console
 from pebble import cli
 from pebble.bench.fleet import Figures, Plan, latencies_ms, measure, run
 from pebble.bench.fleet_operator import STEPS
+from pebble.bench.results import load
 from pebble.errors import ConfigError, PebbleError
 from pebble.simulation.fleet import MOST, Moved, members
 from tests.support import ROOT, Broker, Child, free_port, until
@@ -83,14 +84,16 @@ def test_a_small_fleet_is_measured() -> None:
     assert figures.lost <= 5
     assert len(figures.beats_hz) == 10
     assert all(rate == pytest.approx(4.0, rel=0.25) for rate in figures.beats_hz)
-    row = figures.as_json()
-    assert row["p50_ms"] < 200
+    cell = figures.cell(10.0)
+    assert cell.percentile(50) < 200
+    assert cell.lost == figures.lost
     assert set(figures.cpu) == {"broker", "fleet", "operator"}
-    assert 0 < row["mb_per_robot"] < 20
+    assert 0 < cell.figures["mb_per_robot"] < 20
 
 
 def test_what_cannot_be_measured_is_named(tmp_path: Path) -> None:
-    for plan in (Plan(robots=MOST + 1), Plan(seconds=0.0), Plan(rate_hz=100.0), Plan(json=tmp_path / "no" / "file")):
+    (tmp_path / "file").touch()
+    for plan in (Plan(robots=MOST + 1), Plan(seconds=0.0), Plan(rate_hz=100.0), Plan(output=tmp_path / "file" / "no")):
         with pytest.raises(PebbleError):
             run(plan)
 
@@ -99,9 +102,11 @@ def test_figures_are_shown_and_written(tmp_path: Path, monkeypatch: pytest.Monke
     figures = Figures(robots=2, seconds=1.0, online=2, sent=3, late=0, latencies_ms=[1.0, 9.0], beats_hz=[4.0, 4.1])
     monkeypatch.setattr("pebble.bench.fleet.measure", lambda *_: figures)
     out = StringIO()
-    assert run(Plan(robots=2, json=tmp_path / "fleet.json"), Console(file=out, width=100)) == 0
+    assert run(Plan(robots=2, output=tmp_path), Console(file=out, width=100)) == 0
     assert "3 / 2 / 1" in out.getvalue()  # sent, obeyed, lost
-    assert '"p99_ms": 9.0' in (tmp_path / "fleet.json").read_text()
+    results = load(tmp_path / "fleet.json")
+    assert results.cells[0].rounds == [[1.0, 9.0]]
+    assert results.verdict[0] == "2 of 2 robots were online; of 3 commands 1 were overtaken or lost"
 
 
 class Command:

@@ -40,6 +40,19 @@ def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> 
     assert read_trace(tmp_path / "trace") == [*entries, mcu.trace.entries()[-1]]
 
 
+def test_on_request_the_trace_has_what_the_mcu_said_and_when(tmp_path: Path) -> None:
+    with PtyMcu("goob", tmp_path / "port", trace_said=True) as mcu:
+        with serial.Serial(str(mcu.link), 460800, timeout=5) as port:
+            port.write(b"M 0.5 0.25\n")
+            assert port.read_until(b"OK M\r\n").endswith(b"OK M\r\n")
+            heard = time.monotonic_ns()
+            assert until(lambda: any(entry.line == "OK M" for entry in mcu.trace.entries()))
+        (answer,) = [entry for entry in mcu.trace.entries() if entry.line == "OK M"]
+        (asked,) = [entry for entry in mcu.trace.entries() if entry.event == "line"]
+    assert answer.event == "said"
+    assert asked.ns <= answer.ns <= heard
+
+
 def test_the_line_is_raw_before_anybody_configures_it(tmp_path: Path) -> None:
     """A terminal's echo would feed the MCU its own reports; its line editing would keep and alter bytes."""
     with PtyMcu("goob", tmp_path / "port") as mcu:

@@ -312,6 +312,23 @@ def test_a_stopped_sibling_blocks_a_flood_once_and_for_a_bounded_time(robot: Rob
     stopped.resume()
 
 
+def test_a_hub_that_stands_still_holds_up_no_flood_it_does_not_listen_to(robot: Robot) -> None:
+    sender, fast = robot.client("sender"), robot.actor("listener")
+    sender.publish("flood", b"first", qos=DELIVERED)
+    assert until(lambda: fast.ask() == "1 first")
+    sender.subscribe("other", lambda _message: None)  # meets the hub, which has said by now that it does not listen
+    states: list[State] = []
+    sender.on_state(states.append)
+    robot.hub.signal(signal.SIGSTOP)
+    for _ in range(100):
+        assert sender.publish("flood", bytes(100_000), qos=DELIVERED)
+    sender.publish("flood", b"end", qos=DELIVERED)
+    assert until(lambda: fast.ask().endswith(" end"))
+    robot.hub.signal(signal.SIGCONT)
+    robot.hub.settle()
+    assert State.CONNECTING not in states, "its link was full, and closed for it"
+
+
 def test_a_stopped_sibling_is_waited_for_once(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
     client, stopped = robot.client("client"), robot.actor("listener")
     stopped.stop()

@@ -10,23 +10,26 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
-
 from pebble.bench.usage import children
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.programs import Program, end_all
-from pebble.simulation.trace import Entry
+from pebble.simulation.trace import Entry, read_trace
 
+KINDS = ("mqtt", "zenoh")
 BASE = "pebble/robots/rover"
 _START_S = 15.0
 _ROBOT_ENDS_S, _REST_ENDS_S = 6.0, 2.0
 
 
 class Robot:
-    """``kind`` is its own transport: ``mqtt`` or ``zenoh``. Operators reach it at ``remote_port`` of loopback."""
+    """``kind`` is its own transport: ``mqtt`` or ``zenoh``. Operators reach it at ``remote_port`` of loopback.
 
-    def __init__(self, kind: str, *, media: bool) -> None:
-        self._kind, self._media = kind, media
+    With ``media`` it has a camera and a microphone, with ``reports`` it passes on every report of its MCU, 50 a second.
+    """
+
+    def __init__(self, kind: str, *, media: bool, reports: bool = False, launched: bool = True) -> None:
+        """Without ``launched`` everything around the robot is started, and it itself by :meth:`launch`."""
+        self._kind, self._media, self._reports, self._launched = kind, media, reports, launched
         self._folder = tempfile.TemporaryDirectory(prefix="pbl-")
         self._root = Path(self._folder.name)
         self._brokers: list[Broker] = []
@@ -39,6 +42,8 @@ class Robot:
         """Start everything; the robot itself is not yet ready. Raises PebbleError if something does not start."""
         try:
             self._start()
+            if self._launched:
+                self.launch()
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -54,12 +59,14 @@ class Robot:
     def remote_port(self) -> int:
         return self._brokers[0].port
 
+    @property
+    def broker_ports(self) -> list[int]:
+        """The remote broker's, then that of the broker on the robot, where it has one."""
+        return [broker.port for broker in self._brokers]
+
     def lines(self, since_ns: int) -> list[Entry]:
-        """What reached the MCU after ``since_ns`` (CLOCK_MONOTONIC)."""
-        raw = (self._root / "trace.jsonl").read_bytes()
-        complete = raw[: raw.rfind(b"\n") + 1].splitlines()
-        entries = (msgspec.json.decode(line, type=Entry) for line in complete)
-        return [entry for entry in entries if entry.ns >= since_ns]
+        """What reached the MCU, what it did and (with ``reports``) said, after ``since_ns`` (CLOCK_MONOTONIC)."""
+        return [entry for entry in read_trace(self._root / "trace.jsonl") if entry.ns >= since_ns]
 
     def pids(self) -> list[int]:
         """The launcher and its children."""
@@ -72,6 +79,11 @@ class Robot:
         path = self._root / "robot.log"
         return path.read_text(errors="replace")[-2000:] if path.exists() else ""
 
+    def launch(self) -> None:
+        """Start the robot itself."""
+        command = [sys.executable, "-m", "pebble.cli", "up", str(self._root / "robot.json")]
+        self._launcher = Program(f"the {self._kind} robot", command, self._root / "robot.log")
+
     def _start(self) -> None:
         for name in ("remote", "local") if self._kind == "mqtt" else ("remote",):
             self._brokers.append(Broker(name, BrokerKind.MOSQUITTO, self._root))
@@ -79,16 +91,12 @@ class Robot:
             broker.wait(self._never)
         port, trace = self._root / "mcu", self._root / "trace.jsonl"
         trace.touch()
-        simulation = [sys.executable, "-m", "pebble.simulation.mcu"]
-        mcu = Program(
-            "MCU", [*simulation, "--kind", "goob", "--link", str(port), "--trace", str(trace)], self._root / "mcu.log"
-        )
+        simulation = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", str(port)]
+        simulation += ["--trace", str(trace), *(["--trace-said"] if self._reports else [])]
+        mcu = Program("MCU", simulation, self._root / "mcu.log")
         self._programs.append(mcu)
         mcu.wait_until(port.exists, _START_S, self._never)
-        config = self._root / "robot.json"
-        config.write_text(json.dumps(self._config(port), indent=1))
-        command = [sys.executable, "-m", "pebble.cli", "up", str(config)]
-        self._launcher = Program(f"the {self._kind} robot", command, self._root / "robot.log")
+        (self._root / "robot.json").write_text(json.dumps(self._config(port), indent=1))
 
     def _config(self, port: Path) -> dict[str, Any]:
         services: dict[str, Any] = {
@@ -97,7 +105,11 @@ class Robot:
                 "remote_mqtt": {"host": "127.0.0.1", "port": self.remote_port},
                 "media": {"video_publisher": {"publish_width": 640, "publish_height": 360, "publish_fps": 15}},
             },
-            "serial_mcu_bridge": {"enabled": True, "serial": {"port": str(port), "baud": 460800}},
+            "serial_mcu_bridge": {
+                "enabled": True,
+                "serial": {"port": str(port), "baud": 460800},
+                "telemetry": {"publish_touch_sensors": self._reports},
+            },
         }
         if self._media:
             services["av_daemon"] = {

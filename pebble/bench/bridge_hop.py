@@ -1,0 +1,60 @@
+"""The floor: the same commands to a stock client of the same broker, one hop, with no robot in it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from typing import Self
+
+from pebble.bench.bridge_drive import RATE_HZ, Found, Stretch
+from pebble.bench.bridge_observer import Observer
+from pebble.bench.bridge_operator import Operator, Wheels
+from pebble.bench.bridge_robot import Robot
+from pebble.contract import DRIVE
+
+HOP = "one hop"
+_NOBODY = "pebble/robots/nobody"
+_ARRIVE_S = 1.0
+_LOOK_S = 0.02
+
+
+class Hop:
+    """Drives and is looked up as a robot is; ``robot`` lends its remote broker."""
+
+    kind = HOP
+
+    def __init__(self, robot: Robot) -> None:
+        self._port, self._log = robot.remote_port, robot.run_dir.with_name("observer.log")
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            observer = Observer(self._port, DRIVE.topic(_NOBODY), self._log)
+            self._observer = stack.enter_context(observer)
+            self._operator = stack.enter_context(closing(Operator(self._port, _NOBODY)))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def drive(self, seconds: float) -> Stretch:
+        began = time.monotonic_ns()
+        sent = self._operator.drive(seconds, RATE_HZ)
+        return Stretch(began, time.monotonic_ns(), sent)
+
+    def look_up(self, stretches: Sequence[Stretch]) -> list[Found]:
+        """As :func:`pebble.bench.bridge_drive.look_up` does."""
+        heard: dict[Wheels, int] = {}
+        end = time.monotonic() + _ARRIVE_S
+        while True:
+            late = time.monotonic() > end
+            heard |= self._observer.heard()
+            if late or list(stretches[-1].sent)[-1] in heard:
+                return [_found(stretch, heard) for stretch in stretches]
+            time.sleep(_LOOK_S)
+
+
+def _found(stretch: Stretch, heard: dict[Wheels, int]) -> Found:
+    down = [(heard[speeds] - sent) / 1e6 for speeds, sent in stretch.sent.items() if speeds in heard]
+    return Found(down, sent=len(stretch.sent))

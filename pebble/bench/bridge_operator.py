@@ -1,0 +1,146 @@
+"""An operator who drives at a steady pace over MQTT, remembers when each command was sent, and hears the reports."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from typing import Any
+
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pebble.bench.null import spin
+from pebble.contract import (
+    AUDIO_CONTROL,
+    DRIVE,
+    MQTT_AUDIO,
+    MQTT_VIDEO,
+    ONLINE,
+    STATUS,
+    TOUCH_SENSORS,
+    VIDEO_CONTROL,
+    Channel,
+)
+from pebble.errors import PebbleError
+from pebble.services.serial_mcu_bridge.goob_base import Touch
+
+Wheels = tuple[float, float]
+
+_DIGITS = 3  # of a wheel's speed on the serial line
+_STEPS = 800  # wheel values 0.100 … 0.899
+_UP_S = 30.0
+_LOOK_S = 0.02
+_QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
+_HEARD = 50_000  # reports that are kept; a robot says 50 a second
+
+
+class Operator:
+    """One MQTT connection to the remote broker. Commands are numbered by what they make the wheels do.
+
+    It treats TCP as our own clients do. It sends at once (TCP_NODELAY): a stock paho client that also hears heartbeats
+    holds one command in a hundred for up to 40 ms, until the broker's delayed ACK. And it acknowledges at once
+    (TCP_QUICKACK): a stock broker holds a report for as long while its answer to a command is not acknowledged. With
+    neither, the comparison would be about that.
+    """
+
+    def __init__(self, port: int, base: str) -> None:
+        self._base, self._number = base, 0
+        self._services: dict[str, Any] = {}
+        self._beats = 0
+        self._heard: deque[tuple[int, bytes]] = deque(maxlen=_HEARD)
+        self._client = Client(CallbackAPIVersion.VERSION2)
+        self._client.on_socket_open = _send_at_once
+        self._client.on_connect = self._subscribe
+        self._client.on_message = self._hear
+        self._client.on_publish = lambda client, *_: _acknowledge(client)
+        self._client.message_callback_add(TOUCH_SENSORS.topic(base), self._hear_report)
+        self._client.connect("127.0.0.1", port)
+        self._client.loop_start()
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def wait_until_up(self) -> None:
+        """Every service says it is ready, and the heart beats. Raises PebbleError if that takes too long."""
+        end = time.monotonic() + _UP_S
+        while time.monotonic() < end:
+            states = {name: service.get("state") for name, service in self._services.items()}
+            waiting = [name for name, state in states.items() if state not in ("ready", "stopped")]
+            if states and not waiting and self._beats > 1:
+                return
+            time.sleep(_LOOK_S)
+        raise PebbleError(f"the robot is not up after {_UP_S:.0f} s: {states}")
+
+    def media(self, wanted: bool) -> None:
+        """Allow and ask for video and audio, or have both stop."""
+        for flag in (MQTT_VIDEO, MQTT_AUDIO):
+            self._send(flag, wanted, retain=True)
+        for request in (VIDEO_CONTROL, AUDIO_CONTROL):
+            self._send(request, {"enabled": wanted})
+
+    def drive(self, seconds: float, rate_hz: float, *, work_us: float = 0.0, slowed: bool = False) -> dict[Wheels, int]:
+        """Returns when (CLOCK_MONOTONIC, ns) the command for each pair of wheel speeds was handed to the client.
+
+        It works for ``work_us`` before each: before it looks at the clock, or, if ``slowed``, after that.
+        """
+        sent: dict[Wheels, int] = {}
+        pause, due = threading.Event(), time.monotonic()
+        for _ in range(round(seconds * rate_hz)):
+            self._number += 1
+            left, right = wheels(self._number)
+            spin(0.0 if slowed else work_us)
+            sent[left, right] = time.monotonic_ns()
+            spin(work_us if slowed else 0.0)
+            self._send(DRIVE, {"x": (left - right) / 2, "z": (left + right) / 2})
+            due += 1 / rate_hz
+            pause.wait(max(0.0, due - time.monotonic()))
+        return sent
+
+    def heard(self, since_ns: int) -> list[tuple[int, Touch]]:
+        """The MCU's reports after ``since_ns``, and when each was heard."""
+        return [(ns, Touch(**json.loads(payload)["value"])) for ns, payload in self._heard.copy() if ns >= since_ns]
+
+    def _send(self, channel: Channel, body: Any, *, retain: bool = False) -> None:
+        self._client.publish(channel.topic(self._base), json.dumps(body), qos=channel.default_qos, retain=retain)
+
+    def _subscribe(self, client: Client, *_: Any) -> None:
+        client.subscribe([(channel.topic(self._base), 1) for channel in (STATUS, ONLINE, TOUCH_SENSORS)])
+
+    def _hear(self, client: Client, _data: Any, message: Any) -> None:
+        _acknowledge(client)
+        if message.topic == STATUS.topic(self._base):
+            self._services = json.loads(message.payload).get("value", {}).get("services", {})
+        elif not message.retain:
+            self._beats += 1
+
+    def _hear_report(self, client: Client, _data: Any, message: Any) -> None:
+        self._heard.append((time.monotonic_ns(), message.payload))
+        _acknowledge(client)
+
+
+def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+def _acknowledge(client: Client) -> None:
+    """The kernel falls back to delaying its ACKs whenever we send, so this follows everything that is heard."""
+    sock: Any = client.socket()
+    if _QUICKACK is not None and sock is not None:
+        with suppress(OSError):  # the other side has just gone
+            sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, 1)
+
+
+def wheels(number: int) -> Wheels:
+    """The speeds that command ``number`` (0 … 639,999) sets: no two alike."""
+    return round(0.1 + (number % _STEPS) / 1000, 3), round(0.1 + (number // _STEPS % _STEPS) / 1000, 3)
+
+
+def wheels_of(payload: bytes) -> Wheels:
+    """The speeds that a drive command sets, as the serial bridge mixes them."""
+    wanted = json.loads(payload)
+    return round(wanted["z"] + wanted["x"], _DIGITS), round(wanted["z"] - wanted["x"], _DIGITS)

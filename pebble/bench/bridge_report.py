@@ -1,0 +1,104 @@
+"""What a comparison of two driven robots says: its table, and its verdict in plain words. Pure but for the printing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from pebble.bench.bridge_hop import HOP
+from pebble.bench.bridge_robot import KINDS
+from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP
+from pebble.bench.ratios import LEAST_ROUNDS, paired
+from pebble.bench.results import Cell
+from pebble.bench.side_by_side import caveat, sentence
+from pebble.bench.tables import figure, latency_table, plain_table
+
+AIMS_MS = {50: 0.7, 99: 2.0}
+WAYS = {DOWN: "command to the wheels", UP: "report to the operator"}
+_FLOWS = {"frames_per_s": "frames/s", "video_per_s": "video/s", "audio_per_s": "audio/s"}
+
+
+def show(cells: Sequence[Cell], console: Console) -> None:
+    """Latencies, then what the robots cost meanwhile."""
+    ordered = sorted(cells, key=lambda cell: (list(WAYS).index(cell.measure), cell.params["load"] == LOADED))
+    title = "Commands down, reports up; and the load on the robot"
+    console.print(latency_table(title, ordered, KINDS[0]))
+    cost = plain_table("Meanwhile", ["robot", "load", "CPU %", *_FLOWS.values()], left=2)
+    for cell in ordered:
+        if cell.measure == DOWN and cell.variant != HOP:
+            flows = [_number(cell, name) for name in _FLOWS]
+            cost.add_row(cell.variant, str(cell.params["load"]), _number(cell, "cpu_percent"), *flows)
+    console.print(cost)
+
+
+def verdict(cells: Sequence[Cell]) -> list[str]:
+    """Sentences for people who run robots."""
+    lines = [*_transports(cells), *_media(cells), *_floor(cells)]
+    plain = [cell for way in WAYS for cell in _robots(cells, way, UNLOADED)]
+    return [*lines, *caveat(plain), *(line for cell in plain for line in _aims(cell))]
+
+
+def _transports(cells: Sequence[Cell]) -> list[str]:
+    """Which robot is faster."""
+    lines = []
+    for load in (UNLOADED, LOADED):
+        for way, words in WAYS.items():
+            if robots := _robots(cells, way, load):
+                what = f"Median, {words}{', media flowing' if load == LOADED else ''}"
+                lines.append(sentence(what, robots, less="faster", more="slower"))
+    return lines
+
+
+def _media(cells: Sequence[Cell]) -> list[str]:
+    """What pictures and sound do to the slowest."""
+    lines = []
+    for way, words in WAYS.items():
+        for loaded in _robots(cells, way, LOADED):
+            for free in _robots(cells, way, UNLOADED):
+                if free.variant == loaded.variant:
+                    lines.append(f"{free.variant}, {words}, p99: {_beside(loaded, free)}")
+    return lines
+
+
+def _beside(loaded: Cell, free: Cell) -> str:
+    times = f"{figure(free.percentile(99))} ms, with media {figure(loaded.percentile(99))} ms"
+    if min(len(loaded.rounds), len(free.rounds)) < LEAST_ROUNDS:
+        return times
+    ratio = paired(loaded.rounds, free.rounds, 99)
+    return f"{times}; {ratio.words('the robot with media', 'the one without')}"
+
+
+def _floor(cells: Sequence[Cell]) -> list[str]:
+    """What the robot adds to one hop through a broker."""
+    hop = next((cell for cell in cells if cell.variant == HOP), None)
+    robots = _robots(cells, DOWN, UNLOADED)
+    if hop is None or not hop.samples or not robots:
+        return []
+    more = ", ".join(f"{cell.variant} {figure(cell.percentile(50) - hop.percentile(50))} ms more" for cell in robots)
+    return [f"One hop, operator to a stock client of the same broker, takes {figure(hop.percentile(50))} ms; {more}."]
+
+
+def _aims(cell: Cell) -> list[str]:
+    """Of all samples: are both aims met, and if not, by how much?"""
+    lines = []
+    for percent, aim in AIMS_MS.items():
+        took = cell.percentile(percent)
+        outcome = f"missed by {took - aim:.2f} ms" if took > aim else "met"
+        what = f"{cell.variant}, {WAYS[cell.measure]}, p{percent} at most {aim:g} ms"
+        lines.append(f"aim: {what}: {outcome} ({figure(took)} ms)")
+    return lines
+
+
+def _robots(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
+    found = [
+        cell
+        for cell in cells
+        if (cell.measure, cell.params["load"]) == (measure, load) and cell.variant in KINDS and cell.samples
+    ]
+    return sorted(found, key=lambda cell: KINDS.index(cell.variant))
+
+
+def _number(cell: Cell, name: str) -> str:
+    value = cell.figures.get(name)
+    return f"{value:.1f}" if isinstance(value, float) else ""

@@ -1,0 +1,53 @@
+"""What was measured of one robot under one load, round after round, and its cells. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from pebble.bench.bridge_drive import Found, Stretch
+from pebble.bench.figures import rounded
+from pebble.bench.results import Cell, Value
+
+UNLOADED, LOADED = "none", "media"
+DOWN, UP = "down", "up"
+
+
+class Tally:
+    """``reports``: there are some to be counted."""
+
+    def __init__(self, variant: str, load: str = UNLOADED, *, reports: bool = True) -> None:
+        self.variant, self.load, self._reports = variant, load, reports
+        self._rounds: list[list[Found]] = []
+        self._cpu_s = self._took_s = 0.0
+        self._flowed: dict[str, int] = {}
+        self._flowed_s = 0.0
+
+    def add_round(self, stretches: Sequence[Stretch], found: Sequence[Found]) -> None:
+        self._rounds.append(list(found))
+        self._cpu_s += sum(stretch.cpu_s for stretch in stretches)
+        self._took_s += sum(stretch.ended - stretch.began for stretch in stretches) / 1e9
+
+    def add_flow(self, counts: Mapping[str, int], seconds: float) -> None:
+        """Media that came through meanwhile."""
+        self._flowed_s += seconds
+        for name, count in counts.items():
+            self._flowed[name] = self._flowed.get(name, 0) + count
+
+    def cells(self) -> list[Cell]:
+        sent = sum(one.sent for one in self._found())
+        down = self._cell(DOWN, sent, [[ms for one in found for ms in one.down] for found in self._rounds])
+        if not self._reports:
+            return [down]
+        said = sum(one.reports for one in self._found())
+        return [down, self._cell(UP, said, [[ms for one in found for ms in one.up] for found in self._rounds])]
+
+    def _found(self) -> Iterable[Found]:
+        return (one for found in self._rounds for one in found)
+
+    def _cell(self, measure: str, sent: int, rounds: list[list[float]]) -> Cell:
+        figures: dict[str, Value] = {"sent": sent}
+        if self._cpu_s:
+            figures["cpu_percent"] = rounded(100 * self._cpu_s / self._took_s, 1)
+        figures |= {f"{name}_per_s": round(count / self._flowed_s, 1) for name, count in self._flowed.items()}
+        params: dict[str, Value] = {"load": self.load}
+        return Cell(variant=self.variant, params=params, measure=measure, unit="ms", rounds=rounds, figures=figures)

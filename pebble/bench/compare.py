@@ -1,0 +1,181 @@
+"""Did anything get worse from one run of a comparison to a later one, beyond what chance does to both? Pure.
+
+Many figures are many chances to be fooled: the certainty asked of each grows with their number, so that in two runs of
+the same thing the chance that anything at all is called changed stays at :data:`CHANCE`.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+from pebble.bench.figures import percentile
+from pebble.bench.ratios import Interval, unpaired
+from pebble.bench.results import Cell, Results
+
+CHANCE = 0.01
+#: Which memory and which core new processes get moves medians by so much from one run to the next, and no number of
+#: rounds within one run shows that.
+THRESHOLD = 1.05
+_PERCENTS = (50, 99)
+_SAME_EVERY_TIME = ("kB/s", "kbit/s")  # what encoders make: one figure is all there is to know
+_LEAST_ROUNDS = 2
+_COURSE = " over time"  # how the measure of a cell ends that holds a curve, not samples
+
+
+class Kind(StrEnum):
+    """In the order in which they are shown."""
+
+    SILENT = "nothing in B"  # it was to be measured, and no sample came
+    WORSE = "worse"
+    ONLY_A = "only in A"
+    ONLY_B = "only in B"
+    BETTER = "better"
+    UNKNOWN = "cannot be told"
+    EQUAL = "no difference"  # beyond noise
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One percentile of one cell in both runs, the median over its rounds. Smaller is better; NaN: not measured."""
+
+    cell: Cell
+    percent: int
+    a: float
+    b: float
+    ratio: Interval  # b / a
+    kind: Kind
+
+    @property
+    def worse(self) -> bool:
+        return self.kind in (Kind.WORSE, Kind.SILENT)
+
+    @property
+    def changed(self) -> bool:
+        return self.kind not in (Kind.EQUAL, Kind.UNKNOWN)
+
+
+def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Finding]:
+    """The worst first. Each figure that both have is judged with :func:`certainty`."""
+    before, after = _by_key(a.cells), _by_key(b.cells)
+    silent = {_key(cell) for cell in b.cells if not cell.samples}
+    asked = [
+        (before[key], after[key], percent)
+        for key in before
+        if key in after
+        for percent in _percents(before[key], after[key])
+    ]
+    level = certainty(len(asked))
+    findings = [_judged(one, other, percent, level, threshold) for one, other, percent in asked]
+    findings += [
+        _alone(before[key], Kind.SILENT if key in silent else Kind.ONLY_A) for key in before if key not in after
+    ]
+    findings += [_alone(after[key], Kind.ONLY_B) for key in after if key not in before]
+    return sorted(findings, key=_order)
+
+
+def certainty(figures: int) -> float:
+    """Of each of so many intervals."""
+    return 1 - CHANCE / max(1, figures)
+
+
+def differences(a: Results, b: Results) -> list[str]:
+    """What else differs between two runs, a line each: then not only the program may be the reason."""
+    return [
+        *_differing("machine", a.machine, b.machine),
+        *_differing("option", a.options, b.options),
+        *_differing("", {"pebble": a.pebble, "quick": a.quick}, {"pebble": b.pebble, "quick": b.quick}),
+    ]
+
+
+def _differing(what: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{what} {name}: {one.get(name)} in A, {other.get(name)} in B".strip()
+        for name in {**one, **other}
+        if one.get(name) != other.get(name)
+    ]
+
+
+def _by_key(cells: Sequence[Cell]) -> dict[Hashable, Cell]:
+    """Those with samples."""
+    return {_key(cell): cell for cell in cells if cell.samples and not cell.measure.endswith(_COURSE)}
+
+
+def _key(cell: Cell) -> Hashable:
+    return cell.variant, frozenset(cell.params.items()), cell.measure
+
+
+def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
+    """Rounds of a single sample have only one percentile."""
+    return _PERCENTS if any(len(samples) > 1 for samples in (*one.rounds, *other.rounds)) else _PERCENTS[:1]
+
+
+def _alone(cell: Cell, kind: Kind) -> Finding:
+    figure = _figure(cell, _PERCENTS[0])
+    a, b = (math.nan, figure) if kind is Kind.ONLY_B else (figure, math.nan)
+    return Finding(cell, _PERCENTS[0], a, b, Interval(math.nan, math.nan, math.nan), kind)
+
+
+def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float) -> Finding:
+    ratio = unpaired(other.rounds, one.rounds, percent, level)
+    if other.unit in _SAME_EVERY_TIME:
+        ratio = replace(ratio, low=ratio.ratio, high=ratio.ratio)
+    kind = _kind(ratio, threshold) if _can_be_told(one, other) else Kind.UNKNOWN
+    return Finding(other, percent, _figure(one, percent), _figure(other, percent), ratio, kind)
+
+
+def _figure(cell: Cell, percent: int) -> float:
+    """What the ratio is made of: the median over the rounds."""
+    return statistics.median(percentile(samples, percent) for samples in cell.rounds if samples)
+
+
+def _can_be_told(one: Cell, other: Cell) -> bool:
+    """A single round shows nothing of how much rounds differ."""
+    rounds = min(sum(map(bool, cell.rounds)) for cell in (one, other))
+    return rounds >= _LEAST_ROUNDS or other.unit in _SAME_EVERY_TIME
+
+
+def _kind(ratio: Interval, threshold: float) -> Kind:
+    if math.isnan(ratio.ratio):  # of figures that are 0
+        return Kind.UNKNOWN
+    if ratio.equal or 1 / threshold < ratio.ratio < threshold:
+        return Kind.EQUAL
+    return Kind.WORSE if ratio.ratio > 1 else Kind.BETTER
+
+
+def _order(finding: Finding) -> tuple[int, float]:
+    size = finding.ratio.ratio
+    return list(Kind).index(finding.kind), 0.0 if math.isnan(size) else -size
+
+
+def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
+    """In plain words."""
+    count = {kind: sum(finding.kind is kind for finding in findings) for kind in Kind}
+    judged = [finding for finding in findings if finding.kind in (Kind.WORSE, Kind.BETTER, Kind.EQUAL)]
+    lines = [
+        f"{len(judged)} figures judged: {count[Kind.WORSE]} worse, {count[Kind.BETTER]} better,"
+        f" {count[Kind.EQUAL]} without a difference beyond noise"
+    ]
+    if judged:
+        lines.append(
+            f"Changed is what lies beyond a factor of {threshold:g} with an interval that does not hold 1.00: of"
+            f" {100 * judged[0].ratio.level:.4g} %, so that {100 * CHANCE:g} % is the chance that noise changes any"
+        )
+    if widths := [_width(finding.ratio) for finding in judged if finding.percent == _PERCENTS[0]]:
+        seen = max(threshold, statistics.median(widths))
+        lines.append(f"Half of the medians would have shown a change by a factor of {seen:.2f}")
+    notes = {
+        Kind.SILENT: "without a sample in B: worse than slow",
+        Kind.UNKNOWN: "cannot be told: measured in a single round, or zero",
+        Kind.ONLY_A: "only in A: left out of B, which then says nothing of it",
+        Kind.ONLY_B: "only in B",
+    }
+    return [*lines, *(f"{count[kind]} {note}" for kind, note in notes.items() if count[kind])]
+
+
+def _width(ratio: Interval) -> float:
+    return max(ratio.high / ratio.ratio, ratio.ratio / ratio.low)

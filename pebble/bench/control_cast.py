@@ -1,0 +1,221 @@
+"""Everybody who plays in a round of the control comparison: brokers and hubs, two ends for each role, and the loads."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from pebble.bench.control_ends import Order
+from pebble.bench.control_plan import HOG, MEDIA, NONE
+from pebble.bench.control_variants import VARIANTS, Variant
+from pebble.bench.control_worker import Answer, Place
+from pebble.bench.frames_process import Worker, end_workers
+from pebble.bench.null import variant_of
+from pebble.bench.usage import cpu_s
+from pebble.demo.broker import Broker, BrokerKind
+from pebble.demo.programs import Program, end_all
+from pebble.errors import PebbleError
+from pebble.transports.settings import ZenohSettings
+
+_READY_S = 40.0
+_ANSWER_S = 30.0  # beyond the slice itself
+_END_S = 4.0
+_FLOWING = 3  # pictures that have arrived: the stream is there
+_FLOW_S = 10.0
+_LOOK_S = 0.02
+_PYTHON = [sys.executable, "-m"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Slice:
+    """What one role did under one condition in one round; CPU in % of one core."""
+
+    answer: Answer
+    cpu: float
+    backbone_cpu: float
+    pictures_hz: float | None
+
+
+def joined(slices: Sequence[Slice]) -> Slice:
+    """Several of the same role and condition as one; at least one."""
+    answers = [one.answer for one in slices]
+    rates = [one.pictures_hz for one in slices if one.pictures_hz is not None]
+    return Slice(
+        answer=Answer(
+            sent=sum(answer.sent for answer in answers),
+            late=sum(answer.late for answer in answers),
+            one_way=[sample for answer in answers for sample in answer.one_way],
+            round_trip=[sample for answer in answers for sample in answer.round_trip],
+        ),
+        cpu=fmean(one.cpu for one in slices),
+        backbone_cpu=fmean(one.backbone_cpu for one in slices),
+        pictures_hz=fmean(rates) if rates else None,
+    )
+
+
+class Backbone:
+    """The broker of an MQTT variant or the hub of a Zenoh one."""
+
+    def __init__(self, variant: Variant, folder: Path) -> None:
+        self._variant, self._run_dir = variant, folder / "z"
+        self._broker: Broker | None = None
+        if variant.on_zenoh:
+            settings = msgspec.json.encode(ZenohSettings(run_dir=self._run_dir), enc_hook=str).decode()
+            self.program = Program("hub", [*_PYTHON, "pebble.hub", settings], folder / "hub.log")
+        else:
+            self._broker = Broker("broker", BrokerKind.MOSQUITTO, folder, variant.broker)
+            self.program = self._broker.program
+
+    def wait(self) -> None:
+        if self._broker is not None:
+            self._broker.wait(threading.Event())
+        else:
+            self.program.wait_until((self._run_dir / "hub.sock").exists, _READY_S, threading.Event())
+
+    @property
+    def place(self) -> Place:
+        variant = self._variant
+        if self._broker is None:
+            return Place(kind=variant.kind, run_dir=str(self._run_dir), client=variant.client)
+        return Place(kind=variant.kind, port=self._broker.port, protocol=variant.protocol)
+
+    @property
+    def stream(self) -> list[str]:
+        """Where pictures flow through the same fabric."""
+        return ["zenoh", str(self._run_dir)] if self._broker is None else ["mqtt", str(self._broker.port)]
+
+
+class Player:
+    """The processes of one role."""
+
+    def __init__(self, role: str, folder: Path) -> None:
+        self.role, self._folder = role, folder
+        self.backbone = Backbone(VARIANTS[variant_of(role)], folder)
+        self.ends: list[Worker] = []  # echo, sender
+        self.media: list[Worker] = []  # reader, writer
+
+    def start(self, *, media: bool) -> None:
+        """Its backbone answers by now."""
+        place = msgspec.json.encode(self.backbone.place).decode()
+        for end in ("echo", "sender"):
+            self.ends.append(self._worker(end, ["pebble.bench.control_worker", end, place]))
+        if media:
+            for end in ("reader", "writer"):
+                self.media.append(self._worker(end, ["pebble.bench.control_load", end, *self.backbone.stream]))
+
+    def run(self, order: Order) -> tuple[Answer, float, float]:
+        """The answer of its sender; the CPU of its two ends, and of its backbone."""
+        pids = [worker.pid for worker in self.ends]
+        began, used, backbone = time.monotonic(), cpu_s(pids), cpu_s([self.backbone.program.pid])
+        line = msgspec.json.encode(order).decode()
+        answer = msgspec.convert(_ask(self.ends[1], line, order.seconds + _ANSWER_S), Answer)
+        took = time.monotonic() - began
+        costs = (cpu_s(pids) - used, cpu_s([self.backbone.program.pid]) - backbone)
+        return answer, 100 * costs[0] / took, 100 * costs[1] / took
+
+    def _worker(self, end: str, arguments: Sequence[str]) -> Worker:
+        return Worker(f"{self.role}: {end}", [*_PYTHON, *arguments], self._folder / f"{end}.log")
+
+
+class Cast:
+    """All players of some rounds; started together, all of them ready once the ``with`` block begins."""
+
+    def __init__(self, roles: Sequence[str], loads: Sequence[str]) -> None:
+        self._roles, self._loads = roles, loads
+        self._players: dict[str, Player] = {}
+        self._hog: Worker | None = None
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
+            stack.callback(self._end)
+            self._start(folder)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._stack.close()
+
+    def run(self, role: str, order: Order, load: str) -> Slice:
+        """One slice. Raises PebbleError if somebody ended, or pictures do not flow."""
+        player = self._players[role]
+        with self._loaded(player, load):
+            before, began = self._pictures(player, load), time.monotonic()
+            answer, cpu, backbone_cpu = player.run(order)
+            pictures = self._pictures(player, load) - before
+        took = time.monotonic() - began
+        pictures_hz = pictures / took if load == MEDIA else None
+        return Slice(answer=answer, cpu=cpu, backbone_cpu=backbone_cpu, pictures_hz=pictures_hz)
+
+    def _start(self, folder: Path) -> None:
+        for number, role in enumerate(self._roles):
+            place = folder / str(number)  # short: unix sockets live below it
+            place.mkdir()
+            self._players[role] = Player(role, place)
+        for player in self._players.values():
+            player.backbone.wait()
+            player.start(media=MEDIA in self._loads)
+        if HOG in self._loads:
+            self._hog = Worker("hog", [*_PYTHON, "pebble.bench.control_load", "hog"], folder / "hog.log")
+        for worker in self._workers():
+            worker.answer(_READY_S)
+
+    def _end(self) -> None:
+        end_workers(self._workers())
+        end_all([player.backbone.program for player in self._players.values()], _END_S)
+
+    def _workers(self) -> list[Worker]:
+        hog = [] if self._hog is None else [self._hog]
+        return hog + [worker for player in self._players.values() for worker in (*player.ends, *player.media)]
+
+    @contextmanager
+    def _loaded(self, player: Player, load: str) -> Iterator[None]:
+        if load == NONE:
+            yield
+            return
+        busy = player.media if load == MEDIA else [self._hog] if self._hog is not None else []
+        try:
+            for worker in busy:
+                _tell(worker, "1")
+            if load == MEDIA:
+                _wait_for_pictures(player)
+            yield
+        finally:
+            for worker in reversed(busy):  # first who writes, then who reads
+                _tell(worker, "0")
+
+    def _pictures(self, player: Player, load: str) -> int:
+        return _tell(player.media[0], "?") if load == MEDIA else 0
+
+
+def _ask(worker: Worker, line: str, timeout: float) -> Any:
+    """What it answers. Raises PebbleError if it has ended, or is silent."""
+    with suppress(BrokenPipeError):  # it has ended: then that is what its answer is
+        worker.tell(line)
+    return worker.answer(timeout)
+
+
+def _tell(worker: Worker, line: str) -> int:
+    """Returns its count of pictures so far."""
+    return int(_ask(worker, line, _FLOW_S)["pictures"])
+
+
+def _wait_for_pictures(player: Player) -> None:
+    reader = player.media[0]
+    enough, end = _tell(reader, "?") + _FLOWING, time.monotonic() + _FLOW_S
+    while _tell(reader, "?") < enough:
+        if time.monotonic() > end:
+            raise PebbleError(f"{player.role}: no pictures flow after {_FLOW_S:.0f} s")
+        time.sleep(_LOOK_S)

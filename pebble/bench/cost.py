@@ -1,0 +1,94 @@
+"""What a robot costs: memory, CPU and threads of each of its processes, at rest and at work, on MQTT and on Zenoh.
+
+Whole robots with a synthetic camera and microphone, stock mosquitto, a simulated MCU. Phases come in one order, each on
+what the one before left in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from rich.console import Console
+
+from pebble.bench.bridge_robot import KINDS
+from pebble.bench.cost_cells import cells_of
+from pebble.bench.cost_robot import RATE_HZ, STREAMS, Reading, measure
+from pebble.bench.figures import LONGEST_S
+from pebble.bench.measured_robot import check_kinds
+from pebble.bench.output import FOLDER, check_folder, finish
+from pebble.bench.results import Stopwatch
+from pebble.errors import PebbleError
+from pebble.signals import interrupted_by_signals
+from pebble.transports.segments import sweep
+
+ROUNDS, QUICK_ROUNDS = 8, 1
+SECONDS, QUICK_SECONDS = 1.5, 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """In every round a fresh robot of each kind, ``seconds`` for each phase."""
+
+    rounds: int | None = None  # None: as many as befit
+    seconds: float | None = None
+    kinds: Sequence[str] = KINDS
+    quick: bool = False
+    output: Path = FOLDER
+
+    @property
+    def robots(self) -> int:
+        return self.rounds or (QUICK_ROUNDS if self.quick else ROUNDS)
+
+    @property
+    def phase_s(self) -> float:
+        return self.seconds or (QUICK_SECONDS if self.quick else SECONDS)
+
+    def check(self) -> None:
+        """Raises PebbleError naming what makes no sense."""
+        check_kinds(self.kinds)
+        if not 0 < self.phase_s <= LONGEST_S:
+            raise PebbleError(f"seconds must be positive, and at most {LONGEST_S:.0f}")
+        check_folder(self.output)
+
+    def command(self) -> list[str]:
+        """That repeats it."""
+        kinds = [] if tuple(self.kinds) == KINDS else ["--variants", ",".join(self.kinds)]
+        amount = ["--rounds", str(self.robots), "--seconds", f"{self.phase_s:g}"]
+        return ["pebble", "bench", "cost", *amount, *kinds, *(["--quick"] if self.quick else [])]
+
+
+def run(plan: Plan, console: Console | None = None) -> int:
+    """Measure, show and write. Raises PebbleError."""
+    console = console or Console()
+    plan.check()
+    streams = _installed(console)
+    options = {"rounds": plan.robots, "seconds": plan.phase_s, "rate_hz": RATE_HZ}
+    watch = Stopwatch("cost", plan.command(), options)
+    rounds: dict[str, list[list[Reading]]] = {kind: [] for kind in plan.kinds}
+    with interrupted_by_signals(), console.status("") as status:
+        try:
+            for number in range(plan.robots):
+                for kind in plan.kinds[:: -1 if number % 2 else 1]:
+                    status.update(f"round {number + 1} of {plan.robots}: {kind}")
+                    rounds[kind].append(measure(kind, plan.phase_s, streams))
+        finally:
+            sweep()  # Zenoh leaves files behind even when it ends politely
+    from pebble.bench.cost_report import legend, table, verdict  # numpy: not while robots are measured that map it too
+
+    cells = cells_of(rounds)
+    console.print(table(cells))
+    for line in legend(cells):
+        console.print(line, style="dim", highlight=False, soft_wrap=True)
+    finish(watch.results(cells, verdict(cells), quick=plan.quick), plan.output, console)
+    return 0
+
+
+def _installed(console: Console) -> list[str]:
+    """The phases with media that this machine can run; says which one is left out."""
+    if find_spec("av") is not None:
+        return list(STREAMS)
+    console.print("h264+opus is left out: pip install 'pebble-robot[media]'", style="yellow", highlight=False)
+    return ["json+pcm"]

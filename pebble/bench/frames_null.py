@@ -1,0 +1,58 @@
+"""The null test of frames: one way of sending them against itself, and against itself made a fifth slower."""
+
+from __future__ import annotations
+
+import statistics
+from typing import Any
+
+from rich.console import Console
+
+from pebble.bench import null, output
+from pebble.bench.frames import READERS, SIZES, Measured, Plan, cells_of, measure
+from pebble.bench.frames_report import OURS, tables
+from pebble.bench.frames_variants import Case, missing, parse_size
+from pebble.bench.results import Stopwatch
+from pebble.errors import PebbleError
+
+
+def plan(*, quick: bool = False, **given: Any) -> Plan:
+    """The usual plan, or the one for the impatient, except for what is given."""
+    usual = {"rounds": 2, "seconds": 0.3} if quick else {"rounds": 30, "seconds": 0.4}
+    only = {"sizes": SIZES[:1], "readers": READERS[:1], "variants": (OURS,)}
+    return Plan(quick=quick, **{**usual, **only, **given})
+
+
+def run(plan: Plan, console: Console | None = None) -> int:
+    """``plan`` has one size, one number of readers and one variant. 0 if the comparison was not fooled.
+
+    With fewer rounds than a judgement takes, the figures are shown and nobody is blamed.
+    """
+    console = console or Console()
+    plan.check()
+    if len(plan.variants) * len(plan.sizes) * len(plan.readers) != 1:
+        raise PebbleError("--null takes one variant, one size and one number of readers")
+    [variant] = plan.variants
+    if (reason := missing(variant)) is not None:
+        raise PebbleError(f"{variant} cannot run: {reason}")
+    command = [word if word != "--variants" else "--null" for word in plan.command()]
+    watch = Stopwatch("frames-null", command, plan.options())
+    size = parse_size(plan.sizes[0])
+    cases = [Case(variant, size, plan.readers[0], role) for role in null.roles(variant)]
+    cells = cells_of(measure(cases, plan, console, slowdown_us))
+    for figures in tables(cells):
+        console.print(figures)
+    output.finish(watch.results(cells, null.verdict(cells), quick=plan.quick), plan.output, console)
+    return 0 if all(cell.samples for cell in cells) and null.judged(cells) else 1
+
+
+def slowdown_us(case: Case, so_far: Measured) -> float:
+    """A fifth of what the variant has usually taken; in the first round its other roles come first."""
+    if not null.is_slowed(case.role):
+        return 0.0
+    usual = [
+        statistics.median(one.latencies_us)
+        for other, rounds in so_far.items()
+        for one in rounds
+        if one is not None and one.latencies_us and not null.is_slowed(other.role)
+    ]
+    return null.SLOWDOWN * statistics.median(usual) if usual else 0.0

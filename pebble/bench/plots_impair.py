@@ -1,0 +1,216 @@
+"""Pictures of robots behind bad links, in the form of the paper's Figures 4.7 and 4.8: trials from left to right."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from pebble.bench.figures import percentile
+from pebble.bench.plots_style import (
+    Picture,
+    around,
+    finite,
+    guide,
+    legend,
+    log_axis,
+    panels,
+    styles,
+    unique,
+)
+from pebble.bench.results import Cell, Results
+
+_PAPER_BEST = 80.0  # % of the audio, "saturated near"
+#: What the original lost when it was measured once through such a link: %, %, ms, pictures a second.
+_ORIGINAL_ARRIVED = {"256k": 40.0, "64k": 5.7}
+_ORIGINAL_ON_TIME = {"256k": 3.5}
+_ORIGINAL_P95_MS = {"256k": 6900.0}
+_ORIGINAL_FPS = {"256k": 2.2}
+_PAPER_SAYS = {"512k": "paper:\ndegraded", "256k": "paper:\nbroken"}
+_QUOTED = Line2D([], [], color="#1a1a1a", marker="x", linestyle="", markersize=7, markeredgewidth=2,
+                 label="the original program itself, measured once elsewhere")  # fmt: skip
+_OVER_TIME = " over time"
+_DRIVEN = {
+    "drive alone": "drive p95\nalone, ms",
+    "drive during video": "drive p95\nwith video, ms",
+    "drive during audio": "drive p95\nwith audio, ms",
+}
+_AIM_MS, _AIM_GAP_S = 400.0, 1.0  # of audio and of pictures, at 256 kbit/s
+_AIM_DRIVE_MS, _AIM_OFFLINE_S = 500.0, 2.0  # at 64 kbit/s with 5 % loss
+
+Value = Callable[[str, str], float]  # of a subject in a trial
+
+
+def over_trials(results: Results) -> list[Picture]:
+    """Audio, video and commands over the trials; each only where something was measured."""
+    if not _trials(results):
+        return []
+    made: list[tuple[str, str, Callable[[str], Figure]]] = [
+        (
+            "audio-delivery",
+            "Audio delivery over the trials, in the form of the paper's Figure 4.7",
+            lambda t: _audio(results, t),
+        ),
+        (
+            "audio-latency",
+            "Audio latency over the trials, in the form of the paper's Figure 4.8",
+            lambda t: _latency(results, t),
+        ),
+        ("video", "Video over the trials: pictures, and how long they stood still", lambda t: _video(results, t)),
+        ("drive", "Drive commands and heartbeat over the trials", lambda t: _drive(results, t)),
+    ]
+    return [_picture(f"{results.bench}-{name}", f"{caption}{_how(results)}", make) for name, caption, make in made]
+
+
+def _picture(name: str, caption: str, make: Callable[[str], Figure]) -> Picture:
+    return Picture(name, caption, lambda: make(caption))
+
+
+def _how(results: Results) -> str:
+    """What a figure of this kind means little without."""
+    options = results.options
+    window = f"; windows of {options['window_s']:g} s" if "window_s" in options else ""
+    link = f", over {'a TCP proxy' if options['link'] == 'proxy' else options['link']}" if "link" in options else ""
+    ways = ", both ways" if options.get("both_ways") else ""
+    return f"{window}{link}{ways}. “original”: this program with the original's encodings"
+
+
+def _audio(results: Results, title: str) -> Figure:
+    figure, (arrived, on_time) = panels(2, 1, (10.5, 3.5), title)
+    for axes, name, crosses, label in (
+        (arrived, "delivered_percent", _ORIGINAL_ARRIVED, "audio that arrived, %"),
+        (on_time, "on_time_percent", _ORIGINAL_ON_TIME, "audio within 1 s, %"),
+    ):
+        _lines(axes, results, _figure(results, "audio", name), crosses)
+        axes.set_ylabel(label)
+        axes.set_ylim(-4, 106)
+    guide(arrived, _PAPER_BEST, "paper:\nat best\n~80 %")
+    for trial, text in _PAPER_SAYS.items():
+        if trial in _trials(results):
+            at = _trials(results).index(trial)
+            arrived.axvspan(at - 0.5, at + 0.5, color="#f2efe6", zorder=0)
+            arrived.annotate(
+                text, (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555", ha="center", va="bottom"
+            )
+    _names(figure, [arrived, on_time], results, [_QUOTED])
+    return figure
+
+
+def _latency(results: Results, title: str) -> Figure:
+    figure, every = panels(2, 1, (10.5, 3.3), title)
+    for axes, percent, crosses in zip(every, (50, 95), ({}, _ORIGINAL_P95_MS), strict=True):
+        seen = _lines(axes, results, _percentile(results, "audio latency", percent), crosses)
+        log_axis(axes, "y", f"audio latency p{percent}, ms", *around([*seen, _AIM_MS]))
+    guide(every[1], _AIM_MS, "aim\nat 256k")
+    _names(figure, every, results, [_QUOTED])
+    return figure
+
+
+def _video(results: Results, title: str) -> Figure:
+    figure, every = panels(3, 1, (10.5, 2.7), title)
+    _lines(every[0], results, _figure(results, "video", "fps"), _ORIGINAL_FPS)
+    every[0].set_ylabel("pictures per second")
+    every[0].set_ylim(bottom=0)
+    still = _lines(every[1], results, _figure(results, "video", "frozen_s"))
+    every[1].set_ylim(-0.1, 1.15 * max(finite([*still, 1.0])))
+    every[1].set_ylabel("standing still, s\n(gaps over 1 s)")
+    seen = _lines(every[2], results, _figure(results, "video", "longest_gap_s"))
+    log_axis(every[2], "y", "longest gap, s", *around([*seen, _AIM_GAP_S]))
+    guide(every[2], _AIM_GAP_S, "aim\nat 256k")
+    _names(figure, every, results, [_QUOTED])
+    return figure
+
+
+def _drive(results: Results, title: str) -> Figure:
+    figure, every = panels(len(_DRIVEN) + 1, 1, (10.5, 2.3), title)
+    seen = [
+        _lines(axes, results, _percentile(results, measure, 95)) for axes, measure in zip(every, _DRIVEN, strict=False)
+    ]
+    for axes, label in zip(every, _DRIVEN.values(), strict=False):  # on one scale: waiting behind media would be seen
+        log_axis(axes, "y", label, *around([*itertools.chain(*seen), _AIM_DRIVE_MS]))
+        guide(axes, _AIM_DRIVE_MS, "aim at\n64k+5%")
+    spells = _lines(every[-1], results, _figure(results, "heartbeat", "longest_offline_s"))
+    every[-1].set_ylabel("robot seen offline,\nlongest, s")
+    every[-1].set_ylim(-0.1, 1.15 * max(finite([*spells, _AIM_OFFLINE_S])))
+    guide(every[-1], _AIM_OFFLINE_S, "aim at\n64k+5%")
+    _names(figure, every, results)
+    return figure
+
+
+def _lines(axes: Axes, results: Results, value: Value, crosses: dict[str, float] | None = None) -> list[float]:
+    """One line per subject; returns everything that was drawn."""
+    trials = _trials(results)
+    looks = styles(_subjects(results))
+    seen: list[float] = []
+    for number, (subject, look) in enumerate(looks.items()):
+        beside = 0.06 * (number - (len(looks) - 1) / 2)  # equal ones do not hide each other
+        heights = [value(subject, trial) for trial in trials]
+        seen += heights
+        axes.plot(
+            np.arange(len(trials)) + beside,
+            heights,
+            color=look.colour,
+            linestyle=look.dash,
+            marker=look.marker,
+            markersize=5,
+            linewidth=1.2,
+            markerfacecolor="white" if look.hollow else look.colour,
+        )
+    for trial, height in (crosses or {}).items():
+        if trial in trials:
+            seen.append(height)
+            axes.plot(trials.index(trial), height, "x", color="#1a1a1a", markersize=7, markeredgewidth=2, zorder=5)
+    return seen
+
+
+def _names(figure: Figure, every: Sequence[Axes], results: Results, more: Sequence[Line2D] = ()) -> None:
+    trials = _trials(results)
+    for axes in every:
+        axes.set_xlim(-0.6, len(trials) - 0.4)
+        axes.set_xticks(range(len(trials)), trials if axes is every[-1] else [""] * len(trials))
+    every[-1].tick_params(axis="x", labelrotation=40)
+    for label in every[-1].get_xticklabels():
+        label.set_horizontalalignment("right")
+        label.set_rotation_mode("anchor")
+    every[-1].set_xlabel("trial: what the link lets through, in the order of the run")
+    legend(figure, styles(_subjects(results)), more=more)
+
+
+def _of_trials(results: Results) -> list[Cell]:
+    return [cell for cell in results.cells if "trial" in cell.params and not cell.measure.endswith(_OVER_TIME)]
+
+
+def _trials(results: Results) -> list[str]:
+    return unique([str(cell.params["trial"]) for cell in _of_trials(results)])
+
+
+def _subjects(results: Results) -> list[str]:
+    return unique([cell.variant for cell in _of_trials(results)])
+
+
+def _figure(results: Results, about: str, name: str) -> Value:
+    """A figure of a cell about audio or about video (its latency, or the gaps between pictures)."""
+    kinds = (about, "picture") if about == "video" else (about,)
+
+    def value(subject: str, trial: str) -> float:
+        for cell in _of_trials(results):
+            if (cell.variant, cell.params["trial"]) == (subject, trial) and cell.measure.startswith(kinds):
+                found = cell.figures.get(name)
+                if isinstance(found, int | float):
+                    return float(found)
+        return math.nan
+
+    return value
+
+
+def _percentile(results: Results, measure: str, percent: float) -> Value:
+    def value(subject: str, trial: str) -> float:
+        cell = results.find(subject, measure, trial=trial)
+        return math.nan if cell is None else percentile(finite(cell.samples), percent)
+
+    return value

@@ -1,0 +1,176 @@
+"""The comparisons of a report: their command lines, how long they take, and what they measure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pebble.errors import PebbleError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Comparison:
+    """One command of the report. Its results are ``<name>.json``, its output ``<name>.txt``."""
+
+    name: str
+    title: str
+    what: str  # is measured, and how to read it
+    full: Sequence[str]  # what follows ``pebble``
+    quick: Sequence[str]
+    full_s: int  # expected
+    quick_s: int
+    #: Lines of its verdict that help somebody to choose a transport; it says the most important first.
+    choosing: int = 0
+
+    def arguments(self, quick: bool) -> Sequence[str]:
+        return self.quick if quick else self.full
+
+    def expected_s(self, quick: bool) -> int:
+        return self.quick_s if quick else self.full_s
+
+
+def _bench(*words: str) -> tuple[str, ...]:
+    return ("bench", *words)
+
+
+COMPARISONS = (
+    Comparison(
+        name="control",
+        title="Service to service",
+        what="A message of a drive command's size goes from one process to another and back, as a robot's services "
+        "send it, unloaded, with camera frames on the same fabric, and beside a program that takes a whole core. "
+        "One-way is from just before the publish call until the receiver's handler runs; both ends have the "
+        "same clock.",
+        full=_bench("control"),
+        quick=_bench("control", "--quick"),
+        full_s=700,
+        quick_s=40,
+        choosing=5,
+    ),
+    Comparison(
+        name="control-null",
+        title="Service to service: the null test",
+        what="One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
+        "The first ratio has to hold 1.00, the second has to lie above it: otherwise the comparison above sees what is "
+        "not there, or not what is.",
+        full=_bench("control", "--null"),
+        quick=_bench("control", "--null", "--quick"),
+        full_s=120,
+        quick_s=15,
+    ),
+    Comparison(
+        name="bridge",
+        title="Operator to wheels, and back",
+        what="A whole robot of each kind, with a stock broker between it and the operator. Down is from the operator's "
+        "publish call to the last byte of the command's line at the MCU's pty; up is from the "
+        "MCU's report to the operator.",
+        full=_bench("bridge", "--with-media"),
+        quick=_bench("bridge", "--quick"),
+        full_s=300,
+        quick_s=22,
+        choosing=3,
+    ),
+    Comparison(
+        name="bridge-null",
+        title="Operator to wheels: the null test",
+        what="Robots of one kind in three roles: plain, again, and with a fifth of the usual latency planted by the "
+        "operator. The first ratio has to hold 1.00, the second has to lie above it.",
+        full=_bench("bridge", "--null"),
+        quick=_bench("bridge", "--null", "--quick"),
+        full_s=150,
+        quick_s=20,
+    ),
+    Comparison(
+        name="startup",
+        title="Start-up",
+        what="How soon a robot that was just started is heard, is ready and obeys, and how soon somebody who comes "
+        "later knows all that is kept. A dot in the figure is one launch, or one who joined.",
+        full=_bench("startup"),
+        quick=_bench("startup", "--quick"),
+        full_s=120,
+        quick_s=12,
+        choosing=2,
+    ),
+    Comparison(
+        name="cost",
+        title="Memory and CPU",
+        what="What each process of a robot needs while it is idle, driven, and streaming. Memory is PSS, in which "
+        "shared pages are divided among those who share them; CPU is per cent of one core.",
+        full=_bench("cost"),
+        quick=_bench("cost", "--quick"),
+        full_s=180,
+        quick_s=20,
+        choosing=8,
+    ),
+    Comparison(
+        name="frames",
+        title="Camera frames inside the robot",
+        what="BGR pictures at 30 Hz from one process to others on the same machine. The latency is from the last byte "
+        "written until the reader has a whole numpy array.",
+        full=_bench("frames"),
+        quick=_bench("frames", "--quick"),
+        full_s=330,
+        quick_s=20,
+        choosing=2,
+    ),
+    Comparison(
+        name="frames-null",
+        title="Camera frames: the null test",
+        what="One way of handing frames over against itself, and with a fifth of its usual latency planted by the "
+        "writer. The first ratio has to hold 1.00, the second has to lie above it.",
+        full=_bench("frames", "--null", "zenoh-shm"),
+        quick=_bench("frames", "--null", "zenoh-shm", "--quick"),
+        full_s=90,
+        quick_s=10,
+    ),
+    Comparison(
+        name="video",
+        title="Video on the wire",
+        what="Bytes of each form of video at equal quality (SSIM) on the same synthetic films. Nothing is sent: this "
+        "is what encoders make.",
+        full=_bench("video"),
+        quick=_bench("video", "--seconds", "1"),
+        full_s=60,
+        quick_s=8,
+    ),
+    Comparison(
+        name="sound",
+        title="Sound on the wire",
+        what="Bytes of each form of sound with the headers of MQTT, TCP and IP. Nothing is sent: this is what encoders "
+        "make of synthetic speech.",
+        full=_bench("sound"),
+        quick=_bench("sound"),
+        full_s=6,
+        quick_s=6,
+    ),
+    Comparison(
+        name="fleet",
+        title="A fleet on one broker",
+        what="Robots that are their own MCU, the real firmware on simulated pins, all on one stock broker and driven "
+        "by one operator at 10 Hz each. The latency is from the operator's publish call to the change of the pins.",
+        full=_bench("fleet", "--robots", "100", "--seconds", "20"),
+        quick=_bench("fleet", "--robots", "30", "--seconds", "5"),
+        full_s=35,
+        quick_s=12,
+    ),
+    Comparison(
+        name="impair",
+        title="Behind a bad link",
+        what="Whole robots behind a link that is made narrow and lossy, trial after trial, as in section 4.2 of the "
+        "paper: heartbeat, driving, video, then audio in each. “original” is this Pebble with the original's encodings "
+        "(JSON video, PCM audio); “h264 opus” are the forms that adapt.",
+        full=("impair",),
+        quick=("impair", "--quick"),
+        full_s=1300,
+        quick_s=85,
+        choosing=9,
+    ),
+)
+NAMES = tuple(one.name for one in COMPARISONS)
+
+
+def chosen(names: Sequence[str]) -> list[Comparison]:
+    """Those with these names, in the report's order; all of them for no names. Raises PebbleError for unknown ones."""
+    if unknown := [name for name in names if name not in NAMES]:
+        raise PebbleError(f"there is no {', '.join(unknown)} in the report: there are {', '.join(NAMES)}")
+    return [one for one in COMPARISONS if not names or one.name in names]

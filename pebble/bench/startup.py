@@ -1,0 +1,227 @@
+"""How soon a robot is there, and how soon somebody who comes late knows all it keeps, on MQTT and on Zenoh.
+
+Every launch is a robot of its own: launcher, hub or local broker, bridges, a simulated MCU, a remote broker.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from pebble.bench import late
+from pebble.bench.bridge_robot import BASE, KINDS
+from pebble.bench.frames_process import Worker, end_workers
+from pebble.bench.measured_robot import MeasuredRobot, check_kinds
+from pebble.bench.onlooker import Onlooker
+from pebble.bench.output import FOLDER, check_folder, finish
+from pebble.bench.results import Cell, Stopwatch
+from pebble.bench.side_by_side import against, caveat, sentence, spread
+from pebble.bench.tables import plain_table
+from pebble.signals import interrupted_by_signals
+from pebble.transports.segments import sweep
+
+ROUNDS, QUICK_ROUNDS = 10, 3
+JOINS, QUICK_JOINS = 5, 3  # latecomers of each sort to each robot
+RATE_HZ = 20.0  # of the operator who drives from the start
+_UP_S = 20.0
+_SLICE_S = 0.2  # of driving, between looks whether it is time to stop
+_ANSWER_S = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """So many launches of each kind, in turn."""
+
+    rounds: int | None = None  # None: as many as befit
+    kinds: Sequence[str] = KINDS
+    quick: bool = False
+    output: Path = FOLDER
+
+    @property
+    def launches(self) -> int:
+        return self.rounds or (QUICK_ROUNDS if self.quick else ROUNDS)
+
+    @property
+    def joins(self) -> int:
+        return QUICK_JOINS if self.quick else JOINS
+
+    def check(self) -> None:
+        """Raises PebbleError naming what makes no sense."""
+        check_kinds(self.kinds)
+        check_folder(self.output)
+
+    def command(self) -> list[str]:
+        """That repeats it."""
+        kinds = [] if tuple(self.kinds) == KINDS else ["--variants", ",".join(self.kinds)]
+        quick = ["--quick"] if self.quick else []
+        return ["pebble", "bench", "startup", "--rounds", str(self.launches), *kinds, *quick]
+
+
+@dataclass(slots=True, kw_only=True)
+class Launch:
+    """One robot's start. Seconds are counted from the moment before its launcher is started."""
+
+    beat_s: float
+    ready_s: float
+    obeyed_s: float
+    stock_operator_ms: list[float] = field(default_factory=list)
+    operator_ms: list[float] = field(default_factory=list)
+    service_ms: list[float] = field(default_factory=list)
+    kept: int = 0  # topics with a kept copy, at the remote broker
+    kept_inside: int = 0  # on the robot's own transport
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """What is measured of every launch."""
+
+    name: str
+    unit: str
+    samples: Callable[[Launch], list[float]]
+    kept: Callable[[Launch], int] | None = None
+
+
+MEASURES = (
+    Measure("first heartbeat", "s", lambda launch: [launch.beat_s]),
+    Measure("all ready", "s", lambda launch: [launch.ready_s]),
+    Measure("first drive obeyed", "s", lambda launch: [launch.obeyed_s]),
+    Measure("late operator", "ms", lambda launch: launch.operator_ms, lambda launch: launch.kept),
+    Measure("late operator, paho", "ms", lambda launch: launch.stock_operator_ms, lambda launch: launch.kept),
+    Measure("late service", "ms", lambda launch: launch.service_ms, lambda launch: launch.kept_inside),
+)
+
+
+def run(plan: Plan, console: Console | None = None) -> int:
+    """Measure, show and write. Raises PebbleError."""
+    console = console or Console()
+    plan.check()
+    watch = Stopwatch("startup", plan.command(), {"rounds": plan.launches, "joins": plan.joins, "rate_hz": RATE_HZ})
+    launches: dict[str, list[Launch]] = {kind: [] for kind in plan.kinds}
+    with interrupted_by_signals(), console.status("") as status:
+        try:
+            for number in range(plan.launches):
+                for kind in plan.kinds[:: -1 if number % 2 else 1]:
+                    status.update(f"launch {number + 1} of {plan.launches}: {kind}")
+                    launches[kind].append(launch(kind, plan.joins))
+        finally:
+            sweep()  # Zenoh leaves files behind even when it ends politely
+    cells = cells_of(launches)
+    console.print(table(cells))
+    finish(watch.results(cells, verdict(cells), quick=plan.quick), plan.output, console)
+    return 0
+
+
+def cells_of(launches: dict[str, list[Launch]]) -> list[Cell]:
+    """One for each measure and kind; a round is a launch."""
+    return [
+        Cell(
+            variant=kind,
+            measure=measure.name,
+            unit=measure.unit,
+            rounds=[measure.samples(launch) for launch in done],
+            figures={} if measure.kept is None else {"topics": max(map(measure.kept, done), default=0)},
+        )
+        for measure in MEASURES
+        for kind, done in launches.items()
+    ]
+
+
+def table(cells: Sequence[Cell]) -> Table:
+    """Measures down, transports across."""
+    kinds = list(dict.fromkeys(cell.variant for cell in cells))
+    ratio = [f"{kinds[1]} / {kinds[0]}"] if len(kinds) > 1 else []
+    rows = plain_table("median (least to greatest) of the launches", ["", "unit", *kinds, *ratio], left=2)
+    for measure, group in _by_measure(cells):
+        rows.add_row(measure, group[0].unit, *map(spread, group), *([against(group)] if ratio else []))
+    return rows
+
+
+def verdict(cells: Sequence[Cell]) -> list[str]:
+    lines = [
+        sentence(f"{measure[0].upper()}{measure[1:]}", group, less="sooner", more="later")
+        for measure, group in _by_measure(cells)
+    ]
+    return lines + caveat(cells)
+
+
+def _by_measure(cells: Sequence[Cell]) -> Iterator[tuple[str, list[Cell]]]:
+    for measure in dict.fromkeys(cell.measure for cell in cells):
+        yield measure, [cell for cell in cells if cell.measure == measure]
+
+
+# -- one launch
+
+
+def launch(kind: str, joins: int) -> Launch:
+    """A robot from nothing to its end. Raises PebbleError with its last words if it does not come up."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
+        robot = stack.enter_context(MeasuredRobot(kind))
+        service = stack.enter_context(_late_service(robot, folder))
+        onlooker = stack.enter_context(closing(Onlooker(robot.remote_port, BASE)))
+        onlooker.wait_until_listening()
+        started = _start(robot, onlooker)
+        service.tell(str(joins))  # it counts what is kept first: by then, start-up work is over
+        said = service.answer(_ANSWER_S)
+        started.service_ms, started.kept_inside = said["ms"], len(said["kept"])
+        port, kept = robot.remote_port, set(onlooker.kept)
+        started.kept = len(kept)
+        started.operator_ms = [late.operator_ms(port, BASE, kept) for _ in range(joins)]
+        started.stock_operator_ms = [late.stock_operator_ms(port, BASE, kept) for _ in range(joins)]
+        return started
+
+
+def _start(robot: MeasuredRobot, onlooker: Onlooker) -> Launch:
+    with _driving(onlooker):
+        began_ns = time.monotonic_ns()
+        robot.launch()
+        robot.expect(lambda: onlooker.first_beat_ns is not None, "no heartbeat", _UP_S)
+        robot.expect(lambda: onlooker.ready_ns is not None, "not every service is ready", _UP_S)
+        robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", _UP_S)
+    obeyed_ns = _obeyed(robot, began_ns)[0]
+    times = (onlooker.first_beat_ns or 0, onlooker.ready_ns or 0, obeyed_ns)
+    beat_s, ready_s, obeyed_s = ((time_ns - began_ns) / 1e9 for time_ns in times)
+    return Launch(beat_s=beat_s, ready_s=ready_s, obeyed_s=obeyed_s)
+
+
+def _obeyed(robot: MeasuredRobot, since_ns: int) -> list[int]:
+    """When lines that move the wheels reached the MCU."""
+    return [line.ns for line in robot.lines(since_ns) if line.drive is not None and any(line.drive)]
+
+
+@contextmanager
+def _driving(operator: Onlooker) -> Iterator[None]:
+    """Commands at a steady rate all the while, whoever listens."""
+    enough = threading.Event()
+
+    def drive() -> None:
+        while not enough.is_set():
+            operator.drive(_SLICE_S, RATE_HZ)
+
+    thread = threading.Thread(target=drive, name="driver", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        enough.set()
+        thread.join()
+
+
+@contextmanager
+def _late_service(robot: MeasuredRobot, folder: Path) -> Iterator[Worker]:
+    """Started beforehand: its imports do not disturb the launch."""
+    worker = Worker("late service", [sys.executable, "-m", "pebble.bench.late", str(robot.config)], folder / "late.log")
+    try:
+        worker.answer(_ANSWER_S)
+        yield worker
+    finally:
+        end_workers([worker])

@@ -1,0 +1,168 @@
+"""From what was recorded to cells of results. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from pebble.bench.figures import rounded
+from pebble.bench.results import Cell, Value
+from pebble.impair import figures
+from pebble.impair.link import Carried
+from pebble.impair.messages import Record, Window
+from pebble.simulation.trace import Entry
+
+SOUND, PICTURES, PICTURE_GAP = "audio latency", "video latency", "picture gap"
+BEAT_GAP, BEAT_DELAY = "heartbeat gap", "heartbeat delay"
+DRIVE, DRIVE_ALONE, DRIVE_VIDEO, DRIVE_AUDIO = "drive", "drive alone", "drive during video", "drive during audio"
+SOUND_OVER_TIME, DRIVE_OVER_TIME = "audio over time", "drive over time"
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One subject in one condition. ``carried``: what the link had carried before and after each phase."""
+
+    subject: str
+    name: str
+    record: Record
+    entries: Sequence[Entry]  # of the MCU
+    carried: dict[str, tuple[Carried, Carried]]
+
+    @property
+    def phases(self) -> dict[str, Window]:
+        return {DRIVE_ALONE: self.record.alone, DRIVE_VIDEO: self.record.video, DRIVE_AUDIO: self.record.audio}
+
+
+def cells_of(trials: Iterable[Trial], fps: float) -> list[Cell]:
+    """All figures of all trials, ``fps`` being the rate of pictures that is wanted."""
+    return [
+        cell for trial in trials for cell in (_sound(trial), *_pictures(trial, fps), *_beats(trial), *_drive(trial))
+    ]
+
+
+def over_time(trials: Iterable[Trial], began_ns: int) -> list[Cell]:
+    """Each subject's sound and commands of the whole run, as they came: rounds are seconds since it began, and ms."""
+    sound: dict[str, list[tuple[int, float]]] = {}
+    drive: dict[str, list[tuple[int, float]]] = {}
+    for trial in trials:
+        sound.setdefault(trial.subject, []).extend(
+            (one.arrived_ns, (one.arrived_ns - one.captured_ns) / 1e6) for one in trial.record.sounds
+        )
+        drive.setdefault(trial.subject, []).extend(
+            (command.sent_ns + round(1e6 * ms), ms)
+            for command, ms in figures.driven_ms(trial.record.commands, trial.entries)
+        )
+    return [
+        _series(subject, measure, points, began_ns)
+        for measure, series in ((SOUND_OVER_TIME, sound), (DRIVE_OVER_TIME, drive))
+        for subject, points in series.items()
+    ]
+
+
+def _series(subject: str, measure: str, points: list[tuple[int, float]], began_ns: int) -> Cell:
+    points = sorted(points)
+    times, values = [(ns - began_ns) / 1e9 for ns, _ in points], [ms for _, ms in points]
+    return Cell(variant=subject, measure=measure, unit="ms", rounds=[times, values])
+
+
+def _cell(trial: Trial, measure: str, unit: str, samples: list[float], **more: Value) -> Cell:
+    return Cell(
+        variant=trial.subject,
+        params={"trial": trial.name},
+        measure=measure,
+        unit=unit,
+        rounds=[samples],
+        figures={name: rounded(value, 3) if isinstance(value, float) else value for name, value in more.items()},
+    )
+
+
+def _sound(trial: Trial) -> Cell:
+    sounds, window = trial.record.sounds, trial.record.audio
+    packets = figures.heard(sounds, window)
+    delivered = figures.sound_percent(sounds, window)
+    on_time = figures.sound_percent(sounds, window, figures.ON_TIME_S)
+    return _cell(
+        trial,
+        SOUND,
+        "ms",
+        [(packet.arrived_ns - packet.captured_ns) / 1e6 for packet in packets],
+        delivered_percent=delivered,
+        on_time_percent=on_time,
+        late_percent=delivered - on_time,
+        sent=figures.sent_packets(packets),
+        first_s=window.first_s,
+        **_wire(trial, "audio", window),
+    )
+
+
+def _pictures(trial: Trial, wanted_fps: float) -> list[Cell]:
+    window = trial.record.video
+    pictures = figures.seen(trial.record.pictures, window)
+    gaps = figures.gaps_s([picture.arrived_ns for picture in pictures], window)
+    latencies = [(one.arrived_ns - one.captured_ns) / 1e6 for one in pictures if one.captured_ns is not None]
+    fps = len(pictures) / window.seconds
+    more: dict[str, Value] = {
+        "fps": fps,
+        "delivered_percent": min(100.0, 100 * fps / wanted_fps),
+        "frozen_s": sum((gap for gap in gaps if gap > figures.FROZEN_S), 0.0),
+        "longest_gap_s": max(gaps),
+        "decoded": len(trial.record.pictures),
+        "arrived": trial.record.payloads,
+        "first_s": window.first_s,
+        **_wire(trial, "video", window),
+    }
+    return [_cell(trial, PICTURES, "ms", latencies, **more), _cell(trial, PICTURE_GAP, "s", gaps)]
+
+
+def _beats(trial: Trial) -> list[Cell]:
+    whole = trial.record.whole
+    beats = [beat for beat in trial.record.beats if trial.record.whole.holds(beat.arrived_ns)]
+    gaps = figures.gaps_s([beat.arrived_ns for beat in beats], whole)
+    spells = figures.offline_s(trial.record.beats, whole)
+    return [
+        _cell(
+            trial,
+            BEAT_GAP,
+            "s",
+            gaps,
+            longest_gap_s=max(gaps),
+            offline_s=sum(spells, 0.0),
+            longest_offline_s=max(spells, default=0.0),
+            window_s=whole.seconds,
+        ),
+        _cell(trial, BEAT_DELAY, "ms", [(beat.arrived_ns - beat.sent_ns) / 1e6 for beat in beats]),
+    ]
+
+
+def _drive(trial: Trial) -> list[Cell]:
+    commands = trial.record.commands
+    driven = figures.driven_ms(commands, trial.entries)
+    cells = [
+        _cell(
+            trial,
+            DRIVE,
+            "ms",
+            [ms for _, ms in driven],
+            sent=len(commands),
+            delivered_percent=100 * len(driven) / len(commands) if commands else None,
+            trips=figures.trips(commands, trial.entries),
+            window_s=trial.record.whole.seconds,
+        )
+    ]
+    for measure, window in trial.phases.items():
+        sent = figures.within(commands, window)
+        took = [ms for command, ms in driven if window.holds(command.sent_ns)]
+        wire = _wire(trial, "alone", window) if measure == DRIVE_ALONE else {"window_s": window.seconds}
+        cells.append(_cell(trial, measure, "ms", took, sent=len(sent), **wire))
+    return cells
+
+
+def _wire(trial: Trial, phase: str, window: Window) -> dict[str, Value]:
+    before, after = trial.carried[phase]
+    return {
+        "window_s": window.seconds,
+        "kbit_up": 8e-3 * (after.bytes_up - before.bytes_up) / window.seconds,
+        "kbit_down": 8e-3 * (after.bytes_down - before.bytes_down) / window.seconds,
+        "dropped_up": after.dropped_up - before.dropped_up,
+        "dropped_down": after.dropped_down - before.dropped_down,
+    }

@@ -1,0 +1,211 @@
+"""Results as comparisons leave them behind, made up: what plots and reports are tested with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from pebble.bench.results import Cell, Results
+
+TRIALS = (
+    "base-start", "1024k", "512k", "256k", "128k", "64k", "1%", "2%", "5%", "10%",
+    "256k+1%", "128k+2%", "64k+5%", "base-end", "starlink", "wifi-power-save",
+)  # fmt: skip
+SUBJECTS = ("mqtt original", "zenoh original", "mqtt h264 opus", "zenoh h264 opus")
+_VARIANTS = {
+    "paho": 520.0, "mqtt": 480.0, "mqtt-nodelay": 440.0, "mqtt5": 450.0, "zenoh-p2p": 190.0, "zenoh-hub": 300.0,
+}  # fmt: skip
+_random = np.random.default_rng(7)
+
+
+def latencies(middle: float, count: int = 300, rounds: int = 10, spread: float = 0.25) -> list[list[float]]:
+    """Rounds of skewed samples, as latencies are, each round in a mood of its own."""
+    return [
+        (middle * _random.lognormal(0, 0.04) * (_random.lognormal(0, spread, count) + _random.exponential(0.1, count)))
+        .round(3)
+        .tolist()
+        for _ in range(rounds)
+    ]
+
+
+def _results(bench: str, cells: list[Cell], verdict: list[str], **more: object) -> Results:
+    machine = {"cpu": "Some CPU @ 2.40GHz", "cores": 2, "kernel": "6.1.0", "python": "3.11.2", "mosquitto": "2.0.11"}
+    return Results(
+        bench=bench,
+        command=["pebble", "bench", bench],
+        machine={**machine, "system": "Debian GNU/Linux 12 (bookworm)"},
+        began="2026-11-20T14:00:00Z",
+        took_s=61.0,
+        cells=cells,
+        verdict=verdict,
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def control(small: bool = False) -> Results:
+    conditions = [("40 B", "20 Hz", "none"), ("40 B", "200 Hz", "none"), ("40 B", "1000 Hz", "none")]
+    conditions += [("1024 B", "20 Hz", "none"), ("1024 B", "200 Hz", "none"), ("1024 B", "1000 Hz", "none")]
+    conditions += [
+        (size, rate, load) for load in ("media", "hog") for size, rate in (("40 B", "20 Hz"), ("40 B", "200 Hz"))
+    ]
+    conditions = conditions[5:8] if small else conditions
+    cells = [
+        Cell(
+            variant=variant,
+            params={"size": size, "rate": rate, "load": load},
+            measure=measure,
+            unit="us",
+            rounds=latencies(middle * (1 if load == "none" else 1.7) * (2 if measure == "round trip" else 1), 60),
+            figures={"sent": 600, "late": 0, "cpu_percent": 3.0},
+        )
+        for size, rate, load in conditions
+        for variant, middle in _VARIANTS.items()
+        for measure in ("one-way", "round trip")
+    ]
+    return _results(
+        "control",
+        cells,
+        [
+            "zenoh-p2p is faster than mqtt-nodelay: 0.43 (0.41 to 0.45) of its figure",
+            "aim: Zenoh peer to peer, p50 at most 0.70 of the better MQTT variant's: met (0.43, at most 0.45)",
+            "aim: with media, p99 at 200 Hz at most 0.35 of it: missed (0.41, at most 0.52)",
+        ],
+    )
+
+
+def null_test(bench: str, variant: str) -> Results:
+    roles = {variant: 1.0, f"{variant} again": 1.0, f"{variant} +20 %": 1.2}
+    cells = [
+        Cell(variant=role, params={"size": "40 B", "rate": "200 Hz"}, measure="one-way", unit="us",
+             rounds=latencies(200 * factor))
+        for role, factor in roles.items()
+    ]  # fmt: skip
+    return _results(f"{bench}-null", cells, ["aim: the same against itself is equal: met (1.01)"])
+
+
+def bridge() -> Results:
+    cells = [
+        Cell(variant=variant, params={"load": load}, measure=measure, unit="ms",
+             rounds=latencies(middle * (1.6 if load == "media" else 1), 80), figures={"sent": 800})
+        for load in ("none", "media")
+        for measure in ("down", "up")
+        for variant, middle in {"mqtt": 0.9, "zenoh": 0.6, "one hop": 0.25}.items()
+        if variant != "one hop" or measure == "down"
+    ]  # fmt: skip
+    return _results("bridge", cells, ["aim: mqtt, p50 at most 0.7 ms: missed (0.9 ms)"])
+
+
+def startup() -> Results:
+    measures = {"first heartbeat": 1.1, "all ready": 1.4, "first command obeyed": 1.2, "late operator": 0.08}
+    cells = [
+        Cell(variant=variant, measure=measure, unit="s", rounds=[[sample] for (sample,) in latencies(middle, 1)])
+        for measure, middle in measures.items()
+        for variant in ("mqtt", "zenoh")
+    ]
+    return _results("startup", cells, ["zenoh and mqtt are equal within noise: 1.01 (0.96 to 1.05)"])
+
+
+def cost(small: bool = False) -> Results:
+    processes = {
+        "mqtt": ["launcher", "mosquitto", "mqtt_bridge", "serial_mcu_bridge", "av_daemon", "camera_publisher", "all"]
+    }
+    processes["zenoh"] = [name.replace("mosquitto", "zenoh_hub") for name in processes["mqtt"]]
+    cells = [
+        Cell(variant=variant, params={"phase": phase, "process": process}, measure=measure, unit=unit,
+             rounds=latencies(80.0 if process == "all" else 15.0, 1, 3))
+        for measure, unit in (("PSS", "MB"), ("CPU", "%"), ("threads", ""))
+        for phase in ("idle", "streaming h264 opus", *(() if small else ("driving", "streaming")))
+        for variant in ("mqtt", "zenoh")
+        for process in processes[variant]
+    ]  # fmt: skip
+    return _results("cost", cells, ["mqtt needs less memory: 80 MB against 95 MB (medians of 3 rounds)"])
+
+
+def frames(small: bool = False) -> Results:
+    variants = {"zenoh-shm": 190, "zenoh-copy": 420, "zenoh-net": 900, "mqtt": 2400, "gstreamer-shm": 350, "memcpy": 60}
+    cells = [
+        Cell(variant=variant, params={"size": size, "readers": readers}, measure="frame", unit="us",
+             rounds=latencies(middle * (5 if size != "640x480" and variant != "zenoh-shm" else 1), 90, 3))
+        for size in ("640x480", "1920x1080")
+        for readers in ((3,) if small else (1, 3))
+        for variant, middle in variants.items()
+    ]  # fmt: skip
+    return _results("frames", cells, ["zenoh-shm is faster than mqtt: 0.08 (0.07 to 0.09) of its figure"])
+
+
+def fleet() -> Results:
+    cells = [Cell(variant="mqtt", params={"robots": 100}, measure="command", unit="ms", rounds=latencies(2.0, 900, 1))]
+    return _results("fleet", cells, [])
+
+
+def video() -> Results:
+    forms = {"reference": 90e3, "json": 86e3, "pbvd": 75e3, "pbvz": 60e3, "h264": 15e3, "h264, key/5": 31e3}
+    cells = [
+        Cell(variant=form, params={"scene": scene}, measure="wire", unit="kB/s", rounds=[[size / 1000]])
+        for scene in ("still", "moving", "dark and noisy")
+        for form, size in forms.items()
+    ]
+    return _results("video", cells, [])
+
+
+def sound() -> Results:
+    cells = [Cell(variant="pcm", params={}, measure="wire", unit="kbit/s", rounds=[[290.0]])]
+    cells += [
+        Cell(variant="opus", params={"bitrate": bitrate, "bundle": bundle}, measure="wire", unit="kbit/s",
+             rounds=[[bitrate / 1000 + 40 / bundle]])
+        for bitrate in (16_000, 24_000, 32_000)
+        for bundle in (1, 2, 3)
+    ]  # fmt: skip
+    return _results("sound", cells, [])
+
+
+def impair(trials: tuple[str, ...] = TRIALS) -> Results:
+    cells = []
+    for subject in SUBJECTS:
+        good = "opus" in subject
+        for number, trial in enumerate(trials):
+            bad = 1 + 4 * ("k" in trial and not good) + (number % 4 if "%" in trial else 0)
+            figures = {"delivered_percent": 99.0 if good else 100 / bad, "on_time_percent": 98.0 if good else 60 / bad}
+            cells += [
+                Cell(variant=subject, params={"trial": trial}, measure=measure, unit=unit,
+                     rounds=latencies(middle * bad, 50, 1), figures=more)
+                for measure, unit, middle, more in (
+                    ("audio latency", "ms", 45, figures),
+                    ("video latency", "ms", 60, {"fps": 15 / bad, "window_s": 8.0}),
+                    ("picture gap", "s", 0.07, {"frozen_s": bad - 1.0, "longest_gap_s": 0.1 * bad}),
+                    ("heartbeat gap", "s", 1.0, {"longest_offline_s": bad - 1.0}),
+                    ("drive alone", "ms", 2, {"sent": 50}),
+                    ("drive during video", "ms", 2.1, {}),
+                    ("drive during audio", "ms", 2.2, {}),
+                )
+            ]  # fmt: skip
+        for what, middle in (("audio", 45.0), ("drive", 2.0)):
+            seconds = np.linspace(2, 24 * len(trials), 1500).round(3).tolist()
+            times = latencies(middle, 1500, 1)[0]
+            cells.append(Cell(variant=subject, measure=f"{what} over time", unit="ms", rounds=[seconds, times]))
+    marks = ";".join(f"{trial}@{2 + 24 * number}" for number, trial in enumerate(trials))
+    aims = ["aim: mqtt h264 opus at 256k, audio at least 99 %: met (99.0 %)"]
+    return _results("impair", cells, aims, options={"link": "proxy", "window_s": 8.0, "marks": marks})
+
+
+def broken() -> Results:
+    """NaN, empty rounds, one round, a variant that is missing in places, names that do not end."""
+    long = "a-variant-with-a-name-that-is-much-longer-than-anybody-would-think"
+    nowhere = Cell(variant="mqtt5", params={"size": "40 B"}, measure="one-way", unit="us", rounds=[[], [math.nan] * 30])
+    cells = [
+        Cell(variant=name, params={"size": size}, measure="one-way", unit="us", rounds=latencies(300, 40, 1))
+        for size, names in {"40 B": ("mqtt", long), "1024 B": (long, "zenoh-p2p")}.items()
+        for name in names
+    ]
+    return _results("control", [*cells, nowhere], [], quick=True)
+
+
+def one_of_each(small: bool = False) -> dict[str, Results]:
+    """By the name of the comparison; ``small``: fewer cells of the largest ones."""
+    trials = ("base-start", "512k", "256k", "64k+5%", "wifi-power-save") if small else TRIALS
+    made: list[Callable[[], Results]] = [bridge, startup, video, sound, fleet]
+    every = [control(small), frames(small), cost(small), *(make() for make in made), impair(trials)]
+    every += [null_test("control", "zenoh-p2p"), null_test("bridge", "zenoh"), null_test("frames", "zenoh-shm")]
+    return {results.bench: results for results in every}

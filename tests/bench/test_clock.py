@@ -1,0 +1,70 @@
+"""The offset of two clocks from messages there and back: within its error, or refused."""
+
+import random
+
+import pytest
+
+from pebble.bench.clock import DRIFT, LEAST, estimate, one_way_ns
+from pebble.bench.control_wire import Exchange
+from pebble.errors import PebbleError
+
+SECOND = 10**9
+SEEDS = range(300)
+
+
+def exchanges(
+    random_: random.Random, *, count: int = 200, offset: int = 0, drift: float = 0.0, there_us: float, back_us: float
+) -> list[Exchange]:
+    """Half of a millisecond each way at least, and queues that are longer one way than the other."""
+
+    def far(now: int) -> int:
+        return now + offset + round(drift * now)
+
+    found, now = [], 0
+    for _ in range(count):
+        heard = now + 500_000 + round(1000 * random_.expovariate(1 / there_us))
+        sent = heard + random_.randrange(5_000, 200_000)
+        back = sent + 500_000 + round(1000 * random_.expovariate(1 / back_us))
+        found.append(Exchange(now, far(heard), far(sent), back))
+        now += SECOND // 100
+    return found
+
+
+@pytest.mark.parametrize("drift", [0.0, DRIFT, -DRIFT])
+def test_the_true_offset_lies_within_the_error_all_the_time(drift: float) -> None:
+    inside = 0
+    for seed in SEEDS:
+        random_ = random.Random(seed)
+        offset = random_.randrange(-5 * SECOND, 5 * SECOND)
+        measured = exchanges(random_, offset=offset, drift=drift, there_us=2000, back_us=50)
+        found = estimate(measured)
+        truths = [offset + drift * now for now in (measured[0].t1, measured[100].t1, measured[-1].t4)]
+        inside += all(abs(found.ns - truth) <= found.error_ns for truth in truths)
+    assert inside == len(SEEDS)
+
+
+def test_the_error_is_no_more_than_half_of_the_shortest_round_trip_and_the_drift() -> None:
+    measured = exchanges(random.Random(1), there_us=300, back_us=300)
+    shortest = min(one.t4 - one.t1 - (one.t3 - one.t2) for one in measured)
+    found = estimate(measured)
+    assert found.error_ns <= shortest / 2 + DRIFT * (measured[-1].t4 - measured[0].t1) + 1
+
+
+def test_the_two_ways_add_up_to_the_round_trip() -> None:
+    measured = exchanges(random.Random(2), offset=-7 * SECOND, there_us=100, back_us=900)
+    found = estimate(measured)
+    for one in measured:
+        assert sum(one_way_ns(one, found)) == one.t4 - one.t1 - (one.t3 - one.t2)
+
+
+def test_too_few_exchanges_are_refused() -> None:
+    measured = exchanges(random.Random(3), count=LEAST - 1, there_us=1, back_us=1)
+    with pytest.raises(PebbleError, match=f"fewer than {LEAST}"):
+        estimate(measured)
+
+
+def test_a_clock_that_was_set_meanwhile_is_refused() -> None:
+    before = exchanges(random.Random(4), there_us=1, back_us=1)
+    after = [one._replace(t2=one.t2 + SECOND, t3=one.t3 + SECOND) for one in before[100:]]
+    with pytest.raises(PebbleError, match="one of them was set"):
+        estimate(before[:100] + after)

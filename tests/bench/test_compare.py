@@ -1,0 +1,175 @@
+"""Two files of results: what got worse is named, noise is not."""
+
+import io
+import random
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pebble import cli
+from pebble.bench import ratios
+from pebble.bench.compare import CHANCE, Kind, certainty, compare, differences, summary
+from pebble.bench.compare_report import run
+from pebble.bench.results import Cell, Results
+from pebble.errors import PebbleError
+
+CONDITIONS = [("640x480", 1), ("1920x1080", 3)]
+VARIANTS = ("zenoh-shm", "zenoh-copy", "mqtt")
+
+
+def results(seed: int, slower: str = "", factor: float = 1.0, rounds: int = 10, bench: str = "frames") -> Results:
+    """A run as on a quiet machine; ``slower`` takes ``factor`` as long everywhere."""
+    noise = random.Random(seed)
+    cells = []
+    for variant in VARIANTS:
+        for size, readers in CONDITIONS:
+            usual = 400 * (factor if variant == slower else 1.0)
+            moods = [usual * noise.lognormvariate(0, 0.02) for _ in range(rounds)]
+            samples = [[mood * noise.lognormvariate(0, 0.1) for _ in range(40)] for mood in moods]
+            params = {"size": size, "readers": readers}
+            cells.append(Cell(variant=variant, params=params, measure="frame", unit="us", rounds=samples))
+    return Results(bench=bench, cells=cells, machine={"cpu": "one", "cores": 2}, options={"rounds": rounds})
+
+
+def one(*rounds: list[float], unit: str = "us", measure: str = "frame") -> Results:
+    return Results(bench="x", cells=[Cell(variant="mqtt", measure=measure, unit=unit, rounds=list(rounds))])
+
+
+def kinds(a: Results, b: Results) -> list[Kind]:
+    return [finding.kind for finding in compare(a, b)]
+
+
+def report(tmp_path: Path, a: Results, b: Results, **options: object) -> tuple[int, str]:
+    a.save(tmp_path / "a.json")
+    b.save(tmp_path / "b.json")
+    said = io.StringIO()
+    code = run(tmp_path / "a.json", tmp_path / "b.json", console=Console(file=said, width=80), **options)  # type: ignore[arg-type]
+    return code, said.getvalue()
+
+
+def test_a_planted_slowdown_is_found_and_named(tmp_path: Path) -> None:
+    code, said = report(tmp_path, results(1), results(2, "zenoh-copy", 1.2))
+    assert code == 1
+    shown = [line for line in said.splitlines() if "us" in line]
+    assert [line.split(",")[0].strip() for line in shown][:2] == ["zenoh-copy"] * 2
+    assert all(line.rstrip().endswith("worse") for line in shown)
+    assert "mqtt" not in said
+
+
+def test_the_same_twice_is_no_change(tmp_path: Path) -> None:
+    code, said = report(tmp_path, results(1), results(2))
+    assert code == 0
+    assert said.startswith("12 figures judged: 0 worse, 0 better, 12 without a difference beyond noise")
+    assert "99.92 %" in said
+
+
+def test_all_shows_what_did_not_change(tmp_path: Path) -> None:
+    _, said = report(tmp_path, results(1), results(2), everything=True)
+    assert said.count("no difference") == 12
+
+
+def test_what_got_faster_is_better_and_nothing_to_fail_for(tmp_path: Path) -> None:
+    code, said = report(tmp_path, results(1, "mqtt", 1.5), results(2))
+    assert code == 0
+    assert "better" in said
+
+
+def test_hardly_ever_fooled_by_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ratios, "_RESAMPLES", 500)
+    fooled = sum(any(finding.changed for finding in compare(results(2 * n), results(2 * n + 1))) for n in range(30))
+    assert fooled <= 1
+
+
+def test_the_worst_comes_first() -> None:
+    a, b = results(1), results(2, "mqtt", 1.3)
+    for cell in b.cells[:1]:
+        cell.rounds = [[9 * sample for sample in samples] for samples in cell.rounds]
+    for cell in b.cells[2:3]:
+        cell.rounds = [[sample / 3 for sample in samples] for samples in cell.rounds]
+    found = compare(a, b)
+    assert [finding.cell.variant for finding in found[:3]] == ["zenoh-shm", "zenoh-shm", "mqtt"]
+    assert [finding.kind for finding in found] == sorted((f.kind for f in found), key=list(Kind).index)
+    assert sum(finding.kind is Kind.BETTER for finding in found) == 2
+
+
+def test_more_figures_are_asked_for_more_certainty() -> None:
+    assert certainty(1) == pytest.approx(1 - CHANCE)
+    assert certainty(100) == pytest.approx(1 - CHANCE / 100)
+    assert {finding.ratio.level for finding in compare(results(1), results(2))} == {certainty(12)}
+
+
+def test_below_the_threshold_nothing_is_a_change() -> None:
+    a, b = one(*[[100.0]] * 10), one(*[[104.0]] * 10)
+    assert kinds(a, b) == kinds(b, a) == [Kind.EQUAL]
+    assert [finding.kind for finding in compare(a, b, 1.03)] == [Kind.WORSE]
+
+
+def test_what_is_in_one_file_only() -> None:
+    a, b = results(1), results(2)
+    del a.cells[:2], b.cells[4:]
+    found = {finding.kind: finding.cell.variant for finding in compare(a, b) if finding.kind is not Kind.EQUAL}
+    assert found == {Kind.ONLY_A: "mqtt", Kind.ONLY_B: "zenoh-shm"}
+
+
+def test_what_does_not_arrive_any_more_is_worse_than_slow(tmp_path: Path) -> None:
+    silent = one([], [])
+    assert kinds(one([1.0], [1.0]), silent) == [Kind.SILENT]
+    assert report(tmp_path, one([1.0], [1.0]), silent)[0] == 1
+    assert kinds(silent, silent) == []
+    assert kinds(silent, one([1.0], [1.0])) == [Kind.ONLY_B]
+
+
+def test_a_single_round_tells_nothing_of_chance() -> None:
+    assert kinds(one([1.0, 2.0]), one([5.0, 6.0])) == [Kind.UNKNOWN] * 2
+    assert kinds(one([1.0], []), one([5.0], [5.0])) == [Kind.UNKNOWN]
+    assert kinds(one([0.0], [0.0]), one([5.0], [5.0])) == [Kind.UNKNOWN]
+    assert "2 cannot be told" in summary(compare(one([1.0, 2.0]), one([5.0, 6.0])))[-1]
+
+
+def test_bytes_of_encoders_are_the_same_every_time() -> None:
+    assert kinds(one([100.0], unit="kB/s"), one([110.0], unit="kB/s")) == [Kind.WORSE]
+    assert kinds(one([100.0], unit="kB/s"), one([101.0], unit="kB/s")) == [Kind.EQUAL]
+
+
+def test_a_curve_is_no_distribution() -> None:
+    assert kinds(*[one([1.0, 2.0], [3.0, 4.0], measure="audio over time")] * 2) == []
+
+
+def test_what_else_differs_is_told(tmp_path: Path) -> None:
+    a, b = results(1), results(2, rounds=9)
+    b.machine, b.quick, b.pebble = {"cpu": "another", "cores": 2, "kernel": "6"}, True, "9.9"
+    assert differences(a, b) == [
+        "machine cpu: one in A, another in B",
+        "machine kernel: None in A, 6 in B",
+        "option rounds: 10 in A, 9 in B",
+        f"pebble: {a.pebble} in A, 9.9 in B",
+        "quick: False in A, True in B",
+    ]
+    assert "not the same: machine cpu" in report(tmp_path, a, b)[1]
+
+
+def test_only_like_can_be_compared(tmp_path: Path) -> None:
+    with pytest.raises(PebbleError, match=r"a\.json is of bench frames, .*b\.json of bench control"):
+        report(tmp_path, results(1), results(2, bench="control"))
+
+
+@pytest.mark.parametrize("threshold", [0.9, float("nan"), float("inf")])
+def test_a_threshold_is_a_factor(tmp_path: Path, threshold: float) -> None:
+    with pytest.raises(PebbleError, match="1 or more"):
+        report(tmp_path, results(1), results(1), threshold=threshold)
+
+
+def test_the_command_ends_with_1_where_something_got_worse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report(tmp_path, results(1), results(2, "mqtt", 1.2))
+    a, b = str(tmp_path / "a.json"), str(tmp_path / "b.json")
+    for arguments, code in (([a, b], 1), ([b, a], 0), ([a, a, "--all"], 0), ([a, b, "--threshold", "2"], 0)):
+        monkeypatch.setattr(sys, "argv", ["pebble", "bench", "compare", *arguments])
+        assert cli.main() == code
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["pebble", "bench", "compare", a, str(tmp_path / "no.json")])
+    assert cli.main() == 1
+    assert "no.json" in capsys.readouterr().err

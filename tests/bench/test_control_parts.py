@@ -1,0 +1,277 @@
+"""The parts of the control comparison by themselves: messages, schedule, plan, order of the slices, words."""
+
+import io
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import ClassVar, Self
+
+import pytest
+from rich.console import Console
+
+from pebble.bench import control, null, output
+from pebble.bench.control_cast import Slice
+from pebble.bench.control_ends import REPLIES, REQUESTS, Echo, Handler, Order, Sender
+from pebble.bench.control_plan import Condition, Plan
+from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, tables, verdict
+from pebble.bench.control_variants import VARIANTS
+from pebble.bench.control_wire import parse, request, stamped
+from pebble.bench.control_worker import Answer
+from pebble.bench.results import Cell, load
+from pebble.demo.broker import Broker, BrokerKind
+from pebble.demo.programs import end_all
+from pebble.errors import PebbleError
+from pebble.inbox import Inbox
+
+
+@pytest.mark.parametrize("size", [40, 1024])
+def test_messages_have_the_size_that_was_asked_for_both_ways(size: int) -> None:
+    there = request(7, 1_000, size)
+    back = stamped(there, 2_000, 3_000)
+    assert len(there) == len(back) == size
+    assert parse(back) == (7, 1_000, 2_000, 3_000)
+
+
+class Loop:
+    """A link to an echo in this very process; what ``spoil`` says is done to replies on their way."""
+
+    def __init__(self, spoil: Callable[[bytes], list[bytes]] = lambda payload: [payload]) -> None:
+        self._handlers: dict[str, Handler] = {}
+        self._spoil = spoil
+        self.sizes: list[int] = []
+
+    def listen(self, filter_: str, handler: Handler) -> None:
+        self._handlers[filter_] = handler
+
+    def publish(self, topic: str, payload: bytes) -> None:
+        self.sizes.append(len(payload))
+        for one in self._spoil(payload) if topic.startswith(f"{REPLIES}/") else [payload]:
+            self._handlers[topic](topic, one)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def run(loop: Loop, order: Order) -> tuple[int, int, int]:
+    ticks = iter(range(0, 10**9, 1000))
+    clock = lambda: next(ticks)  # noqa: E731
+    echo = Echo(loop, "me", clock)
+    sender = Sender(loop, "me", clock, Inbox())
+    assert sender.warm_up(2, 5.0)
+    sent, _, heard = sender.run(order)
+    assert all(one.t1 < one.t2 < one.t3 < one.t4 for one in heard)
+    return sent, len(heard), echo.count
+
+
+def test_a_slice_counts_what_it_sends_after_the_first_tenth_of_a_second() -> None:
+    loop = Loop()
+    assert run(loop, Order(size=64, rate=500, seconds=0.1)) == (50, 50, 2 + 50 + 50)
+    assert set(loop.sizes[4:]) == {64}
+
+
+@pytest.mark.parametrize(("slowed", "least"), [(False, 0), (True, 2_000_000)])
+def test_the_slowed_one_works_between_its_stamp_and_its_publish_call(slowed: bool, least: int) -> None:
+    loop = Loop()
+    Echo(loop, "me", time.monotonic_ns)
+    sender = Sender(loop, "me", time.monotonic_ns, Inbox())
+    _, _, heard = sender.run(Order(size=40, rate=100, seconds=0.05, work_us=2000, slowed=slowed))
+    assert min(one.t2 - one.t1 for one in heard) >= least
+
+
+def test_what_comes_twice_counts_once_and_strangers_do_not() -> None:
+    loop = Loop(lambda payload: [b"hello", payload, payload])
+    assert run(loop, Order(size=40, rate=1000, seconds=0.05))[:2] == (50, 50)
+
+
+def test_a_stranger_s_request_is_not_echoed() -> None:
+    loop = Loop()
+    echo = Echo(loop, "me", lambda: 0)
+    loop.publish(f"{REQUESTS}/me", b"hello")
+    assert echo.count == 0
+
+
+def test_the_default_has_sixty_cells_and_the_quick_one_twelve() -> None:
+    assert len(Plan.of().conditions) * len(Plan.of().roles) == 60
+    quick = Plan.of(quick=True)
+    assert len(quick.conditions) * len(quick.roles) == 12
+    assert {condition.load for condition in quick.conditions} == {"none", "media"}
+
+
+def test_what_is_asked_for_is_what_is_run_and_remembered() -> None:
+    plan = Plan.of(variants=["mqtt"], sizes=[40], rates=[20.0], loads=["none", "hog"], seconds=0.5, rounds=2)
+    assert plan.conditions == (Condition(40, 20.0, "none"), Condition(40, 20.0, "hog"))
+    assert plan.command == [
+        *("pebble", "bench", "control", "--variants", "mqtt", "--sizes", "40", "--rates", "20"),
+        *("--loads", "none,hog", "--seconds", "0.5", "--rounds", "2"),
+    ]
+    assert Plan.of(loads=["media"]).conditions == tuple(Condition(40, rate, "media") for rate in (20.0, 200.0))
+
+
+def test_the_null_test_runs_one_variant_in_three_roles() -> None:
+    plan = Plan.of(null=True, quick=True, variants=["mqtt"])
+    assert plan.roles == null.roles("mqtt")
+    assert plan.bench == "control-null"
+    assert Plan.of(null=True).rounds >= 8
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        {"variants": ["zenoh"]},
+        {"variants": ["mqtt", "mqtt"]},
+        {"variants": ["mqtt", "paho"], "null": True},
+        {"loads": ["heavy"]},
+        {"sizes": [8]},
+        {"rates": [0.0]},
+        {"rates": [float("nan")]},
+        {"seconds": 0.0},
+        {"rounds": 0},
+    ],
+)
+def test_nonsense_is_refused_before_anything_starts(nonsense: dict[str, object]) -> None:
+    with pytest.raises(PebbleError):
+        Plan.of(**nonsense)  # type: ignore[arg-type]
+
+
+class FakeCast:
+    """Answers at once; the second one started cannot be."""
+
+    calls: ClassVar[list[tuple[str, Order, str]]] = []
+    started: ClassVar[list[tuple[str, ...]]] = []
+
+    def __init__(self, roles: tuple[str, ...], _loads: tuple[str, ...]) -> None:
+        self.started.append(roles)
+
+    def __enter__(self) -> Self:
+        if len(self.started) == 2:
+            raise PebbleError("mqtt: echo said nothing")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """Nothing was started."""
+
+    def run(self, role: str, order: Order, load: str) -> Slice:
+        self.calls.append((role, order, load))
+        times = [100.0 + order.slowed * order.work_us + number for number in range(10)]
+        answer = Answer(sent=10, late=0, one_way=times, round_trip=[2 * one for one in times])
+        return Slice(answer=answer, cpu=1.0, backbone_cpu=0.5, pictures_hz=None)
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeCast]:
+    monkeypatch.setattr(control, "Cast", FakeCast)
+    monkeypatch.setattr(output, "find_spec", lambda _name: None)  # no plots
+    monkeypatch.setattr(FakeCast, "calls", [])
+    monkeypatch.setattr(FakeCast, "started", [])
+    return FakeCast
+
+
+def test_every_other_round_goes_backwards_and_one_that_fails_is_left_out_for_all(
+    fake: type[FakeCast], tmp_path: Path
+) -> None:
+    said = io.StringIO()
+    plan = Plan.of(variants=["mqtt", "zenoh-p2p"], sizes=[40], rates=[200.0], loads=["none", "hog"], rounds=4,
+                   output=tmp_path)  # fmt: skip
+    assert control.run(plan, Console(file=said, width=80)) == 0
+    there = [("mqtt", "none"), ("zenoh-p2p", "none"), ("mqtt", "hog"), ("zenoh-p2p", "hog")]
+    expected = [*there, *there[::-1]] * 2 + [*there[::-1], *there]
+    assert [(role, load) for role, _, load in fake.calls] == expected
+    assert "mqtt: echo said nothing" in said.getvalue()
+    results = load(tmp_path / "control.json")
+    assert all(len(cell.rounds) == 3 for cell in results.cells)
+    assert results.verdict[0] == "1 of 4 rounds failed and were left out."
+    assert {cell.lost for cell in results.cells} == {0}
+
+
+@pytest.mark.usefixtures("fake")
+def test_a_round_of_several_passes_has_the_samples_of_all(tmp_path: Path) -> None:
+    plan = Plan.of(null=True, rounds=1, output=tmp_path)
+    assert control.run(plan, Console(file=io.StringIO(), width=80)) == 0
+    for one in load(tmp_path / "control-null.json").cells:
+        assert [len(samples) for samples in one.rounds] == [10 * plan.passes]
+        assert one.lost == 0
+
+
+def test_all_roles_work_for_a_fifth_of_the_pilot_s_median_and_the_slowed_one_when_the_time_runs(
+    fake: type[FakeCast], tmp_path: Path
+) -> None:
+    plan = Plan.of(null=True, rounds=10, variants=["mqtt"], output=tmp_path)
+    assert control.run(plan, Console(file=io.StringIO(), width=80)) == 0
+    pilot, *orders = [(role, order) for role, order, _ in fake.calls]
+    assert pilot == ("mqtt", Order(size=40, rate=200.0, seconds=plan.seconds))
+    assert [order.work_us for _, order in orders] == pytest.approx([0.2 * 104.0] * len(orders))
+    assert all(order.slowed == null.is_slowed(role) for role, order in orders)
+    results = load(tmp_path / "control-null.json")
+    assert {cell.measure for cell in results.cells} == {ONE_WAY}
+    assert ": met (" in results.verdict[-1]
+
+
+def cell(variant: str, load: str, p50: float, *, measure: str = ONE_WAY, late: int = 0) -> Cell:
+    rounds = [[p50 + number % 7 + 3 * round_ for number in range(100)] for round_ in range(10)]
+    return Cell(
+        variant=variant,
+        params={"size": "40 B", "rate": "200 Hz", "load": load},
+        measure=measure,
+        unit="us",
+        rounds=rounds,
+        figures={"sent": 1000, "late": late},
+    )
+
+
+def some(p2p: float) -> list[Cell]:
+    usual = {
+        "paho": 24_000.0,
+        "mqtt": 1000.0,
+        "mqtt-nodelay": 900.0,
+        "mqtt5": 905.0,
+        "zenoh-p2p": p2p,
+        "zenoh-hub": 800.0,
+    }
+    return [
+        cell(name, load, usual[name] * factor, measure=measure)
+        for measure in (ONE_WAY, ROUND_TRIP)
+        for load, factor in (("none", 1), ("media", 3), ("hog", 1.5))
+        for name in usual
+    ]
+
+
+def test_the_verdict_compares_with_the_better_mqtt_variant_and_names_the_aims() -> None:
+    said = verdict(some(450.0))
+    assert any("zenoh-p2p is faster than mqtt-nodelay (the better MQTT variant): 0.50" in line for line in said)
+    assert any(line.startswith("aim: ") and "at most 0.70: met (0.5" in line for line in said)
+    assert any(line.startswith("aim: ") and "at most 0.35: missed by 0.15 (0.5" in line for line in said)
+    assert any("paho is slower than mqtt-nodelay" in line for line in said)
+
+
+def test_the_verdict_says_equal_where_it_is_so() -> None:
+    said = verdict(some(900.0))
+    assert any("equal within noise: 1.00" in line for line in said)
+    assert [line for line in said if line.startswith("aim: ") and "met (" in line] == []
+
+
+def test_the_verdict_speaks_only_of_what_was_measured() -> None:
+    assert verdict([cell("mqtt", "hog", 900.0)]) == []
+    assert verdict([]) == ["An interval of 99 % takes 8 rounds."]
+
+
+def test_a_pace_that_could_not_be_kept_is_said() -> None:
+    assert verdict([cell("mqtt", "hog", 900.0, late=600)]) == [
+        "At 200 Hz 60% of the messages left late: this machine cannot keep that pace."
+    ]
+
+
+def test_the_tables_of_all_variants_fit_a_narrow_terminal() -> None:
+    said = io.StringIO()
+    for table in tables(some(450.0)):
+        Console(file=said, width=80).print(table)
+    assert "…" not in said.getvalue()
+    assert "24k/24k" in said.getvalue()
+
+
+def test_the_broker_gets_the_lines_of_its_variant(tmp_path: Path) -> None:
+    broker = Broker("broker", BrokerKind.MOSQUITTO, tmp_path, VARIANTS["mqtt-nodelay"].broker)
+    try:
+        assert "set_tcp_nodelay true" in (tmp_path / "broker.conf").read_text().splitlines()
+    finally:
+        end_all([broker.program], 5.0)

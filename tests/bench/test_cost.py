@@ -1,0 +1,99 @@
+"""What is made of the readings of robots."""
+
+import io
+import subprocess
+import sys
+
+import pytest
+from rich.console import Console
+
+from pebble.bench.cost_cells import cells_of
+from pebble.bench.cost_report import legend, table, verdict
+from pebble.bench.cost_robot import IDLE, Reading
+from pebble.bench.onlooker import form_of
+from pebble.bench.results import Cell
+from pebble.packets import Codec, Picture, PictureKind, Sound
+
+
+def reading(phase: str, scale: float, broker: str, pictures_per_s: float | None = None) -> Reading:
+    names = ("launcher", "mqtt_bridge", broker)
+    return Reading(
+        phase=phase,
+        memory=dict.fromkeys(names, 10.0 * scale),
+        cpu=dict.fromkeys(names, 1.0 * scale),
+        threads=dict.fromkeys(names, 2),
+        pictures_per_s=pictures_per_s,
+    )
+
+
+def robot(scale: float, broker: str) -> list[Reading]:
+    return [reading(IDLE, scale, broker), reading("json+pcm", 2 * scale, broker, 15.0)]
+
+
+@pytest.fixture
+def cells() -> list[Cell]:
+    return cells_of(
+        {"mqtt": [robot(1.0, "mosquitto"), robot(1.1, "mosquitto")], "zenoh": [robot(2.0, "zenoh_hub")] * 2}
+    )
+
+
+def find(cells: list[Cell], kind: str, measure: str, process: str, phase: str = IDLE) -> Cell:
+    wanted = {"phase": phase, "process": process}
+    (cell,) = (one for one in cells if (one.variant, one.measure, one.params) == (kind, measure, wanted))
+    return cell
+
+
+def test_each_round_of_a_cell_is_one_figure_of_one_robot(cells: list[Cell]) -> None:
+    assert find(cells, "mqtt", "PSS", "launcher").rounds == [[10.0], [11.0]]
+    assert find(cells, "zenoh", "CPU", "zenoh_hub", "json+pcm").rounds == [[4.0], [4.0]]
+
+
+def test_the_sum_is_over_the_processes_of_each_robot(cells: list[Cell]) -> None:
+    whole = find(cells, "mqtt", "PSS", "all")
+    assert whole.rounds == [[30.0], [pytest.approx(33.0)]]
+    assert whole.figures == {"processes": 3}
+    assert find(cells, "zenoh", "threads", "all").rounds == [[6], [6]]
+
+
+def test_a_picture_costs_the_cpu_time_of_the_whole_robot(cells: list[Cell]) -> None:
+    assert find(cells, "mqtt", "CPU per picture", "all", "json+pcm").rounds[0] == [pytest.approx(60 / 15)]
+
+
+def test_without_a_picture_none_has_a_price() -> None:
+    cells = cells_of({"mqtt": [[reading("json+pcm", 1.0, "mosquitto", 0.0)]]})
+    assert find(cells, "mqtt", "CPU per picture", "all", "json+pcm").rounds == [[]]
+
+
+def test_the_table_has_the_processes_of_both_within_100_columns(cells: list[Cell]) -> None:
+    out = io.StringIO()
+    Console(file=out, width=100).print(table(cells))
+    shown = out.getvalue()
+    assert all(name in shown for name in ("idle", "json+pcm", "launcher", "mosquitto", "zenoh_hub", "all"))
+    assert "…" not in shown
+
+
+def test_the_verdict_is_about_sums(cells: list[Cell]) -> None:
+    said = "\n".join(verdict(cells))
+    assert (
+        "idle, memory: mqtt 31.5 (30.0 to 33.0) MB, zenoh 60.0 (60.0 to 60.0) MB: mqtt is smaller in every round"
+        in said
+    )
+    assert "json+pcm, CPU for each picture delivered: mqtt 4.20" in said
+    assert "takes 8" in said
+
+
+def test_the_legend_says_what_is_in_the_sum(cells: list[Cell]) -> None:
+    assert any("Not: the remote broker" in line for line in legend(cells))
+
+
+def test_forms_are_told_apart() -> None:
+    pcm = Sound(Codec.PCM16LE, 1, 16_000, 320, 1, 0, b"\0" * 640).pack()
+    opus = Sound(Codec.OPUS, 1, 16_000, 320, 1, 0, b"\0").pack()
+    h264, jpeg = (Picture(kind, 0, 0, b"").pack() for kind in (PictureKind.H264, PictureKind.JPEG))
+    assert [form_of(raw) for raw in (pcm, opus, h264, jpeg, b'{"a": 1}')] == ["pcm", "opus", "h264", "pbvd", "json"]
+
+
+def test_who_measures_memory_does_not_share_the_large_libraries() -> None:
+    """Or part of what a robot takes would be counted as the measurer's."""
+    look = "import sys, pebble.bench.cost; print({'numpy', 'cv2', 'av', 'zenoh'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout == "set()\n"

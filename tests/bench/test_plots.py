@@ -1,0 +1,147 @@
+"""Every shape of results becomes pictures that can be read."""
+
+import io
+import itertools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+from PIL import Image
+
+from pebble.bench.plots import draw, pictures
+from pebble.bench.plots_style import place, save, styles
+from pebble.bench.plots_time import marks
+from pebble.bench.results import Cell, Results
+from pebble.errors import PebbleError
+from tests.bench import synthetic
+
+pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib warns where a layout has no room
+SHAPES = [*synthetic.one_of_each(small=True).values(), synthetic.broken()]
+LARGEST = 200_000  # bytes of a file
+TOUCH = 1.0  # pixels
+
+
+def texts(figure: Figure) -> Iterator[tuple[str, Bbox]]:
+    """What is written in a drawn figure, with its place; a tick beyond the ends of its axis is not to be seen."""
+    figure.set_layout_engine("none")  # it has its layout
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    unseen = set()
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            slack = 1e-6 * (high - low)
+            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
+                if not low - slack <= tick.get_loc() <= high + slack:
+                    unseen |= {tick.label1, tick.label2}
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        if text.get_visible() and text.get_text().strip() and text not in unseen and text.get_rotation() in (0, 90):
+            yield text.get_text(), text.get_window_extent(renderer)
+
+
+def unreadable(figure: Figure) -> list[tuple[str, ...]]:
+    """Pairs of texts that lie over each other, and texts that reach over the edge."""
+    box, places = figure.bbox, list(texts(figure))
+    assert places
+    return [
+        *((one, other) for (one, a), (other, b) in itertools.combinations(places, 2) if _meet(a, b)),
+        *(
+            (text,)
+            for text, a in places
+            if a.x0 < -TOUCH or a.y0 < -TOUCH or a.x1 > box.x1 + TOUCH or a.y1 > box.y1 + TOUCH
+        ),
+    ]
+
+
+def _meet(a: Bbox, b: Bbox) -> bool:
+    return min(a.x1, b.x1) - max(a.x0, b.x0) > TOUCH and min(a.y1, b.y1) - max(a.y0, b.y0) > TOUCH
+
+
+@pytest.mark.parametrize("results", SHAPES, ids=[results.bench for results in SHAPES[:-1]] + ["broken"])
+def test_pictures_of_every_comparison_can_be_read(
+    results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Figure] = []
+    savefig = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *a, **k: (made.append(figure), savefig(figure, *a, **k)))
+    files = draw(results, tmp_path)
+    assert files
+    assert [file.stem for file in files] == [picture.name for picture in pictures(results)]
+    for file, figure in zip(files, made, strict=True):
+        assert file.name.startswith(results.bench)
+        assert file.stat().st_size < LARGEST
+        assert Image.open(file).format == "PNG"
+        assert unreadable(figure) == []
+        assert all(axes.get_xlabel() or axes.get_ylabel() for axes in figure.axes)
+
+
+def test_texts_that_lie_over_each_other_would_be_seen() -> None:
+    figure = Figure(layout="constrained")
+    axes = figure.add_subplot()
+    axes.text(0.5, 0.5, "one")
+    axes.text(0.51, 0.5, "other")
+    axes.text(1.2, 0.2, "outside")
+    figure.savefig(io.BytesIO())
+    figure.set_size_inches(5, 4)
+    assert ("one", "other") in unreadable(figure)
+    assert ("outside",) in unreadable(figure)
+
+
+@pytest.mark.parametrize("bench", [*synthetic.one_of_each(small=True), "something-new"])
+def test_nothing_measured_is_no_picture(bench: str, tmp_path: Path) -> None:
+    nothing = [Cell(variant="mqtt", measure="one-way", unit="us", rounds=rounds) for rounds in ([], [[]], [[math.nan]])]
+    assert draw(Results(bench=bench, cells=nothing), tmp_path) == []
+    assert draw(Results(bench=bench), tmp_path) == []
+
+
+def test_the_trials_that_were_run_are_enough(tmp_path: Path) -> None:
+    one = synthetic.impair(("5%",))
+    one.cells = [cell for cell in one.cells if cell.variant == "zenoh h264 opus" and cell.measure != "audio latency"]
+    assert len(draw(one, tmp_path)) == 6
+
+
+def test_a_quick_run_says_so_in_the_picture(tmp_path: Path) -> None:
+    (picture,) = pictures(synthetic.startup())
+    for quick in (False, True):
+        save(picture, tmp_path / f"{quick}.png", Results(bench="startup", quick=quick))
+    quick_one, full_one = (Image.open(tmp_path / f"{quick}.png").convert("L") for quick in (True, False))
+    corner = (quick_one.width - 120, 0, quick_one.width, 30)
+    assert quick_one.crop(corner).getextrema() != (255, 255)
+    assert full_one.crop(corner).getextrema() == (255, 255)
+
+
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(PebbleError, match="No such file or directory"):
+        draw(synthetic.startup(), tmp_path / "nowhere")
+
+
+def test_a_variant_looks_the_same_everywhere_and_like_no_other() -> None:
+    alone, together = styles(["zenoh-p2p"]), styles(["mqtt", "paho", "zenoh-hub", "zenoh-p2p"])
+    assert together["zenoh-p2p"] == alone["zenoh-p2p"]
+    unknown = styles(["mqtt", "mqtt again", "mqtt +20 %", "zenoh", "zenoh-new", "other", "another"])
+    assert len({style.colour for style in unknown.values()}) == len(unknown)
+
+
+def test_conditions_read_as_people_say_them() -> None:
+    def of(**params: str | int | None) -> str:
+        return place(Cell(variant="mqtt", params=params, measure="", unit=""))
+
+    assert of(size="40 B", rate="200 Hz", load="none") == "40 B, 200 Hz"
+    assert of(size="40 B", rate="200 Hz", load="media") == "40 B, 200 Hz, with media"
+    assert of(size="640x480", readers=3) == "640x480, readers 3"
+    assert of(load="none") == "unloaded"
+    assert of() == ""
+
+
+def test_marks_are_read_in_the_order_of_time() -> None:
+    assert marks("64k@30.5;base-start@1;;nonsense;256k+1%@20") == [
+        ("base-start", 1.0),
+        ("256k+1%", 20.0),
+        ("64k", 30.5),
+    ]
+    assert marks("") == []

@@ -1,0 +1,99 @@
+"""Intervals of ratios: right as often as they say, and sharp enough to see a fifth."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pebble.bench import ratios
+from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired, unpaired
+
+Rounds = list[list[float]]
+RUNS = 300
+
+
+@pytest.fixture(autouse=True)
+def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For hundreds of intervals within a second or two."""
+    monkeypatch.setattr(ratios, "_RESAMPLES", 1000)
+
+
+def make(random: np.random.Generator, rounds: int, *, factor: float = 1.0, mood: float = 0.05) -> Rounds:
+    """As measured: each round has a mood of its own, and samples with a long tail."""
+    moods = factor * np.exp(random.normal(0, mood, rounds))
+    return [(100 * one * np.exp(random.normal(0, 0.1, 25))).tolist() for one in moods]
+
+
+@pytest.mark.parametrize("rounds", [LEAST_ROUNDS, 12])
+@pytest.mark.parametrize("judge", [paired, unpaired])
+def test_the_same_twice_is_called_equal(judge: type[paired], rounds: int) -> None:
+    random = np.random.default_rng(rounds)
+    equal = sum(judge(make(random, rounds), make(random, rounds)).equal for _ in range(RUNS))
+    assert equal >= 0.975 * RUNS  # 99 % is claimed; 300 runs do not tell it from 98 %
+
+
+@pytest.mark.parametrize("judge", [paired, unpaired])
+def test_a_fifth_more_is_seen(judge: type[paired]) -> None:
+    random = np.random.default_rng(7)
+    seen = sum(judge(make(random, 12, factor=1.2, mood=0.04), make(random, 12, mood=0.04)).low > 1 for _ in range(100))
+    assert seen >= 95
+
+
+def test_rounds_in_turn_forgive_a_mood_that_both_share() -> None:
+    random = np.random.default_rng(3)
+    theirs = make(random, 10, mood=0.5)
+    ours = [[1.2 * sample for sample in one] for one in theirs]
+    assert paired(ours, theirs).low == pytest.approx(1.2)
+    assert unpaired(ours, theirs).equal
+
+
+def test_few_rounds_give_wider_intervals() -> None:
+    ours, theirs = [[90.0], [110.0]], [[100.0], [100.0]]
+    few, more = paired(ours, theirs), paired(4 * ours, 4 * theirs)
+    assert few.low < more.low < 1 < more.high < few.high
+
+
+def test_a_higher_certainty_takes_a_wider_interval() -> None:
+    random = np.random.default_rng(4)
+    ours, theirs = make(random, 10), make(random, 10)
+    usual, surer = unpaired(ours, theirs), unpaired(ours, theirs, level=0.9999)
+    assert surer.low < usual.low < usual.high < surer.high
+    assert surer.level == 0.9999
+
+
+def test_the_percentile_is_that_of_each_round() -> None:
+    rounds = [[1.0] * 98 + [50.0, 50.0]] * 3
+    assert paired(rounds, [[1.0]] * 3, 99).ratio == pytest.approx(50)
+    assert paired(rounds, [[1.0]] * 3, 50).ratio == pytest.approx(1)
+
+
+def test_rounds_that_failed_do_not_count() -> None:
+    ours, theirs = [[2.0], [], [2.0], [9.0]], [[1.0], [1.0], [], [0.0]]
+    assert paired(ours, theirs).ratio == pytest.approx(2)
+    assert unpaired([[2.0], []], [[], [1.0]]).ratio == pytest.approx(2)
+
+
+@pytest.mark.parametrize("judge", [paired, unpaired])
+@pytest.mark.parametrize(("ours", "theirs"), [([], []), ([[]], [[1.0]]), ([[1.0]], [[]]), ([[1.0]], [[0.0]])])
+def test_nothing_measured_is_nothing_claimed(judge: type[paired], ours: Rounds, theirs: Rounds) -> None:
+    interval = judge(ours, theirs)
+    assert math.isnan(interval.ratio)
+    assert not interval.equal
+    assert (str(interval), interval.words("a", "b")) == ("–", "a and b: nothing was measured")
+
+
+def test_the_same_samples_give_the_same_interval() -> None:
+    rounds = make(np.random.default_rng(1), 8), make(np.random.default_rng(2), 8)
+    assert paired(*rounds) == paired(*rounds)
+
+
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        (Interval(0.5, 0.4, 0.6), "a is faster than b: 0.50 (0.40 to 0.60) of its figure"),
+        (Interval(2.0, 1.5, 2.5), "a is slower than b: 2.00 (1.50 to 2.50) of its figure"),
+        (Interval(1.1, 0.9, 1.3), "a and b are equal within noise: 1.10 (0.90 to 1.30)"),
+    ],
+)
+def test_words(interval: Interval, words: str) -> None:
+    assert interval.words("a", "b") == words

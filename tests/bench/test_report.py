@@ -1,0 +1,243 @@
+"""What a report says, and that it is written whatever happens to the comparisons."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import typer
+from rich.console import Console
+
+from pebble.bench import report
+from pebble.bench.report_limits import limits
+from pebble.bench.report_plan import COMPARISONS, Comparison, chosen
+from pebble.bench.report_text import Section, text
+from pebble.bench.results import Results
+from pebble.commands import bench, impair
+from pebble.errors import PebbleError
+from tests.bench import synthetic
+from tests.support import ROOT, Child, until
+
+
+def section(name: str, results: Results | None = None, said: str = "") -> Section:
+    return Section(comparison=chosen([name])[0], results=results, said=said)
+
+
+def comparison(name: str, *arguments: str) -> Comparison:
+    return Comparison(name=name, title=name, what="", full=arguments, quick=arguments, full_s=1, quick_s=1)
+
+
+def put(folder: Path, results: Results, said: str) -> None:
+    results.save(folder / f"{results.bench}.json")
+    (folder / f"{results.bench}.txt").write_text(said)
+
+
+def test_aims_of_all_comparisons_stand_in_one_table() -> None:
+    bridge = Results(bench="bridge", verdict=["aim: p50 | p99: missed by 0.2 ms (0.9 ms)", "aim: bytes: 0.15, met"])
+    lines = text([section("control", synthetic.control(small=True)), section("bridge", bridge)]).splitlines()
+    assert [line for line in lines if line.startswith("| ") and "](#" in line] == [
+        "| Zenoh peer to peer, p50 at most 0.70 of the better MQTT variant's | [control](#service-to-service) | met "
+        "| 0.43, at most 0.45 |",
+        "| with media, p99 at 200 Hz at most 0.35 of it | [control](#service-to-service) | **missed** "
+        "| 0.41, at most 0.52 |",
+        "| p50 \\| p99 | [bridge](#operator-to-wheels-and-back) | **missed** | by 0.2 ms, 0.9 ms |",
+        "| bytes | [bridge](#operator-to-wheels-and-back) | met | 0.15 |",
+    ]
+
+
+def test_what_helps_to_choose_and_what_can_be_believed_comes_first() -> None:
+    null_test = synthetic.null_test("control", "zenoh-p2p")
+    said = text([section("control", synthetic.control(small=True)), section("control-null", null_test)])
+    summary = said[said.index("## In short") : said.index("## Aims")]
+    assert "* [Service to service](#service-to-service)\n  * zenoh-p2p is faster than mqtt-nodelay" in summary
+    assert "control passed" in summary
+
+
+def test_a_null_test_of_few_rounds_is_not_judged() -> None:
+    few = synthetic.null_test("frames", "zenoh-shm")
+    for cell in few.cells:
+        cell.rounds = cell.rounds[:3]
+    assert "frames not judged, for that takes 8 rounds" in text([section("frames-null", few)])
+
+
+def test_a_table_stands_in_it_once_and_the_verdict_is_not_repeated() -> None:
+    said = "conditions  p50\n40 B  12.0\nzenoh is faster\nWritten: a, b\n"
+    results = Results(
+        bench="control", verdict=["zenoh is faster"], command=["pebble", "bench", "control", "--rounds", "3"]
+    )
+    written = text([section("control", results, said)])
+    assert "```text\nconditions  p50\n40 B  12.0\n```" in written
+    assert written.count("zenoh is faster") == 2  # in short, and in its section
+    assert "    pebble bench control --rounds 3\n" in written
+    assert "Written" not in written
+
+
+def test_long_tables_are_folded() -> None:
+    assert "<details><summary>The tables, 100 lines" in text(
+        [section("control", Results(bench="control"), "row\n" * 100)]
+    )
+
+
+def test_what_failed_is_named_with_what_it_said() -> None:
+    written = text(
+        [section("control", Results(bench="control")), section("bridge", None, "pebble: mosquitto is missing")]
+    )
+    assert "* [Operator to wheels, and back](#operator-to-wheels-and-back): **failed**" in written
+    assert "pebble: mosquitto is missing" in written
+
+
+def test_a_quick_run_says_so_and_how_little_it_means() -> None:
+    assert "# Results of a quick run" in text([section("startup", Results(bench="startup", quick=True))])
+    assert "quick" not in text([section("startup", Results(bench="startup"))]).lower()
+
+
+def test_a_proxy_is_no_link() -> None:
+    proxy, spaces = ([Results(bench="impair", options={"link": kind})] for kind in ("proxy", "namespaces"))
+    assert any("TCP proxy" in line for line in limits(proxy))
+    assert not any("TCP proxy" in line for line in limits(spaces))
+
+
+def test_render_writes_all_again_from_what_is_there(tmp_path: Path) -> None:
+    put(tmp_path, synthetic.startup(), "a table")
+    put(tmp_path, synthetic.null_test("frames", "zenoh-shm"), "another table")
+    (tmp_path / "sound.txt").write_text("Opus needs PyAV")
+    written = report.write(tmp_path).read_text()
+    links = re.findall(r"!\[[^]]+\]\(([^)]+)\)", written)
+    assert links == ["startup.png", "frames-null-ratios.png", "frames-null-one-way.png"]
+    assert all((tmp_path / link).exists() for link in links)
+    headings = re.findall(r"^## (.+)$", written, re.MULTILINE)
+    assert headings[3:] == [
+        "Start-up", "Camera frames: the null test", "Sound on the wire", "What these numbers do not show",
+    ]  # fmt: skip
+    anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    assert set(re.findall(r"\]\(#([^)]+)\)", written)) <= anchors
+
+
+def test_results_of_another_version_do_not_keep_the_others_out(tmp_path: Path) -> None:
+    put(tmp_path, synthetic.startup(), "a table")
+    (tmp_path / "cost.json").write_text('{"bench": "cost", "format": 0}')
+    written = report.write(tmp_path).read_text()
+    assert "startup.png" in written
+    assert "cost.json has format 0, this pebble reads 1: measure again" in written
+
+
+def test_pictures_that_were_just_drawn_are_not_drawn_again(tmp_path: Path) -> None:
+    put(tmp_path, synthetic.startup(), "a table")
+    picture = tmp_path / "startup.png"
+    report.write(tmp_path, anew=False)
+    assert picture.exists()
+    picture.write_text("drawn")
+    report.write(tmp_path, anew=False)
+    assert picture.read_text() == "drawn"
+    report.write(tmp_path)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(PebbleError, match="holds no results"):
+        report.write(tmp_path)
+
+
+def test_a_comparison_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both command lines are wrong; what an earlier run of one of them left must not hide that."""
+    plan = [comparison("control", "bench", "nonsense"), comparison("sound", "topics")]
+    monkeypatch.setattr(report, "COMPARISONS", plan)
+    put(tmp_path, synthetic.control(small=True), "old")
+    (tmp_path / "control-ratios.png").write_text("old")
+    console = Console(record=True, width=100)
+    assert report.run(plan, tmp_path, quick=True, console=console) == 1
+    assert not (tmp_path / "control.json").exists()
+    assert not (tmp_path / "control-ratios.png").exists()
+    assert "No such command 'nonsense'" in (tmp_path / "README.md").read_text()
+    assert "No such option" in (tmp_path / "README.md").read_text()
+    said = console.export_text()
+    assert "control ended with code 2: see" in said
+    assert "sound ended with code 2: see" in said
+
+
+def test_one_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "_PATIENCE", 0)
+    monkeypatch.setattr(report, "_PATIENCE_S", 0.0)
+    plan = [comparison("fleet", "bench", "fleet")]
+    monkeypatch.setattr(report, "COMPARISONS", plan)
+    console = Console(record=True, width=100)
+    assert report.run(plan, tmp_path, quick=True, console=console) == 1
+    assert "fleet hung and was ended" in console.export_text()
+
+
+def test_one_that_ends_well_runs_as_its_command_line_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = [comparison("sound", "bench", "sound")]
+    monkeypatch.setattr(report, "COMPARISONS", plan)
+    assert report.run(plan, tmp_path, quick=False, console=Console(quiet=True)) == 0
+    written = (tmp_path / "README.md").read_text()
+    assert "    pebble bench sound\n" in written
+    assert "opus 24 kbit/s" in written
+    assert "\x1b" not in (tmp_path / "sound.txt").read_text()
+
+
+def test_ctrl_c_ends_the_comparison_that_runs(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pebble.cli", "bench", "report", str(tmp_path / "out"), "--only", "startup"]
+    with Child(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        assert until(lambda: children(process.pid), 30)
+        (child,) = children(process.pid)
+        assert until(lambda: b"startup" in Path(f"/proc/{child}/cmdline").read_bytes())
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(40) == 130
+        assert not Path(f"/proc/{child}").exists()
+
+
+def children(pid: int) -> list[int]:
+    try:
+        return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+@pytest.mark.parametrize("quick", [False, True], ids=["full", "quick"])
+@pytest.mark.parametrize("one", COMPARISONS, ids=lambda one: one.name)
+def test_every_command_line_is_one_that_exists(one: Comparison, quick: bool) -> None:
+    app = typer.Typer()
+    app.callback()(lambda: None)
+    bench.register(app)
+    impair.register(app)
+    parse(typer.main.get_command(app), [*one.arguments(quick), "--output", "somewhere"])
+
+
+def parse(command: object, words: Sequence[str]) -> None:
+    """Reads a command line to its end without running it."""
+    while True:
+        context = command.make_context("pebble", list(words))  # type: ignore[attr-defined]
+        if not hasattr(command, "resolve_command"):
+            return
+        rest = [*context._protected_args, *context.args]
+        _, command, words = command.resolve_command(context, rest)
+
+
+def test_unknown_names_are_an_error() -> None:
+    assert [one.name for one in chosen(["impair", "control"])] == ["control", "impair"]
+    assert chosen([]) == list(COMPARISONS)
+    with pytest.raises(PebbleError, match=r"there is no nonsense in the report: there are control, "):
+        chosen(["nonsense"])
+
+
+def test_the_times_that_were_promised() -> None:
+    assert sum(one.full_s for one in COMPARISONS) <= 3600
+    assert sum(one.quick_s for one in COMPARISONS) <= 280
+
+
+def test_no_robot_and_no_command_loads_matplotlib() -> None:
+    program = (
+        "import sys; sys.argv = ['pebble', 'bench', '--help']; from pebble.cli import main; main(); "
+        "import pebble.bench.output, pebble.bench.report, pebble.launcher.programs, pebble.service; "
+        "sys.exit('matplotlib' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, check=False, env=dict(os.environ)
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,62 @@
+"""Figures of two robots in words: what is claimed, and what is not."""
+
+import pytest
+
+from pebble.bench.measured_robot import check_kinds
+from pebble.bench.results import Cell
+from pebble.bench.side_by_side import against, caveat, sentence, spread
+from pebble.errors import PebbleError
+
+
+def cells(mqtt: list[float], zenoh: list[float]) -> list[Cell]:
+    return [
+        Cell(variant=kind, measure="m", unit="ms", rounds=[[figure] for figure in figures])
+        for kind, figures in (("mqtt", mqtt), ("zenoh", zenoh))
+    ]
+
+
+def said(mqtt: list[float], zenoh: list[float]) -> str:
+    return sentence("M", cells(mqtt, zenoh), less="sooner", more="later")
+
+
+def test_a_spread_is_the_median_and_both_ends() -> None:
+    assert spread(cells([3.0, 1.0, 2.0], [])[0]) == "2.00 (1.00 to 3.00)"
+    assert spread(cells([3.0], [])[0]) == "3.00"
+    assert spread(cells([], [])[0]) == "–"
+
+
+def test_enough_rounds_give_an_interval() -> None:
+    pair = cells([10.0 + n / 100 for n in range(8)], [20.0 + n / 100 for n in range(8)])
+    assert sentence("M", pair, less="sooner", more="later").startswith("M: zenoh is later than mqtt: 2.00 (")
+    assert against(pair).startswith("2.00 (")
+    assert caveat(pair) == []
+
+
+def test_what_differs_by_chance_is_equal() -> None:
+    noisy = [10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0]
+    assert "equal within noise" in said(noisy, noisy[::-1])
+
+
+def test_few_rounds_give_no_interval_and_say_so() -> None:
+    assert said([1.0, 2.0], [3.0, 4.0]).endswith(": mqtt is sooner in every round")
+    assert said([3.0, 4.0], [1.0, 2.0]).endswith(": zenoh is sooner in every round")
+    assert said([1.0, 3.0], [2.0, 4.0]).endswith(": not told apart")
+    pair = cells([1.0, 2.0], [2.0, 4.0])
+    assert against(pair) == "2.00"
+    (line,) = caveat(pair)
+    assert line.startswith("2 rounds, and an interval of 99 % takes 8")
+
+
+def test_one_round_claims_nothing() -> None:
+    assert said([1.0], [2.0]) == "M: mqtt 1.00 ms, zenoh 2.00 ms"
+    assert caveat(cells([1.0], [2.0])) == ["One round is no comparison; an interval of 99 % takes 8."]
+
+
+def test_one_robot_alone_is_compared_with_nobody() -> None:
+    assert sentence("M", cells([1.0, 2.0], [])[:1], less="sooner", more="later") == "M: mqtt 1.50 (1.00 to 2.00) ms"
+
+
+@pytest.mark.parametrize("kinds", [[], ["carrier-pigeon"], ["mqtt", ""]])
+def test_strangers_are_refused(kinds: list[str]) -> None:
+    with pytest.raises(PebbleError, match="there are mqtt, zenoh"):
+        check_kinds(kinds)

@@ -1,0 +1,253 @@
+"""What a trial comes to, from recordings made by hand."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import pytest
+from rich.console import Console
+
+from pebble.bench.results import Cell, Results
+from pebble.errors import PebbleError
+from pebble.impair import cells, figures
+from pebble.impair.cells import Trial, cells_of, over_time
+from pebble.impair.link import Carried
+from pebble.impair.messages import Beat, Command, Picture, Record, Sound, Window
+from pebble.impair.plan import NAMES, QUICK, Plan
+from pebble.impair.report import tables, verdict
+from pebble.simulation.trace import Entry
+
+S, MS = 1_000_000_000, 1_000_000
+WINDOW = Window(10 * S, 20 * S, first_s=0.5)
+
+
+def packet(number: int, late_ms: float = 50, at_ms: float | None = None) -> Sound:
+    """Packet ``number`` of the window, 40 ms long."""
+    captured = 10 * S + round((40 * number if at_ms is None else at_ms) * MS)
+    return Sound(captured, captured + round(late_ms * MS), 0.04, number)
+
+
+def beat(at_s: float, delay_ms: float = 20, *, online: bool = True) -> Beat:
+    return Beat(round(at_s * S) - round(delay_ms * MS), round(at_s * S), online)
+
+
+def line(ns: int, left: float, right: float) -> Entry:
+    return Entry(ns, "line", f"M {left:.3f} {right:.3f}")
+
+
+# -- sound
+
+
+def test_all_sound_of_the_window_is_a_hundred_per_cent() -> None:
+    assert figures.sound_percent(map(packet, range(-5, 300)), WINDOW) == pytest.approx(100)
+
+
+def test_late_sound_is_delivered_and_not_on_time() -> None:
+    sounds = [packet(number, late_ms=1500 if number % 2 else 50) for number in range(250)]
+    assert figures.sound_percent(sounds, WINDOW) == pytest.approx(100)
+    assert figures.sound_percent(sounds, WINDOW, 1.0) == pytest.approx(50)
+
+
+def test_lost_sound_is_not_delivered() -> None:
+    assert figures.sound_percent(map(packet, range(0, 250, 4)), WINDOW) == pytest.approx(25, abs=0.5)
+    assert figures.sound_percent([], WINDOW) == 0
+
+
+def test_a_packet_that_comes_twice_counts_once() -> None:
+    assert figures.sound_percent([packet(1), packet(1), packet(2)], WINDOW) == pytest.approx(0.8)
+
+
+def test_packets_at_the_edges_count_for_their_part_in_the_window() -> None:
+    edges = [packet(1, at_ms=-30), packet(2, at_ms=9990)]
+    assert [figures.overlap_s(sound, WINDOW) for sound in edges] == [pytest.approx(0.01), pytest.approx(0.01)]
+    assert figures.heard([packet(3, at_ms=-40), packet(4, at_ms=10_000)], WINDOW) == []
+
+
+def test_packets_sent_are_counted_by_their_numbers() -> None:
+    assert figures.sent_packets([packet(3), packet(4), packet(9)]) == 7
+    assert figures.sent_packets([]) == 0
+
+
+# -- pictures
+
+
+def test_gaps_reach_from_edge_to_edge() -> None:
+    assert figures.gaps_s([9 * S, 12 * S, 13 * S, 21 * S], WINDOW) == [2, 1, 7]
+
+
+def test_without_any_picture_the_window_is_one_gap() -> None:
+    assert figures.gaps_s([], WINDOW) == [10]
+
+
+# -- heartbeats
+
+
+def test_a_steady_heart_is_never_offline() -> None:
+    assert figures.offline_s([beat(8 + number / 4) for number in range(48)], WINDOW) == []
+
+
+def test_silence_is_offline_from_the_operators_patience_on() -> None:
+    beats = [beat(8 + number / 4) for number in range(17)] + [beat(15 + number / 4) for number in range(20)]
+    (spell,) = figures.offline_s(beats, WINDOW)  # from 12 to 15, less two intervals
+    assert spell == pytest.approx(2.5, abs=0.02)
+
+
+def test_a_silence_that_does_not_end_lasts_as_long_as_one_looks() -> None:
+    (spell,) = figures.offline_s([beat(8 + number / 4) for number in range(17)], WINDOW)
+    assert spell == pytest.approx(7.5, abs=0.02)
+
+
+def test_a_spoken_goodbye_is_offline_at_once() -> None:
+    beats = [beat(8 + number / 4) for number in range(17)]
+    goodbye, back = beat(12.1, online=False), [beat(12.6 + number / 4) for number in range(30)]
+    (spell,) = figures.offline_s([*beats, goodbye, *back], WINDOW)
+    assert spell == pytest.approx(0.5, abs=0.02)
+
+
+# -- driving
+
+COMMANDS = [Command(0.2 + number / 1000, 0.3, (10 + number) * S) for number in range(5)]
+
+
+def test_latency_is_to_the_first_line_that_sets_the_wheels() -> None:
+    entries = [line(10 * S + 5 * MS, 0.2, 0.3), line(11 * S + 9 * MS, 0.2, 0.3), line(12 * S + 7 * MS, 0.202, 0.3)]
+    assert figures.driven_ms(COMMANDS, entries) == [(COMMANDS[0], 5), (COMMANDS[2], 7)]
+
+
+def test_a_stop_between_commands_is_one_trip_however_often_it_is_said() -> None:
+    entries = [line(10 * S, 0.2, 0.3), line(11 * S, 0, 0), line(11 * S + 1, 0, 0), line(12 * S, 0.202, 0.3)]
+    assert figures.trips(COMMANDS, entries) == 1
+
+
+def test_the_stops_before_the_first_and_after_the_last_command_are_no_trips() -> None:
+    entries = [line(9 * S, 0, 0), line(10 * S, 0.2, 0.3), line(15 * S, 0, 0)]
+    assert figures.trips(COMMANDS, entries) == 0
+    assert figures.trips([], entries) == 0
+
+
+# -- cells, tables, verdict
+
+
+def trial(subject: str = "zenoh h264 opus", name: str = "256k", late_ms: float = 50, **more: object) -> Trial:
+    """A window of video, one of audio, and three seconds before them; everything arrives after ``late_ms``."""
+    video, audio = Window(3 * S, 10 * S, 0.4), WINDOW
+    commands = [Command(round(0.1 + number / 1000, 3), 0.5, number * S // 10) for number in range(200)]
+    late = round(late_ms * MS)
+    record = {
+        "commands": commands,
+        "beats": [beat(number / 4) for number in range(80)],
+        "pictures": [Picture(ns, ns + late) for ns in range(3 * S, 10 * S - late, S // 10)],
+        "sounds": [packet(number, late_ms) for number in range(250)],
+        "alone": Window(0, 3 * S),
+        "video": video,
+        "audio": audio,
+        "payloads": 70,
+    }
+    entries = [line(command.sent_ns + 10 * MS, command.left, command.right) for command in commands]
+    carried = dict.fromkeys(("alone", "video", "audio"), (Carried(1000, 500), Carried(126_000, 1750, dropped_up=3)))
+    return Trial(subject, name, Record(**{**record, **more}), entries, carried)
+
+
+def of(found: list[Cell], measure: str) -> Cell:
+    (cell,) = (cell for cell in found if cell.measure == measure)
+    return cell
+
+
+def test_a_good_trial_has_all_its_cells() -> None:
+    found = cells_of([trial()], fps=10)
+    assert len({cell.measure for cell in found}) == len(found) == 9
+    sound, video = of(found, cells.SOUND), of(found, cells.PICTURES)
+    assert sound.figures["delivered_percent"] == sound.figures["on_time_percent"] == 100
+    assert (sound.lost, sound.percentile(95), sound.figures["window_s"]) == (0, 50, 10)
+    assert (sound.figures["kbit_up"], sound.figures["dropped_up"]) == (100, 3)
+    assert video.figures["fps"] == pytest.approx(10, abs=0.2)
+    assert (video.figures["frozen_s"], of(found, cells.PICTURE_GAP).unit) == (0, "s")
+    assert of(found, cells.BEAT_GAP).figures["longest_offline_s"] == 0
+    drive = of(found, cells.DRIVE)
+    assert (drive.figures["sent"], drive.figures["delivered_percent"], drive.figures["trips"]) == (200, 100, 0)
+    assert [len(of(found, name).samples) for name in (cells.DRIVE_ALONE, cells.DRIVE_VIDEO, cells.DRIVE_AUDIO)] == [
+        *(30, 70, 100)
+    ]
+
+
+def test_a_trial_in_which_nothing_came_has_figures_too() -> None:
+    nothing = trial(pictures=[], sounds=[], beats=[], payloads=0)
+    found = cells_of([nothing], fps=10)
+    assert of(found, cells.SOUND).figures["delivered_percent"] == 0
+    assert math.isnan(of(found, cells.SOUND).percentile(95))
+    assert of(found, cells.PICTURES).figures["frozen_s"] == 7
+    assert of(found, cells.BEAT_GAP).figures["longest_gap_s"] == 20
+    assert "No robot stopped by itself while it was driven." in verdict(found)
+    assert any("nothing came" in sentence and "missed" in sentence for sentence in verdict(found))
+
+
+def test_series_over_time_are_ordered_and_begin_with_the_run() -> None:
+    sound, drive = over_time([trial(), trial(name="64k+5%")], began_ns=-5 * S)
+    assert (sound.measure, drive.measure) == (cells.SOUND_OVER_TIME, cells.DRIVE_OVER_TIME)
+    times, latencies = sound.rounds
+    assert len(times) == len(latencies) == 500
+    assert times == sorted(times)
+    assert times[0] == pytest.approx(15.05)
+
+
+def test_the_aims_are_met_or_missed_by_so_much() -> None:
+    good, bad = trial("mqtt h264 opus"), trial("zenoh h264 opus", late_ms=500)
+    lines = verdict(cells_of([good, bad], fps=10))
+    assert "aim: mqtt h264 opus at 256k, sound p95 at most 400 ms: met (50.0 ms)" in lines
+    assert "aim: zenoh h264 opus at 256k, sound p95 at most 400 ms: missed (500 ms, by 100 ms)" in lines
+    assert not any("64k+5%" in sentence for sentence in lines)
+
+
+def test_transports_are_compared_where_both_were_tried() -> None:
+    both = [trial(f"{kind} original", name, late_ms=50) for name in QUICK for kind in ("mqtt", "zenoh")]
+    lines = verdict(cells_of(both, fps=10))
+    assert any("original, sound p50 over 4 trials: zenoh and mqtt are equal" in sentence for sentence in lines)
+    assert not any(sentence.startswith("aim:") for sentence in lines)
+    assert not any("zenoh and mqtt" in sentence for sentence in verdict(cells_of(both[::2], fps=10)))
+
+
+@pytest.mark.parametrize("width", [80, 105, 120])
+def test_the_tables_fit(width: int) -> None:
+    tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in NAMES]
+    results = Results(bench="impair", cells=cells_of(tried, fps=10), options={"link_words": "a proxy", "window_s": 8.0})
+    console = Console(file=io.StringIO(), width=width)
+    shown = list(tables(results, width))
+    assert len(shown) == 2
+    for table in shown:
+        assert console.measure(table).maximum <= width
+        assert "a proxy" in str(table.title)
+
+
+# -- plans
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        Plan(trials=["512"]),
+        Plan(subjects=["pigeon"]),
+        Plan(subjects=[]),
+        Plan(link="string"),
+        Plan(window_s=0.1),
+        Plan(window_s=math.nan),
+    ],
+)
+def test_nonsense_is_refused_before_anything_starts(plan: Plan) -> None:
+    with pytest.raises(PebbleError):
+        plan.check()
+
+
+def test_a_whole_plan_tries_transports_side_by_side_and_a_quick_one_everybody() -> None:
+    assert [[one.name for one in group] for group in Plan().groups()] == [list(NAMES[:2]), list(NAMES[2:])]
+    assert [len(group) for group in Plan(quick=True).groups()] == [4]
+    assert tuple(condition.name for condition in Plan(quick=True).conditions()) == QUICK
+    assert len(Plan().conditions()) == 16
+
+
+def test_the_command_line_repeats_the_plan() -> None:
+    assert Plan().command() == ["pebble", "impair", "--link", "auto", "--window", "8"]
+    plan = Plan(trials=["256k", "1%"], subjects=[NAMES[3]], both_ways=True, link="proxy", quick=True)
+    assert plan.command()[4:] == [
+        *("--window", "4", "--trials", "256k,1%", "--subjects", "zenoh h264 opus", "--both-ways", "--quick")
+    ]

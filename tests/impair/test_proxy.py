@@ -1,0 +1,104 @@
+"""What the proxy makes of TCP."""
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from pebble.impair.conditions import Condition, Shape
+from pebble.impair.proxy import ProxyLink
+from tests.support import free_port, until
+
+
+@pytest.fixture
+def link() -> Iterator[ProxyLink]:
+    with ProxyLink("of a test") as made:
+        yield made
+
+
+@pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    with socket.create_server(("127.0.0.1", 0)) as made:
+        made.settimeout(10)
+        yield made
+
+
+def joined(link: ProxyLink, listener: socket.socket) -> tuple[socket.socket, socket.socket]:
+    near = socket.create_connection(link.broker_address(listener.getsockname()[1]), 10)
+    far, _ = listener.accept()
+    far.settimeout(10)
+    return near, far
+
+
+def test_a_port_is_asked_for_once(link: ProxyLink) -> None:
+    port = free_port()
+    assert link.broker_address(port) == link.broker_address(port)
+    assert link.broker_address(port) != (link.broker_host, port)
+
+
+def test_an_end_in_one_direction_leaves_the_other_open(link: ProxyLink, listener: socket.socket) -> None:
+    near, far = joined(link, listener)
+    with near, far:
+        near.sendall(b"question")
+        near.shutdown(socket.SHUT_WR)
+        assert far.makefile("rb").read() == b"question"
+        far.sendall(b"answer")
+        far.close()
+        assert near.makefile("rb").read() == b"answer"
+
+
+def test_a_connection_to_nobody_ends(link: ProxyLink) -> None:
+    with socket.create_connection(link.broker_address(free_port()), 10) as near:
+        assert until(lambda: _ended(near))
+
+
+def test_an_end_that_is_gone_takes_the_other_with_it(link: ProxyLink, listener: socket.socket) -> None:
+    near, far = joined(link, listener)
+    with near:
+        near.sendall(b"unread")
+        far.close()
+        assert until(lambda: _ended(near))
+
+
+def test_what_was_sent_arrives_whole_through_loss_delay_and_rate(link: ProxyLink, listener: socket.socket) -> None:
+    near, far = joined(link, listener)
+    link.apply(Condition("all", Shape(kbit=2000, loss=0.02, delay_ms=10, jitter_ms=10)))
+    sent = bytes(n % 251 for n in range(100_000))
+    with near, far:
+        threading.Thread(target=lambda: (near.sendall(sent), near.shutdown(socket.SHUT_WR)), daemon=True).start()
+        assert far.makefile("rb").read() == sent
+
+
+def test_a_lost_segment_holds_up_what_is_behind_it(link: ProxyLink, listener: socket.socket) -> None:
+    near, far = joined(link, listener)
+    link.apply(Condition("lost", Shape(loss=0.99)))  # lost so often that it would take minutes
+    with near, far:
+        near.sendall(b"x")
+        assert until(lambda: link.carried().dropped_up > 0)
+        far.settimeout(0.1)
+        with pytest.raises(TimeoutError):
+            far.recv(1)
+
+
+def test_connections_share_the_rate(link: ProxyLink, listener: socket.socket) -> None:
+    pairs = [joined(link, listener) for _ in range(2)]
+    link.apply(Condition("512k", Shape(kbit=512)))
+    began = time.monotonic()
+    for near, _ in pairs:
+        threading.Thread(target=near.sendall, args=(b"x" * 16_000,), daemon=True).start()
+    for near, far in pairs:
+        with near, far:
+            assert len(far.makefile("rb").read(16_000)) == 16_000
+    assert time.monotonic() - began > 2 * 16_000 * 8 / 512_000
+
+
+def _ended(near: socket.socket) -> bool:
+    near.settimeout(0.05)
+    try:
+        return near.recv(100) == b""
+    except TimeoutError:
+        return False
+    except OSError:
+        return True

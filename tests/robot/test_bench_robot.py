@@ -1,0 +1,93 @@
+"""Whole robots are launched and weighed for a moment, and leave nothing behind."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pebble.bench import cost, cost_robot, startup
+from pebble.bench.bridge_robot import KINDS
+from pebble.bench.results import load
+from pebble.bench.usage import children
+from tests.robot.rig import Rig
+from tests.support import ROOT, Child, until
+
+pytestmark = pytest.mark.alone  # whole robots
+
+
+@pytest.fixture(autouse=True)
+def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have tests of their own, and take as long as a robot."""
+    monkeypatch.setattr("pebble.bench.plots.draw", lambda *_: [])
+
+
+def test_startup_of_both_kinds(tmp_path: Path) -> None:
+    said = io.StringIO()
+    assert startup.run(startup.Plan(rounds=1, quick=True, output=tmp_path), Console(file=said, width=100)) == 0
+    results = load(tmp_path / "startup.json")
+    assert (results.bench, results.quick) == ("startup", True)
+    assert results.command == ["pebble", "bench", "startup", "--rounds", "1", "--quick"]
+    assert {(cell.measure, cell.variant) for cell in results.cells} == {
+        (measure.name, kind) for measure in startup.MEASURES for kind in KINDS
+    }
+    for kind in KINDS:
+        beat, ready, obeyed, operator, paho, service = (
+            cell for measure in startup.MEASURES if (cell := results.find(kind, measure.name)) is not None
+        )
+        assert all(0 < cell.samples[0] < 60 for cell in (beat, ready, obeyed))
+        assert all(len(cell.samples) == startup.QUICK_JOINS for cell in (operator, paho, service))
+        assert all(cell.figures["topics"] for cell in (operator, paho, service))
+    assert "first drive obeyed" in said.getvalue()
+    assert children(os.getpid()) == []
+
+
+def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cost_robot, "_SETTLE_S", 0.1)
+    said = io.StringIO()
+    plan = cost.Plan(rounds=1, seconds=0.4, quick=True, output=tmp_path)
+    assert cost.run(plan, Console(file=said, width=100)) == 0
+    results = load(tmp_path / "cost.json")
+    assert results.command == ["pebble", "bench", "cost", "--rounds", "1", "--seconds", "0.4", "--quick"]
+    for kind, own in (("mqtt", "mosquitto"), ("zenoh", "zenoh_hub")):
+        for phase in ("idle", "driving", "json+pcm", "h264+opus"):
+            names = {
+                cell.params["process"]
+                for cell in results.cells
+                if (cell.variant, cell.params["phase"]) == (kind, phase)
+            }
+            assert {"all", "launcher", "announcer", "serial_mcu_bridge", "mqtt_bridge", "av_daemon", own} <= names
+            memory, cpu, threads = (
+                results.find(kind, measure, phase=phase, process="all") for measure in ("PSS", "CPU", "threads")
+            )
+            assert memory is not None
+            assert cpu is not None
+            assert threads is not None
+            assert memory.samples[0] > 20
+            assert 0 < cpu.samples[0] < 400
+            assert threads.samples[0] > 10
+        for phase in ("json+pcm", "h264+opus"):
+            pictures = results.find(kind, "pictures", phase=phase)
+            assert pictures is not None
+            assert pictures.samples[0] > 0
+    assert children(os.getpid()) == []
+
+
+def test_the_end_of_a_command_ends_its_robots(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pebble.cli", "bench", "startup", "--output", str(tmp_path)]
+    with Child(command, cwd=ROOT) as bench:
+        assert until(lambda: len(descendants(bench.pid)) > 6, 30), "no robot was launched"
+        started = descendants(bench.pid)
+        bench.send_signal(signal.SIGINT)
+        assert bench.wait(60) == 130
+    assert until(lambda: not any(map(Rig.alive, started)), 10)
+    assert not (tmp_path / "startup.json").exists()
+
+
+def descendants(pid: int) -> list[int]:
+    return [found for child in children(pid) for found in (child, *descendants(child))]

@@ -1,0 +1,84 @@
+"""One short trial of whole robots over each kind of link, and an interrupted one: nothing stays behind."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pebble.bench.results import load
+from pebble.bench.usage import children
+from pebble.impair import cells
+from pebble.impair.link import why_no_namespaces
+from pebble.impair.plan import Plan
+from pebble.impair.run import run
+from tests.robot.rig import Rig
+from tests.support import ROOT, until
+
+pytestmark = pytest.mark.alone  # whole robots
+
+_NO_NAMESPACES = why_no_namespaces()
+KINDS = [
+    pytest.param(
+        "namespaces", "mqtt original", marks=pytest.mark.skipif(bool(_NO_NAMESPACES), reason=_NO_NAMESPACES or "")
+    ),
+    ("proxy", "zenoh h264 opus"),
+]
+
+
+@pytest.mark.parametrize(("kind", "subject"), KINDS)
+def test_a_robot_is_driven_watched_and_listened_to_over_a_slow_link(
+    kind: str, subject: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pebble.bench.output.find_spec", lambda _name: None)  # no plots
+    said = io.StringIO()
+    plan = Plan(trials=["512k"], subjects=[subject], link=kind, window_s=1.0, quick=True, output=tmp_path)
+    assert run(plan, Console(file=said, width=120)) == 0
+    results = load(tmp_path / "impair.json")
+    sound, video, drive, heart = (
+        results.find(subject, measure, trial="512k")
+        for measure in (cells.SOUND, cells.PICTURES, cells.DRIVE, cells.BEAT_GAP)
+    )
+    assert sound is not None
+    assert sound.samples
+    assert video is not None
+    assert video.samples
+    assert float(str(video.figures["kbit_up"])) > 10
+    assert drive is not None
+    assert drive.samples
+    assert min(drive.samples) > 0
+    assert heart is not None
+    assert len(heart.samples) > 1
+    assert results.options["link"] == kind
+    assert {"namespaces": "network namespaces", "proxy": "loss modelled"}[kind] in said.getvalue()
+    assert "512k@" in str(results.options["marks"])
+    assert children(os.getpid()) == []
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pebble.cli", "impair", "--subjects", "mqtt original", "--output", str(tmp_path)]
+    process = subprocess.Popen(
+        command, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)}, stdout=subprocess.DEVNULL
+    )
+    try:
+        assert until(lambda: len(list(tmp_path.glob("pbl-*/*/operator.log"))) == 1, 60), "the robot does not start"
+        started = descendants(process.pid)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+    finally:
+        process.kill()
+        process.wait()
+    assert len(started) > 4
+    assert until(lambda: not any(map(Rig.alive, started)))
+    assert not list(tmp_path.glob("pbl-*"))
+
+
+def descendants(pid: int) -> list[int]:
+    found = children(pid)
+    return [*found, *(below for child in found for below in descendants(child))]
