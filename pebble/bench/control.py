@@ -87,6 +87,7 @@ def _measure(plan: Plan, console: Console) -> list[Round]:
                     for number in range(first, min(first + plan.fresh_every, plan.rounds)):
                         progress.update(bar, description=f"round {number + 1} of {plan.rounds}")
                         rounds.append(_round(cast, plan, number, work_us, lambda: progress.advance(bar)))
+                        work_us = {condition: _a_fifth(plan, condition, rounds) for condition in work_us}
             except PebbleError as error:
                 console.print(f"round {len(rounds) + 1}: {error}", style="red", highlight=False, markup=False)
     if not rounds:
@@ -108,12 +109,19 @@ def _round(cast: Cast, plan: Plan, number: int, work_us: Mapping[Condition, floa
 
 
 def _pilot(cast: Cast, plan: Plan, condition: Condition) -> float:
-    """For how long, in us, each role is to work at each message: a fifth of the usual latency.
+    """For how long, in us, each role is to work at each message of the first round: a fifth of the usual latency.
 
     The slowed one does it when the time runs, the others before that: nothing else shall differ.
     """
     answer = cast.run(plan.roles[0], _order(plan, condition), condition.load).answer
     return null.SLOWDOWN * percentile(answer.one_way, 50)
+
+
+def _a_fifth(plan: Plan, condition: Condition, rounds: Sequence[Round]) -> float:
+    """The same for the next round: what is usual is known better by then."""
+    plain = [one[role, condition].answer.one_way for one in rounds for role in plan.roles if not null.is_slowed(role)]
+    latencies = [latency for one in plain for latency in one]
+    return null.SLOWDOWN * percentile(latencies, 50) if latencies else 0.0
 
 
 def _order(plan: Plan, condition: Condition, work_us: float = 0.0, *, slowed: bool = False) -> Order:

@@ -5,10 +5,10 @@ The paper caps, or loses packets on, the robot's uplink only. Its list counts 14
 ``starlink``
     A median round trip of 50 ms, 40 to 60 ms between the quartiles (APNIC blog, 28 Nov 2022, measured in Belgium).
     Another satellite every 15 s; round trips differ by 6.7 ms from one to the next, and by another 30 ms and more
-    after a handover, 30 to 80 ms at worst (Huston, APNIC blog, 17 May 2024). Handovers lose up to half of the packets
-    (Kassem et al., "A browser-side view of Starlink connectivity", IMC 2022). Hence per direction 25 ms ± 5 ms, and
-    every 15 s a gap, after which 25 ms more die away within a second. How long the gap is, 100 ms, is our choice. The
-    rate is not capped: it is not what limits a robot.
+    after a handover, 30 to 80 ms at worst (Huston, APNIC blog, 17 May 2024, as quoted by The Register). Handovers lose
+    up to half of the packets (Kassem et al., "A browser-side view of Starlink connectivity", IMC 2022, abstract). Hence
+    per direction 25 ms ± 5 ms, and every 15 s a gap, after which more delay dies away. Our choices: a gap of 100 ms,
+    25 ms within a second, the first after 5 s, and no cap on the rate, which is not what limits a robot.
 ``wifi-power-save``
     A Raspberry Pi as it is shipped: the access point keeps what is for the robot until a beacon, every 102.4 ms (100
     time units of 1.024 ms), while the robot may send at any time. With power save on, pings had a p50 of 49 to 127 ms,

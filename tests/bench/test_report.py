@@ -219,9 +219,12 @@ def parse(command: object, words: Sequence[str]) -> None:
         _, command, words = command.resolve_command(context, rest)
 
 
-def test_unknown_names_are_an_error() -> None:
+def test_unknown_names_are_an_error_and_no_names_are_all(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [one.name for one in chosen(["impair", "control"])] == ["control", "impair"]
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
     assert chosen([]) == list(COMPARISONS)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert [one.name for one in COMPARISONS if one not in chosen([])] == ["bridge-profile"]
     with pytest.raises(PebbleError, match=r"there is no nonsense in the report: there are control, "):
         chosen(["nonsense"])
 

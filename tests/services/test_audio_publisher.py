@@ -136,7 +136,7 @@ def test_a_link_too_slow_for_pcm_loses_packets_but_no_time(local: Broker, remote
         assert until(lambda: (robot.newest.dropped or 0) > 20, 20)
         ear.wait(30)
         ages = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.heard, strict=False)][-20:]
-        assert median(ages) < 1.0  # 0.2 s wait with us, the rest is what the link's own buffers hold
+        assert median(ages) < 1.0  # 0.2 s of PCM wait with us, the rest is what the link's own buffers hold
 
 
 def test_it_goes_when_told_and_leaves_nothing(local: Broker, remote: Broker, ear: Ear) -> None:
