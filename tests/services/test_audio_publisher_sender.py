@@ -1,0 +1,57 @@
+"""What the sender does with sound while the link takes nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from pebble.config.later import AudioPublisher as Options
+from pebble.services.audio_publisher.sender import Sender
+from pebble.transports import Message, QoS, State, Transport
+from pebble.transports.base import Subscription
+from pebble.transports.counters import Counters
+from pebble.transports.frames import FrameInfo
+from pebble.transports.outgoing import Outgoing
+
+CHUNK_S = 0.02
+CHUNK = bytes(640)  # 20 ms at 16 kHz
+SOUND = FrameInfo(format="s16le", rate=16_000, channels=1, captured_ms=1)
+
+
+class Stuck(Transport):
+    """Accepts everything, and nobody confirms any of it."""
+
+    def __init__(self) -> None:
+        super().__init__("stuck")
+        self.accepted = 0
+
+    @property
+    def outgoing(self) -> Outgoing:
+        return Outgoing(waiting=self.accepted)
+
+    def _open(self, timeout: float) -> None:
+        self._set_state(State.CONNECTED)
+
+    def _close(self, will: Message | None) -> None: ...
+
+    def _send(self, message: Message, urgent: bool) -> bool:
+        self.accepted += len(message.payload) + 60
+        return True
+
+    def _declare(self, subscription: Subscription) -> None: ...
+
+    def _undeclare(self, subscription: Subscription) -> None: ...
+
+
+@pytest.mark.parametrize(("encoding", "most_s"), [("pcm", 0.2), ("opus", 0.5)])
+def test_sound_waits_for_so_long_and_then_the_newest_is_dropped(encoding: str, most_s: float) -> None:
+    counters, transport = Counters(), Stuck().open()
+    sender = Sender(Options(encoding=encoding, bundle=1), transport, "sound", QoS.LATEST, counters, 0.0)  # type: ignore[arg-type]
+    dropped_at = None
+    for number in range(100):
+        now = number * CHUNK_S
+        sender.take(SOUND, CHUNK, now)
+        if counters["dropped"]:
+            dropped_at = now
+            break
+    assert dropped_at == pytest.approx(most_s, abs=4 * CHUNK_S)  # Opus may wait for a bundle
+    assert sender.encoding == encoding
