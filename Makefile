@@ -13,7 +13,7 @@ help:
 	@echo "make check            lint, types and imports only"
 	@echo "make firmware         what the firmware costs of each board, measured in the real MicroPython; into docs/firmware.md"
 	@echo "make report           every comparison and the bad links, an hour; writes docs/results"
-	@echo "make report QUICK=1   the same from fewer cases, five minutes; writes build/report-quick"
+	@echo "make report QUICK=1   the same from fewer cases, under five minutes; writes build/report-quick"
 	@echo "make clean            remove what the other targets made"
 
 demo: .venv/.ready-demo

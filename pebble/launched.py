@@ -46,6 +46,7 @@ def end_with_parent(number: int = signal.SIGKILL) -> None:
 def tied(command: Sequence[str], number: signal.Signals = signal.SIGKILL) -> list[str]:
     """``command``, to be started so that it gets ``number`` when the thread that starts it is gone.
 
+    Until setpriv has asked for that, a few milliseconds, it is tied to nobody.
     Raises FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2
     may wait for ever for a lock that a thread of Zenoh held.
     """

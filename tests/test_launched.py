@@ -26,7 +26,8 @@ def test_a_child_goes_when_its_parent_is_killed() -> None:
     try:
         assert parent.stdout is not None
         child = Path("/proc", parent.stdout.readline().decode().strip())
-        assert child.exists()
+        program = sys.executable.encode()
+        assert until(lambda: (child / "cmdline").read_bytes().startswith(program)), "until then it is tied to nobody"
     finally:
         parent.send_signal(signal.SIGKILL)
         parent.wait(10)

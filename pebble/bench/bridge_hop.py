@@ -1,37 +1,44 @@
-"""The floor: the same commands to a stock client of the same broker, one hop, with no robot in it."""
+"""The floor: the same commands to a stock client, one hop through a stock broker that carries nothing else."""
 
 from __future__ import annotations
 
+import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Self
 
 from pebble.bench.bridge_drive import RATE_HZ, Found, Stretch
 from pebble.bench.bridge_observer import Observer
 from pebble.bench.bridge_operator import Operator, Wheels
-from pebble.bench.bridge_robot import Robot
 from pebble.contract import DRIVE
+from pebble.demo.broker import Broker, BrokerKind
+from pebble.demo.programs import end_all
 
 HOP = "one hop"
 _NOBODY = "pebble/robots/nobody"
 _ARRIVE_S = 1.0
 _LOOK_S = 0.02
+_END_S = 2.0
 
 
 class Hop:
-    """Drives and is looked up as a robot is; ``robot`` lends its remote broker."""
+    """Drives and is looked up as a robot is."""
 
     kind = HOP
 
-    def __init__(self, robot: Robot) -> None:
-        self._port, self._log = robot.remote_port, robot.run_dir.with_name("observer.log")
-
     def __enter__(self) -> Self:
+        """Raises PebbleError if something does not start."""
         with ExitStack() as stack:
-            observer = Observer(self._port, DRIVE.topic(_NOBODY), self._log)
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
+            broker = Broker("hop", BrokerKind.MOSQUITTO, folder)
+            stack.callback(end_all, [broker.program], _END_S)
+            broker.wait(threading.Event())
+            observer = Observer(broker.port, DRIVE.topic(_NOBODY), folder / "observer.log")
             self._observer = stack.enter_context(observer)
-            self._operator = stack.enter_context(closing(Operator(self._port, _NOBODY)))
+            self._operator = stack.enter_context(closing(Operator(broker.port, _NOBODY)))
             self._stack = stack.pop_all()
         return self
 

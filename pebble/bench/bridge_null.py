@@ -21,6 +21,7 @@ from pebble.bench.results import Stopwatch
 from pebble.bench.tables import latency_table
 from pebble.errors import PebbleError
 from pebble.signals import interrupted_by_signals
+from pebble.transports.segments import sweep
 
 RATE_HZ = 100.0  # more commands than an operator's 20 a second: the test is to be over soon
 _TURN_S = 0.05
@@ -29,24 +30,35 @@ _PILOT_S = 2.0
 
 
 def run(plan: Plan, console: Console | None = None) -> int:
-    """0 if the comparison was not fooled. With fewer rounds than a judgement takes, the figures are shown only."""
+    """0 if everything has figures; whether the comparison was fooled, the verdict says. Raises PebbleError."""
     console = console or Console()
     plan.check()
     [kind] = plan.kinds
     watch = Stopwatch("bridge-null", plan.command(), {**plan.options(), "rate_hz": RATE_HZ})
     tallies = [Tally(role, reports=False) for role in null.roles(kind)]
-    with interrupted_by_signals(), Driven(kind) as driven:
+    with interrupted_by_signals():
+        try:
+            work_us = _measure(plan, tallies, console)
+        finally:
+            sweep()  # Zenoh leaves files behind even when it ends politely
+    cells = [cell for tally in tallies for cell in tally.cells()]
+    console.print(latency_table(f"{kind} against itself", cells, kind))
+    lines = [*null.verdict(cells), _how(work_us, plan.rounds)]
+    output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
+    return 0 if all(cell.samples for cell in cells) else 1
+
+
+def _measure(plan: Plan, tallies: list[Tally], console: Console) -> float:
+    """For how long, in us, the operator worked at each command."""
+    [kind] = plan.kinds
+    with Driven(kind) as driven:
         with console.status(f"{kind}: starting a robot"):
             driven.wait()
             time.sleep(_SETTLE_S)
             work_us = null.SLOWDOWN * _usual_us(driven)
         for number in track(range(plan.rounds), "rounds", console=console, transient=True):
             _round(driven, tallies, plan.seconds, work_us, backwards=bool(number % 2))
-    cells = [cell for tally in tallies for cell in tally.cells()]
-    console.print(latency_table(f"{kind} against itself", cells, kind))
-    lines = [*null.verdict(cells), _how(work_us, plan.rounds)]
-    output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
-    return 0 if all(cell.samples for cell in cells) and null.judged(cells) else 1
+    return work_us
 
 
 def _usual_us(driven: Driven) -> float:

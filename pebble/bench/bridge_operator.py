@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from collections import deque
-from contextlib import suppress
 from typing import Any
 
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.bench.null import spin
+from pebble.bench.tcp import acknowledge, send_at_once
 from pebble.contract import (
     AUDIO_CONTROL,
     DRIVE,
@@ -34,7 +33,6 @@ _DIGITS = 3  # of a wheel's speed on the serial line
 _STEPS = 800  # wheel values 0.100 … 0.899
 _UP_S = 30.0
 _LOOK_S = 0.02
-_QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _HEARD = 50_000  # reports that are kept; a robot says 50 a second
 
 
@@ -53,10 +51,10 @@ class Operator:
         self._beats = 0
         self._heard: deque[tuple[int, bytes]] = deque(maxlen=_HEARD)
         self._client = Client(CallbackAPIVersion.VERSION2)
-        self._client.on_socket_open = _send_at_once
+        self._client.on_socket_open = send_at_once
         self._client.on_connect = self._subscribe
         self._client.on_message = self._hear
-        self._client.on_publish = lambda client, *_: _acknowledge(client)
+        self._client.on_publish = lambda client, *_: acknowledge(client)
         self._client.message_callback_add(TOUCH_SENSORS.topic(base), self._hear_report)
         self._client.connect("127.0.0.1", port)
         self._client.loop_start()
@@ -112,7 +110,7 @@ class Operator:
         client.subscribe([(channel.topic(self._base), 1) for channel in (STATUS, ONLINE, TOUCH_SENSORS)])
 
     def _hear(self, client: Client, _data: Any, message: Any) -> None:
-        _acknowledge(client)
+        acknowledge(client)
         if message.topic == STATUS.topic(self._base):
             self._services = json.loads(message.payload).get("value", {}).get("services", {})
         elif not message.retain:
@@ -120,19 +118,7 @@ class Operator:
 
     def _hear_report(self, client: Client, _data: Any, message: Any) -> None:
         self._heard.append((time.monotonic_ns(), message.payload))
-        _acknowledge(client)
-
-
-def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-
-def _acknowledge(client: Client) -> None:
-    """The kernel falls back to delaying its ACKs whenever we send, so this follows everything that is heard."""
-    sock: Any = client.socket()
-    if _QUICKACK is not None and sock is not None:
-        with suppress(OSError):  # the other side has just gone
-            sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, 1)
+        acknowledge(client)
 
 
 def wheels(number: int) -> Wheels:

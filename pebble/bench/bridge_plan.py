@@ -11,6 +11,7 @@ from typing import Any
 from pebble.bench.bridge_drive import RATE_HZ
 from pebble.bench.bridge_robot import KINDS
 from pebble.bench.figures import LONGEST_S
+from pebble.bench.measured_robot import check_kinds
 from pebble.bench.output import FOLDER, check_folder
 from pebble.bench.results import Value
 from pebble.errors import PebbleError
@@ -51,9 +52,7 @@ class Plan:
 
     def check(self) -> None:
         """Raises PebbleError naming what makes no sense."""
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
-        if unknown or not self.kinds:
-            raise PebbleError(f"unknown transport {', '.join(unknown)}: there are {', '.join(KINDS)}")
+        check_kinds(self.kinds)
         if self.mode is Mode.NULL and len(self.kinds) != 1:
             raise PebbleError("--null takes one transport: --variants mqtt, or zenoh")
         if not 0 < self.seconds <= LONGEST_S or self.rounds < 1:

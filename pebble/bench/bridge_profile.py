@@ -24,6 +24,7 @@ from pebble.bench.figures import percentile
 from pebble.bench.results import Cell, Stopwatch
 from pebble.bench.tables import figure, plain_table
 from pebble.signals import interrupted_by_signals
+from pebble.transports.segments import sweep
 
 #: By transport, in order: who has the command in hand.
 HOPS = {
@@ -33,6 +34,7 @@ HOPS = {
 ALL = "all the way"
 _SETTLE_S = 1.0
 _SLOWEST = 99  # per cent
+_LEAST = 5  # of the slowest: fewer may be chance
 
 Times = list[tuple[float, ...]]
 """Of each command: the ms of each hop."""
@@ -45,9 +47,12 @@ def run(plan: Plan, console: Console | None = None) -> int:
     watch = Stopwatch("bridge-profile", plan.command(), plan.options())
     found: dict[str, list[Times]] = {kind: [] for kind in plan.kinds}
     with interrupted_by_signals():
-        for _ in track(range(plan.rounds), "rounds", console=console, transient=True):
-            for kind in plan.kinds:
-                found[kind].append(_follow(kind, plan.seconds))
+        try:
+            for number in track(range(plan.rounds), "rounds", console=console, transient=True):
+                for kind in plan.kinds[:: -1 if number % 2 else 1]:
+                    found[kind].append(_follow(kind, plan.seconds))
+        finally:
+            sweep()  # Zenoh leaves files behind even when it ends politely
     cells = [cell for kind, rounds in found.items() for cell in cells_of(kind, rounds)]
     for kind, rounds in found.items():
         _show(kind, [times for one in rounds for times in one], console)
@@ -117,15 +122,18 @@ def cells_of(kind: str, rounds: Sequence[Times]) -> list[Cell]:
 
 
 def verdict(kind: str, times: Times) -> list[str]:
-    """Which hop makes the slowest slow."""
+    """Which hop makes the slowest slow; nothing is claimed of a handful."""
     if not times:
         return [f"{kind}: no command was followed all the way"]
-    more = [slow - usual for slow, usual in zip(_means(slowest(times)), _means(typical(times)), strict=True)]
+    late = slowest(times)
+    if len(late) < _LEAST:
+        return [f"{kind}: {len(times)} commands are too few to say what makes the slowest slow."]
+    more = [slow - usual for slow, usual in zip(_means(late), _means(typical(times)), strict=True)]
     worst = max(range(len(HOPS[kind])), key=lambda number: more[number])
     share = 100 * more[worst] / sum(more) if sum(more) > 0 else 0.0
     return [
-        f"{kind}: of what the slowest hundredth takes longer than a typical command ({sum(more):.2f} ms),"
-        f" {share:.0f} % is spent in: {HOPS[kind][worst]}."
+        f"{kind}: of what the slowest {len(late)} of {len(times)} commands take longer than a typical one"
+        f" ({sum(more):.2f} ms), {share:.0f} % is spent in: {HOPS[kind][worst]}."
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -9,12 +10,16 @@ from rich.console import Console
 from pebble.bench.bridge_hop import HOP
 from pebble.bench.bridge_robot import KINDS
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP
+from pebble.bench.figures import percentile
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, Value
 from pebble.bench.side_by_side import caveat, sentence
 from pebble.bench.tables import figure, latency_table, plain_table
 
 AIMS_MS = {50: 0.7, 99: 2.0}
+LEAST_SAMPLES = {50: 1, 99: 300}  # to judge an aim: of fewer, hardly any lie beyond that percentile
+_LEAST_IN_ROUND = 100  # to compare p99 round by round: of fewer it is the slowest one
+_TELL_LOST = 0.005
 WAYS = {DOWN: "command to the wheels", UP: "report to the operator"}
 _FLOWS = {"frames_per_s": "frames/s", "video_per_s": "video/s", "audio_per_s": "audio/s"}
 
@@ -34,7 +39,7 @@ def show(cells: Sequence[Cell], console: Console) -> None:
 
 def verdict(cells: Sequence[Cell]) -> list[str]:
     """Sentences for people who run robots."""
-    lines = [*_transports(cells), *_media(cells), *_floor(cells)]
+    lines = [*_transports(cells), *_media(cells), *_floor(cells), *_lost(cells)]
     plain = [cell for way in WAYS for cell in _robots(cells, way, UNLOADED)]
     return [*lines, *caveat(plain), *(line for cell in plain for line in _aims(cell))]
 
@@ -45,7 +50,7 @@ def _transports(cells: Sequence[Cell]) -> list[str]:
     for load in (UNLOADED, LOADED):
         for way, words in WAYS.items():
             if robots := _robots(cells, way, load):
-                what = f"Median, {words}{', media flowing' if load == LOADED else ''}"
+                what = f"Median, {words}{_beside_media(load)}"
                 lines.append(sentence(what, robots, less="faster", more="slower"))
     return lines
 
@@ -63,7 +68,8 @@ def _media(cells: Sequence[Cell]) -> list[str]:
 
 def _beside(loaded: Cell, free: Cell) -> str:
     times = f"{figure(free.percentile(99))} ms, with media {figure(loaded.percentile(99))} ms"
-    if min(len(loaded.rounds), len(free.rounds)) < LEAST_ROUNDS:
+    rounds = [*loaded.rounds, *free.rounds]
+    if min(len(loaded.rounds), len(free.rounds)) < LEAST_ROUNDS or min(map(len, rounds)) < _LEAST_IN_ROUND:
         return times
     ratio = paired(loaded.rounds, free.rounds, 99)
     return f"{times}; {ratio.words('the robot with media', 'the one without')}"
@@ -76,26 +82,46 @@ def _floor(cells: Sequence[Cell]) -> list[str]:
     if hop is None or not hop.samples or not robots:
         return []
     more = ", ".join(f"{cell.variant} {figure(cell.percentile(50) - hop.percentile(50))} ms more" for cell in robots)
-    return [f"One hop, operator to a stock client of the same broker, takes {figure(hop.percentile(50))} ms; {more}."]
+    floor = f"{figure(hop.percentile(50))} ms"
+    return [f"One hop, operator to a stock client through a broker of their own, takes {floor}; {more}."]
 
 
-def _aims(cell: Cell) -> list[str]:
-    """Of all samples: are both aims met, and if not, by how much?"""
+def _lost(cells: Sequence[Cell]) -> list[str]:
+    """What did not arrive, where that is more than a stray one."""
     lines = []
-    for percent, aim in AIMS_MS.items():
-        took = cell.percentile(percent)
-        outcome = f"missed by {took - aim:.2f} ms" if took > aim else "met"
-        what = f"{cell.variant}, {WAYS[cell.measure]}, p{percent} at most {aim:g} ms"
-        lines.append(f"aim: {what}: {outcome} ({figure(took)} ms)")
+    for cell in cells:
+        lost, sent = cell.lost or 0, len(cell.samples) + (cell.lost or 0)
+        if lost > _TELL_LOST * sent:
+            what = f"{cell.variant}, {WAYS[cell.measure]}{_beside_media(cell.params['load'])}"
+            lines.append(f"{what}: {100 * lost / sent:.1f} % of {sent} were overtaken, or did not arrive within 1 s.")
     return lines
 
 
+def _beside_media(load: Value) -> str:
+    return ", media flowing" if load == LOADED else ""
+
+
+def _aims(cell: Cell) -> list[str]:
+    """Are both aims met, and if not, by how much? What never arrived took longer than anything."""
+    lines = []
+    for percent, aim in AIMS_MS.items():
+        times = [*cell.samples, *[math.inf] * (cell.lost or 0)]
+        judged = len(cell.rounds) >= LEAST_ROUNDS and len(times) >= LEAST_SAMPLES[percent]
+        took = percentile(times, percent)
+        what = f"{cell.variant}, {WAYS[cell.measure]}, p{percent} at most {aim:g} ms"
+        told = "not within 1 s" if math.isinf(took) else f"{figure(took)} ms"
+        lines.append(f"aim: {what}: {_outcome(took - aim) if judged else 'not judged'} ({told})")
+    return lines
+
+
+def _outcome(beyond_ms: float) -> str:
+    if beyond_ms <= 0:
+        return "met"
+    return "missed" if math.isinf(beyond_ms) else f"missed by {beyond_ms:.2f} ms"
+
+
 def _robots(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
-    found = [
-        cell
-        for cell in cells
-        if (cell.measure, cell.params["load"]) == (measure, load) and cell.variant in KINDS and cell.samples
-    ]
+    found = [cell for cell in cells if (cell.measure, cell.params["load"]) == (measure, load) and cell.variant in KINDS]
     return sorted(found, key=lambda cell: KINDS.index(cell.variant))
 
 

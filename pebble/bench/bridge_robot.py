@@ -69,10 +69,10 @@ class Robot:
         return [entry for entry in read_trace(self._root / "trace.jsonl") if entry.ns >= since_ns]
 
     def pids(self) -> list[int]:
-        """The launcher and its children."""
+        """The launcher, its children (a hub is one), and the broker on the robot, where it has one."""
         if self._launcher is None:
             return []
-        return [self._launcher.pid, *children(self._launcher.pid)]
+        return [self._launcher.pid, *children(self._launcher.pid), *(one.program.pid for one in self._brokers[1:])]
 
     def log(self) -> str:
         """The end of what the robot said."""

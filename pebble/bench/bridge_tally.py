@@ -20,17 +20,15 @@ class Tally:
         self._rounds: list[list[Found]] = []
         self._cpu_s = self._took_s = 0.0
         self._flowed: dict[str, int] = {}
-        self._flowed_s = 0.0
 
-    def add_round(self, stretches: Sequence[Stretch], found: Sequence[Found]) -> None:
+    def add_round(
+        self, stretches: Sequence[Stretch], found: Sequence[Found], flowed: Mapping[str, int] | None = None
+    ) -> None:
+        """``flowed`` is what media came through meanwhile."""
         self._rounds.append(list(found))
         self._cpu_s += sum(stretch.cpu_s for stretch in stretches)
         self._took_s += sum(stretch.ended - stretch.began for stretch in stretches) / 1e9
-
-    def add_flow(self, counts: Mapping[str, int], seconds: float) -> None:
-        """Media that came through meanwhile."""
-        self._flowed_s += seconds
-        for name, count in counts.items():
+        for name, count in (flowed or {}).items():
             self._flowed[name] = self._flowed.get(name, 0) + count
 
     def cells(self) -> list[Cell]:
@@ -48,6 +46,6 @@ class Tally:
         figures: dict[str, Value] = {"sent": sent}
         if self._cpu_s:
             figures["cpu_percent"] = rounded(100 * self._cpu_s / self._took_s, 1)
-        figures |= {f"{name}_per_s": round(count / self._flowed_s, 1) for name, count in self._flowed.items()}
+        figures |= {f"{name}_per_s": round(count / self._took_s, 1) for name, count in self._flowed.items()}
         params: dict[str, Value] = {"load": self.load}
         return Cell(variant=self.variant, params=params, measure=measure, unit="ms", rounds=rounds, figures=figures)

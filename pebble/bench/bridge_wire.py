@@ -21,6 +21,7 @@ _LOAD_HEADER_LENGTH, _LOAD_HALF_AFTER, _JUMP_IF_EQUAL, _RETURN = 0xB1, 0x48, 0x1
 _BUFFER = 64 * 1024 * 1024  # bytes: everything that passes within a minute
 _LARGEST = 65_536
 _ETHERNET, _TCP = 14, 6
+_TIMESPEC = struct.Struct("qq")
 _COMMAND = re.compile(rb'/drive-values.{0,3}?(\{"x": [-+.0-9e]+, "z": [-+.0-9e]+\})', re.DOTALL)  # a packet's number
 
 Passed = dict[tuple[int, int], dict[Wheels, int]]
@@ -95,5 +96,7 @@ def commands(frame: bytes) -> list[tuple[tuple[int, int], Wheels]]:
 
 
 def _stamp(stamps: list[tuple[int, int, bytes]]) -> int:
-    seconds, ns = struct.unpack("qq", stamps[0][2])
+    if len(stamps[0][2]) != _TIMESPEC.size:
+        raise PebbleError("--profile cannot read this kernel's time stamps: it takes a 64-bit Linux")
+    seconds, ns = _TIMESPEC.unpack(stamps[0][2])
     return int(seconds) * 1_000_000_000 + int(ns)

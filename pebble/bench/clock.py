@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pebble.bench.control_wire import Exchange
 from pebble.errors import PebbleError
 
-#: How much faster one clock may run than the other: quartz is within 50 ppm on each side.
+#: How much faster one clock may run than the other: quartz is within 50 ppm on each side, where NTP does not slew it.
 DRIFT = 100e-6
 LEAST = 8  # exchanges
 

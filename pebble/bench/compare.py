@@ -1,7 +1,7 @@
 """Did anything get worse from one run of a comparison to a later one, beyond what chance does to both? Pure.
 
-Many figures are many chances to be fooled: the certainty asked of each grows with their number, so that in two runs of
-the same thing the chance that anything at all is called changed stays at :data:`CHANCE`.
+Many figures are many chances to be fooled: the certainty asked of each grows with their number, so that noise within
+two runs of the same thing has a chance of about :data:`CHANCE` to have anything at all called changed.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from enum import StrEnum
 from typing import Any
 
 from pebble.bench.figures import percentile
-from pebble.bench.ratios import Interval, unpaired
-from pebble.bench.results import Cell, Results
+from pebble.bench.ratios import LEAST_ROUNDS, Interval, student, unpaired
+from pebble.bench.results import OVER_TIME, Cell, Results
 
 CHANCE = 0.01
 #: Which memory and which core new processes get moves medians by so much from one run to the next, and no number of
@@ -23,14 +23,15 @@ CHANCE = 0.01
 THRESHOLD = 1.05
 _PERCENTS = (50, 99)
 _SAME_EVERY_TIME = ("kB/s", "kbit/s")  # what encoders make: one figure is all there is to know
-_LEAST_ROUNDS = 2
-_COURSE = " over time"  # how the measure of a cell ends that holds a curve, not samples
+_MORE_IS_BETTER = ("1/s",)
+_LEAST_SAMPLES = 100  # of a round: with fewer, its p99 is its largest
+_LOSS = 0.005  # of what was sent: a smaller change is none
 
 
 class Kind(StrEnum):
     """In the order in which they are shown."""
 
-    SILENT = "nothing in B"  # it was to be measured, and no sample came
+    SILENT = "nothing in B"  # it was to be measured, and no sample came; or what came was none a second
     WORSE = "worse"
     ONLY_A = "only in A"
     ONLY_B = "only in B"
@@ -41,14 +42,18 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One percentile of one cell in both runs, the median over its rounds. Smaller is better; NaN: not measured."""
+    """One percentile of one cell in both runs, the median over its rounds; or what was lost. NaN: not measured."""
 
     cell: Cell
-    percent: int
+    percent: int | None  # None: the share that was lost, in %
     a: float
     b: float
     ratio: Interval  # b / a
     kind: Kind
+
+    @property
+    def what(self) -> str:
+        return "lost %" if self.percent is None else f"p{self.percent} {self.cell.unit}".strip()
 
     @property
     def worse(self) -> bool:
@@ -63,14 +68,12 @@ def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Findin
     """The worst first. Each figure that both have is judged with :func:`certainty`."""
     before, after = _by_key(a.cells), _by_key(b.cells)
     silent = {_key(cell) for cell in b.cells if not cell.samples}
-    asked = [
-        (before[key], after[key], percent)
-        for key in before
-        if key in after
-        for percent in _percents(before[key], after[key])
-    ]
-    level = certainty(len(asked))
+    both = [(before[key], after[key]) for key in before if key in after]
+    asked = [(one, other, percent) for one, other in both for percent in _percents(one, other)]
+    losing = [(one, other) for one, other in both if _counts(one) and _counts(other) and (one.lost or other.lost)]
+    level = certainty(len(asked) + len(losing))
     findings = [_judged(one, other, percent, level, threshold) for one, other, percent in asked]
+    findings += [_lost(one, other, level) for one, other in losing]
     findings += [
         _alone(before[key], Kind.SILENT if key in silent else Kind.ONLY_A) for key in before if key not in after
     ]
@@ -102,7 +105,7 @@ def _differing(what: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> l
 
 def _by_key(cells: Sequence[Cell]) -> dict[Hashable, Cell]:
     """Those with samples."""
-    return {_key(cell): cell for cell in cells if cell.samples and not cell.measure.endswith(_COURSE)}
+    return {_key(cell): cell for cell in cells if cell.samples and not cell.measure.endswith(OVER_TIME)}
 
 
 def _key(cell: Cell) -> Hashable:
@@ -110,8 +113,9 @@ def _key(cell: Cell) -> Hashable:
 
 
 def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
-    """Rounds of a single sample have only one percentile."""
-    return _PERCENTS if any(len(samples) > 1 for samples in (*one.rounds, *other.rounds)) else _PERCENTS[:1]
+    """Those that most rounds have samples enough for."""
+    fewest = min(statistics.median(len(samples) for samples in cell.rounds if samples) for cell in (one, other))
+    return _PERCENTS if fewest >= _LEAST_SAMPLES else _PERCENTS[:1]
 
 
 def _alone(cell: Cell, kind: Kind) -> Finding:
@@ -124,8 +128,36 @@ def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float
     ratio = unpaired(other.rounds, one.rounds, percent, level)
     if other.unit in _SAME_EVERY_TIME:
         ratio = replace(ratio, low=ratio.ratio, high=ratio.ratio)
-    kind = _kind(ratio, threshold) if _can_be_told(one, other) else Kind.UNKNOWN
-    return Finding(other, percent, _figure(one, percent), _figure(other, percent), ratio, kind)
+    a, b = _figure(one, percent), _figure(other, percent)
+    if other.unit in _MORE_IS_BETTER and a > 0 and not b:
+        return Finding(other, percent, a, b, ratio, Kind.SILENT)
+    told = not ratio.few or other.unit in _SAME_EVERY_TIME
+    kind = _kind(ratio, threshold, other.unit) if told else Kind.UNKNOWN
+    return Finding(other, percent, a, b, ratio, kind)
+
+
+def _lost(one: Cell, other: Cell, level: float) -> Finding:
+    """Judged by how much the rounds differ: losses come in bursts. Rounds of one cell send alike."""
+    a, b = _lost_shares(one), _lost_shares(other)
+    rounds = min(len(a), len(b))
+    grown, kind = statistics.fmean(b) - statistics.fmean(a), Kind.UNKNOWN
+    if rounds >= LEAST_ROUNDS:
+        error = math.sqrt(sum(statistics.variance(shares) / len(shares) for shares in (a, b)))
+        told = abs(grown) > max(_LOSS, student(level, rounds) * error)
+        kind = Kind.EQUAL if not told else Kind.WORSE if grown > 0 else Kind.BETTER
+    unknown = Interval(math.nan, math.nan, math.nan, level, rounds)
+    return Finding(other, None, 100 * statistics.fmean(a), 100 * statistics.fmean(b), unknown, kind)
+
+
+def _counts(cell: Cell) -> bool:
+    """Is it known what was sent?"""
+    return cell.lost is not None and cell.lost >= 0
+
+
+def _lost_shares(cell: Cell) -> list[float]:
+    arrived = [len(samples) for samples in cell.rounds if samples]
+    each = int(cell.figures["sent"] or 0) / len(arrived)
+    return [1 - count / each for count in arrived]
 
 
 def _figure(cell: Cell, percent: int) -> float:
@@ -133,18 +165,12 @@ def _figure(cell: Cell, percent: int) -> float:
     return statistics.median(percentile(samples, percent) for samples in cell.rounds if samples)
 
 
-def _can_be_told(one: Cell, other: Cell) -> bool:
-    """A single round shows nothing of how much rounds differ."""
-    rounds = min(sum(map(bool, cell.rounds)) for cell in (one, other))
-    return rounds >= _LEAST_ROUNDS or other.unit in _SAME_EVERY_TIME
-
-
-def _kind(ratio: Interval, threshold: float) -> Kind:
+def _kind(ratio: Interval, threshold: float, unit: str) -> Kind:
     if math.isnan(ratio.ratio):  # of figures that are 0
         return Kind.UNKNOWN
     if ratio.equal or 1 / threshold < ratio.ratio < threshold:
         return Kind.EQUAL
-    return Kind.WORSE if ratio.ratio > 1 else Kind.BETTER
+    return Kind.WORSE if (ratio.ratio > 1) != (unit in _MORE_IS_BETTER) else Kind.BETTER
 
 
 def _order(finding: Finding) -> tuple[int, float]:
@@ -163,14 +189,15 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
     if judged:
         lines.append(
             f"Changed is what lies beyond a factor of {threshold:g} with an interval that does not hold 1.00: of"
-            f" {100 * judged[0].ratio.level:.4g} %, so that {100 * CHANCE:g} % is the chance that noise changes any"
+            f" {100 * judged[0].ratio.level:.4g} %, so that noise within the runs changes any with a chance of about"
+            f" {100 * CHANCE:g} %; what differs from run to run comes on top"
         )
     if widths := [_width(finding.ratio) for finding in judged if finding.percent == _PERCENTS[0]]:
         seen = max(threshold, statistics.median(widths))
         lines.append(f"Half of the medians would have shown a change by a factor of {seen:.2f}")
     notes = {
         Kind.SILENT: "without a sample in B: worse than slow",
-        Kind.UNKNOWN: "cannot be told: measured in a single round, or zero",
+        Kind.UNKNOWN: f"cannot be told: fewer than {LEAST_ROUNDS} rounds, or zero",
         Kind.ONLY_A: "only in A: left out of B, which then says nothing of it",
         Kind.ONLY_B: "only in B",
     }

@@ -48,7 +48,7 @@ def _table(findings: Sequence[Finding], bench: str) -> Table:
         cell = finding.cell
         table.add_row(
             ", ".join(filter(None, (cell.variant, cell.measure, cell.conditions()))),
-            f"p{finding.percent} {cell.unit}".strip(),
+            finding.what,
             figure(finding.a),
             figure(finding.b),
             str(finding.ratio),

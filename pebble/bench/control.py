@@ -14,6 +14,7 @@ from pebble.bench.control_plan import Condition, Plan
 from pebble.bench.control_report import MEASURES, ONE_WAY, legend, tables, verdict
 from pebble.bench.figures import percentile, rounded
 from pebble.bench.output import check_folder, finish
+from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, Stopwatch, Value
 from pebble.errors import PebbleError
 from pebble.signals import interrupted_by_signals
@@ -26,28 +27,32 @@ Round = dict[tuple[str, Condition], Slice]
 
 
 def run(plan: Plan, console: Console | None = None) -> int:
-    """Measure, show and write; 0 if every role has figures and no null test was missed. Raises PebbleError."""
+    """Measure, show and write; 0 if every role has figures, of rounds enough to judge if so many were asked for.
+
+    Raises PebbleError.
+    """
     console = console or Console()
     check_folder(plan.output)
     console.print(_announcement(plan), highlight=False, soft_wrap=True)
     watch = Stopwatch(plan.bench, plan.command, _options(plan))
     with interrupted_by_signals():
         try:
-            measured = _measure(plan, console)
+            measured, problems = _measure(plan, console)
         finally:
             sweep()  # Zenoh leaves a file behind even when it ends politely
     cells = cells_of(plan, measured)
     said = null.verdict(cells) if plan.null else verdict(cells)
     if len(measured) < plan.rounds:
-        said.insert(0, f"{plan.rounds - len(measured)} of {plan.rounds} rounds failed and were left out.")
+        why = ", ".join(dict.fromkeys(problems))
+        said.insert(0, f"{plan.rounds - len(measured)} of {plan.rounds} rounds failed and were left out: {why}")
     results = watch.results(cells, said, quick=plan.quick)
     for line in legend(plan.roles):
         console.print(line, style="dim", highlight=False, soft_wrap=True)
     for table in tables(cells):
         console.print(table)
     finish(results, plan.output, console)
-    complete = all(cell.samples for cell in cells)
-    return 0 if complete and (not plan.null or null.judged(cells)) else 1
+    enough = len(measured) >= LEAST_ROUNDS or plan.rounds < LEAST_ROUNDS
+    return 0 if enough and all(cell.samples for cell in cells) else 1
 
 
 def _announcement(plan: Plan) -> str:
@@ -68,13 +73,17 @@ def _options(plan: Plan) -> dict[str, Value | list[Value]]:
     }
 
 
-def _measure(plan: Plan, console: Console) -> list[Round]:
-    """A round that somebody did not survive is left out for all. Raises PebbleError if none is left."""
+def _measure(plan: Plan, console: Console) -> tuple[list[Round], list[str]]:
+    """A round that somebody did not survive is left out for all, and why is told in a line.
+
+    Raises PebbleError if none is left.
+    """
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console,
         transient=True,
     )  # fmt: skip
     rounds: list[Round] = []
+    problems: list[str] = []
     work_us: dict[Condition, float] = {}
     with progress:
         bar = progress.add_task("control", total=plan.rounds * plan.passes * len(plan.roles) * len(plan.conditions))
@@ -89,10 +98,11 @@ def _measure(plan: Plan, console: Console) -> list[Round]:
                         rounds.append(_round(cast, plan, number, work_us, lambda: progress.advance(bar)))
                         work_us = {condition: _a_fifth(plan, condition, rounds) for condition in work_us}
             except PebbleError as error:
+                problems.append(str(error).partition("\n")[0].rstrip(":"))
                 console.print(f"round {len(rounds) + 1}: {error}", style="red", highlight=False, markup=False)
     if not rounds:
         raise PebbleError("no round could be measured: see the lines above")
-    return rounds
+    return rounds, problems
 
 
 def _round(cast: Cast, plan: Plan, number: int, work_us: Mapping[Condition, float], done: Callable[[], None]) -> Round:

@@ -7,7 +7,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -154,8 +154,7 @@ class Cast:
         with self._loaded(player, load):
             before, began = self._pictures(player, load), time.monotonic()
             answer, cpu, backbone_cpu = player.run(order)
-            pictures = self._pictures(player, load) - before
-        took = time.monotonic() - began
+            pictures, took = self._pictures(player, load) - before, time.monotonic() - began
         pictures_hz = pictures / took if load == MEDIA else None
         return Slice(answer=answer, cpu=cpu, backbone_cpu=backbone_cpu, pictures_hz=pictures_hz)
 
@@ -202,8 +201,7 @@ class Cast:
 
 def _ask(worker: Worker, line: str, timeout: float) -> Any:
     """What it answers. Raises PebbleError if it has ended, or is silent."""
-    with suppress(BrokenPipeError):  # it has ended: then that is what its answer is
-        worker.tell(line)
+    worker.tell(line)
     return worker.answer(timeout)
 
 

@@ -102,9 +102,13 @@ class Way:
 
 
 def wall_clock() -> Clock:
-    """This machine's time of day, ns; from now on not moved by whoever sets the clock."""
-    since = time.time_ns() - time.monotonic_ns()
-    return lambda: time.monotonic_ns() + since
+    """This machine's time of day, ns; from now on neither set nor slewed: NTP may slew CLOCK_MONOTONIC by 500 ppm."""
+    since = time.time_ns() - _quartz_ns()
+    return lambda: _quartz_ns() + since
+
+
+def _quartz_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
 
 def serve(settings: MqttSettings, clock: Clock | None = None, console: Console | None = None) -> int:

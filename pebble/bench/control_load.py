@@ -21,6 +21,7 @@ from pebble.bench.frames_worker import MqttReader, MqttWriter, ZenohReader, Zeno
 
 SIZE = 640 * 480 * 3
 _READ_S = 0.2
+_ALIVE_S = 0.01  # of reading at rest: a client's network loop has to run for it to stay connected
 _EVERY = 64  # bytes: a look at every cache line
 _REST_S = 1.0  # between two signs of life to a broker
 
@@ -99,7 +100,7 @@ def _read(reader: Reader, switch: Switch) -> None:
     switch.say()
     while not switch.ended:
         switch.wait(_REST_S)
-        frame = reader.read(_READ_S if switch.on else 0.0)
+        frame = reader.read(_READ_S if switch.on else _ALIVE_S)
         if frame is not None:
             switch.pictures += bool(frame[::_EVERY].any())
             del frame

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
+from msgspec.structs import replace
 from rich.table import Table
 
 from pebble.bench.control_plan import HOG, LOADED_SIZE, MEDIA, NONE, rate_name, size_name
 from pebble.bench.control_variants import BASELINE, HUB, MQTT, P2P, VARIANTS
+from pebble.bench.frames_loop import RATE_HZ
 from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell
@@ -16,7 +19,8 @@ from pebble.bench.tables import base_of, figure, plain_table
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
 MEASURES = {ONE_WAY: "one_way", ROUND_TRIP: "round_trip"}  # and the field of a worker's answer
 _LONG_US = 995.0
-_MUCH_LATE = 0.05
+_MUCH_LATE, _MUCH_LOST = 0.05, 0.005
+_FEWER = 0.9 * RATE_HZ  # pictures: a lighter load than was meant
 AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
 _JUDGED = {"size": size_name(LOADED_SIZE), "rate": rate_name(200)}
 
@@ -67,6 +71,8 @@ def _ratio(cell: Cell, base: Cell | None) -> str:
     if base is None:
         return ""
     interval = paired(cell.rounds, base.rounds)
+    if interval.few:
+        return str(interval)
     return f"{figure(interval.ratio)}\n{figure(interval.low)}–{figure(interval.high)}"
 
 
@@ -90,7 +96,7 @@ def verdict(cells: Sequence[Cell]) -> list[str]:
     """Plain sentences; what was not measured is not spoken of."""
     ways = {(cell.variant, str(cell.params["load"])): cell for cell in cells if _is_judged(cell)}
     said = ["40 B at 200 Hz, one way, medians unless p99 is named; in brackets the 99 % interval of the ratio."]
-    said += _against_mqtt(ways, NONE, 50) + _against_mqtt(ways, MEDIA, 99)
+    said += _against_mqtt(ways, NONE, 50) + _against_mqtt(ways, MEDIA, 99) + _pictures(ways)
     said += _pair(ways, (HUB, NONE), (P2P, NONE), 50)
     said += [line for name in (P2P, _better(ways, NONE, 50)) for line in _with_hog(ways, name)]
     for slow in ("paho", "mqtt"):
@@ -98,7 +104,7 @@ def verdict(cells: Sequence[Cell]) -> list[str]:
             said += _pair(ways, (slow, NONE), ("mqtt-nodelay", NONE), percent, why="Nagle: ")
     said += _pair(ways, ("mqtt5", NONE), ("mqtt-nodelay", NONE), 50)
     said = said if len(said) > 1 else []
-    return said + _doubts(cells) + _aims(ways)
+    return said + _doubts(cells) + _aims({key: _with_lost(cell) for key, cell in ways.items()})
 
 
 def _is_judged(cell: Cell) -> bool:
@@ -133,6 +139,20 @@ def _against_mqtt(ways: _Ways, load: str, percent: float) -> list[str]:
     return [] if best is None else _pair(ways, (P2P, load), (best, load), percent, aside=" (the better MQTT variant)")
 
 
+def _pictures(ways: _Ways) -> list[str]:
+    """What flowed beside the messages: a variant that carries less of it has it easier."""
+    rates = {name: cell.figures.get("pictures_hz") for (name, load), cell in ways.items() if load == MEDIA}
+    known = {name: rate for name, rate in rates.items() if isinstance(rate, (int, float))}
+    if not known:
+        return []
+    told = ", ".join(f"{name} {figure(rate)}" for name, rate in known.items())
+    said = [f"With media, pictures a second that arrived meanwhile, of {RATE_HZ:g}: {told}"]
+    fewer = [name for name, rate in known.items() if rate < _FEWER]
+    if fewer:
+        said.append(f"With media, {', '.join(fewer)}: fewer pictures than {_FEWER:g}, so figures of a lighter load.")
+    return said
+
+
 def _with_hog(ways: _Ways, name: str | None) -> list[str]:
     found = []
     for percent in (50, 99):
@@ -156,26 +176,54 @@ def _doubts(cells: Sequence[Cell]) -> list[str]:
         late, sent = (sum(int(figures.get(name) or 0) for figures in ours) for name in ("late", "sent"))
         if late > _MUCH_LATE * sent:
             said.append(f"At {rate} {late / sent:.0%} of the messages left late: this machine cannot keep that pace.")
+        said += _lost([cell for cell in cells if cell.measure == ONE_WAY and cell.params["rate"] == rate], rate)
     return said
 
 
+def _lost(cells: Sequence[Cell], rate: str) -> list[str]:
+    shares = {
+        name: sum(cell.lost or 0 for cell in cells if cell.variant == name)
+        / max(1, sum(int(cell.figures.get("sent") or 0) for cell in cells if cell.variant == name))
+        for name in dict.fromkeys(cell.variant for cell in cells)
+    }
+    told = ", ".join(f"{share:.1%} of {name}" for name, share in shares.items() if share > _MUCH_LOST)
+    return (
+        [f"At {rate} messages were lost: {told}. Percentiles are of the others, aims count them as infinitely late."]
+        if told
+        else []
+    )
+
+
+def _with_lost(cell: Cell) -> Cell:
+    """What never arrived is infinitely late; as much was sent in each round."""
+    each = int(cell.figures.get("sent") or 0) // max(1, len(cell.rounds))
+    return replace(cell, rounds=[[*one, *[math.inf] * (each - len(one))] for one in cell.rounds])
+
+
 def _aims(ways: _Ways) -> list[str]:
-    """The p50's is for the upper end of the interval, the p99's for the ratio: so the aims were set."""
+    """The p50's is for the upper end of the interval, the p99's for the ratio: so the aims were set.
+
+    Where too much of all that was sent never arrived the ratio does not help, even if that was in few rounds.
+    """
     said = []
     without = _compared(ways, (P2P, NONE), (_better(ways, NONE, 50), NONE), 50)
     if without is not None:
         said.append(_aim(f"{P2P} / better MQTT, p50, upper end of the interval", without.high, AIM_P50, without))
     media = _compared(ways, (P2P, MEDIA), (_better(ways, MEDIA, 99), MEDIA), 99)
     if media is not None:
-        said.append(_aim(f"{P2P} / better MQTT with media, p99", media.ratio, AIM_MEDIA_P99, media))
+        value = media.ratio if math.isfinite(ways[P2P, MEDIA].percentile(99)) else math.inf
+        said.append(_aim(f"{P2P} / better MQTT with media, p99", value, AIM_MEDIA_P99, media))
     return said
 
 
 def _aim(what: str, value: float, aim: float, interval: Interval) -> str:
     """What cannot be told from equal is no aim met, however lucky its ratio."""
-    if interval.equal:
-        return f"aim: {what}, at most {aim:.2f}: missed ({interval}, equal within noise)"
     if interval.few:
-        return f"{what}, at most {aim:.2f}: not judged, {interval} of {interval.rounds} rounds"
-    outcome = "met" if value <= aim else f"missed by {value - aim:.2f}"
-    return f"aim: {what}, at most {aim:.2f}: {outcome} ({interval})"
+        outcome, why = "not judged", f" of {interval.rounds} rounds"
+    elif math.isinf(value):
+        outcome, why = "missed", ", too much was lost"
+    elif interval.equal:
+        outcome, why = "missed", ", equal within noise"
+    else:
+        outcome, why = "met" if value <= aim else "missed", ""
+    return f"aim: {what}, at most {aim:.2f}: {outcome} ({interval}{why})"

@@ -15,11 +15,12 @@ from rich.console import Console
 
 from pebble.bench.bridge_robot import KINDS
 from pebble.bench.cost_cells import cells_of
-from pebble.bench.cost_robot import RATE_HZ, STREAMS, Reading, measure
+from pebble.bench.cost_robot import RATE_HZ, STREAMS, measure
 from pebble.bench.figures import LONGEST_S
 from pebble.bench.measured_robot import check_kinds
 from pebble.bench.output import FOLDER, check_folder, finish
 from pebble.bench.results import Stopwatch
+from pebble.bench.rounds import Rounds
 from pebble.errors import PebbleError
 from pebble.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
@@ -61,29 +62,32 @@ class Plan:
 
 
 def run(plan: Plan, console: Console | None = None) -> int:
-    """Measure, show and write. Raises PebbleError."""
+    """Measure, show and write; 0 if everything has figures and rounds enough are left. Raises PebbleError."""
     console = console or Console()
     plan.check()
     streams = _installed(console)
     options = {"rounds": plan.robots, "seconds": plan.phase_s, "rate_hz": RATE_HZ}
     watch = Stopwatch("cost", plan.command(), options)
-    rounds: dict[str, list[list[Reading]]] = {kind: [] for kind in plan.kinds}
+    rounds, done = Rounds(plan.robots, console), []
     with interrupted_by_signals(), console.status("") as status:
         try:
             for number in range(plan.robots):
-                for kind in plan.kinds[:: -1 if number % 2 else 1]:
-                    status.update(f"round {number + 1} of {plan.robots}: {kind}")
-                    rounds[kind].append(measure(kind, plan.phase_s, streams))
+                with rounds.attempt(number):
+                    one = {}
+                    for kind in plan.kinds[:: -1 if number % 2 else 1]:
+                        status.update(f"round {number + 1} of {plan.robots}: {kind}")
+                        one[kind] = measure(kind, plan.phase_s, streams)
+                    done.append(one)
         finally:
             sweep()  # Zenoh leaves files behind even when it ends politely
     from pebble.bench.cost_report import legend, table, verdict  # numpy: not while robots are measured that map it too
 
-    cells = cells_of(rounds)
+    cells = cells_of({kind: [one[kind] for one in done] for kind in plan.kinds})
     console.print(table(cells))
     for line in legend(cells):
         console.print(line, style="dim", highlight=False, soft_wrap=True)
-    finish(watch.results(cells, verdict(cells), quick=plan.quick), plan.output, console)
-    return 0
+    finish(watch.results(cells, [*rounds.told(), *verdict(cells)], quick=plan.quick), plan.output, console)
+    return rounds.code(cells)
 
 
 def _installed(console: Console) -> list[str]:

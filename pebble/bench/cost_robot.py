@@ -14,7 +14,7 @@ from pathlib import Path
 from pebble.bench.bridge_robot import BASE
 from pebble.bench.measured_robot import MeasuredRobot
 from pebble.bench.onlooker import Onlooker
-from pebble.bench.usage import pss_mb
+from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
 
 RATE_HZ = 20.0  # of driving
@@ -67,11 +67,11 @@ def _read(robot: MeasuredRobot, onlooker: Onlooker, phase: str, work: Callable[[
     """What the robot's processes take while ``work`` is done; their memory is looked at afterwards."""
     time.sleep(_SETTLE_S)
     processes = robot.processes()
-    before = {name: _cpu_s(pid) for name, pid in processes.items()}
+    before = {name: cpu_s([pid]) for name, pid in processes.items()}
     pictures, began = _pictures(onlooker, phase), time.monotonic()
     work()
     took = time.monotonic() - began
-    cpu = {name: 100 * (_cpu_s(pid) - before[name]) / took for name, pid in processes.items()}
+    cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in processes.items()}
     arrived = _pictures(onlooker, phase) - pictures
     if robot.processes() != processes:
         raise PebbleError(f"{phase}: processes of the robot ended or were started meanwhile\n{robot.log()}")
@@ -82,17 +82,6 @@ def _read(robot: MeasuredRobot, onlooker: Onlooker, phase: str, work: Callable[[
         threads={name: _threads(pid) for name, pid in processes.items()},
         pictures_per_s=arrived / took if phase in STREAMS else None,
     )
-
-
-def _cpu_s(pid: int) -> float:
-    """CPU time of all its threads so far, to the nanosecond: /proc counts in ticks, a per cent of a second's phase.
-
-    The number of the clock is what clock_getcpuclockid(3) makes of a pid. 0 for a process that has gone.
-    """
-    try:
-        return time.clock_gettime(~pid << 3 | 2)
-    except OSError:
-        return 0.0
 
 
 def _pictures(onlooker: Onlooker, phase: str) -> int:

@@ -48,6 +48,7 @@ class Plan:
     rate_hz: float = 10.0
     kinds: Sequence[str] = KINDS
     output: Path = output.FOLDER
+    quick: bool = False  # the results are marked so
 
     def check(self) -> None:
         """Raises PebbleError naming what makes no sense."""
@@ -62,7 +63,14 @@ class Plan:
     def command(self) -> list[str]:
         """The command line that repeats it."""
         words = ["pebble", "bench", "fleet", "--robots", str(self.robots)]
-        return [*words, "--seconds", f"{self.seconds:g}", "--rate", f"{self.rate_hz:g}"]
+        words += ["--seconds", f"{self.seconds:g}", "--rate", f"{self.rate_hz:g}"]
+        return [*words, *(["--quick"] if self.quick else [])]
+
+
+def plan(*, quick: bool = False, **given: Any) -> Plan:
+    """The usual plan, or the one for the impatient, except for what is given."""
+    usual = {"robots": 30, "seconds": 5.0} if quick else {}
+    return Plan(quick=quick, **{**usual, **given})
 
 
 @dataclass(slots=True, kw_only=True)
@@ -76,7 +84,7 @@ class Figures:
     late: int  # commands that the operator could not send in time
     latencies_ms: list[float] = field(default_factory=list)
     beats_hz: list[float] = field(default_factory=list)
-    longest_gap_s: float = 0.0  # between two beats of one robot
+    longest_gap_s: float = 0.0  # without a beat of one robot
     cpu: dict[str, float] = field(default_factory=dict)
     fleet_mb: float = 0.0
 
@@ -130,7 +138,8 @@ def run(plan: Plan, console: Console | None = None) -> int:
     with interrupted_by_signals(), console.status("starting") as status:
         figures = measure(plan, status.update)
     console.print(_table(figures))
-    output.finish(watch.results([figures.cell(plan.rate_hz)], figures.verdict()), plan.output, console)
+    results = watch.results([figures.cell(plan.rate_hz)], figures.verdict(), quick=plan.quick)
+    output.finish(results, plan.output, console)
     return 0 if figures.online == plan.robots and figures.latencies_ms else 1
 
 
@@ -169,8 +178,9 @@ def _start_operator(plan: Plan, port: int, folder: Path) -> Worker:
 
 def _observe(plan: Plan, online: int, operator: Worker, fleet: Program, broker: Broker, trace: Path) -> Figures:
     pids = {"broker": broker.program.pid, "fleet": fleet.pid, "operator": operator.pid}
-    began, used = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
+    began, before = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
     said = operator.answer(plan.seconds + _ONLINE_S)
+    used = {name: cpu_s([pid]) - before[name] for name, pid in pids.items()}
     took = time.monotonic() - began
     time.sleep(_ARRIVE_S)  # what is under way arrives, or is lost
     sent: list[list[int]] = said["sent"]
@@ -183,8 +193,8 @@ def _observe(plan: Plan, online: int, operator: Worker, fleet: Program, broker: 
         late=said["late"],
         latencies_ms=latencies_ms(dict(zip(ids, sent, strict=True)), _moves(trace)),
         beats_hz=[rate for beats in said["beats"] if (rate := _rate(beats)) is not None],
-        longest_gap_s=_longest_gap_s(said["beats"]),
-        cpu={name: 100 * (cpu_s([pid]) - used[name]) / took for name, pid in pids.items()},
+        longest_gap_s=longest_gap_s(said["beats"], said["began"], said["ended"]),
+        cpu={name: 100 * seconds / took for name, seconds in used.items()},
         fleet_mb=pss_mb(fleet.pid),
     )
 
@@ -221,8 +231,10 @@ def _rate(beats: list[int]) -> float | None:
     return (len(beats) - 1) / (beats[-1] - beats[0]) * 1e9 if len(beats) > 1 else None
 
 
-def _longest_gap_s(robots: list[list[int]]) -> float:
-    return max((later - earlier for beats in robots for earlier, later in itertools.pairwise(beats)), default=0) / 1e9
+def longest_gap_s(robots: list[list[int]], began: int, ended: int) -> float:
+    """Of all robots, from the first command to the last: who falls silent is missed until the end."""
+    gaps = (b - a for beats in robots for a, b in itertools.pairwise([began, *beats, ended]))
+    return max(gaps, default=0) / 1e9
 
 
 def _table(figures: Figures) -> Table:
@@ -232,7 +244,7 @@ def _table(figures: Figures) -> Table:
     rows = {
         "robots online": f"{figures.online}",
         "heartbeats of a robot, Hz: min / median / max": " / ".join(beats),
-        "longest gap between two, s": f"{figures.longest_gap_s:.2f}",
+        "longest time without one, s": f"{figures.longest_gap_s:.2f}",
         "command to pins, ms: p50 / p95 / p99 / max": " / ".join(times),
         "commands sent / obeyed / overtaken or lost": f"{figures.sent} / {len(figures.latencies_ms)} / {figures.lost}",
         "commands sent late": f"{figures.late}",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import sys
 import threading
 import time
@@ -19,6 +18,7 @@ from typing import Any, Final
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
+from pebble.bench.tcp import send_at_once
 from pebble.contract import DRIVE, ONLINE
 from pebble.identity import Identity
 
@@ -40,7 +40,7 @@ class FleetOperator:
         self.late = 0  # commands that could not go out in time
         self._client = Client(CallbackAPIVersion.VERSION2)
         self._client.max_inflight_messages_set(65_535)
-        self._client.on_socket_open = _send_at_once
+        self._client.on_socket_open = send_at_once
         self._client.on_connect = self._subscribe
         self._client.on_message = self._hear
         self._client.connect("127.0.0.1", port)
@@ -104,10 +104,6 @@ def _say(what: dict[str, Any]) -> None:
 def _end_with_input() -> None:
     sys.stdin.read()
     os._exit(0)
-
-
-def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from pebble.bench import output
 from pebble.bench.figures import LONGEST_S
 from pebble.bench.frames_process import Worker, end_workers
-from pebble.bench.frames_report import Round, cell_of, legend, tables, verdict
+from pebble.bench.frames_report import Round, cell_of, complete, legend, tables, verdict
 from pebble.bench.frames_variants import VARIANTS, Case, missing, parse_size
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, Stopwatch, Value
@@ -93,7 +93,7 @@ def plan(*, quick: bool = False, **given: Any) -> Plan:
 
 
 def run(plan: Plan, console: Console | None = None) -> int:
-    """Measure and show; 0 if every case that this machine can run gave figures. Raises PebbleError.
+    """Measure and show; 0 if every case that this machine can run gave figures, of enough rounds. Raises PebbleError.
 
     Variants whose programs are not installed are left out, with the reason.
     """
@@ -112,7 +112,7 @@ def run(plan: Plan, console: Console | None = None) -> int:
     for figures in tables(cells):
         console.print(figures)
     output.finish(watch.results(cells, verdict(cells), quick=plan.quick), plan.output, console)
-    return 0 if all(cell.samples for cell in cells) else 1
+    return 0 if complete(cells, plan.rounds) else 1
 
 
 def _installed(variants: Sequence[str], console: Console) -> list[str]:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from pebble.bench import null, output
 from pebble.bench.frames import READERS, SIZES, Measured, Plan, cells_of, measure
-from pebble.bench.frames_report import OURS, tables
+from pebble.bench.frames_report import OURS, complete, failed_rounds, tables
 from pebble.bench.frames_variants import Case, missing, parse_size
 from pebble.bench.results import Stopwatch
 from pebble.errors import PebbleError
@@ -23,9 +23,9 @@ def plan(*, quick: bool = False, **given: Any) -> Plan:
 
 
 def run(plan: Plan, console: Console | None = None) -> int:
-    """``plan`` has one size, one number of readers and one variant. 0 if the comparison was not fooled.
+    """``plan`` has one size, one number of readers and one variant. 0 if all roles gave figures, of enough rounds.
 
-    With fewer rounds than a judgement takes, the figures are shown and nobody is blamed.
+    Whether the comparison was fooled says the verdict; with fewer rounds than a judgement takes nobody is blamed.
     """
     console = console or Console()
     plan.check()
@@ -41,8 +41,9 @@ def run(plan: Plan, console: Console | None = None) -> int:
     cells = cells_of(measure(cases, plan, console, slowdown_us))
     for figures in tables(cells):
         console.print(figures)
-    output.finish(watch.results(cells, null.verdict(cells), quick=plan.quick), plan.output, console)
-    return 0 if all(cell.samples for cell in cells) and null.judged(cells) else 1
+    words = [*null.verdict(cells), *failed_rounds(cells)]
+    output.finish(watch.results(cells, words, quick=plan.quick), plan.output, console)
+    return 0 if complete(cells, plan.rounds) else 1
 
 
 def slowdown_us(case: Case, so_far: Measured) -> float:

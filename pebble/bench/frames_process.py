@@ -49,9 +49,11 @@ class Worker:
         return said
 
     def tell(self, line: str) -> None:
+        """Nothing happens if it has ended: :meth:`answer` says so."""
         if self._process.stdin is not None:
-            self._process.stdin.write(line.encode() + b"\n")
-            self._process.stdin.flush()
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.write(line.encode() + b"\n")
+                self._process.stdin.flush()
 
     def ask_to_end(self) -> None:
         if self._process.stdin is not None and not self._process.stdin.closed:

@@ -67,7 +67,19 @@ def verdict(cells: Sequence[Cell]) -> list[str]:
                 lines.append(f"{', '.join(_conditions(ours))}: {words}{_reader_cpu(ours, theirs)}")
     if lines and not judged:
         lines.append(f"Nothing is judged: that takes {LEAST_ROUNDS} rounds.")
-    return [*lines, *(line for cell in cells for line in _faults(cell))]
+    return [*lines, *failed_rounds(cells), *(line for cell in cells for line in _faults(cell))]
+
+
+def complete(cells: Sequence[Cell], rounds: int) -> bool:
+    """Did every case give figures, and enough of the ``rounds`` that were asked for to judge by?"""
+    least = LEAST_ROUNDS if rounds >= LEAST_ROUNDS else 1
+    return all(sum(map(bool, cell.rounds)) >= least for cell in cells)
+
+
+def failed_rounds(cells: Sequence[Cell]) -> list[str]:
+    """A line for each case of which rounds gave nothing."""
+    gone = {f"{', '.join(_conditions(cell))}, {cell.variant}": sum(not one for one in cell.rounds) for cell in cells}
+    return [f"{where}: {count} rounds failed and are left out" for where, count in gone.items() if count]
 
 
 def _faults(cell: Cell) -> list[str]:

@@ -81,7 +81,9 @@ def _comm(pid: int) -> str:
 
 
 def check_kinds(kinds: Sequence[str]) -> None:
-    """Raises PebbleError naming what is no transport of a robot."""
+    """Raises PebbleError naming what is no transport of a robot, or is there twice."""
     unknown = [kind for kind in kinds if kind not in KINDS]
     if unknown or not kinds:
         raise PebbleError(f"unknown transport {', '.join(unknown)}: there are {', '.join(KINDS)}")
+    if len(set(kinds)) < len(kinds):
+        raise PebbleError(f"{', '.join(kinds)}: name each transport once")

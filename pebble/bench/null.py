@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
+from pebble.bench.ratios import Interval, paired
 from pebble.bench.results import Cell
 
 AGAIN, SLOWED = " again", " +20 %"
@@ -52,18 +52,11 @@ def intervals(cells: Sequence[Cell]) -> list[tuple[Cell, Interval]]:
 def verdict(cells: Sequence[Cell]) -> list[str]:
     """A line for each, ``MISSED`` where it was fooled, and the aim. With too few rounds nobody is judged."""
     found = intervals(cells)
-    if any(interval.few for _, interval in found):
-        return [*(_ratio(cell, interval) for cell, interval in found), f"Not judged: that takes {LEAST_ROUNDS} rounds."]
-    outcome = "met" if passed(cells) else "missed"
+    few = any(interval.few for _, interval in found)
+    outcome = "not judged" if few else "met" if passed(cells) else "missed"
     told = ", ".join(f"{cell.variant} {interval}" for cell, interval in found)
-    lines = [_line(cell, interval) for cell, interval in found]
+    lines = [_ratio(cell, interval) if few else _line(cell, interval) for cell, interval in found]
     return [*lines, f"aim: no difference seen where none is, and the planted 20 % seen: {outcome} ({told})"]
-
-
-def judged(cells: Sequence[Cell]) -> bool:
-    """Passed, or too few rounds to say so; False where nothing was measured."""
-    found = intervals(cells)
-    return bool(found) and (passed(cells) or any(interval.few for _, interval in found))
 
 
 def passed(cells: Sequence[Cell]) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from collections import Counter
@@ -13,6 +12,7 @@ from paho.mqtt.client import Client, MQTTv5
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from pebble.bench.tcp import send_at_once
 from pebble.contract import (
     AUDIO,
     AUDIO_CONTROL,
@@ -46,7 +46,7 @@ class Onlooker:
         self.kept: set[str] = set()  # the topics below the base that have a kept copy
         self.arrived: Counter[str] = Counter()  # pictures and packets of sound, by form: "json", "h264", "pcm", "opus"
         self._client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5)
-        self._client.on_socket_open = _send_at_once
+        self._client.on_socket_open = send_at_once
         self._client.on_connect = self._subscribe
         self._client.on_subscribe = self._listen
         self._client.on_message = self._hear
@@ -97,11 +97,6 @@ class Onlooker:
             self.first_beat_ns = now
         elif topic == STATUS.suffix and self.ready_ns is None and _all_ready(message.payload):
             self.ready_ns = now
-
-
-def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
-    """Or who hears as much as this would hold a command in a hundred for 40 ms, until the broker's delayed ACK."""
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def form_of(raw: bytes) -> str:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import tempfile
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-
-from pebble.bench.results import Results
 from pebble.errors import PebbleError
+
+if TYPE_CHECKING:  # command lines import the name of the folder from here, even to show their help
+    from rich.console import Console
+
+    from pebble.bench.results import Results
 
 FOLDER = Path("bench-results")
 
 
 def check_folder(folder: Path) -> None:
-    """Raises PebbleError where no folder can be made: before an hour of measuring, not after it."""
+    """Raises PebbleError where nothing can be written: before an hour of measuring, not after it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise PebbleError(f"{folder}: {error.strerror}") from None
 

@@ -38,6 +38,8 @@ def pictures(results: Results) -> list[Picture]:
             return costs(results, "What a robot costs")
         case "frames":
             return [*tails(results, "Frames between processes"), *distributions(results, "Frames between processes")]
+        case "bridge-profile":
+            return distributions(results, "Operator to wheels, hop by hop")
         case "video":
             return amounts(results, "Video at equal quality")
         case "sound":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -29,13 +30,14 @@ from pebble.bench.tables import figure as digits
 _BAR = 0.8
 _SUM = "all"  # the process whose figures are those of all
 _COSTS = ("PSS", "CPU")  # the others are in the table
+_WORDS = {"wire": "on the wire", "PSS": "memory (PSS)"}
 _LONGEST = 34  # characters of a name at an axis
 
 
 def launches(results: Results, title: str) -> list[Picture]:
     """A dot per launch, and the median."""
     cells = [cell for cell in results.cells if finite(cell.samples)]
-    caption = f"{title}: a dot for each launch or joining, a line at the median"
+    caption = f"{title}: a dot for each launch or joining, a line at the median of the rounds"
     return [Picture(results.bench, caption, lambda: _dots(cells, caption))] if cells else []
 
 
@@ -80,14 +82,14 @@ def _dots(cells: Sequence[Cell], title: str) -> Figure:
             samples, look = finite(cell.samples), looks[cell.variant]
             beside = spread.uniform(-0.16, 0.16, len(samples))
             axes.scatter(at + beside, samples, s=18, color=look.colour, marker=look.marker, alpha=0.65, linewidths=0)
-            middle = percentile(samples, 50)
+            middle = statistics.median(percentile(finite(one), 50) for one in cell.rounds if finite(one))
             axes.plot([at - 0.3, at + 0.3], [middle, middle], color="#222", linewidth=1.5)
             axes.annotate(
                 digits(middle), (at + 0.32, middle), fontsize=8, va="center", annotation_clip=False,
             )  # fmt: skip
         axes.set_xticks(range(len(shown)), [short(cell.variant, 14) for cell in shown])
         axes.set_xlim(-0.6, len(shown) - 0.2)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.08 * max(sample for cell in shown for sample in finite(cell.samples)) or 1.0)
         axes.grid(visible=False, axis="x")
         axes.set_title("\n".join(short(line, 40) for line in kind.split("\n")), loc="left")
         axes.set_ylabel(f"time, {unit_of(shown[0].unit)}")
@@ -138,6 +140,8 @@ def _grouped(
     longest = max((percentile(finite(cell.samples), 50) for cell in cells), default=0.0)
     for at, name in enumerate(groups):
         members = [cell for cell in cells if group(cell) == name]
+        if not members:
+            axes.annotate(" not running", (0, at), fontsize=8, va="center", color="#777")
         for number, cell in enumerate(members):
             value = percentile(finite(cell.samples), 50)
             y = at + _BAR * ((number + 0.5) / len(members) - 0.5)
@@ -179,8 +183,9 @@ def _process(cell: Cell) -> str:
 
 
 def _axis(cell: Cell) -> str:
-    return f"{_spoken(cell.measure)}, {unit_of(cell.unit)}" if cell.unit else _spoken(cell.measure)
+    unit = "% of one core" if (cell.measure, cell.unit) == ("CPU", "%") else unit_of(cell.unit)
+    return ", ".join(filter(None, (_spoken(cell.measure), unit)))
 
 
 def _spoken(measure: str) -> str:
-    return "on the wire" if measure == "wire" else measure
+    return _WORDS.get(measure, measure)

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from pebble.bench import paper
 from pebble.bench.figures import percentile
 from pebble.bench.plots_style import (
     Picture,
@@ -23,25 +24,16 @@ from pebble.bench.plots_style import (
     styles,
     unique,
 )
-from pebble.bench.results import Cell, Results
+from pebble.bench.results import OVER_TIME, Cell, Results
 
-_PAPER_BEST = 80.0  # % of the audio, "saturated near"
-#: What the original lost when it was measured once through such a link: %, %, ms, pictures a second.
-_ORIGINAL_ARRIVED = {"256k": 40.0, "64k": 5.7}
-_ORIGINAL_ON_TIME = {"256k": 3.5}
-_ORIGINAL_P95_MS = {"256k": 6900.0}
-_ORIGINAL_FPS = {"256k": 2.2}
-_PAPER_SAYS = {"512k": "paper:\ndegraded", "256k": "paper:\nbroken"}
 _QUOTED = Line2D([], [], color="#1a1a1a", marker="x", linestyle="", markersize=7, markeredgewidth=2,
                  label="the original program itself, measured once elsewhere")  # fmt: skip
-_OVER_TIME = " over time"
 _DRIVEN = {
     "drive alone": "drive p95\nalone, ms",
     "drive during video": "drive p95\nwith video, ms",
     "drive during audio": "drive p95\nwith audio, ms",
 }
-_AIM_MS, _AIM_GAP_S = 400.0, 1.0  # of audio and of pictures, at 256 kbit/s
-_AIM_DRIVE_MS, _AIM_OFFLINE_S = 500.0, 2.0  # at 64 kbit/s with 5 % loss
+_NARROW, _WORST = f"aim\nat {paper.NARROW}", f"aim at\n{paper.WORST}"
 
 Value = Callable[[str, str], float]  # of a subject in a trial
 
@@ -58,11 +50,15 @@ def over_trials(results: Results) -> list[Picture]:
         ),
         (
             "audio-latency",
-            "Audio latency over the trials, in the form of the paper's Figure 4.8",
+            "Latency of the audio that arrived, over the trials, in the form of the paper's Figure 4.8",
             lambda t: _latency(results, t),
         ),
         ("video", "Video over the trials: pictures, and how long they stood still", lambda t: _video(results, t)),
-        ("drive", "Drive commands and heartbeat over the trials", lambda t: _drive(results, t)),
+        (
+            "drive",
+            "Drive commands and heartbeat over the trials (no point: more than 5 % of the commands never arrived)",
+            lambda t: _drive(results, t),
+        ),
     ]
     return [_picture(f"{results.bench}-{name}", f"{caption}{_how(results)}", make) for name, caption, make in made]
 
@@ -75,53 +71,59 @@ def _how(results: Results) -> str:
     """What a figure of this kind means little without."""
     options = results.options
     window = f"; windows of {options['window_s']:g} s" if "window_s" in options else ""
-    link = f", over {'a TCP proxy' if options['link'] == 'proxy' else options['link']}" if "link" in options else ""
-    ways = ", both ways" if options.get("both_ways") else ""
-    return f"{window}{link}{ways}. “original”: this program with the original's encodings"
+    link = f", over {options['link_words']}" if "link_words" in options else ""
+    return f"{window}{link}. “original”: this program with the original's encodings"
+
+
+def _original(value: Callable[[paper.Original], float | None]) -> dict[str, float]:
+    """By trial, where somebody measured it."""
+    return {trial: known for trial, one in paper.ORIGINAL.items() if (known := value(one)) is not None}
 
 
 def _audio(results: Results, title: str) -> Figure:
     figure, (arrived, on_time) = panels(2, 1, (10.5, 3.5), title)
     for axes, name, crosses, label in (
-        (arrived, "delivered_percent", _ORIGINAL_ARRIVED, "audio that arrived, %"),
-        (on_time, "on_time_percent", _ORIGINAL_ON_TIME, "audio within 1 s, %"),
+        (arrived, "delivered_percent", _original(lambda one: one.delivered_percent), "audio that arrived, %"),
+        (on_time, "on_time_percent", _original(lambda one: one.on_time_percent), "audio within 1 s, %"),
     ):
         _lines(axes, results, _figure(results, "audio", name), crosses)
         axes.set_ylabel(label)
         axes.set_ylim(-4, 106)
-    guide(arrived, _PAPER_BEST, "paper:\nat best\n~80 %")
-    for trial, text in _PAPER_SAYS.items():
+    guide(arrived, paper.PAPER_BEST_PERCENT, f"paper:\nat best\n~{paper.PAPER_BEST_PERCENT:g} %")
+    for trial, word in paper.PAPER_SAYS.items():
         if trial in _trials(results):
             at = _trials(results).index(trial)
             arrived.axvspan(at - 0.5, at + 0.5, color="#f2efe6", zorder=0)
             arrived.annotate(
-                text, (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555", ha="center", va="bottom"
-            )
+                f"paper:\n{word}", (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555",
+                ha="center", va="bottom",
+            )  # fmt: skip
     _names(figure, [arrived, on_time], results, [_QUOTED])
     return figure
 
 
 def _latency(results: Results, title: str) -> Figure:
     figure, every = panels(2, 1, (10.5, 3.3), title)
-    for axes, percent, crosses in zip(every, (50, 95), ({}, _ORIGINAL_P95_MS), strict=True):
+    original_ms = {trial: 1000 * seconds for trial, seconds in _original(lambda one: one.p95_s).items()}
+    for axes, percent, crosses in zip(every, (50, 95), ({}, original_ms), strict=True):
         seen = _lines(axes, results, _percentile(results, "audio latency", percent), crosses)
-        log_axis(axes, "y", f"audio latency p{percent}, ms", *around([*seen, _AIM_MS]))
-    guide(every[1], _AIM_MS, "aim\nat 256k")
+        log_axis(axes, "y", f"audio latency p{percent}, ms", *around([*seen, paper.NARROW_SOUND_P95_MS]))
+    guide(every[1], paper.NARROW_SOUND_P95_MS, _NARROW)
     _names(figure, every, results, [_QUOTED])
     return figure
 
 
 def _video(results: Results, title: str) -> Figure:
     figure, every = panels(3, 1, (10.5, 2.7), title)
-    _lines(every[0], results, _figure(results, "video", "fps"), _ORIGINAL_FPS)
+    _lines(every[0], results, _figure(results, "video", "fps"), _original(lambda one: one.fps))
     every[0].set_ylabel("pictures per second")
     every[0].set_ylim(bottom=0)
     still = _lines(every[1], results, _figure(results, "video", "frozen_s"))
     every[1].set_ylim(-0.1, 1.15 * max(finite([*still, 1.0])))
     every[1].set_ylabel("standing still, s\n(gaps over 1 s)")
     seen = _lines(every[2], results, _figure(results, "video", "longest_gap_s"))
-    log_axis(every[2], "y", "longest gap, s", *around([*seen, _AIM_GAP_S]))
-    guide(every[2], _AIM_GAP_S, "aim\nat 256k")
+    log_axis(every[2], "y", "longest gap, s", *around([*seen, paper.NARROW_PICTURE_GAP_S]))
+    guide(every[2], paper.NARROW_PICTURE_GAP_S, _NARROW)
     _names(figure, every, results, [_QUOTED])
     return figure
 
@@ -129,15 +131,16 @@ def _video(results: Results, title: str) -> Figure:
 def _drive(results: Results, title: str) -> Figure:
     figure, every = panels(len(_DRIVEN) + 1, 1, (10.5, 2.3), title)
     seen = [
-        _lines(axes, results, _percentile(results, measure, 95)) for axes, measure in zip(every, _DRIVEN, strict=False)
+        _lines(axes, results, _percentile(results, measure, 95, lost=True))
+        for axes, measure in zip(every, _DRIVEN, strict=False)
     ]
     for axes, label in zip(every, _DRIVEN.values(), strict=False):  # on one scale: waiting behind media would be seen
-        log_axis(axes, "y", label, *around([*itertools.chain(*seen), _AIM_DRIVE_MS]))
-        guide(axes, _AIM_DRIVE_MS, "aim at\n64k+5%")
+        log_axis(axes, "y", label, *around([*itertools.chain(*seen), paper.WORST_DRIVE_P95_MS]))
+        guide(axes, paper.WORST_DRIVE_P95_MS, _WORST)
     spells = _lines(every[-1], results, _figure(results, "heartbeat", "longest_offline_s"))
     every[-1].set_ylabel("robot seen offline,\nlongest, s")
-    every[-1].set_ylim(-0.1, 1.15 * max(finite([*spells, _AIM_OFFLINE_S])))
-    guide(every[-1], _AIM_OFFLINE_S, "aim at\n64k+5%")
+    every[-1].set_ylim(-0.1, 1.15 * max(finite([*spells, paper.WORST_OFFLINE_S])))
+    guide(every[-1], paper.WORST_OFFLINE_S, _WORST)
     _names(figure, every, results)
     return figure
 
@@ -182,7 +185,7 @@ def _names(figure: Figure, every: Sequence[Axes], results: Results, more: Sequen
 
 
 def _of_trials(results: Results) -> list[Cell]:
-    return [cell for cell in results.cells if "trial" in cell.params and not cell.measure.endswith(_OVER_TIME)]
+    return [cell for cell in results.cells if "trial" in cell.params and not cell.measure.endswith(OVER_TIME)]
 
 
 def _trials(results: Results) -> list[str]:
@@ -208,9 +211,17 @@ def _figure(results: Results, about: str, name: str) -> Value:
     return value
 
 
-def _percentile(results: Results, measure: str, percent: float) -> Value:
+def _percentile(results: Results, measure: str, percent: float, *, lost: bool = False) -> Value:
+    """Of what arrived, or with what was ``lost`` as infinitely late: then nothing is drawn where that is too much."""
+
     def value(subject: str, trial: str) -> float:
         cell = results.find(subject, measure, trial=trial)
-        return math.nan if cell is None else percentile(finite(cell.samples), percent)
+        if cell is None:
+            return math.nan
+        never = [math.inf] * max(0, cell.lost or 0) if lost else []
+        found = percentile([*finite(cell.samples), *never], percent)
+        return found if math.isfinite(found) else math.nan
+
+    return value
 
     return value

@@ -26,7 +26,7 @@ from pebble.bench.plots_style import (
     unique,
     unit_of,
 )
-from pebble.bench.ratios import Interval, paired
+from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Results
 from pebble.bench.tables import base_of
 
@@ -40,18 +40,20 @@ _RATIOS = {
 }
 _BAR = 0.8
 _ITSELF = "itself"
+_WHOLE = "all the way"  # comes after its parts
 
 
 def distributions(results: Results, title: str) -> list[Picture]:
     """For each measure the share of messages within a time, one panel per condition."""
-    return [
-        Picture(
-            file_name(results.bench, measure),
-            f"{title}, {measure}: share of messages that took no longer than the time below",
-            lambda cells=cells, measure=measure: _curves(cells, f"{title}: {measure}"),  # type: ignore[misc]
-        )
-        for measure, cells in by_measure(results.cells, least=_LEAST).items()
-    ]
+    found = []
+    for measure, cells in by_measure(results.cells, least=_LEAST).items():
+        about = title if measure in title.lower() else f"{title}: {measure}"
+        caption = f"{about}. Share of all messages that took no longer than the time below"
+        if any(_never(cell) for cell in cells):
+            caption += "; what never arrived is missing from 100 %"
+        make = lambda cells=cells, about=about: _curves(cells, about)  # noqa: E731
+        found.append(Picture(file_name(results.bench, measure), caption, make))
+    return found
 
 
 def ratios(results: Results, baseline: str, title: str) -> list[Picture]:
@@ -61,8 +63,7 @@ def ratios(results: Results, baseline: str, title: str) -> list[Picture]:
         base = base_of(cell, results.cells, baseline)
         if base is not None and base is not cell:
             found.append((cell, paired(cell.rounds, base.rounds)))
-    caption = f"{title}: median latency as a ratio to {baseline}'s, with intervals of 99 %"
-    return _picture(results, found, caption, baseline)
+    return _picture(results, found, f"{title}: median latency as a ratio to {baseline}'s", baseline)
 
 
 def null_ratios(results: Results, title: str) -> list[Picture]:
@@ -81,7 +82,7 @@ def by_measure(cells: Sequence[Cell], least: int = 1) -> dict[str, list[Cell]]:
 
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:
-    conditions = unique([place(cell) for cell in cells])
+    conditions = sorted(unique([place(cell) for cell in cells]), key=lambda name: name == _WHOLE)
     figure, every = panels(len(conditions), 3, (3.9, 2.7), title)
     looks = styles(unique([cell.variant for cell in cells]))
     ends = _ends(cells)
@@ -102,11 +103,17 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
 
 
 def _curve(cell: Cell) -> tuple[list[float], list[float]]:
-    """Even steps of the share, and finer ones where only the slowest are left."""
+    """Even steps of the share, and finer ones where only the slowest are left; it ends below 100 % by what was lost."""
     ordered = np.sort(finite(cell.samples))
     shares = np.unique(np.concatenate([np.linspace(0, 1, _POINTS), 1 - np.geomspace(1e-4, 0.05, 60)]))
     picked = np.minimum(len(ordered) - 1, (shares * len(ordered)).astype(int))
-    return ordered[picked].tolist(), (100 * shares).tolist()
+    arrived = len(ordered) / (len(ordered) + _never(cell))
+    return ordered[picked].tolist(), (100 * arrived * shares).tolist()
+
+
+def _never(cell: Cell) -> int:
+    """How many of its messages never arrived, as far as anybody counted."""
+    return max(0, cell.lost or 0)
 
 
 def _ends(cells: Sequence[Cell]) -> tuple[float, float]:
@@ -121,6 +128,11 @@ def _picture(results: Results, found: Sequence[tuple[Cell, Interval]], caption: 
     found = [(cell, interval) for cell, interval in found if math.isfinite(interval.ratio)]
     if not found:
         return []
+    few = [interval.few for _, interval in found]
+    if all(few):
+        caption += f"; no intervals, for that takes {LEAST_ROUNDS} rounds"
+    else:
+        caption += "; lines: intervals of 99 %" + (f", none for fewer than {LEAST_ROUNDS} rounds" if any(few) else "")
     return [Picture(f"{results.bench}-ratios", caption, lambda: _bars(found, caption, baseline))]
 
 
@@ -130,9 +142,10 @@ def _bars(found: Sequence[tuple[Cell, Interval]], title: str, baseline: str) -> 
     groups = unique([place(cell) for cell, _ in found])
     height = 0.9 + len(groups) * (0.22 + 0.2 * len(variants))
     figure, every = panels(len(measures), 2, (5.6, max(1.9, height)), title)
-    looks = styles(variants)
-    low = min(interval.low for _, interval in found)
-    high = max(interval.high for _, interval in found)
+    looks = styles(unique([*map(null.variant_of, variants), *variants]))  # a role looks as it does beside the plain one
+    looks = {name: looks[name] for name in variants}
+    low = min(min(_ends_of(interval)) for _, interval in found)
+    high = max(max(_ends_of(interval)) for _, interval in found)
     for number, (axes, measure) in enumerate(zip(every, measures, strict=True)):
         for cell, interval in found:
             if cell.measure == measure:
@@ -153,8 +166,13 @@ def _bars(found: Sequence[tuple[Cell, Interval]], title: str, baseline: str) -> 
 
 def _bar(axes: Axes, at: float, height: float, interval: Interval, look: Style) -> None:
     axes.barh(at, interval.ratio - 1, left=1, height=0.86 * height, color=look.colour, alpha=0.55)
-    axes.plot([interval.low, interval.high], [at, at], color="#222", linewidth=1.1, solid_capstyle="butt")
+    axes.plot(_ends_of(interval), [at, at], color="#222", linewidth=1.1, solid_capstyle="butt")
     axes.plot(interval.ratio, at, marker="|", color="#222", markersize=6, markeredgewidth=1.4)
+
+
+def _ends_of(interval: Interval) -> tuple[float, float]:
+    """Where its line begins and ends: with too few rounds it has none."""
+    return (interval.ratio, interval.ratio) if interval.few else (interval.low, interval.high)
 
 
 def _ratio_axis(axes: Axes, low: float, high: float) -> None:

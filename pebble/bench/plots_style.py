@@ -23,7 +23,7 @@ from pebble.bench.results import Cell, Results
 
 _DPI = 150
 _COLOURS = 255  # of the palette: a third of the bytes
-_FEW_DECADES = 2.5  # on a logarithmic axis: so few get ticks between the powers of ten
+_FEW_DECADES = {"x": 2.5, "y": 3.2}  # on a logarithmic axis: so few get ticks between the powers of ten
 _GREY = "#8a8a8a"
 _BACKGROUND = "white"
 _WIDEST = 13.0  # inches
@@ -141,7 +141,9 @@ def place(cell: Cell) -> str:
 def _said(name: str, value: object) -> str:
     if name == "load":
         return "" if value in (None, "none") else f"with {value}"
-    return "" if value is None else str(value) if isinstance(value, str) else f"{name} {value}"
+    if value is None or isinstance(value, str):
+        return value or ""
+    return f"{value} {name.removesuffix('s') if value == 1 else name}"
 
 
 def _unloaded(cell: Cell) -> str:
@@ -201,11 +203,11 @@ def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> Non
         axes.set_yscale("log")
         axes.set_ylim(low, high)
     decades = math.log10(high / low)
-    steps = (1.0,) if decades > _FEW_DECADES else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
+    steps = (1.0,) if decades > _FEW_DECADES[which] else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
     axis.set_major_locator(LogLocator(subs=steps, numticks=20))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}"))
     axis.set_minor_formatter(NullFormatter())
-    if decades <= _FEW_DECADES:
+    if decades <= _FEW_DECADES[which]:
         axis.set_minor_locator(NullLocator())
     axis.set_label_text(label)
 
@@ -223,4 +225,7 @@ def unit_of(unit: str) -> str:
 def guide(axes: Axes, value: float, text: str) -> None:
     """A light line across, at a value that matters, with its name behind its end."""
     axes.axhline(value, color=_GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
-    axes.text(1.0, value, text, transform=axes.get_yaxis_transform(), fontsize=8, color="#555", ha="left", va="center")
+    axes.annotate(
+        text, (1.0, value), xycoords=axes.get_yaxis_transform(), xytext=(4, 0), textcoords="offset points", fontsize=8,
+        color="#555", ha="left", va="center", annotation_clip=False,
+    )  # fmt: skip

@@ -8,17 +8,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pebble.bench.plots_style import Picture, around, finite, log_axis, panels, short, styles
-from pebble.bench.results import Cell, Results
+from pebble.bench.results import OVER_TIME, Cell, Results
 
-_SUFFIX = " over time"
 _BANDS = ("#f3f0e7", "#ffffff")
 
 
 def over_time(results: Results) -> list[Picture]:
     """One picture for each measure ``… over time``, whose cells hold two rounds: seconds, and milliseconds."""
     found = []
-    for measure in dict.fromkeys(cell.measure for cell in results.cells if cell.measure.endswith(_SUFFIX)):
-        what = measure.removesuffix(_SUFFIX)
+    for measure in dict.fromkeys(cell.measure for cell in results.cells if cell.measure.endswith(OVER_TIME)):
+        what = measure.removesuffix(OVER_TIME)
         cells = [
             cell
             for cell in results.cells

@@ -20,6 +20,8 @@ LEVEL = 0.99
 #: Fewer rounds than this cannot carry an interval of 99 %: it is shown, and means little.
 LEAST_ROUNDS = 8
 _RESAMPLES = 20_000
+_INFINITE = 1e15  # stands for infinity where ratios are resampled, which takes differences
+_LARGEST = 1e6  # ratio that is written as a number
 _SEED = 1  # the same samples give the same interval
 
 _Floats = np.ndarray[Any, np.dtype[np.float64]]
@@ -72,12 +74,12 @@ def paired(
     percent: float = 50,
     level: float = LEVEL,
 ) -> Interval:
-    """The median, over rounds run in turn, of the ratio of their percentiles. Rounds without samples do not count."""
-    ratios = [
-        percentile(a, percent) / percentile(b, percent)
-        for a, b in zip(ours, theirs, strict=False)
-        if a and b and percentile(b, percent) > 0
-    ]
+    """The median, over rounds run in turn, of the ratio of their percentiles.
+
+    A sample may be infinite: what never arrived. Rounds without samples do not count, nor where both are infinite.
+    """
+    pairs = [(percentile(a, percent), percentile(b, percent)) for a, b in zip(ours, theirs, strict=False) if a and b]
+    ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
     if not ratios:
         return Interval(math.nan, math.nan, math.nan, level, 0)
     logs = np.log(ratios)
@@ -104,18 +106,24 @@ def unpaired(
 
 
 def _interval(ratio: float, resampled: _Floats, rounds: int, level: float) -> Interval:
-    """Few rounds tell little of their own spread: the interval is widened as Student's is against the normal one."""
     if rounds < 2:
         return Interval(math.exp(ratio), 0.0, math.inf, level, rounds)
     tail = (1 - level) / 2
-    z, freedom = NormalDist().inv_cdf(1 - tail), max(1, rounds - 1)
-    wider = 1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
+    wider = student(level, rounds) / NormalDist().inv_cdf(1 - tail)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(resampled, [tail, 1 - tail]))
     return Interval(math.exp(ratio), math.exp(low), math.exp(high), level, rounds)
 
 
+def student(level: float, rounds: int) -> float:
+    """Half of an interval's width in standard errors: few rounds tell little of their own spread; at least two."""
+    z, freedom = NormalDist().inv_cdf((1 + level) / 2), rounds - 1
+    return z * (1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2))
+
+
 def _digits(ratio: float) -> str:
-    return f"{ratio:.2f}" if ratio >= 0.1 else f"{ratio:.2g}"
+    if ratio >= _LARGEST:
+        return "∞"
+    return f"{ratio:.2f}" if ratio >= 0.1 else f"{ratio:.2g}" if ratio > 1 / _LARGEST else "0"
 
 
 def _generator() -> np.random.Generator:

@@ -8,47 +8,76 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from pebble.bench import report_run
 from pebble.bench.output import check_folder
 from pebble.bench.report_plan import COMPARISONS, Comparison
-from pebble.bench.report_text import Section, text
+from pebble.bench.report_run import HUNG, INTERRUPTED, Ended, Run
+from pebble.bench.report_text import HEADING, Section, text
 from pebble.bench.results import Results, load
 from pebble.errors import PebbleError
 from pebble.launched import tied
 from pebble.signals import interrupted_by_signals
 
 NAME = "README.md"
-_WIDTH = 110  # characters of the comparisons' tables
+_WIDTH = 120  # characters of the comparisons' tables
 _LOOK_S = 0.2
 _PATIENCE = 4  # times the expected time, then a comparison hangs
 _PATIENCE_S = 60.0  # and this
 _END_S = 20.0  # for a comparison to end its processes when it is told to
-_HUNG = -1
 
 
-def run(comparisons: Sequence[Comparison], folder: Path, *, quick: bool, console: Console | None = None) -> int:
+def run(
+    comparisons: Sequence[Comparison],
+    folder: Path,
+    *,
+    quick: bool,
+    left_out: Sequence[Comparison] = (),
+    console: Console | None = None,
+) -> int:
     """Measure and write; 0 if every comparison ended well. One that fails does not keep the others from running.
 
-    Raises PebbleError where nothing can be written.
+    What is ``left_out`` is said to be, and what an earlier run found of it goes. Raises PebbleError where nothing can
+    be written.
     """
     console = console or Console()
     _need_matplotlib()  # before an hour of measuring, not after it
     check_folder(folder)
+    _check_ours(folder)
     expected = sum(one.expected_s(quick) for one in comparisons)
     about = f"{expected / 60:.0f} min" if expected > 120 else f"{expected} s"
     console.print(f"{len(comparisons)} comparisons: about {about}", highlight=False)
-    with interrupted_by_signals():
-        failed = _measure(comparisons, folder, quick, console)
+    known = _begin(comparisons, left_out, folder)
+    try:
+        with interrupted_by_signals():
+            _measure(comparisons, folder, quick, known, console)
+    except KeyboardInterrupt:
+        with suppress(PebbleError):  # there is nothing to write about yet
+            write(folder, anew=False)
+        raise
     write(folder, anew=False)
     console.print(f"Written: {folder / NAME}", highlight=False, soft_wrap=True)
+    failed = {one.name: wrong for one in comparisons if (wrong := known.ended[one.name].wrong)}
     for name, why in failed.items():
         console.print(f"{name} {why}: see {folder / name}.txt", style="red", highlight=False, soft_wrap=True)
     return 1 if failed else 0
+
+
+def _begin(comparisons: Sequence[Comparison], left_out: Sequence[Comparison], folder: Path) -> Run:
+    """What is known of the folder, without what will be measured now or cannot be."""
+    known = report_run.load(folder)
+    for one in left_out:
+        _forget(one, folder)
+        known.ended.pop(one.name, None)
+    told = {one.name for one in (*comparisons, *left_out)}
+    known.left_out = [*(name for name in known.left_out if name not in told), *(one.name for one in left_out)]
+    return known
 
 
 def write(folder: Path, *, anew: bool = True) -> Path:
@@ -57,12 +86,14 @@ def write(folder: Path, *, anew: bool = True) -> Path:
     Raises PebbleError.
     """
     _need_matplotlib()
-    sections = [section for one in COMPARISONS if (section := _section(one, folder, anew)) is not None]
+    _check_ours(folder)
+    known = report_run.load(folder)
+    sections = [section for one in COMPARISONS if (section := _section(one, folder, known, anew)) is not None]
     if not sections:
         raise PebbleError(f"{folder} holds no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME
     try:
-        path.write_text(text(sections))
+        path.write_text(text(sections, known))
     except OSError as error:
         raise PebbleError(f"{path}: {error.strerror}") from None
     return path
@@ -73,19 +104,32 @@ def _need_matplotlib() -> None:
         raise PebbleError("a report has pictures, and matplotlib is not installed: pip install 'pebble-robot[bench]'")
 
 
-def _section(comparison: Comparison, folder: Path, anew: bool) -> Section | None:
+def _check_ours(folder: Path) -> None:
+    """Raises PebbleError rather than write over somebody's README.md."""
+    path = folder / NAME
+    try:
+        ours = not path.exists() or path.read_text(errors="replace").startswith(HEADING)
+    except OSError as error:
+        raise PebbleError(f"{path}: {error.strerror}") from None
+    if not ours:
+        raise PebbleError(f"{path} is no report of pebble bench and would be written over: name another folder")
+
+
+def _section(comparison: Comparison, folder: Path, known: Run, anew: bool) -> Section | None:
     """None for what was never run."""
     said, measured = folder / f"{comparison.name}.txt", folder / f"{comparison.name}.json"
     if not said.exists() and not measured.exists():
         return None
     words = said.read_text(errors="replace") if said.exists() else ""
+    ended = known.ended.get(comparison.name)
     if not measured.exists():
-        return Section(comparison=comparison, results=None, said=words)
+        return Section(comparison=comparison, results=None, said=words, ended=ended)
     try:
         results = load(measured)
     except PebbleError as error:  # of another version: no reason to lose what the others took an hour for
-        return Section(comparison=comparison, results=None, said=str(error))
-    return Section(comparison=comparison, results=results, said=words, pictures=_pictures(results, folder, anew))
+        return Section(comparison=comparison, results=None, said=str(error), ended=ended)
+    pictures = _pictures(results, folder, anew)
+    return Section(comparison=comparison, results=results, said=words, ended=ended, pictures=pictures)
 
 
 def _pictures(results: Results, folder: Path, anew: bool) -> list[tuple[str, str]]:
@@ -125,32 +169,25 @@ class _Bar:
         )
 
 
-def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, console: Console) -> dict[str, str]:
-    """What failed, and how."""
-    failed = {}
+def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known: Run, console: Console) -> None:
+    """All of them; how each ended is ``known`` at once, whatever becomes of the next."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         bar = _Bar(progress, comparisons, quick)
-        for one in comparisons:
+        for number, one in enumerate(comparisons):
             _forget(one, folder)
+            known.ended[one.name] = Ended(code=INTERRUPTED, took_s=0.0)  # until it ends
+            known.interrupted = f"in {one.name}, after {number} of {len(comparisons)}"
+            known.save(folder)
             bar.next(one)
             began = time.monotonic()
             code = _run(one, folder, quick, bar.tick)
-            how = _how(code, folder / f"{one.name}.json")
-            took = f"{one.name}: {time.monotonic() - began:.0f} s"
-            console.print(", ".join(filter(None, (took, how))), highlight=False, soft_wrap=True)
-            if how:
-                failed[one.name] = how
-    return failed
-
-
-def _how(code: int, measured: Path) -> str:
-    """What went wrong; empty when nothing did."""
-    if code == _HUNG:
-        return "hung and was ended"
-    if code:
-        return f"ended with code {code}"
-    return "" if measured.exists() else "left no results"
+            left = (folder / f"{one.name}.json").exists()
+            ended = Ended(code=code, took_s=round(time.monotonic() - began, 1), results=left)
+            known.ended[one.name], known.interrupted = ended, ""
+            known.save(folder)
+            took = f"{one.name}: {ended.took_s:.0f} s"
+            console.print(", ".join(filter(None, (took, ended.wrong))), highlight=False, soft_wrap=True)
 
 
 def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[float], None]) -> int:
@@ -174,7 +211,7 @@ def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[floa
             hung = process.poll() is None
         finally:
             _end(process)
-    return _HUNG if hung else process.returncode
+    return HUNG if hung else process.returncode
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

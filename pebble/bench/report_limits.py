@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from pebble.bench.results import Results
 
@@ -57,12 +57,15 @@ def _this_machine(measured: Sequence[Results]) -> str:
 
 
 def _link(measured: Sequence[Results]) -> list[str]:
-    """Without root the link is another one."""
-    kinds = {str(one.options.get("link") or one.options.get("link kind")) for one in measured if one.bench == "impair"}
-    if "proxy" not in kinds:
-        return []
+    """Not every link loses packets."""
+    proxies = [one.options for one in measured if one.bench == "impair" and one.options.get("link") == "proxy"]
     return [
-        "No namespaces: the bad link was a TCP proxy, because this user may make none. A proxy ends TCP on each side, "
-        "so what is called loss is a delay as TCP's retransmission would cause it; nothing is lost or resent on any "
-        "wire."
+        f"No namespaces: the bad link was a TCP proxy{_because(options)}. A proxy ends TCP on each side, so what is "
+        "called loss is a delay as TCP's retransmission would cause it; nothing is lost or resent on any wire."
+        for options in proxies
     ]
+
+
+def _because(options: Mapping[str, object]) -> str:
+    why = options.get("why_proxy")
+    return f" ({why})" if why else ""

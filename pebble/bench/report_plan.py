@@ -86,8 +86,8 @@ COMPARISONS = (
     Comparison(
         name="bridge-null",
         title="Operator to wheels: the null test",
-        what="Robots of one kind in three roles: plain, again, and with a fifth of the usual latency planted by the "
-        "operator. The first ratio has to hold 1.00, the second has to lie above it.",
+        what="One robot in three roles that take turns: plain, again, and with a fifth of the usual latency planted by "
+        "the operator. The first ratio has to hold 1.00, the second has to lie above it.",
         full=_bench("bridge", "--null"),
         quick=_bench("bridge", "--null", "--quick"),
         full_s=150,
@@ -113,7 +113,7 @@ COMPARISONS = (
         quick=_bench("cost", "--quick"),
         full_s=180,
         quick_s=20,
-        choosing=8,
+        choosing=10,
     ),
     Comparison(
         name="frames",
@@ -124,7 +124,7 @@ COMPARISONS = (
         quick=_bench("frames", "--quick"),
         full_s=330,
         quick_s=20,
-        choosing=2,
+        choosing=4,
     ),
     Comparison(
         name="frames-null",
@@ -142,7 +142,7 @@ COMPARISONS = (
         what="Bytes of each form of video at equal quality (SSIM) on the same synthetic films. Nothing is sent: this "
         "is what encoders make.",
         full=_bench("video"),
-        quick=_bench("video", "--seconds", "1"),
+        quick=_bench("video", "--quick"),
         full_s=60,
         quick_s=8,
     ),
@@ -162,7 +162,7 @@ COMPARISONS = (
         what="Robots that are their own MCU, the real firmware on simulated pins, all on one stock broker and driven "
         "by one operator at 10 Hz each. The latency is from the operator's publish call to the change of the pins.",
         full=_bench("fleet", "--robots", "100", "--seconds", "20"),
-        quick=_bench("fleet", "--robots", "30", "--seconds", "5"),
+        quick=_bench("fleet", "--quick"),
         full_s=35,
         quick_s=12,
     ),
@@ -190,5 +190,14 @@ def chosen(names: Sequence[str]) -> list[Comparison]:
     if unknown := [name for name in names if name not in NAMES]:
         raise PebbleError(f"there is no {', '.join(unknown)} in the report: there are {', '.join(NAMES)}")
     if not names:
-        return [one for one in COMPARISONS if not one.root or os.geteuid() == 0]
+        return [one for one in COMPARISONS if one not in needs_root()]
     return [one for one in COMPARISONS if one.name in names]
+
+
+def title_of(name: str) -> str:
+    return next((one.title for one in COMPARISONS if one.name == name), name)
+
+
+def needs_root() -> list[Comparison]:
+    """What this user may not run."""
+    return [one for one in COMPARISONS if one.root and os.geteuid() != 0]

@@ -10,12 +10,15 @@ from dataclasses import dataclass, field
 from pebble.bench import null
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.report_limits import limits
-from pebble.bench.report_plan import Comparison
+from pebble.bench.report_plan import Comparison, title_of
+from pebble.bench.report_run import Ended, Run
 from pebble.bench.results import Results
 
-#: ``aim: <what>: met (<figure>)``, ``… missed by <figure>`` or ``… <figure>, met``
+HEADING = "# Results"  # how every document of ours begins
+#: ``aim: <what>: met (<figure>)``, ``… missed by <figure>``, ``… not judged (<figure>)`` or ``… <figure>, met``
 _AIM = re.compile(
-    r"aim: (?P<aim>.+): (?:(?P<before>[^:]+), )?(?P<how>met|missed)(?P<by> by [^()]+)?(?: \((?P<figure>.*)\))?\.?"
+    r"aim: (?P<aim>.+): (?:(?P<before>[^:]+), )?(?P<how>met|missed|not judged)"
+    r"(?P<by> by [^()]+)?(?: \((?P<figure>.*)\))?\.?"
 )
 _NULL = "-null"
 _NOT_THE_TABLE = ("Written:", "No plots:")  # what a command says about its files
@@ -30,6 +33,7 @@ class Section:
     comparison: Comparison
     results: Results | None
     said: str = ""
+    ended: Ended | None = None  # None: nobody knows how
     pictures: Sequence[tuple[str, str]] = field(default_factory=tuple)
 
     @property
@@ -43,14 +47,30 @@ class Section:
         found = filter(None, map(_AIM.fullmatch, self._lines()))
         return [(one["aim"], one["how"], _figure(one["before"], one["by"], one["figure"])) for one in found]
 
+    @property
+    def wrong(self) -> str:
+        """How its command line failed; empty when it did not."""
+        return "" if self.ended is None else self.ended.wrong
+
+    @property
+    def took_s(self) -> float:
+        if self.ended is not None:
+            return self.ended.took_s
+        return 0.0 if self.results is None else self.results.took_s
+
+    @property
+    def quick(self) -> bool:
+        return self.results is not None and self.results.quick
+
     def _lines(self) -> list[str]:
         return [] if self.results is None else self.results.verdict
 
 
-def text(sections: Sequence[Section]) -> str:
+def text(sections: Sequence[Section], run: Run | None = None) -> str:
     """The whole document."""
-    parts = [*_head(sections), *_summary(sections), *_aims(sections), *_machine(sections)]
-    quick = any(results.quick for results in _measured(sections))
+    run = run or Run()
+    parts = [*_head(sections, run), *_summary(sections, run), *_aims(sections), *_machine(sections)]
+    quick = any(section.quick for section in sections)
     for section in sections:
         parts += _section(section, quick)
     parts += ["## What these numbers do not show", "\n".join(f"* {line}" for line in limits(_measured(sections)))]
@@ -61,32 +81,54 @@ def _measured(sections: Sequence[Section]) -> list[Results]:
     return [section.results for section in sections if section.results is not None]
 
 
-def _head(sections: Sequence[Section]) -> Iterator[str]:
+def _head(sections: Sequence[Section], run: Run) -> Iterator[str]:
     measured = _measured(sections)
-    quick = any(results.quick for results in measured)
-    yield "# Results of a quick run" if quick else "# Results"
+    quick = any(section.quick for section in sections)
+    yield f"{HEADING} of a quick run" if quick else HEADING
     if quick:
         yield (
             "**Quick: fewer cases, fewer and shorter rounds than a full report.** It shows that everything works, and "
             "differences that are large; nothing less."
         )
-    minutes = sum(results.took_s for results in measured) / 60
+    if quick and any(not one.quick and _has_quick(one) for one in sections):
+        yield "**Not all of it is quick: it comes from several runs. Each comparison says when it was begun.**"
+    if run.interrupted:
+        yield (
+            f"**The run was interrupted {run.interrupted} comparisons.** What stands here of those after that is of an "
+            "earlier run."
+        )
     days = sorted({results.began[:10] for results in measured})
+    took = _span(sum(section.took_s for section in sections))
+    when = f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1])))}, in {took}. " if days else ""
     yield (
-        f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1]))) if days else 'no day'}, in {minutes:.0f} min. "
-        f"Everything here, this text included, is made by `make report{' QUICK=1' if quick else ''}`; every sample is "
-        "in the `.json` beside each comparison's figures, with the options and versions it was taken with."
+        f"{when}Everything here, this text included, is made by `make report{' QUICK=1' if quick else ''}`; every "
+        "sample is in the `.json` beside each comparison's figures, with the options and versions it was taken with."
     )
 
 
-def _summary(sections: Sequence[Section]) -> Iterator[str]:
+def _has_quick(section: Section) -> bool:
+    about = section.comparison
+    return section.results is not None and list(about.quick) != list(about.full)
+
+
+def _span(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{seconds / 60:.0f} min" if minutes >= 10 else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def _summary(sections: Sequence[Section], run: Run) -> Iterator[str]:
     lines = []
     for section in sections:
         about = section.comparison
-        if found := [f"  * {line}" for line in section.verdict[: about.choosing]]:
-            lines += [f"* [{about.title}](#{_anchor(about.title)})", *found]
-        elif section.results is None:
-            lines.append(f"* [{about.title}](#{_anchor(about.title)}): **failed**, nothing was measured")
+        link = f"* [{about.title}](#{_anchor(about.title)})"
+        found = [f"  * {line}" for line in section.verdict[: about.choosing]]
+        if section.results is None:
+            lines.append(f"{link}: **failed**, {section.wrong or 'nothing was measured'}")
+        elif section.wrong:
+            lines += [f"{link}: **incomplete**, it {section.wrong}", *found]
+        elif found:
+            lines += [link, *found]
+    lines += [f"* {title_of(name)}: left out, it needs root" for name in run.left_out]
     lines += _nulls(sections)
     if lines:
         yield "## In short"
@@ -103,15 +145,15 @@ def _nulls(sections: Sequence[Section]) -> list[str]:
 
 
 def _null(results: Results) -> str:
-    if min((len(cell.rounds) for cell in results.cells), default=0) < LEAST_ROUNDS:
-        return f"not judged, for that takes {LEAST_ROUNDS} rounds"
+    if any(interval.few for _, interval in null.intervals(results.cells)):
+        return f"not judged (fewer than {LEAST_ROUNDS} rounds)"
     return "passed" if null.passed(results.cells) else "**missed**"
 
 
 def _aims(sections: Sequence[Section]) -> Iterator[str]:
     rows = [
         f"| {_cell(aim)} | [{section.comparison.name}](#{_anchor(section.comparison.title)}) "
-        f"| {'met' if how == 'met' else '**missed**'} | {_cell(figure)} |"
+        f"| {'**missed**' if how == 'missed' else how} | {_cell(figure)} |"
         for section in sections
         for aim, how, figure in section.aims
     ]
@@ -142,11 +184,14 @@ def _section(section: Section, quick: bool) -> Iterator[str]:
     command = shlex.join(results.command if results and results.command else ["pebble", *about.arguments(quick)])
     yield f"    {command}"
     if results is None:
-        yield "**It failed and left no results.** The end of what it said:"
+        yield f"**It {section.wrong or 'failed'}, and left no results.** The end of its output:"
         yield _fenced(section.said.strip().splitlines()[-_TAIL:])
         return
-    if results.quick:
-        yield "A quick run."
+    if results.began:
+        quickly = ", a quick run" if results.quick else ""
+        yield f"Begun {results.began[:10]} {results.began[11:16]} UTC, {_span(section.took_s)}{quickly}."
+    if section.wrong:
+        yield f"**It {section.wrong}: something could not be measured.** What, its output says."
     if results.verdict:
         yield "\n".join(f"* {line}" for line in results.verdict)
     for file, caption in section.pictures:
@@ -163,6 +208,8 @@ def _output(section: Section, results: Results) -> Iterator[str]:
     ]
     while lines and not lines[-1]:
         lines.pop()
+    while lines and not lines[0]:
+        lines.pop(0)
     if not lines:
         return
     if len(lines) <= _LONG:

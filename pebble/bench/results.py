@@ -18,6 +18,7 @@ from pebble.errors import PebbleError
 from pebble.version import __version__
 
 FORMAT = 1
+OVER_TIME = " over time"  # how the measure of a cell ends that holds a curve: times, then values
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
 _MOSQUITTO = "/usr/sbin:/usr/local/sbin"
 _DIGITS = 3  # of a sample that are kept behind the point
@@ -113,6 +114,7 @@ class Stopwatch:
 
     def __init__(self, bench: str, command: Sequence[str], options: Mapping[str, Value | list[Value]]) -> None:
         self._bench, self._command, self._options = bench, list(command), dict(options)
+        self._machine = machine()
         self._began, self._since = time.gmtime(), time.monotonic()
 
     def results(self, cells: Sequence[Cell], verdict: Sequence[str] = (), *, quick: bool = False) -> Results:
@@ -120,7 +122,7 @@ class Stopwatch:
             bench=self._bench,
             command=self._command,
             options=self._options,
-            machine=machine(),
+            machine=self._machine,
             began=time.strftime("%Y-%m-%dT%H:%M:%SZ", self._began),
             took_s=round(time.monotonic() - self._since, 1),
             quick=quick,
@@ -162,7 +164,10 @@ def _mosquitto() -> str | None:
     program = shutil.which("mosquitto") or shutil.which("mosquitto", path=_MOSQUITTO)
     if program is None:
         return None
-    said = subprocess.run([program, "-h"], capture_output=True, text=True, check=False, timeout=5).stdout
+    try:
+        said = subprocess.run([program, "-h"], capture_output=True, text=True, check=False, timeout=5).stdout
+    except (OSError, subprocess.SubprocessError):
+        return None
     return said.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
 
 

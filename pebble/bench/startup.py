@@ -24,6 +24,7 @@ from pebble.bench.measured_robot import MeasuredRobot, check_kinds
 from pebble.bench.onlooker import Onlooker
 from pebble.bench.output import FOLDER, check_folder, finish
 from pebble.bench.results import Cell, Stopwatch
+from pebble.bench.rounds import Rounds
 from pebble.bench.side_by_side import against, caveat, sentence, spread
 from pebble.bench.tables import plain_table
 from pebble.signals import interrupted_by_signals
@@ -101,23 +102,26 @@ MEASURES = (
 
 
 def run(plan: Plan, console: Console | None = None) -> int:
-    """Measure, show and write. Raises PebbleError."""
+    """Measure, show and write; 0 if everything has figures and rounds enough are left. Raises PebbleError."""
     console = console or Console()
     plan.check()
     watch = Stopwatch("startup", plan.command(), {"rounds": plan.launches, "joins": plan.joins, "rate_hz": RATE_HZ})
-    launches: dict[str, list[Launch]] = {kind: [] for kind in plan.kinds}
+    rounds, done = Rounds(plan.launches, console), []
     with interrupted_by_signals(), console.status("") as status:
         try:
             for number in range(plan.launches):
-                for kind in plan.kinds[:: -1 if number % 2 else 1]:
-                    status.update(f"launch {number + 1} of {plan.launches}: {kind}")
-                    launches[kind].append(launch(kind, plan.joins))
+                with rounds.attempt(number):
+                    one = {}
+                    for kind in plan.kinds[:: -1 if number % 2 else 1]:
+                        status.update(f"launch {number + 1} of {plan.launches}: {kind}")
+                        one[kind] = launch(kind, plan.joins)
+                    done.append(one)
         finally:
             sweep()  # Zenoh leaves files behind even when it ends politely
-    cells = cells_of(launches)
+    cells = cells_of({kind: [one[kind] for one in done] for kind in plan.kinds})
     console.print(table(cells))
-    finish(watch.results(cells, verdict(cells), quick=plan.quick), plan.output, console)
-    return 0
+    finish(watch.results(cells, [*rounds.told(), *verdict(cells)], quick=plan.quick), plan.output, console)
+    return rounds.code(cells)
 
 
 def cells_of(launches: dict[str, list[Launch]]) -> list[Cell]:

@@ -1,36 +1,57 @@
-"""What processes cost, from /proc."""
+"""What processes cost, from the kernel."""
 
 from __future__ import annotations
 
-import os
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
+from pebble.errors import PebbleError
+
+_PROC = Path("/proc")
+
 
 def cpu_s(pids: Iterable[int]) -> float:
-    """CPU seconds these processes have used so far, all threads, in user and system; those that have gone: 0."""
-    return sum(map(_ticks, pids)) / os.sysconf("SC_CLK_TCK")
+    """CPU seconds these processes have used so far, all threads, in user and system; those that have gone: 0.
+
+    To the nanosecond: /proc counts in ticks of 10 ms, too coarse for slices of less than a second.
+    """
+    return sum(map(_cpu_s, pids))
+
+
+def _cpu_s(pid: int) -> float:
+    try:
+        return time.clock_gettime(~pid << 3 | 2)  # the number that clock_getcpuclockid(3) makes of a pid
+    except OSError:
+        return 0.0
 
 
 def pss_mb(pid: int) -> float:
-    """Proportional set size: shared pages are divided among those who share them. 0 for a process that has gone."""
+    """Proportional set size: shared pages are divided among those who share them. 0 for a process that has gone.
+
+    Raises PebbleError where the kernel does not tell.
+    """
     try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    except OSError:
+        lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()
+    except (FileNotFoundError, PermissionError) as error:
+        if (_PROC / str(pid)).exists():
+            raise PebbleError(f"{error.filename}: {error.strerror}: memory is not known without it") from None
+        return 0.0
+    except ProcessLookupError:
         return 0.0
     return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0) / 1024
 
 
-def _ticks(pid: int) -> int:
-    try:
-        return sum(map(int, Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]))
-    except OSError:
-        return 0
-
-
 def children(pid: int) -> list[int]:
-    """The direct children of a process; none of one that has gone."""
+    """The direct children of a process; none of one that has gone.
+
+    By everybody's parent: not every kernel has ``/proc/<pid>/task/<tid>/children``.
+    """
+    return sorted(int(one.name) for one in _PROC.iterdir() if one.name.isdecimal() and _parent(one) == pid)
+
+
+def _parent(process: Path) -> int | None:
     try:
-        return list(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
-    except OSError:
-        return []
+        return int((process / "stat").read_text().rpartition(")")[2].split()[1])
+    except (FileNotFoundError, ProcessLookupError):  # it has gone meanwhile
+        return None

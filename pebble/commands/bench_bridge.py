@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from pebble.bench.output import FOLDER
+
 
 def register(group: typer.Typer) -> None:
     """Add the commands of this file."""
@@ -34,14 +36,12 @@ def bridge(
     profile: Annotated[
         bool, typer.Option("--profile", help="Where on its way a command spends its time, hop by hop.")
     ] = False,
-    output: Annotated[
-        Path | None, typer.Option(help="Folder for results and plots. [default: bench-results]", metavar="FOLDER")
-    ] = None,
+    output: Annotated[Path, typer.Option(help="Where results and plots go.", metavar="FOLDER")] = FOLDER,
 ) -> int:
     """Drive commands from an operator to the wheels of a whole simulated robot, and its reports back.
 
-    Latency at 20 commands and 50 reports a second, on MQTT and on Zenoh, side by side; beside it one hop through the
-    same broker. With --with-media also while the robot's camera gives 1920x1080 at 30 Hz to a program on it, and
+    Latency at 20 commands and 50 reports a second, on MQTT and on Zenoh, side by side; beside it one hop through a
+    stock broker. With --with-media also while the robot's camera gives 1920x1080 at 30 Hz to a program on it, and
     video and audio go to an operator. Needs mosquitto.
 
     \b
@@ -62,7 +62,7 @@ def bridge(
         "rounds": rounds,
         "seconds": seconds,
         "kinds": None if variants is None else [name.strip() for name in variants.split(",")],
-        "output": output,
     }
-    wanted = plan(mode, quick=quick, **{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in given.items() if value is not None}
+    wanted = plan(mode, quick=quick, output=output, **given)
     return {Mode.NULL: bridge_null.run, Mode.PROFILE: bridge_profile.run}.get(mode, run)(wanted)

@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
+from pebble.bench.output import FOLDER
+
 _Variants = Annotated[
     str | None, typer.Option(help="mqtt or zenoh. [default: both, in turn]", metavar="NAMES", show_default=False)
 ]
 _Quick = Annotated[bool, typer.Option("--quick", help="Fewer and shorter rounds, marked as quick.")]
 _Output = Annotated[Path, typer.Option(help="Where results and plots go.", metavar="FOLDER")]
-_FOLDER = Path("bench-results")
 
 
 def startup(
@@ -21,7 +22,7 @@ def startup(
     ] = None,
     variants: _Variants = None,
     quick: _Quick = False,
-    output: _Output = _FOLDER,
+    output: _Output = FOLDER,
 ) -> int:
     """How soon a robot is there: heartbeat, all services ready, first drive command obeyed.
 
@@ -46,7 +47,7 @@ def cost(
     ] = None,
     variants: _Variants = None,
     quick: _Quick = False,
-    output: _Output = _FOLDER,
+    output: _Output = FOLDER,
 ) -> int:
     """What a robot costs: memory, CPU and threads of each of its processes.
 
@@ -65,7 +66,7 @@ def cost(
 def _kinds(variants: str | None) -> list[str]:
     from pebble.bench.bridge_robot import KINDS
 
-    return list(KINDS if variants is None else dict.fromkeys(name.strip() for name in variants.split(",")))
+    return list(KINDS) if variants is None else [name.strip() for name in variants.split(",")]
 
 
 def register(group: typer.Typer) -> None:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from pebble.bench.output import FOLDER
+
 
 def impair(
     trials: Annotated[
@@ -24,7 +26,7 @@ def impair(
     quick: Annotated[
         bool, typer.Option("--quick", help="Four trials, short windows, all robots at the same time.")
     ] = False,
-    output: Annotated[Path, typer.Option(help="Where the results go.", metavar="FOLDER")] = Path("bench-results"),
+    output: Annotated[Path, typer.Option(help="Where the results go.", metavar="FOLDER")] = FOLDER,
 ) -> int:
     """A robot behind a bad link: the impairment trials of the paper, chapter 4.2.
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from pebble.bench.figures import rounded
-from pebble.bench.results import Cell, Value
+from pebble.bench.results import OVER_TIME, Cell, Value
 from pebble.impair import figures
 from pebble.impair.link import Carried
 from pebble.impair.messages import Record, Window
@@ -15,7 +15,7 @@ from pebble.simulation.trace import Entry
 SOUND, PICTURES, PICTURE_GAP = "audio latency", "video latency", "picture gap"
 BEAT_GAP, BEAT_DELAY = "heartbeat gap", "heartbeat delay"
 DRIVE, DRIVE_ALONE, DRIVE_VIDEO, DRIVE_AUDIO = "drive", "drive alone", "drive during video", "drive during audio"
-SOUND_OVER_TIME, DRIVE_OVER_TIME = "audio over time", "drive over time"
+SOUND_OVER_TIME, DRIVE_OVER_TIME = f"audio{OVER_TIME}", f"drive{OVER_TIME}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def _sound(trial: Trial) -> Cell:
         delivered_percent=delivered,
         on_time_percent=on_time,
         late_percent=delivered - on_time,
-        sent=figures.sent_packets(packets),
+        sent=figures.sent_packets(packets, delivered),
         first_s=window.first_s,
         **_wire(trial, "audio", window),
     )
@@ -137,6 +137,7 @@ def _beats(trial: Trial) -> list[Cell]:
 def _drive(trial: Trial) -> list[Cell]:
     commands = trial.record.commands
     driven = figures.driven_ms(commands, trial.entries)
+    overtaken = figures.overtaken(commands, trial.entries)
     cells = [
         _cell(
             trial,
@@ -144,8 +145,10 @@ def _drive(trial: Trial) -> list[Cell]:
             "ms",
             [ms for _, ms in driven],
             sent=len(commands),
-            delivered_percent=100 * len(driven) / len(commands) if commands else None,
+            delivered_percent=100 * (len(driven) - overtaken) / len(commands) if commands else None,
+            overtaken=overtaken,
             trips=figures.trips(commands, trial.entries),
+            rest_s=figures.rest_s(commands, trial.entries),
             window_s=trial.record.whole.seconds,
         )
     ]

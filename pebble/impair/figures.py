@@ -6,6 +6,7 @@ and its lateness is in the latencies.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
@@ -47,9 +48,9 @@ def sound_percent(sounds: Iterable[Sound], window: Window, within_s: float | Non
     return min(100.0, 100 * sum(arrived) / window.seconds)
 
 
-def sent_packets(sounds: Sequence[Sound]) -> int:
-    """From the first to the last that arrived: those between them that did not are numbered, too."""
-    return sounds[-1].sequence - sounds[0].sequence + 1 if sounds else 0
+def sent_packets(sounds: Sequence[Sound], percent: float) -> int | None:
+    """How many the window's sound would have been, of which these are so many per cent; None if none came."""
+    return max(len(sounds), round(100 * len(sounds) / percent)) if sounds and percent else None
 
 
 # -- pictures, heartbeats: what matters is how long there is none
@@ -90,16 +91,30 @@ def offline_s(beats: Sequence[Beat], window: Window) -> list[float]:
 
 
 def driven_ms(commands: Sequence[Command], entries: Iterable[Entry]) -> list[tuple[Command, float]]:
-    """Every command that reached the MCU, with the time it took."""
+    """Every command with the time until it, or a newer one that overtook it, reached the MCU; else it is left out."""
+    arrived = _arrivals(entries)
+    driven, soonest = [], math.inf
+    for command in reversed(commands):
+        soonest = min(soonest, arrived.get((command.left, command.right), math.inf))
+        if soonest < math.inf:
+            driven.append((command, (soonest - command.sent_ns) / 1e6))
+    return driven[::-1]
+
+
+def overtaken(commands: Sequence[Command], entries: Iterable[Entry]) -> int:
+    """Commands that did not reach the MCU, but a newer one did."""
+    arrived = _arrivals(entries)
+    came = [(command.left, command.right) in arrived for command in commands]
+    return came[: len(came) - came[::-1].index(True)].count(False) if any(came) else 0
+
+
+def _arrivals(entries: Iterable[Entry]) -> dict[tuple[float, float], int]:
+    """When the wheels were first told these speeds."""
     arrived: dict[tuple[float, float], int] = {}
     for entry in entries:
         if entry.drive is not None:
             arrived.setdefault(entry.drive, entry.ns)
-    return [
-        (command, (arrived[command.left, command.right] - command.sent_ns) / 1e6)
-        for command in commands
-        if (command.left, command.right) in arrived
-    ]
+    return arrived
 
 
 def within(commands: Iterable[Command], window: Window) -> list[Command]:
@@ -111,3 +126,16 @@ def trips(commands: Sequence[Command], entries: Iterable[Entry]) -> int:
     wheels = {(command.left, command.right) for command in commands}
     drives = [entry for entry in entries if entry.drive is not None and commands and entry.ns <= commands[-1].sent_ns]
     return sum(a.drive in wheels and b.drive == _STOP for a, b in pairwise(drives))
+
+
+def rest_s(commands: Sequence[Command], entries: Iterable[Entry]) -> float:
+    """Seconds from the first to the last command in which the wheels stood still, as they do before the first."""
+    if not commands:
+        return 0.0
+    since, ended, rest = commands[0].sent_ns, commands[-1].sent_ns, True
+    rest_ns = 0
+    for entry in (*(entry for entry in entries if entry.motors is not None), Entry(ended, "motors")):
+        now = min(max(entry.ns, since), ended)
+        rest_ns += now - since if rest else 0
+        since, rest = now, entry.motors == _STOP
+    return rest_ns / 1e9

@@ -25,6 +25,7 @@ import msgspec
 
 from pebble.errors import PebbleError
 from pebble.impair.conditions import Condition, Schedule, Shape
+from pebble.impair.helper import UnavailableError
 
 TIMED = "timed"  # the device whose packets pass through here
 _TUN = Path("/dev/net/tun")
@@ -160,15 +161,17 @@ def _make_tun_node() -> None:
 
 
 def _hold() -> Holder:
-    """Raises PebbleError where namespaces or TUN devices are not to be had."""
+    """Raises UnavailableError where namespaces are not permitted or there is no TUN, PebbleError for other trouble."""
     _make_tun_node()
     try:
         return Holder()
     except PermissionError as error:
         what = error.filename or "new namespaces"
-        raise PebbleError(f"{what}: not permitted: run it as root, or in `unshare --map-root-user --net`") from None
+        raise UnavailableError(f"{what}: not permitted: run it as root, or in `unshare --map-root-user`") from None
     except OSError as error:
-        raise PebbleError(f"{error.filename or 'namespaces'}: {error.strerror}: does the kernel have TUN?") from None
+        if error.filename == str(_TUN):
+            raise UnavailableError(f"{_TUN}: {error.strerror}: the kernel has no TUN") from None
+        raise PebbleError(f"new namespaces: {error.strerror}") from None
 
 
 def _say(answer: dict[str, Any]) -> None:
@@ -183,7 +186,7 @@ def main() -> int:
     try:
         holder = _hold()
     except PebbleError as error:
-        _say({"error": str(error)})
+        _say({"unavailable" if isinstance(error, UnavailableError) else "error": str(error)})
         return 1
     _say({"robot": holder.robot, "remote": holder.remote})
     holder.serve(sys.stdin.fileno())

@@ -14,6 +14,10 @@ from pebble.errors import PebbleError
 _ANSWER_S = 10.0
 
 
+class UnavailableError(PebbleError):
+    """There can be no such link on this machine, or for this user."""
+
+
 class Helper:
     """Starts ``python -m module``, waits for its first answer (`hello`), and asks it from any thread."""
 
@@ -23,7 +27,7 @@ class Helper:
         self._worker = Worker(name, [sys.executable, "-m", module], Path(f"/proc/self/fd/{self._log}"))
         self._open = True
         try:
-            self.hello = self._answer()
+            self.hello = self._greeting()
         except BaseException:
             self.close()
             raise
@@ -33,25 +37,34 @@ class Helper:
         return self._worker.pid
 
     def ask(self, line: str) -> dict[str, Any]:
-        """Raises PebbleError if it answers with ``{"error": …}``, ends, or is silent."""
+        """Raises PebbleError if it ends or is silent: then it is closed, or its late answer would be the next one's."""
         with self._lock:
             if not self._open:
                 raise PebbleError(f"{self._worker.name} is closed")
             try:
                 self._worker.tell(line)
+                return self._worker.answer(_ANSWER_S)
             except BrokenPipeError:
                 raise PebbleError(f"{self._worker.name} has ended") from None
-            return self._answer()
+            except PebbleError:
+                self._close()
+                raise
 
     def close(self) -> None:
         with self._lock:
-            if self._open:
-                self._open = False
-                end_workers([self._worker])
-                os.close(self._log)
+            self._close()
 
-    def _answer(self) -> dict[str, Any]:
+    def _close(self) -> None:
+        if self._open:
+            self._open = False
+            end_workers([self._worker])
+            os.close(self._log)
+
+    def _greeting(self) -> dict[str, Any]:
+        """Raises PebbleError for ``{"error": …}``, UnavailableError for ``{"unavailable": …}``."""
         said = self._worker.answer(_ANSWER_S)
+        if "unavailable" in said:
+            raise UnavailableError(str(said["unavailable"]))
         if "error" in said:
             raise PebbleError(str(said["error"]))
         return said

@@ -59,23 +59,29 @@ class Link(Protocol):
 
 
 def open_link(kind: str = "auto", *, name: str = "") -> Link:
-    """``auto``: namespaces where they are permitted, else the proxy. ``name`` appears in messages.
-
-    Raises PebbleError if there can be no such link here.
-    """
+    """Of a kind as `resolved` takes it. ``name`` appears in messages. Raises PebbleError if there can be none here."""
     from pebble.impair.namespaces import NamespaceLink
     from pebble.impair.proxy import ProxyLink
 
+    kind, _ = resolved(kind)
+    return ProxyLink(name) if kind == "proxy" else NamespaceLink(name)
+
+
+def resolved(kind: str) -> tuple[str, str | None]:
+    """``auto``: namespaces where they are to be had, else the proxy, and why it has to be that.
+
+    Raises PebbleError if there can be no such link here.
+    """
     if kind not in KINDS:
         raise PebbleError(f"no kind of link {kind!r}: choose from {', '.join(KINDS)}")
     obstacle = None if kind == "proxy" else why_no_namespaces()
     if kind == "namespaces" and obstacle:
         raise PebbleError(f"no network namespaces: {obstacle}; or choose the proxy")
-    return ProxyLink(name) if kind == "proxy" or obstacle else NamespaceLink(name)
+    return "proxy" if kind == "proxy" or obstacle else "namespaces", obstacle
 
 
 def why_no_namespaces() -> str | None:
-    """What is missing for links of kind ``namespaces``; None: nothing."""
+    """What is missing for links of kind ``namespaces``; None: nothing. Raises PebbleError if they do not work."""
     from pebble.impair import namespaces
 
     return namespaces.obstacle()

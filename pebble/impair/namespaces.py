@@ -7,7 +7,9 @@ with them the connections.
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -20,7 +22,7 @@ import msgspec
 from pebble.errors import PebbleError
 from pebble.impair.conditions import Condition, Shape
 from pebble.impair.forwarder import TIMED
-from pebble.impair.helper import Helper
+from pebble.impair.helper import Helper, UnavailableError
 from pebble.impair.link import Carried
 
 WIRE = "wire"
@@ -163,12 +165,21 @@ class _Side:
     def _run(self, program: str, *arguments: str, stdin: str = "") -> str:
         command = self.inside([_program(program), *arguments])
         try:
-            done = subprocess.run(command, input=stdin, capture_output=True, text=True, timeout=_COMMAND_S, check=False)
+            done = subprocess.run(
+                command,
+                input=stdin,
+                capture_output=True,
+                text=True,
+                timeout=_COMMAND_S,
+                check=False,
+                env={**os.environ, "LC_ALL": "C"},  # `_not_permitted` reads what it says
+            )
         except subprocess.TimeoutExpired:
             raise PebbleError(f"{program} did not end within {_COMMAND_S:.0f} s") from None
         if done.returncode:
             said = done.stderr.strip().splitlines() or [f"code {done.returncode}"]
-            raise PebbleError(f"{program} {' '.join(arguments)}: {said[0]}")
+            problem = f"{program} {' '.join(arguments)}: {said[0]}"
+            raise UnavailableError(problem) if _not_permitted(said[0]) else PebbleError(problem)
         return done.stdout
 
 
@@ -190,18 +201,27 @@ def _program(name: str) -> str:
     """Users' PATH lacks the folders where Debian puts these."""
     found = shutil.which(name) or shutil.which(name, path=_SBIN)
     if found is None:
-        raise PebbleError(f"there is no program {name}: apt-get install {_PACKAGES[name]}")
+        raise UnavailableError(f"there is no program {name}: apt-get install {_PACKAGES[name]}")
     return found
+
+
+def _not_permitted(said: str) -> bool:
+    return any(os.strerror(number) in said for number in (errno.EPERM, errno.EACCES))
 
 
 @cache
 def obstacle() -> str | None:
-    """Why there can be no such link on this machine: it is tried, with everything a condition may ask for."""
+    """Why there can be no such link on this machine: it is tried, with everything a condition may ask for.
+
+    Raises PebbleError if it is to be had, but does not work.
+    """
     everything = Shape(kbit=1000, loss=0.01, delay_ms=1)
     try:
         with NamespaceLink("on trial") as link:
             link.apply(Condition("trial", everything, everything))
             link.carried()
-    except PebbleError as error:
+    except UnavailableError as error:
         return str(error)
+    except PebbleError as error:
+        raise PebbleError(f"network namespaces do not work here: {error}; or choose the proxy") from None
     return None

@@ -44,13 +44,13 @@ class Direction:
     def __init__(self, seed: str) -> None:
         self._seed = seed
         self._turn = asyncio.Lock()
-        self._free_at = 0.0
         self.bytes = self.packets = self.dropped = 0
         self.apply(Shape(), 0.0)
 
     def apply(self, shape: Shape, round_trip_s: float) -> None:
         self._shape, self._rto_s = shape, _RTO_MIN_S + round_trip_s
         self._began, self._schedule = time.monotonic(), Schedule(shape, self._seed)
+        self._free_at = 0.0
         self._chance = Random(self._seed)  # noqa: S311
 
     @property
@@ -59,25 +59,30 @@ class Direction:
 
     async def carry(self, size: int) -> float:
         """Wait for a turn at the rate; returns when this piece arrives (monotonic)."""
+        if self._shape.kbit is None:
+            self._send(size)
+        else:
+            async with self._turn:
+                await asyncio.sleep(self._send(size))
+        return self._began + self._arrival(time.monotonic() - self._began, size)
+
+    def _send(self, size: int) -> float:
+        """It takes so many seconds, with those the line is already taken for."""
         packets = math.ceil(size / _SEGMENT)
         on_the_wire = size + packets * _HEADERS
-        await self._wait(on_the_wire)
         self.bytes += on_the_wire
         self.packets += packets
-        return self._began + self._arrival(time.monotonic() - self._began)
-
-    async def _wait(self, size: int) -> None:
         if self._shape.kbit is None:
-            return
-        async with self._turn:
-            now = time.monotonic()
-            self._free_at = max(self._free_at, now - _SLACK_S) + size * 8 / (self._shape.kbit * 1000)
-            await asyncio.sleep(self._free_at - now)
+            return 0.0
+        now = time.monotonic()
+        self._free_at = max(self._free_at, now - _SLACK_S) + on_the_wire * 8 / (self._shape.kbit * 1000)
+        return self._free_at - now
 
-    def _arrival(self, sent: float) -> float:
+    def _arrival(self, sent: float, size: int) -> float:
         wait = self._rto_s
         while (arrival := self._schedule.arrival(sent)) is None or self._chance.random() < self._shape.loss:
             self.dropped += 1
+            self._send(size)  # the repetition takes its part of the line, too
             sent += wait
             wait *= 2
         return arrival

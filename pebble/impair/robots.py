@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import socket
 import sys
 import tempfile
 import threading
@@ -18,6 +15,7 @@ from typing import Any, Self
 import msgspec
 
 from pebble.bench.frames_process import Worker, end_workers
+from pebble.demo.broker import free_port, mosquitto_command
 from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
 from pebble.impair.link import Link, open_link
@@ -50,9 +48,10 @@ class Robot:
 
     def start(self) -> None:
         """Everything, one after the other; the robot is not yet up. Raises PebbleError."""
-        self._start("remote broker", self.link.on_remote(self._mosquitto("remote", self.link.broker_host, self._port)))
+        remote = mosquitto_command(self._port, self._folder / "remote", host=self.link.broker_host)
+        self._start("remote broker", self.link.on_remote(remote))
         if self.subject.transport == "mqtt":
-            self._start("local broker", self.link.on_robot(self._mosquitto("local", "127.0.0.1", self._local_port)))
+            self._start("local broker", self.link.on_robot(mosquitto_command(self._local_port, self._folder / "local")))
         port = self._folder / "mcu"
         self._trace.touch()
         simulation = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob"]
@@ -61,7 +60,7 @@ class Robot:
         config = self._folder / "robot.json"
         config.write_text(json.dumps(self._config(port), indent=1))
         command = [sys.executable, "-m", "pebble.cli", "up", str(config)]
-        self.launcher = Program(f"the robot {self.subject.name}", self.link.on_robot(command), self._log("robot"))
+        self.launcher = Program(f"robot of {self.subject.name}", self.link.on_robot(command), self._log("robot"))
         operator = [sys.executable, "-m", "pebble.impair.operator", self.link.broker_host, str(self._port), BASE]
         name = f"the operator of {self.subject.name}"
         self.operator = Worker(name, self.link.on_remote(operator), self._log("operator"))
@@ -72,12 +71,17 @@ class Robot:
                 self.operator.tell(msgspec.json.encode(order).decode())
 
     def hear(self, timeout: float) -> Said:
-        """What the operator says next. Raises PebbleError if that is a problem, or nothing."""
+        """What the operator says next. Raises PebbleError if that is a problem, or nothing, or a program has ended."""
         if self.operator is None:
             raise PebbleError(f"{self.subject.name} was not started")
-        said = msgspec.convert(self.operator.answer(timeout), Said)
+        try:
+            said = msgspec.convert(self.operator.answer(timeout), Said)
+        except PebbleError as error:
+            said = Said(problem=str(error))
+        if ended := next((each for each in (*self.programs, self.launcher) if each is not None and each.ended), None):
+            raise PebbleError(f"{ended.name} has ended\n{_tail(ended.log)}".rstrip())
         if said.problem is not None:
-            raise PebbleError(f"{self.subject.name}: {said.problem}\n{self._tail()}".rstrip())
+            raise PebbleError(f"{self.subject.name}: {said.problem}\n{_tail(self._log('robot'))}".rstrip())
         return said
 
     def entries(self, since_ns: int) -> list[Entry]:
@@ -91,21 +95,6 @@ class Robot:
 
     def _log(self, name: str) -> Path:
         return self._folder / f"{name}.log"
-
-    def _tail(self) -> str:
-        path = self._log("robot")
-        return path.read_text(errors="replace")[-_LOG_TAIL:] if path.exists() else ""
-
-    def _mosquitto(self, name: str, host: str, port: int) -> list[str]:
-        program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
-        if program is None:
-            raise PebbleError("mosquitto is not installed: apt install mosquitto")
-        config = self._folder / f"{name}.conf"
-        lines = [f"listener {port} {host}", "allow_anonymous true", "log_dest stderr"]
-        if os.geteuid() == 0:
-            lines.append("user root")  # a change of user would undo the tie to our life that Program made
-        config.write_text("\n".join(lines) + "\n")
-        return [program, "-c", str(config)]
 
     def _config(self, port: Path) -> dict[str, Any]:
         """With the original's keys and values wherever it has them."""
@@ -169,8 +158,5 @@ class Field:
                 robot.operator.ask_to_end()
 
 
-def free_port() -> int:
-    """Free on this machine's own loopback, and so in a namespace where nobody listens at all."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def _tail(log: Path) -> str:
+    return log.read_text(errors="replace")[-_LOG_TAIL:] if log.exists() else ""

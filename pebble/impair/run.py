@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from typing import TypeVar
 
 from rich.console import Console
@@ -15,7 +16,7 @@ from pebble.bench.results import Results, Stopwatch, Value
 from pebble.errors import PebbleError
 from pebble.impair.cells import Trial, cells_of, over_time
 from pebble.impair.conditions import Condition
-from pebble.impair.link import Carried
+from pebble.impair.link import Carried, resolved
 from pebble.impair.messages import Settle
 from pebble.impair.plan import Plan, Subject
 from pebble.impair.report import QUOTED, tables, verdict
@@ -40,15 +41,21 @@ def run(plan: Plan, console: Console | None = None) -> int:
     console = console or Console()
     plan.check()
     check_folder(plan.output)
+    kind, why_proxy = resolved(plan.link)
+    plan = replace(plan, link=kind)  # the command line that repeats it takes the same
+    if why_proxy is not None:
+        console.print(f"A proxy stands in for the link: {why_proxy}", highlight=False, soft_wrap=True)
     began_ns, stopwatch = time.monotonic_ns(), Stopwatch("impair", plan.command(), {})
     subjects = [subject for group in plan.groups() for subject in group]
     with interrupted_by_signals(), _progress(console) as progress, Field(subjects, plan.link) as field:
         session = _Session(plan, field, progress, began_ns)
         problem = session.run()
-        kind = field.robots[0].link.kind
     cells = [*cells_of(session.trials, FPS), *over_time(session.trials, began_ns)]
-    results = stopwatch.results(cells, verdict(cells), quick=plan.quick)
-    results.options = _options(plan, kind, session.marks)
+    said = verdict(cells)
+    if problem is not None:
+        said.insert(0, f"The trials ended early: {str(problem).splitlines()[0]}")
+    results = stopwatch.results(cells, said, quick=plan.quick)
+    results.options = _options(plan, why_proxy, session.marks)
     show(results, console)
     finish(results, plan.output, console)
     if problem is not None:
@@ -84,8 +91,9 @@ class _Session:
         try:
             self._all(self._field.robots, lambda robot: robot.hear(_UP_S))
             self._step(10.0)
-            for condition in conditions:
-                self._condition(condition, groups, each_s)
+            for number, condition in enumerate(conditions):  # whoever comes first, comes last in the next
+                turn = slice(None, None, -1 if number % 2 else 1)
+                self._condition(condition, [group[turn] for group in groups[turn]], each_s)
         except PebbleError as error:
             if not self.trials:
                 raise
@@ -102,11 +110,9 @@ class _Session:
             self._all(group, self._settle)
             if group is groups[0]:
                 self.marks.append(f"{condition.name}@{(time.monotonic_ns() - self._began_ns) / 1e9:.1f}")
-            for robot in group:
-                robot.link.apply(condition)
+            self._all(group, lambda robot: robot.link.apply(condition))
             self.trials += self._all(group, lambda robot: self._try(robot, condition.name), each_s)
-            for robot in group:
-                robot.link.apply(CLEAN)
+            self._all(group, lambda robot: robot.link.apply(CLEAN))
             self._step(each_s)
 
     def _settle(self, robot: Robot) -> None:
@@ -151,12 +157,14 @@ def _length_s(plan: Plan, subject: Subject) -> float:
     return order.alone_s + 2 * order.window_s + order.grace_s
 
 
-def _options(plan: Plan, kind: str, marks: Sequence[str]) -> dict[str, Value | list[Value]]:
-    words = _LINKS[kind].replace("robot's uplink", "both directions") if plan.both_ways else _LINKS[kind]
+def _options(plan: Plan, why_proxy: str | None, marks: Sequence[str]) -> dict[str, Value | list[Value]]:
+    words = _LINKS[plan.link]
+    words = words.replace("robot's uplink", "both directions") if plan.both_ways else words
     order = plan.order(plan.groups()[0][0])
     return {
-        "link": kind,
+        "link": plan.link,
         "link_words": words,
+        "why_proxy": why_proxy,  # None: it is none, or was asked for
         "both_ways": plan.both_ways,
         "window_s": plan.window,
         "alone_s": order.alone_s,

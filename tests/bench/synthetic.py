@@ -187,7 +187,8 @@ def impair(trials: tuple[str, ...] = TRIALS) -> Results:
             cells.append(Cell(variant=subject, measure=f"{what} over time", unit="ms", rounds=[seconds, times]))
     marks = ";".join(f"{trial}@{2 + 24 * number}" for number, trial in enumerate(trials))
     aims = ["aim: mqtt h264 opus at 256k, audio at least 99 %: met (99.0 %)"]
-    return _results("impair", cells, aims, options={"link": "proxy", "window_s": 8.0, "marks": marks})
+    link = {"link": "proxy", "link_words": "a userspace proxy, loss modelled; robot's uplink impaired"}
+    return _results("impair", cells, aims, options={**link, "window_s": 8.0, "marks": marks})
 
 
 def broken() -> Results:

@@ -5,6 +5,7 @@ import json
 import math
 import struct
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -14,8 +15,9 @@ from pebble.bench.bridge_drive import Found, Stretch, arrivals, found_of, matche
 from pebble.bench.bridge_hop import HOP
 from pebble.bench.bridge_operator import wheels, wheels_of
 from pebble.bench.bridge_plan import Mode, Plan, plan
+from pebble.bench.bridge_robot import Robot
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP, Tally
-from pebble.bench.bridge_wire import commands
+from pebble.bench.bridge_wire import _stamp, commands
 from pebble.bench.results import Cell, Value
 from pebble.errors import PebbleError
 from pebble.services.serial_mcu_bridge.goob_base import Touch
@@ -93,10 +95,8 @@ def test_waiting_is_over_when_the_last_have_arrived() -> None:
 def test_cells_have_a_list_of_samples_for_each_round() -> None:
     tally = Tally("zenoh", LOADED)
     stretches = [Stretch(0, 500 * MS, {}, cpu_s=0.1), Stretch(600 * MS, 1100 * MS, {}, cpu_s=0.1)]
-    tally.add_round(stretches, [Found([1.0], [2.0], 1, 1), Found([1.5], [], 1, 1)])
-    tally.add_round(stretches, [Found([3.0], [2.5], 2, 1)])
-    tally.add_flow({"frames": 30, "video": 15}, 1.0)
-    tally.add_flow({"frames": 28, "video": 15}, 1.0)
+    tally.add_round(stretches, [Found([1.0], [2.0], 1, 1), Found([1.5], [], 1, 1)], {"frames": 30, "video": 15})
+    tally.add_round(stretches, [Found([3.0], [2.5], 2, 1)], {"frames": 28, "video": 15})
     down, up = tally.cells()
     assert (down.variant, down.measure, down.params, down.unit) == ("zenoh", DOWN, {"load": "media"}, "ms")
     assert (down.rounds, down.lost) == ([[1.0, 1.5], [3.0]], 1)
@@ -119,6 +119,7 @@ def test_where_nobody_reports_there_is_one_cell() -> None:
     [
         Plan(kinds=["carrier-pigeon"]),
         Plan(kinds=[]),
+        Plan(kinds=["mqtt", "mqtt"]),
         Plan(seconds=0.0),
         Plan(rounds=0),
         Plan(seconds=math.inf),
@@ -126,10 +127,36 @@ def test_where_nobody_reports_there_is_one_cell() -> None:
         Plan(output=Path("/dev/null/there")),
     ],
 )
-def test_nonsense_is_refused_before_anything_starts(nonsense: Plan) -> None:
-    for run in (bridge.run, bridge_null.run, bridge_profile.run):
+def test_nonsense_is_refused_before_anything_starts(nonsense: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (bridge, bridge_null, bridge_profile):
+        monkeypatch.setattr(module, "Driven", None)
         with pytest.raises(PebbleError):
-            run(nonsense, Console(file=io.StringIO()))
+            module.run(nonsense, Console(file=io.StringIO()))
+
+
+@pytest.mark.parametrize(
+    ("module", "mode"), [(bridge, Mode.COMPARE), (bridge_null, Mode.NULL), (bridge_profile, Mode.PROFILE)]
+)
+def test_shared_memory_is_swept_however_it_ends(
+    module: ModuleType, mode: Mode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise PebbleError("no robot today")
+
+    swept: list[bool] = []
+    monkeypatch.setattr(module, "Driven", fail)
+    monkeypatch.setattr(module, "sweep", lambda: swept.append(True))
+    with pytest.raises(PebbleError, match="no robot today"):
+        module.run(plan(mode, rounds=1, output=tmp_path), Console(file=io.StringIO()))
+    assert swept == [True]
+
+
+def test_the_broker_on_the_robot_is_the_robots_as_a_hub_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot("mqtt", media=False)
+    brokers = [SimpleNamespace(program=SimpleNamespace(pid=pid)) for pid in (-1, -2)]
+    monkeypatch.setattr(robot, "_brokers", brokers)
+    monkeypatch.setattr(robot, "_launcher", SimpleNamespace(pid=-3))
+    assert robot.pids() == [-3, -2]
 
 
 def test_the_impatient_have_fewer_and_what_is_given_counts() -> None:
@@ -144,10 +171,12 @@ def test_the_impatient_have_fewer_and_what_is_given_counts() -> None:
 # -- telling
 
 
-def cell(variant: str, ms: float, measure: str = DOWN, load: str = UNLOADED, rounds: int = 8) -> Cell:
+def cell(
+    variant: str, ms: float, measure: str = DOWN, load: str = UNLOADED, rounds: int = 8, each: int = 100, lost: int = 0
+) -> Cell:
     params: dict[str, Value] = {"load": load}
-    figures: dict[str, Value] = {"sent": 2 * rounds, "cpu_percent": 12.5}
-    samples = [[ms, ms * 1.1] for _ in range(rounds)]
+    figures: dict[str, Value] = {"sent": each * rounds + lost, "cpu_percent": 12.5}
+    samples = [[ms, ms * 1.1] * (each // 2) for _ in range(rounds)]
     return Cell(variant=variant, params=params, measure=measure, unit="ms", rounds=samples, figures=figures)
 
 
@@ -170,10 +199,38 @@ def test_a_missed_aim_is_told_with_how_much() -> None:
     assert last == "aim: zenoh, command to the wheels, p99 at most 2 ms: missed by 0.20 ms (2.20 ms)"
 
 
+def test_what_never_arrived_took_longer_than_anything() -> None:
+    *_, median, slowest = bridge_report.verdict([cell("zenoh", 0.4, lost=9)])
+    assert median.endswith("p50 at most 0.7 ms: met (0.44 ms)")
+    assert slowest.endswith("p99 at most 2 ms: missed (not within 1 s)")
+
+
+def test_a_robot_that_heard_nothing_missed_its_aims() -> None:
+    lines = bridge_report.verdict([cell("mqtt", 0.4), cell("zenoh", 0.4, each=0, lost=800), cell(HOP, 0.1)])
+    assert "zenoh, command to the wheels: 100.0 % of 800 were overtaken, or did not arrive within 1 s." in lines
+    assert "aim: zenoh, command to the wheels, p50 at most 0.7 ms: missed (not within 1 s)" in lines
+
+
+@pytest.mark.parametrize(("lost", "told"), [(4, False), (5, True)])
+def test_loss_is_said_where_it_is_more_than_a_stray_one(lost: int, told: bool) -> None:
+    lines = bridge_report.verdict([cell("zenoh", 0.4, load=LOADED, lost=lost)])
+    line = f"zenoh, command to the wheels, media flowing: 0.6 % of {800 + lost} were overtaken"
+    assert any(found.startswith(line) for found in lines) is told
+
+
 def test_few_rounds_and_nothing_at_all_can_be_told_too() -> None:
-    few = [cell("mqtt", 0.6, rounds=2), cell("zenoh", 0.4, rounds=2), cell("zenoh", 0.4, load=LOADED, rounds=2)]
-    assert any("2 rounds" in line for line in bridge_report.verdict(few))
+    few = [cell("mqtt", 0.6, rounds=7), cell("zenoh", 0.4, rounds=7), cell("zenoh", 0.4, load=LOADED, rounds=7)]
+    lines = bridge_report.verdict(few)
+    assert any("7 rounds" in line for line in lines)
+    assert lines[-1] == "aim: zenoh, command to the wheels, p99 at most 2 ms: not judged (0.44 ms)"
     assert bridge_report.verdict([]) == []
+
+
+def test_a_percentile_is_judged_only_where_something_lies_beyond_it() -> None:
+    cells = [cell("zenoh", 0.4, each=36), cell("zenoh", 2.4, load=LOADED, each=98)]
+    lines = bridge_report.verdict(cells)
+    assert "zenoh, command to the wheels, p99: 0.44 ms, with media 2.64 ms" in lines
+    assert [line.partition(" ms: ")[2] for line in lines[-2:]] == ["met (0.40 ms)", "not judged (0.44 ms)"]
 
 
 def test_the_tables_have_the_robots_cost() -> None:
@@ -193,11 +250,22 @@ def test_hops_are_the_times_between_stations() -> None:
 
 
 def test_the_profile_tells_which_hop_makes_the_slowest_slow() -> None:
-    times: bridge_profile.Times = [*(98 * [(0.1, 0.1, 0.3)]), *(2 * [(0.1, 3.1, 1.3)])]
-    assert bridge_profile.slowest(times) == 2 * [(0.1, 3.1, 1.3)]
+    times: bridge_profile.Times = [*(395 * [(0.1, 0.1, 0.3)]), *(5 * [(0.1, 3.1, 1.3)])]
+    assert bridge_profile.slowest(times) == 5 * [(0.1, 3.1, 1.3)]
     (line,) = bridge_profile.verdict("zenoh", times)
-    assert "(4.00 ms), 75 % is spent in: remote broker" in line
+    assert line.startswith(
+        "zenoh: of what the slowest 5 of 400 commands take longer than a typical one (4.00 ms), 75 %"
+    )
+    assert line.endswith("is spent in: remote broker.")
+    (line,) = bridge_profile.verdict("zenoh", times[1:300] + times[-4:])
+    assert line == "zenoh: 303 commands are too few to say what makes the slowest slow."
     assert bridge_profile.verdict("zenoh", []) == ["zenoh: no command was followed all the way"]
+
+
+def test_stamps_of_another_form_are_refused() -> None:
+    assert _stamp([(1, 35, struct.pack("qq", 2, 5))]) == 2_000_000_005
+    with pytest.raises(PebbleError, match="64-bit"):
+        _stamp([(1, 35, struct.pack("ii", 2, 5))])
 
 
 def test_commands_are_found_in_the_packets_that_carry_them() -> None:

@@ -1,6 +1,8 @@
 """The parts of the control comparison by themselves: messages, schedule, plan, order of the slices, words."""
 
 import io
+import socket
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import ClassVar, Self
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, null, output
+from pebble.bench import control, control_load, null, output
 from pebble.bench.control_cast import Slice
 from pebble.bench.control_ends import REPLIES, REQUESTS, Echo, Handler, Order, Sender
 from pebble.bench.control_plan import Condition, Plan
@@ -18,11 +20,14 @@ from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, tables, verdict
 from pebble.bench.control_variants import VARIANTS
 from pebble.bench.control_wire import parse, request, stamped
 from pebble.bench.control_worker import Answer
+from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
+from pebble.demo import broker as demo_broker
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.programs import end_all
 from pebble.errors import PebbleError
 from pebble.inbox import Inbox
+from tests.support import until
 
 
 @pytest.mark.parametrize("size", [40, 1024])
@@ -173,15 +178,22 @@ def test_every_other_round_goes_backwards_and_one_that_fails_is_left_out_for_all
     said = io.StringIO()
     plan = Plan.of(variants=["mqtt", "zenoh-p2p"], sizes=[40], rates=[200.0], loads=["none", "hog"], rounds=4,
                    output=tmp_path)  # fmt: skip
-    assert control.run(plan, Console(file=said, width=80)) == 0
+    assert control.run(plan, Console(file=said, width=80)) == 0  # nobody asked for as many as a judgement takes
     there = [("mqtt", "none"), ("zenoh-p2p", "none"), ("mqtt", "hog"), ("zenoh-p2p", "hog")]
     expected = [*there, *there[::-1]] * 2 + [*there[::-1], *there]
     assert [(role, load) for role, _, load in fake.calls] == expected
     assert "mqtt: echo said nothing" in said.getvalue()
     results = load(tmp_path / "control.json")
     assert all(len(cell.rounds) == 3 for cell in results.cells)
-    assert results.verdict[0] == "1 of 4 rounds failed and were left out."
+    assert results.verdict[0] == "1 of 4 rounds failed and were left out: mqtt: echo said nothing"
     assert {cell.lost for cell in results.cells} == {0}
+
+
+@pytest.mark.usefixtures("fake")
+@pytest.mark.parametrize(("rounds", "code"), [(8, 1), (9, 0)])
+def test_too_few_rounds_that_are_left_are_an_error(rounds: int, code: int, tmp_path: Path) -> None:
+    plan = Plan.of(variants=["mqtt"], sizes=[40], rates=[200.0], loads=["none"], rounds=rounds, output=tmp_path)
+    assert control.run(plan, Console(file=io.StringIO(), width=80)) == code
 
 
 @pytest.mark.usefixtures("fake")
@@ -207,15 +219,26 @@ def test_all_roles_work_for_a_fifth_of_the_pilot_s_median_and_the_slowed_one_whe
     assert ": met (" in results.verdict[-1]
 
 
-def cell(variant: str, load: str, p50: float, *, measure: str = ONE_WAY, late: int = 0) -> Cell:
-    rounds = [[p50 + number % 7 + 3 * round_ for number in range(100)] for round_ in range(10)]
+def cell(
+    variant: str,
+    load: str,
+    p50: float,
+    *,
+    measure: str = ONE_WAY,
+    late: int = 0,
+    lost: int = 0,
+    count: int = 10,
+    pictures: float | None = None,
+) -> Cell:
+    """``lost``: in each of ``count`` rounds."""
+    rounds = [[p50 + number % 7 + 3 * round_ for number in range(100 - lost)] for round_ in range(count)]
     return Cell(
         variant=variant,
         params={"size": "40 B", "rate": "200 Hz", "load": load},
         measure=measure,
         unit="us",
         rounds=rounds,
-        figures={"sent": 1000, "late": late},
+        figures={"sent": 100 * count, "late": late, "pictures_hz": pictures},
     )
 
 
@@ -240,7 +263,7 @@ def test_the_verdict_compares_with_the_better_mqtt_variant_and_names_the_aims() 
     said = verdict(some(450.0))
     assert any("zenoh-p2p is faster than mqtt-nodelay (the better MQTT variant): 0.50" in line for line in said)
     assert any(line.startswith("aim: ") and "at most 0.70: met (0.5" in line for line in said)
-    assert any(line.startswith("aim: ") and "at most 0.35: missed by 0.15 (0.5" in line for line in said)
+    assert any(line.startswith("aim: ") and "at most 0.35: missed (0.5" in line for line in said)
     assert any("paho is slower than mqtt-nodelay" in line for line in said)
 
 
@@ -261,6 +284,35 @@ def test_a_pace_that_could_not_be_kept_is_said() -> None:
     ]
 
 
+def test_too_few_rounds_are_not_judged_and_have_no_interval() -> None:
+    few = [cell(name, "media", p50, count=7) for name, p50 in (("mqtt", 900.0), ("zenoh-p2p", 900.0))]
+    assert "at most 0.35: not judged (1.00 of 7 rounds)" in verdict(few)[-1]
+    said = io.StringIO()
+    Console(file=said, width=80).print(tables(few)[-1])
+    assert "–" not in said.getvalue()
+
+
+@pytest.mark.parametrize(("lost", "outcome"), [(0, "met (0.20"), (1, "met (0.20"), (2, "missed (∞")])
+def test_what_is_lost_is_said_and_fails_an_aim(lost: int, outcome: str) -> None:
+    said = verdict([cell("mqtt", "media", 5000.0), cell("zenoh-p2p", "media", 1000.0, lost=lost)])
+    assert f"at most 0.35: {outcome}" in said[-1]
+    assert any(f"At 200 Hz messages were lost: {lost}.0% of zenoh-p2p." in line for line in said) == bool(lost)
+
+
+def test_too_much_lost_in_few_rounds_fails_an_aim() -> None:
+    ours = cell("zenoh-p2p", "media", 1000.0)
+    ours.rounds[0] = ours.rounds[0][:80]
+    assert "at most 0.35: missed (0.20" in verdict([cell("mqtt", "media", 5000.0), ours])[-1]
+
+
+def test_pictures_that_flowed_meanwhile_are_told_and_too_few_are_a_doubt() -> None:
+    cells = [cell("mqtt", "media", 900.0, pictures=29.9), cell("zenoh-p2p", "media", 300.0, pictures=20.0)]
+    said = verdict(cells)
+    assert any(line.endswith("of 30: mqtt 29.9, zenoh-p2p 20.0") for line in said)
+    assert any("zenoh-p2p: fewer pictures than 27" in line for line in said)
+    assert not any("mqtt: fewer" in line or "mqtt, zenoh-p2p: fewer" in line for line in said)
+
+
 def test_the_tables_of_all_variants_fit_a_narrow_terminal() -> None:
     said = io.StringIO()
     for table in tables(some(450.0)):
@@ -275,3 +327,41 @@ def test_the_broker_gets_the_lines_of_its_variant(tmp_path: Path) -> None:
         assert "set_tcp_nodelay true" in (tmp_path / "broker.conf").read_text().splitlines()
     finally:
         end_all([broker.program], 5.0)
+
+
+def test_a_stranger_on_the_broker_s_port_is_not_the_broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as stranger:
+        monkeypatch.setattr(demo_broker, "free_port", lambda: stranger.getsockname()[1])
+        broker = Broker("broker", BrokerKind.MOSQUITTO, tmp_path)
+        assert until(lambda: broker.program.ended)
+        with pytest.raises(PebbleError, match="broker ended at once"):
+            broker.wait(threading.Event())
+
+
+class Idle:
+    """A switch that is off for three looks."""
+
+    pictures, on, looks = 0, False, 0
+
+    @property
+    def ended(self) -> bool:
+        return self.looks == 3
+
+    def wait(self, _timeout: float) -> None:
+        self.looks += 1
+
+    def say(self) -> None:
+        """Nobody listens."""
+
+
+def test_a_reader_at_rest_still_runs_its_network_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broker, looped = Broker("broker", BrokerKind.MOSQUITTO, tmp_path), []
+    try:
+        broker.wait(threading.Event())
+        reader = MqttReader(broker.port)
+        loop = reader._client.loop
+        monkeypatch.setattr(reader._client, "loop", lambda timeout: (looped.append(timeout), loop(timeout)))
+        control_load._read(reader, Idle())  # type: ignore[arg-type]
+    finally:
+        end_all([broker.program], 5.0)
+    assert len(looped) >= 3

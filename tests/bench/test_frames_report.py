@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from pebble.bench.frames_report import Round, cell_of, legend, tables, verdict
+from pebble.bench.frames_report import Round, cell_of, complete, legend, tables, verdict
 from pebble.bench.frames_variants import VARIANTS, Case, Size
 from pebble.bench.results import Cell
 
@@ -83,6 +83,16 @@ def test_few_rounds_are_shown_and_not_judged(rounds: int, lines: int) -> None:
     cells = [cell_of(Case(name, HD, 1), [a_round(5.0)] * rounds) for name in ("zenoh-shm", "mqtt")]
     assert len(verdict(cells)) == lines
     assert ("equal within noise" in verdict(cells)[0]) == (lines == 1)
+
+
+@pytest.mark.parametrize(
+    ("gone", "asked", "enough"), [(0, 8, True), (2, 10, True), (3, 10, False), (1, 2, True), (2, 2, False)]
+)
+def test_rounds_that_failed_are_told_and_too_few_are_not_enough(gone: int, asked: int, enough: bool) -> None:
+    cell = cell_of(Case("mqtt", HD, 1), [None] * gone + [a_round(1.0)] * (asked - gone))
+    assert complete([cell], asked) == enough
+    told = [f"1920x1080, one reader, mqtt: {gone} rounds failed and are left out"]
+    assert verdict([cell]) == (told if gone else [])
 
 
 def test_frames_that_arrived_otherwise_than_they_should_are_told() -> None:

@@ -54,9 +54,8 @@ def test_fooled(again: float, slowed: float, missed: list[bool]) -> None:
 
 def test_few_rounds_are_shown_and_not_judged() -> None:
     few = cells(1.3, 1.0, rounds=4)
-    assert null.judged(few)
-    assert not null.passed(few)
-    assert null.verdict(few)[-1] == "Not judged: that takes 8 rounds."
+    assert ": not judged (mqtt again 1." in null.verdict(few)[-1]
+    assert "MISSED" not in "".join(null.verdict(few))
 
 
 def test_nothing_measured_is_not_passed() -> None:
@@ -94,8 +93,8 @@ class Processes:
     ("obedient", "quick", "code", "outcome"),
     [
         (True, False, 0, ": met ("),
-        (False, False, 1, ": missed ("),
-        (False, True, 0, "Not judged: that takes 8 rounds."),
+        (False, False, 0, ": missed ("),
+        (False, True, 0, ": not judged ("),
     ],
 )
 def test_frames_against_themselves(

@@ -115,6 +115,50 @@ def test_a_quick_run_says_so_in_the_picture(tmp_path: Path) -> None:
     assert full_one.crop(corner).getextrema() == (255, 255)
 
 
+def test_a_distribution_ends_below_100_percent_by_what_was_lost() -> None:
+    whole = Cell(variant="mqtt", measure="way", unit="ms", rounds=[[1.0] * 90])
+    lossy = Cell(variant="mqtt", measure="way", unit="ms", rounds=[[1.0] * 90], figures={"sent": 100})
+    (all_of_it,), (most_of_it,) = (pictures(Results(bench="fleet", cells=[cell])) for cell in (whole, lossy))
+    assert "never arrived" not in all_of_it.caption
+    assert most_of_it.caption.endswith("what never arrived is missing from 100 %")
+    for picture, top in ((all_of_it, 100), (most_of_it, 90)):
+        (curve, *_) = picture.make().axes[0].get_lines()
+        assert max(curve.get_ydata()) == pytest.approx(top)  # type: ignore[arg-type]
+
+
+def test_a_percentile_of_commands_counts_those_that_never_arrived() -> None:
+    def drawn(sent: int) -> list[float]:
+        cell = Cell(variant="mqtt original", params={"trial": "64k"}, measure="drive alone", unit="ms",
+                    rounds=[[5.0] * 90], figures={"sent": sent})  # fmt: skip
+        (picture,) = (one for one in pictures(Results(bench="impair", cells=[cell])) if one.name == "impair-drive")
+        return list(picture.make().axes[0].get_lines()[0].get_ydata())  # type: ignore[arg-type]
+
+    assert drawn(94) == [5.0]
+    assert math.isnan(drawn(99)[0])
+
+
+@pytest.mark.parametrize(("rounds", "lines"), [(7, False), (8, True)])
+def test_few_rounds_have_no_interval(rounds: int, lines: bool) -> None:
+    cells = [Cell(variant=name, measure="up", unit="ms", rounds=synthetic.latencies(1.0, 30, rounds))
+             for name in ("mqtt", "zenoh")]  # fmt: skip
+    (picture,) = (one for one in pictures(Results(bench="bridge", cells=cells)) if one.name == "bridge-ratios")
+    assert ("intervals of 99 %" in picture.caption) == lines
+    (interval, *_) = picture.make().axes[0].get_lines()
+    low, high = interval.get_xdata()  # type: ignore[misc]
+    assert (low < high) == lines
+
+
+def test_a_role_of_a_null_test_has_one_colour_in_all_pictures() -> None:
+    ratios, curves = (one.make() for one in pictures(synthetic.null_test("bridge", "zenoh")))
+
+    def colours(figure: Figure) -> dict[str, object]:
+        (legend,) = figure.legends
+        texts = [text.get_text() for text in legend.get_texts()]
+        return dict(zip(texts, [line.get_color() for line in legend.get_lines()], strict=True))
+
+    assert colours(ratios).items() <= colours(curves).items()
+
+
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match="No such file or directory"):
         draw(synthetic.startup(), tmp_path / "nowhere")
@@ -133,7 +177,8 @@ def test_conditions_read_as_people_say_them() -> None:
 
     assert of(size="40 B", rate="200 Hz", load="none") == "40 B, 200 Hz"
     assert of(size="40 B", rate="200 Hz", load="media") == "40 B, 200 Hz, with media"
-    assert of(size="640x480", readers=3) == "640x480, readers 3"
+    assert of(size="640x480", readers=3) == "640x480, 3 readers"
+    assert of(readers=1) == "1 reader"
     assert of(load="none") == "unloaded"
     assert of() == ""
 

@@ -73,6 +73,15 @@ def test_rounds_that_failed_do_not_count() -> None:
     assert unpaired([[2.0], []], [[], [1.0]]).ratio == pytest.approx(2)
 
 
+def test_what_never_arrived_is_infinitely_late() -> None:
+    mostly, never = [[1.0, 1.0, math.inf]] * 10, [[1.0, math.inf, math.inf]] * 10
+    assert paired(mostly, [[2.0]] * 10).ratio == pytest.approx(0.5)
+    assert str(paired(never, [[2.0]] * 10)) == "∞ (∞ to ∞)"
+    assert str(paired([[2.0]] * 10, never)) == "0 (0 to 0)"
+    assert math.isnan(paired(never, never).ratio)
+    assert paired([*never[:1], *mostly[:9]], [*never[:2], *mostly[:8]]).rounds == 9
+
+
 @pytest.mark.parametrize("judge", [paired, unpaired])
 @pytest.mark.parametrize(("ours", "theirs"), [([], []), ([[]], [[1.0]]), ([[1.0]], [[]]), ([[1.0]], [[0.0]])])
 def test_nothing_measured_is_nothing_claimed(judge: type[paired], ours: Rounds, theirs: Rounds) -> None:

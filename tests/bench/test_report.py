@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,10 @@ from rich.console import Console
 from pebble.bench import report
 from pebble.bench.report_limits import limits
 from pebble.bench.report_plan import COMPARISONS, Comparison, chosen
+from pebble.bench.report_run import Ended, Run
 from pebble.bench.report_text import Section, text
 from pebble.bench.results import Results
+from pebble.bench.usage import children
 from pebble.commands import bench, impair
 from pebble.errors import PebbleError
 from tests.bench import synthetic
@@ -63,7 +66,14 @@ def test_a_null_test_of_few_rounds_is_not_judged() -> None:
     few = synthetic.null_test("frames", "zenoh-shm")
     for cell in few.cells:
         cell.rounds = cell.rounds[:3]
-    assert "frames not judged, for that takes 8 rounds" in text([section("frames-null", few)])
+    assert "frames not judged (fewer than 8 rounds)" in text([section("frames-null", few)])
+
+
+def test_an_aim_that_was_not_judged_is_neither_met_nor_missed() -> None:
+    few = Results(bench="bridge", verdict=["aim: p50 at most 0.7 ms: not judged (0.6 ms)", "zenoh is faster"])
+    written = text([section("bridge", few)])
+    assert "| p50 at most 0.7 ms | [bridge](#operator-to-wheels-and-back) | not judged | 0.6 ms |" in written
+    assert "  * zenoh is faster" in written
 
 
 def test_a_table_stands_in_it_once_and_the_verdict_is_not_repeated() -> None:
@@ -93,14 +103,42 @@ def test_what_failed_is_named_with_what_it_said() -> None:
 
 
 def test_a_quick_run_says_so_and_how_little_it_means() -> None:
-    assert "# Results of a quick run" in text([section("startup", Results(bench="startup", quick=True))])
-    assert "quick" not in text([section("startup", Results(bench="startup"))]).lower()
+    quick, full = (section("startup", Results(bench="startup", quick=quick)) for quick in (True, False))
+    sound = section("sound", Results(bench="sound"))  # is as long in either
+    assert "# Results of a quick run" in text([quick, sound])
+    assert "several runs" not in text([quick, sound])
+    assert "quick" not in text([full]).lower()
+    assert "Not all of it is quick: it comes from several runs" in text([quick, section("cost", Results(bench="cost"))])
+
+
+def test_what_ended_badly_is_no_whole_result() -> None:
+    """It left results, and its exit code says that something is missing."""
+    one = section("startup", synthetic.startup())
+    known = replace(one, ended=Ended(code=1, took_s=90.0))
+    assert "incomplete" not in text([one])
+    assert "[Start-up](#start-up): **incomplete**, it ended with code 1" in text([known])
+    assert "**It ended with code 1: something could not be measured.**" in text([known])
+
+
+def test_what_was_left_out_or_cut_short_is_said_and_times_are_those_of_the_clock() -> None:
+    run = Run(left_out=["bridge-profile"], interrupted="in cost, after 3 of 12")
+    one = replace(section("startup", synthetic.startup()), ended=Ended(code=0, took_s=119.7))
+    written = text([one], run)
+    assert "* Operator to wheels: where the time goes: left out, it needs root" in written
+    assert "**The run was interrupted in cost, after 3 of 12 comparisons.**" in written
+    assert "Measured on 2026-11-20, in 2 min 0 s." in written
+    assert "Begun 2026-11-20 14:00 UTC, 2 min 0 s." in written
 
 
 def test_a_proxy_is_no_link() -> None:
-    proxy, spaces = ([Results(bench="impair", options={"link": kind})] for kind in ("proxy", "namespaces"))
-    assert any("TCP proxy" in line for line in limits(proxy))
-    assert not any("TCP proxy" in line for line in limits(spaces))
+    why = "ip is not installed"
+    proxy, asked, spaces = (
+        limits([Results(bench="impair", options=options)])
+        for options in ({"link": "proxy", "why_proxy": why}, {"link": "proxy"}, {"link": "namespaces"})
+    )
+    assert any("was a TCP proxy (ip is not installed). " in line for line in proxy)
+    assert any("was a TCP proxy. " in line for line in asked)
+    assert not any("TCP proxy" in line for line in spaces)
 
 
 def test_render_writes_all_again_from_what_is_there(tmp_path: Path) -> None:
@@ -139,6 +177,16 @@ def test_pictures_that_were_just_drawn_are_not_drawn_again(tmp_path: Path) -> No
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_no_document_of_somebody_else_is_written_over(tmp_path: Path) -> None:
+    put(tmp_path, synthetic.startup(), "a table")
+    (tmp_path / "README.md").write_text("# My robot")
+    with pytest.raises(PebbleError, match=r"README\.md is no report of pebble bench"):
+        report.write(tmp_path)
+    with pytest.raises(PebbleError, match=r"README\.md is no report of pebble bench"):
+        report.run([comparison("sound", "bench", "sound")], tmp_path, quick=True, console=Console(quiet=True))
+    assert (tmp_path / "README.md").read_text() == "# My robot"
+
+
 def test_nothing_there_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match="holds no results"):
         report.write(tmp_path)
@@ -159,6 +207,44 @@ def test_a_comparison_that_fails_does_not_stop_the_others(tmp_path: Path, monkey
     said = console.export_text()
     assert "control ended with code 2: see" in said
     assert "sound ended with code 2: see" in said
+
+
+def test_what_this_user_may_not_run_is_not_taken_from_an_earlier_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, root = [comparison("sound", "bench", "sound")], comparison("bridge", "bench", "nonsense")
+    monkeypatch.setattr(report, "COMPARISONS", [*plan, root])
+    put(tmp_path, synthetic.bridge(), "old")
+    report.write(tmp_path)
+    assert report.run(plan, tmp_path, quick=False, left_out=[root], console=Console(quiet=True)) == 0
+    assert not (tmp_path / "bridge.json").exists()
+    written = (tmp_path / "README.md").read_text()
+    assert "bridge-down.png" not in written
+    assert "left out, it needs root" in written
+    assert "left out, it needs root" in report.write(tmp_path).read_text()
+
+
+def test_a_run_that_was_interrupted_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = [comparison("sound", "bench", "sound"), comparison("startup", "bench", "startup")]
+    monkeypatch.setattr(report, "COMPARISONS", plan)
+    ran: list[str] = []
+
+    def run(one: Comparison, folder: Path, *_: object) -> int:
+        ran.append(one.name)
+        (folder / f"{one.name}.txt").touch()
+        if one.name == "startup":
+            raise KeyboardInterrupt
+        put(folder, synthetic.sound(), "a table")
+        return 0
+
+    monkeypatch.setattr(report, "_run", run)
+    with pytest.raises(KeyboardInterrupt):
+        report.run(plan, tmp_path, quick=True, console=Console(quiet=True))
+    assert ran == ["sound", "startup"]
+    written = (tmp_path / "README.md").read_text()
+    assert "interrupted in startup, after 1 of 2 comparisons" in written
+    assert "sound-wire.png" in written
+    assert "**It was interrupted, and left no results.**" in written
 
 
 def test_one_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,13 +276,6 @@ def test_ctrl_c_ends_the_comparison_that_runs(tmp_path: Path) -> None:
         process.send_signal(signal.SIGTERM)
         assert process.wait(40) == 130
         assert not Path(f"/proc/{child}").exists()
-
-
-def children(pid: int) -> list[int]:
-    try:
-        return [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    except OSError:
-        return []
 
 
 @pytest.mark.parametrize("quick", [False, True], ids=["full", "quick"])

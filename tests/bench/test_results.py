@@ -1,10 +1,12 @@
 """What a comparison leaves behind comes back as it was, and anything else is refused in one line."""
 
 import math
+import subprocess
 from pathlib import Path
 
 import pytest
 
+from pebble.bench.output import check_folder
 from pebble.bench.results import FORMAT, Cell, Results, Stopwatch, load, machine
 from pebble.errors import PebbleError
 
@@ -31,6 +33,27 @@ def test_all_that_repeats_it_is_there(tmp_path: Path) -> None:
     assert results.machine["kernel"]
     assert results.machine["eclipse-zenoh"]
     assert results.machine == machine()
+
+
+def test_a_broker_that_does_not_say_its_version_costs_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stuck(*_: object, **__: object) -> None:
+        raise subprocess.TimeoutExpired("mosquitto", 5)
+
+    monkeypatch.setattr(subprocess, "run", stuck)
+    assert machine()["mosquitto"] is None
+
+
+def test_the_machine_is_asked_before_anything_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    watch = Stopwatch("control", ["pebble"], {})
+    monkeypatch.setattr("pebble.bench.results.machine", None)
+    assert watch.results([]).machine["cpu"]
+
+
+def test_a_folder_in_which_nothing_can_be_written_is_refused(tmp_path: Path) -> None:
+    check_folder(tmp_path / "new")
+    assert list((tmp_path / "new").iterdir()) == []
+    with pytest.raises(PebbleError, match="/proc: "):
+        check_folder(Path("/proc"))  # it is there, and not even root writes into it
 
 
 def test_samples_keep_three_digits(tmp_path: Path) -> None:

@@ -38,13 +38,19 @@ def test_what_differs_by_chance_is_equal() -> None:
 
 
 def test_few_rounds_give_no_interval_and_say_so() -> None:
-    assert said([1.0, 2.0], [3.0, 4.0]).endswith(": mqtt is sooner in every round")
-    assert said([3.0, 4.0], [1.0, 2.0]).endswith(": zenoh is sooner in every round")
-    assert said([1.0, 3.0], [2.0, 4.0]).endswith(": not told apart")
+    low, high = [1.0, 2.0, 3.0, 4.0, 5.0], [6.0, 7.0, 8.0, 9.0, 10.0]
+    assert said(low, high).endswith(": mqtt is sooner in every round")
+    assert said(high, low).endswith(": zenoh is sooner in every round")
+    assert said(low, [5.0, *high[1:]]).endswith(": not told apart")
     pair = cells([1.0, 2.0], [2.0, 4.0])
     assert against(pair) == "2.00"
     (line,) = caveat(pair)
     assert line.startswith("2 rounds, and an interval of 99 % takes 8")
+
+
+def test_what_happens_by_chance_is_not_claimed() -> None:
+    """Of two equal robots, all four figures of one lie beyond those of the other in one run of 35."""
+    assert said([1.0, 2.0, 3.0, 4.0], [6.0, 7.0, 8.0, 9.0]).endswith("(6.00 to 9.00) ms")
 
 
 def test_one_round_claims_nothing() -> None:
@@ -60,3 +66,8 @@ def test_one_robot_alone_is_compared_with_nobody() -> None:
 def test_strangers_are_refused(kinds: list[str]) -> None:
     with pytest.raises(PebbleError, match="there are mqtt, zenoh"):
         check_kinds(kinds)
+
+
+def test_nobody_is_compared_with_himself() -> None:
+    with pytest.raises(PebbleError, match="name each transport once"):
+        check_kinds(["mqtt", "zenoh", "mqtt"])

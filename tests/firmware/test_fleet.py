@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from pebble import cli
-from pebble.bench.fleet import Figures, Plan, latencies_ms, measure, run
+from pebble.bench.fleet import Figures, Plan, latencies_ms, longest_gap_s, measure, plan, run
 from pebble.bench.fleet_operator import STEPS
 from pebble.bench.results import load
 from pebble.errors import ConfigError, PebbleError
@@ -76,6 +76,21 @@ class TestLatencies:
         assert len(set(STEPS)) == len(STEPS)
 
 
+def test_a_robot_that_falls_silent_is_missed_until_the_end() -> None:
+    second = 1_000_000_000
+    alive, dead = [number * second for number in range(1, 10)], [second, 2 * second]
+    assert longest_gap_s([alive], 0, 10 * second) == 1.0
+    assert longest_gap_s([alive, dead], 0, 10 * second) == 8.0
+    assert longest_gap_s([alive, []], 0, 10 * second) == 10.0
+
+
+def test_a_quick_fleet_is_small_and_says_so() -> None:
+    quick = plan(quick=True, seconds=2.0)
+    assert (quick.robots, quick.seconds) == (30, 2.0)
+    assert " ".join(quick.command()) == "pebble bench fleet --robots 30 --seconds 2 --rate 10 --quick"
+    assert plan() == Plan()
+
+
 def test_a_small_fleet_is_measured() -> None:
     """Whole: a broker, ten robots, an operator; with bounds that hold on a busy machine too."""
     figures = measure(Plan(robots=10, seconds=5.0))
@@ -93,9 +108,9 @@ def test_a_small_fleet_is_measured() -> None:
 
 def test_what_cannot_be_measured_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for plan in (Plan(robots=MOST + 1), Plan(seconds=0.0), Plan(rate_hz=100.0), Plan(output=tmp_path / "file" / "no")):
+    for bad in (Plan(robots=MOST + 1), Plan(seconds=0.0), Plan(rate_hz=100.0), Plan(output=tmp_path / "file" / "no")):
         with pytest.raises(PebbleError):
-            run(plan)
+            run(bad)
 
 
 def test_figures_are_shown_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

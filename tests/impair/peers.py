@@ -39,7 +39,7 @@ class Talk:
         """Seconds until so many bytes have come from the broker's side."""
         return float(self._ask(f"down {size}"))
 
-    def round_trips(self, n: int = 10) -> list[float]:
+    def round_trips(self, n: int = 5) -> list[float]:
         return [self.up(1) for _ in range(n)]
 
     def send_datagrams(self, n: int) -> None:

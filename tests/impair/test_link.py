@@ -21,7 +21,7 @@ link = open_link(sys.argv[1])
 print(link.kind, flush=True)
 time.sleep(60)
 """
-_SLACK = 8.0  # how many times longer than it must a transfer may take on a busy machine
+_SLACK = 20.0  # how many times longer than it must a transfer may take on a busy machine
 
 
 def gone(pid: int) -> bool:
@@ -34,18 +34,18 @@ def gone(pid: int) -> bool:
 
 def test_a_rate_limits_the_uplink_only_and_the_connection_stays(link: Link, tmp_path: Path) -> None:
     with Talk(link, tmp_path) as talk:
-        link.apply(Condition("256k", Shape(kbit=256)))
-        must = 30_000 * 8 / 256_000
+        link.apply(Condition("1024k", Shape(kbit=1024)))
+        must = 30_000 * 8 / 1_024_000
         assert must * 0.95 < talk.up(30_000) < must * _SLACK
-        assert talk.down(1_000_000) < 1_000_000 * 8 / 256_000 / 2
+        assert talk.down(1_000_000) < 1_000_000 * 8 / 1_024_000 / 2
         link.apply(Condition("base-end"))
-        assert talk.up(1_000_000) < 1_000_000 * 8 / 256_000 / 2
+        assert talk.up(1_000_000) < 1_000_000 * 8 / 1_024_000 / 2
 
 
 def test_both_ways(link: Link, tmp_path: Path) -> None:
     with Talk(link, tmp_path) as talk:
-        link.apply(Condition("256k", Shape(kbit=256), Shape(kbit=256)))
-        must = 30_000 * 8 / 256_000
+        link.apply(Condition("1024k", Shape(kbit=1024), Shape(kbit=1024)))
+        must = 30_000 * 8 / 1_024_000
         assert must * 0.95 < talk.down(30_000) < must * _SLACK
 
 

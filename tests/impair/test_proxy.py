@@ -1,5 +1,6 @@
 """What the proxy makes of TCP."""
 
+import asyncio
 import socket
 import threading
 import time
@@ -9,6 +10,7 @@ import pytest
 
 from pebble.impair.conditions import Condition, Shape
 from pebble.impair.proxy import ProxyLink
+from pebble.impair.proxy_process import _HEADERS, _SEGMENT, Direction
 from tests.support import free_port, until
 
 
@@ -80,6 +82,24 @@ def test_a_lost_segment_holds_up_what_is_behind_it(link: ProxyLink, listener: so
         far.settimeout(0.1)
         with pytest.raises(TimeoutError):
             far.recv(1)
+
+
+def test_a_repetition_is_on_the_wire_too_and_takes_its_part_of_the_rate() -> None:
+    direction, pieces, kbit = Direction("up"), 50, 10_000
+    direction.apply(Shape(kbit=kbit, loss=0.5), 0.0)
+
+    async def carry() -> float:
+        began = time.monotonic()
+        for _ in range(pieces):
+            await direction.carry(_SEGMENT)
+        before = direction.packets
+        await direction.carry(1)  # waits for all of them
+        return (time.monotonic() - began) * kbit * 1000 / 8 - (before - 5) * (_SEGMENT + _HEADERS)
+
+    assert asyncio.run(carry()) > 0
+    assert direction.dropped > pieces / 4
+    assert direction.packets == pieces + 1 + direction.dropped
+    assert direction.bytes > (pieces + direction.dropped / 2) * (_SEGMENT + _HEADERS)
 
 
 def test_connections_share_the_rate(link: ProxyLink, listener: socket.socket) -> None:

@@ -48,7 +48,7 @@ def test_startup_of_both_kinds(tmp_path: Path) -> None:
 
 
 def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost_robot, "_SETTLE_S", 0.1)
+    monkeypatch.setattr(cost_robot, "_SETTLE_S", 0.0)
     said = io.StringIO()
     plan = cost.Plan(rounds=1, seconds=0.4, quick=True, output=tmp_path)
     assert cost.run(plan, Console(file=said, width=100)) == 0

@@ -1,0 +1,51 @@
+"""What /proc tells of processes, and of those that have gone."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pebble.bench import usage
+from pebble.bench.frames_process import Worker
+from pebble.bench.usage import children, cpu_s, pss_mb
+from pebble.errors import PebbleError
+from tests.support import Child
+
+GONE = 1 << 22  # above the largest pid
+
+
+def test_cpu_time_is_finer_than_ticks() -> None:
+    before, end = cpu_s([os.getpid()]), time.process_time() + 0.003
+    while time.process_time() < end:
+        pass
+    assert 0.003 <= cpu_s([os.getpid(), GONE]) - before < 5
+
+
+def test_a_child_is_found_by_its_parent() -> None:
+    child = Child([sys.executable, "-c", "input()"], stdin=-1)
+    assert child.pid in children(os.getpid())
+    assert children(child.pid) == []
+    child.communicate()
+    assert child.pid not in children(os.getpid())
+
+
+def test_memory_of_what_has_gone_is_nothing_and_of_what_is_not_told_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert pss_mb(os.getpid()) > 1
+    assert pss_mb(GONE) == 0
+    monkeypatch.setattr(usage, "_PROC", tmp_path)
+    (tmp_path / "7").mkdir()
+    with pytest.raises(PebbleError, match="smaps_rollup"):
+        pss_mb(7)
+    assert pss_mb(8) == 0
+
+
+def test_a_worker_that_has_ended_says_so_when_it_is_asked(tmp_path: Path) -> None:
+    worker = Worker("sender", [sys.executable, "-c", "exit('no broker')"], tmp_path / "log")
+    with pytest.raises(PebbleError, match="no broker"):
+        worker.answer(20)
+    worker.tell("1")
+    worker.ask_to_end()
