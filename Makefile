@@ -24,7 +24,7 @@ test: check
 	@echo "pebble: tests"
 	@$(VENV) -m pytest --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone"
 	@echo "pebble: whole robots and lines, two at a time because their deadlines are checked"
-	@$(VENV) -m pytest --numprocesses 2 --dist loadscope -m alone tests/robot tests/services
+	@$(VENV) -m pytest --numprocesses 2 --dist loadscope -m alone tests/robot tests/services tests/test_demo.py
 
 firmware: .venv/.ready-dev
 	@sh tools/debian-packages.sh node=nodejs

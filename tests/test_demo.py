@@ -19,6 +19,8 @@ from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.script import ROUND_S
 from tests.support import ROOT, until
 
+pytestmark = pytest.mark.alone
+
 START_S, END_S = 40.0, 5.0
 MARK = "PEBBLE_TEST_DEMO"
 

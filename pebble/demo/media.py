@@ -29,6 +29,7 @@ _CHANGE_S = 1.5  # until another encoding has surely come; not judged
 ROUND_S = LOOK_S * len(VIDEO)
 _LISTEN_S = ROUND_S / len(AUDIO)
 _STEP_S = 0.1
+_GAP_MS = 15.0  # less than the shortest chunk
 _KNOWN_S = 5.0
 _PICTURES, _SOUNDS, _VERDICTS = 1000, 5000, 200  # that wait to be judged
 
@@ -41,7 +42,7 @@ class Watched(Audience):
         self.problem = ""
         self.audio_rate = 0
         self._shown: deque[tuple[str, Shown]] = deque(maxlen=_PICTURES)
-        self._stretch: deque[tuple[str, int, Samples]] = deque(maxlen=_SOUNDS)
+        self._stretch: deque[Heard] = deque(maxlen=_SOUNDS)
 
     def take_shown(self, encoding: str) -> list[Shown]:
         """The pictures of ``encoding`` since the last time."""
@@ -49,17 +50,14 @@ class Watched(Audience):
         return [one for name, one in list(shown) if name == encoding]
 
     def take_heard(self, encoding: str) -> Samples:
-        """The longest stretch of sound of ``encoding`` since the last time in which no packet is missing; mono."""
-        heard, self._stretch = self._stretch, deque(maxlen=_SOUNDS)
+        """The longest stretch of sound of ``encoding`` since the last time in which nothing is missing; mono."""
+        taken, self._stretch = self._stretch, deque(maxlen=_SOUNDS)
+        heard = [one for one in list(taken) if one.encoding == encoding]
         stretches: list[list[Samples]] = [[]]
-        before = None
-        for name, sequence, samples in list(heard):
-            if name != encoding:
-                continue
-            if before is not None and sequence != before + 1:
+        for before, one in zip([None, *heard], heard, strict=False):
+            if before is not None and not _follows(before, one):
                 stretches.append([])
-            stretches[-1].append(samples)
-            before = sequence
+            stretches[-1].append(one.samples.mean(axis=1))
         longest = max(stretches, key=len)
         return np.concatenate(longest) if longest else np.zeros(0)
 
@@ -69,7 +67,13 @@ class Watched(Audience):
 
     def on_sound(self, heard: Heard) -> None:
         self.audio_rate = heard.rate
-        self._stretch.append((heard.encoding, heard.sequence, heard.samples.mean(axis=1)))
+        self._stretch.append(heard)
+
+
+def _follows(before: Heard, one: Heard) -> bool:
+    """Is it the very next? On a machine that stood still the microphone, too, misses something, and counts on."""
+    due_ms = before.captured_ms + 1000 * len(before.samples) / before.rate
+    return one.sequence == before.sequence + 1 and abs(one.captured_ms - due_ms) < _GAP_MS
 
 
 class MediaShow:
