@@ -170,13 +170,13 @@ class MqttBridge(Service):
     def _open(self) -> None:
         if self._remote.state is not State.CONNECTED or self._forwarder.gate is Gate.OPEN:
             return
-        self.log.info("forwarding between the robot and its remote side")
         was_shut = self._forwarder.gate is Gate.SHUT
         self._forwarder.open()
         if was_shut:  # what was said meanwhile went nowhere: ask for the kept copies again
             _close_all(self._local_subscriptions)
             self._listen_locally()
         self._listen_remotely()
+        self.log.info("forwarding between the robot and its remote side")
 
     def _suspect(self) -> None:
         """A heartbeat like ours came from the local side: ours, or one of the same millisecond?"""
