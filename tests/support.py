@@ -36,6 +36,14 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def gone(pid: int) -> bool:
+    """Has this process ended? A container without init may have nobody who collects it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
 class Child(subprocess.Popen[Any]):
     """A program that a killed pytest leaves not behind."""
 

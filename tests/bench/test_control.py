@@ -45,14 +45,6 @@ def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output, "find_spec", lambda _name: None)
 
 
-@pytest.fixture
-def temporary(tmp_path: Path) -> Path:
-    """Where the bench makes its folders; short, because of unix sockets."""
-    folder = tmp_path / "t"
-    folder.mkdir()
-    return folder
-
-
 def test_all_variants_alone_and_beside_a_busy_process(temporary: Path, tmp_path: Path) -> None:
     options = ("--sizes", "40", "--rates", "200", "--loads", "none,hog", "--seconds", "0.1", "--rounds", "1")
     ended = subprocess.run(

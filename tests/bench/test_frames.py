@@ -38,14 +38,6 @@ def segments(pid: int) -> set[Path]:
     return {Path(line.split()[5]) for line in lines if line.endswith(".zenoh")}
 
 
-@pytest.fixture
-def temporary(tmp_path: Path) -> Path:
-    """Where the bench makes its folders; short, because of unix sockets."""
-    folder = tmp_path / "t"
-    folder.mkdir()
-    return folder
-
-
 def test_a_short_run_leaves_results_and_nothing_else(temporary: Path, tmp_path: Path) -> None:
     folder = tmp_path / "results"
     options = ("--seconds", "0.3", "--rounds", "2", "--size", "64x48", "--readers", "1", "--output", str(folder))

@@ -25,7 +25,7 @@ from pebble.bench.usage import children
 from pebble.commands import bench, impair
 from pebble.errors import PebbleError
 from tests.bench import synthetic
-from tests.support import ROOT, Child, until
+from tests.support import ROOT, Child, gone, until
 
 
 def section(name: str, results: Results | None = None, said: str = "") -> Section:
@@ -276,14 +276,6 @@ def test_ctrl_c_ends_the_comparison_that_runs(tmp_path: Path) -> None:
         process.send_signal(signal.SIGTERM)
         assert process.wait(40) == 130
         assert until(lambda: gone(child), 20)
-
-
-def gone(pid: int) -> bool:
-    """Ended; a container without init may have nobody who collects it."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
 
 
 @pytest.mark.parametrize("quick", [False, True], ids=["full", "quick"])

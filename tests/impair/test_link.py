@@ -12,7 +12,7 @@ from pebble.errors import PebbleError
 from pebble.impair.conditions import Condition, Shape, chosen
 from pebble.impair.link import Link, open_link
 from tests.impair.peers import Talk
-from tests.support import ROOT, Child, until
+from tests.support import ROOT, Child, gone, until
 
 _OWNER = """
 import sys, time
@@ -22,14 +22,6 @@ print(link.kind, flush=True)
 time.sleep(60)
 """
 _SLACK = 20.0  # how many times longer than it must a transfer may take on a busy machine
-
-
-def gone(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return True
-    return state == "Z"
 
 
 def test_a_rate_limits_the_uplink_only_and_the_connection_stays(link: Link, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.launcher.program import Stage
-from tests.support import ROOT, until
+from tests.support import ROOT, gone, until
 
 BASE = "pebble/robots/rover"
 FAKES = ROOT / "tests" / "fakes"
@@ -117,13 +117,6 @@ def _config(run_dir: Path, launcher: dict[str, Any]) -> dict[str, Any]:
 def lines_of(file: Path) -> list[str]:
     """The complete lines of a file that may still be written to."""
     return file.read_text().rpartition("\n")[0].splitlines() if file.exists() else []
-
-
-def gone(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
 
 
 Launch = Callable[..., Robot]

@@ -21,8 +21,8 @@ from pebble.launcher.launcher import Launcher
 from pebble.launcher.program import Program, Stage
 from pebble.launcher.programs import programs, shared_modules, transport_modules
 from pebble.launcher.run_lock import RunLock
-from tests.launcher.robot import BASE, DEVICE, FABRIC, LINK, Launch, gone, lines_of
-from tests.support import ROOT, until
+from tests.launcher.robot import BASE, DEVICE, FABRIC, LINK, Launch, lines_of
+from tests.support import ROOT, gone, until
 
 # -- starting
 

@@ -18,8 +18,8 @@ from pebble.launcher.keeper import Keeper
 from pebble.launcher.on_demand import OnDemand
 from pebble.launcher.program import Program, Stage
 from pebble.launcher.reactor import Reactor
-from tests.launcher.robot import DEVICE, LINK, Launch, Robot, Row, gone, lines_of
-from tests.support import until
+from tests.launcher.robot import DEVICE, LINK, Launch, Robot, Row, lines_of
+from tests.support import gone, until
 
 ASKER: Row = ("bridge", "asker", LINK, {"asks": True})
 

@@ -15,7 +15,7 @@ from typing import Any
 from pebble.simulation.trace import Entry, read_trace
 from tests.link import Link
 from tests.robot.operator import Operator
-from tests.support import ROOT, Broker, until
+from tests.support import ROOT, Broker, gone, until
 
 BASE = "pebble/robots/rover"
 STOP = (0.0, 0.0)
@@ -163,10 +163,7 @@ class Rig:
     @staticmethod
     def alive(pid: int) -> bool:
         """Does this process still run? (A zombie does not.)"""
-        try:
-            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-        except FileNotFoundError:
-            return False
+        return not gone(pid)
 
     def close(self) -> None:
         self.operator.close()
