@@ -11,10 +11,11 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from enum import Enum, IntEnum
 from types import TracebackType
 from typing import Self
+
+import msgspec
 
 from pebble.errors import TransportError
 from pebble.transports.counters import Counters
@@ -43,8 +44,7 @@ class State(Enum):
     CONNECTED = "connected"
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(msgspec.Struct, frozen=True):
     """What travels. ``retain`` and ``keep`` differ: a *kept copy* is old news, a message *to be kept* is fresh.
 
     Published: ``retain`` asks for a kept copy. Received: ``retain`` marks the kept copy itself; on a connection opened
@@ -250,7 +250,7 @@ class Transport(ABC):
         check_topic(topic)
         if not isinstance(payload, bytes):
             raise TransportError(f"payload of {topic} must be bytes, not {type(payload).__name__}")
-        message = Message(topic, payload, QoS(qos), retain)
+        message = Message(topic, payload, qos if type(qos) is QoS else QoS(qos), retain)
         with self._publishing:
             if self._state is State.CLOSED:
                 self.counters.add("refused")

@@ -8,7 +8,9 @@ from __future__ import annotations
 import itertools
 import threading
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+
+from msgspec.structs import replace
 
 from pebble.transports.base import Message, State, Subscription, Transport
 

@@ -19,6 +19,11 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.transports.settings import TlsSettings, ZenohSettings
 
+# Zenoh reads this once, before the first session. By default links are accepted, opened and read on runtimes of their
+# own: what arrives wakes up a thread that does nothing but wake up another. Measured with 1.10.2 (40 B at 200 Hz, there
+# and back, two cores): 9.6 wake-ups instead of 14, and 0.9 of the time. Sending keeps its own: a callback may send.
+os.environ.setdefault("ZENOH_RUNTIME", "(acc: (handover: rx), net: (handover: rx))")
+
 HUB_SOCKET = "hub.sock"
 
 BLOCK_MS = 300  # a publish waits this long for a receiver that takes nothing; then that receiver's link is closed

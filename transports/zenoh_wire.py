@@ -40,6 +40,8 @@ TREATMENTS = {  # by quality and urgency
     (QoS.LATEST, True): {**_FIRST, **_DROP},
 }
 
+_QUALITIES = (QoS.LATEST, QoS.DELIVERED)
+
 _LIVE = struct.Struct(">BIQ")  # quality and keep, boot, ns since it
 _KEPT = struct.Struct(">BQ")
 _NUMBER = struct.Struct(">Q")
@@ -67,10 +69,11 @@ def pack_live(qos: QoS, *, keep: bool) -> bytes:
 
 def read_live(attachment: zenoh.ZBytes | None) -> LiveStamp:
     """Messages of programs that are not ours have no stamp."""
-    if attachment is None or len(attachment) != _LIVE.size:
+    data = b"" if attachment is None else attachment.to_bytes()
+    if len(data) != _LIVE.size:
         return LiveStamp(QoS.LATEST, None, 0, 0)
-    flags, boot, sent_ns = _LIVE.unpack(attachment.to_bytes())
-    return LiveStamp(QoS.DELIVERED if flags & 1 else QoS.LATEST, bool(flags & 2), boot, sent_ns)
+    flags, boot, sent_ns = _LIVE.unpack(data)
+    return LiveStamp(_QUALITIES[flags & 1], bool(flags & 2), boot, sent_ns)
 
 
 class Stamp(msgspec.Struct, frozen=True):

@@ -11,11 +11,12 @@ from pebble.bench import null
 from pebble.bench.control_cast import Cast, Slice, joined
 from pebble.bench.control_ends import Order
 from pebble.bench.control_plan import Condition, Plan
-from pebble.bench.control_report import MEASURES, ONE_WAY, legend, tables, verdict
+from pebble.bench.control_report import MEASURES, ONE_WAY, legend, tables, verdict, waking
 from pebble.bench.figures import percentile, rounded
 from pebble.bench.output import check_folder, finish
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, Stopwatch, Value
+from pebble.bench.wake import wake_up_us
 from pebble.errors import PebbleError
 from pebble.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
@@ -35,13 +36,14 @@ def run(plan: Plan, console: Console | None = None) -> int:
     check_folder(plan.output)
     console.print(_announcement(plan), highlight=False, soft_wrap=True)
     watch = Stopwatch(plan.bench, plan.command, _options(plan))
+    wake_ups_us = wake_up_us()
     with interrupted_by_signals():
         try:
             measured, problems = _measure(plan, console)
         finally:
             sweep()  # Zenoh leaves a file behind even when it ends politely
     cells = cells_of(plan, measured)
-    said = null.verdict(cells) if plan.null else verdict(cells)
+    said = null.verdict(cells) if plan.null else [*waking(cells, *wake_ups_us), *verdict(cells)]
     if len(measured) < plan.rounds:
         why = ", ".join(dict.fromkeys(problems))
         said.insert(0, f"{plan.rounds - len(measured)} of {plan.rounds} rounds failed and were left out: {why}")
@@ -163,5 +165,10 @@ def _figures(slices: Sequence[Slice]) -> dict[str, Value]:
         "late": whole.answer.late,
         "cpu_percent": round(whole.cpu, 1),
         "broker_cpu_percent": round(whole.backbone_cpu, 1),
+        "call_us": rounded(percentile(whole.answer.call, 50), 1),
+        "fabric_us": rounded(percentile(whole.answer.fabric, 50), 1),
+        "inbox_us": rounded(percentile(whole.answer.inbox, 50), 1),
+        "wake_ups": round(whole.wake_ups, 1),
+        "broker_wake_ups": round(whole.backbone_wake_ups, 1),
         "pictures_hz": rounded(whole.pictures_hz, 1),
     }

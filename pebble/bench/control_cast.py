@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from types import TracebackType
@@ -22,7 +22,7 @@ from pebble.bench.control_variants import VARIANTS, Variant
 from pebble.bench.control_worker import Answer, Place
 from pebble.bench.frames_process import Worker, end_workers
 from pebble.bench.null import variant_of
-from pebble.bench.usage import cpu_s
+from pebble.bench.usage import cpu_s, wake_ups
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
@@ -39,12 +39,29 @@ _PYTHON = [sys.executable, "-m"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slice:
-    """What one role did under one condition in one round; CPU in % of one core."""
+    """What one role did under one condition in one round; CPU in % of one core, wake-ups per round trip."""
 
     answer: Answer
     cpu: float
     backbone_cpu: float
-    pictures_hz: float | None
+    wake_ups: float
+    backbone_wake_ups: float
+    pictures_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Used:
+    """By some processes, until a moment, or between two."""
+
+    cpu_s: float
+    wake_ups: int
+
+    def __sub__(self, earlier: Used) -> Used:
+        return Used(self.cpu_s - earlier.cpu_s, self.wake_ups - earlier.wake_ups)
+
+
+def _used(pids: Sequence[int]) -> Used:
+    return Used(cpu_s(pids), wake_ups(pids))
 
 
 def joined(slices: Sequence[Slice]) -> Slice:
@@ -53,13 +70,19 @@ def joined(slices: Sequence[Slice]) -> Slice:
     rates = [one.pictures_hz for one in slices if one.pictures_hz is not None]
     return Slice(
         answer=Answer(
+            trips=sum(answer.trips for answer in answers),
             sent=sum(answer.sent for answer in answers),
             late=sum(answer.late for answer in answers),
             one_way=[sample for answer in answers for sample in answer.one_way],
             round_trip=[sample for answer in answers for sample in answer.round_trip],
+            call=[sample for answer in answers for sample in answer.call],
+            fabric=[sample for answer in answers for sample in answer.fabric],
+            inbox=[sample for answer in answers for sample in answer.inbox],
         ),
         cpu=fmean(one.cpu for one in slices),
         backbone_cpu=fmean(one.backbone_cpu for one in slices),
+        wake_ups=fmean(one.wake_ups for one in slices),
+        backbone_wake_ups=fmean(one.backbone_wake_ups for one in slices),
         pictures_hz=fmean(rates) if rates else None,
     )
 
@@ -114,15 +137,21 @@ class Player:
             for end in ("reader", "writer"):
                 self.media.append(self._worker(end, ["pebble.bench.control_load", end, *self.backbone.stream]))
 
-    def run(self, order: Order) -> tuple[Answer, float, float]:
-        """The answer of its sender; the CPU of its two ends, and of its backbone."""
-        pids = [worker.pid for worker in self.ends]
-        began, used, backbone = time.monotonic(), cpu_s(pids), cpu_s([self.backbone.program.pid])
+    def run(self, order: Order) -> Slice:
+        """What its sender answers, and what its ends and its backbone have used for that."""
+        every = ([worker.pid for worker in self.ends], [self.backbone.program.pid])
+        began, before = time.monotonic(), [_used(pids) for pids in every]
         line = msgspec.json.encode(order).decode()
         answer = msgspec.convert(_ask(self.ends[1], line, order.seconds + _ANSWER_S), Answer)
         took = time.monotonic() - began
-        costs = (cpu_s(pids) - used, cpu_s([self.backbone.program.pid]) - backbone)
-        return answer, 100 * costs[0] / took, 100 * costs[1] / took
+        ends, backbone = (_used(pids) - used for pids, used in zip(every, before, strict=True))
+        return Slice(
+            answer=answer,
+            cpu=100 * ends.cpu_s / took,
+            backbone_cpu=100 * backbone.cpu_s / took,
+            wake_ups=ends.wake_ups / answer.trips,
+            backbone_wake_ups=backbone.wake_ups / answer.trips,
+        )
 
     def _worker(self, end: str, arguments: Sequence[str]) -> Worker:
         return Worker(f"{self.role}: {end}", [*_PYTHON, *arguments], self._folder / f"{end}.log")
@@ -153,10 +182,9 @@ class Cast:
         player = self._players[role]
         with self._loaded(player, load):
             before, began = self._pictures(player, load), time.monotonic()
-            answer, cpu, backbone_cpu = player.run(order)
+            slice_ = player.run(order)
             pictures, took = self._pictures(player, load) - before, time.monotonic() - began
-        pictures_hz = pictures / took if load == MEDIA else None
-        return Slice(answer=answer, cpu=cpu, backbone_cpu=backbone_cpu, pictures_hz=pictures_hz)
+        return replace(slice_, pictures_hz=pictures / took) if load == MEDIA else slice_
 
     def _start(self, folder: Path) -> None:
         for number, role in enumerate(self._roles):

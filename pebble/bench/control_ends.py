@@ -20,7 +20,7 @@ from pebble.bench.null import spin
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.inbox import Inbox
-from pebble.transports import QoS, State, Transport
+from pebble.transports import Message, QoS, State, Transport
 
 REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"  # below them: who asks
 QOS = QoS(DRIVE.default_qos)
@@ -46,6 +46,8 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 class Link(Protocol):
     """One connection of one end."""
 
+    came_ns: int  # CLOCK_MONOTONIC: when its own thread had the message that is being handled
+
     def listen(self, filter_: str, handler: Handler) -> None: ...
 
     def publish(self, topic: str, payload: bytes) -> None: ...
@@ -57,6 +59,7 @@ class TransportLink:
     """Any of Pebble's transports, used with the calls that pebble.service.Service uses."""
 
     def __init__(self, transport: Transport, inbox: Inbox) -> None:
+        self.came_ns = 0
         self._transport, self._inbox = transport, inbox
         transport.open(_CONNECT_S)
         if transport.state is not State.CONNECTED:
@@ -65,12 +68,15 @@ class TransportLink:
             raise PebbleError(f"no connection: {problem or 'nobody answers'}")
 
     def listen(self, filter_: str, handler: Handler) -> None:
-        self._transport.subscribe(
-            filter_,
-            lambda message: self._inbox.post(lambda: handler(message.topic, message.payload)),
-            qos=QOS,
-            direct=True,
-        )
+        def hear(message: Message) -> None:
+            came_ns = time.monotonic_ns()
+            self._inbox.post(lambda: handle(message, came_ns))
+
+        def handle(message: Message, came_ns: int) -> None:
+            self.came_ns = came_ns
+            handler(message.topic, message.payload)
+
+        self._transport.subscribe(filter_, hear, qos=QOS, direct=True)
 
     def publish(self, topic: str, payload: bytes) -> None:
         self._transport.publish(topic, payload, qos=QOS)
@@ -87,6 +93,7 @@ class PahoLink:
         from paho.mqtt.enums import CallbackAPIVersion
 
         connected, subscribed = threading.Event(), threading.Event()
+        self.came_ns = 0
         self._subscribed = subscribed
         self._client = Client(CallbackAPIVersion.VERSION2)
         self._client.on_connect = lambda *_: connected.set()
@@ -98,6 +105,7 @@ class PahoLink:
 
     def listen(self, filter_: str, handler: Handler) -> None:
         def hear(_client: Any, _data: Any, message: Any) -> None:
+            self.came_ns = time.monotonic_ns()
             handler(message.topic, message.payload)
 
         self._client.on_message = hear
@@ -142,6 +150,9 @@ class Sender:
         self._topic = f"{REQUESTS}/{who}"
         self._next = self._first = self._missing = 0
         self._heard: list[Exchange | None] = []
+        self._calls: list[int] = []
+        self.trips = 0  # in the last slice
+        self.calls_ns: list[int] = []  # how long its publish calls took
         self.ended = False
         link.listen(f"{REPLIES}/{who}", self._hear)
 
@@ -173,11 +184,12 @@ class Sender:
                 self._send(self._first + sent, order)
                 sent, due = sent + 1, due + period
         self._collect(_LAST_S)
+        self.trips, self.calls_ns = sent, self._calls[lead:]
         return counting, late, [exchange for exchange in self._heard[lead:] if exchange is not None]
 
     def _expect(self, count: int) -> None:
         self._first, self._next = self._next, self._next + count
-        self._heard, self._missing = [None] * count, count
+        self._heard, self._missing, self._calls = [None] * count, count, []
 
     def _send(self, number: int, order: Order) -> None:
         if not order.slowed:
@@ -185,7 +197,9 @@ class Sender:
         message = request(number, self._clock(), order.size)
         if order.slowed:
             spin(order.work_us)
+        called = time.monotonic_ns()
         self._link.publish(self._topic, message)
+        self._calls.append(time.monotonic_ns() - called)
 
     def _collect(self, timeout: float) -> None:
         end = time.monotonic() + timeout
@@ -205,5 +219,5 @@ class Sender:
             return
         index = number - self._first
         if 0 <= index < len(self._heard) and self._heard[index] is None:  # QoS 1 may deliver twice
-            self._heard[index] = Exchange(t1, t2, t3, heard)
+            self._heard[index] = Exchange(t1, t2, t3, heard, self._link.came_ns)
             self._missing -= 1

@@ -38,7 +38,10 @@ def tables(cells: Sequence[Cell]) -> list[Table]:
     measures = list(dict.fromkeys(cell.measure for cell in cells))
     found = [_times([cell for cell in cells if cell.measure == measure], measure) for measure in measures]
     others = [cell for cell in cells if cell.measure == ONE_WAY and cell.variant != BASELINE]
-    return [*found, _ratios(others, cells)] if others and len(others) < len(cells) / len(measures) else found
+    if others and len(others) < len(cells) / len(measures):
+        found.append(_ratios(others, cells))
+    known = [cell for cell in cells if _is_judged(cell) and cell.params["load"] == NONE and "fabric_us" in cell.figures]
+    return [*found, _hops(known)] if known else found
 
 
 def _times(cells: Sequence[Cell], measure: str) -> Table:
@@ -56,6 +59,15 @@ def _ratios(cells: Sequence[Cell], everybody: Sequence[Cell]) -> Table:
     for row in _by_condition(cells):
         by_name = {cell.variant: _ratio(cell, base_of(cell, everybody, BASELINE)) for cell in row}
         table.add_row(*_conditions(row[0]), *(by_name.get(name, "") for name in names))
+    return table
+
+
+def _hops(cells: Sequence[Cell]) -> Table:
+    heads = ["publish\ncall", "thread\nhas it", "handler\nruns", "wake-ups:\nends", "broker\nor hub"]
+    table = plain_table("where the time goes: 40 B at 200 Hz, unloaded, medians, us", ["variant", *heads])
+    for cell in cells:
+        names = ("call_us", "fabric_us", "inbox_us", "wake_ups", "broker_wake_ups")
+        table.add_row(cell.variant, *(figure(float(cell.figures.get(name) or math.nan)) for name in names))
     return table
 
 
@@ -92,9 +104,25 @@ def _table(title: str, names: Sequence[str]) -> Table:
     return table
 
 
+def waking(cells: Sequence[Cell], same_us: float, other_us: float) -> list[str]:
+    """What one wake-up costs here, on the same core and on another one, beside how many of them a message takes."""
+    ways, told = _judged(cells), []
+    for name in (_better(ways, NONE, 50), P2P):
+        figures = ways[name, NONE].figures if name and (name, NONE) in ways else {}
+        ends, backbone = (float(figures.get(key) or 0) for key in ("wake_ups", "broker_wake_ups"))
+        if ends:
+            told.append(f"{ends + backbone:.1f} with {name}")
+    if not told:
+        return []
+    return [
+        f"A process that waits is woken up within {same_us:.0f} us on the same core, {other_us:.0f} us on another; "
+        f"there and back a message takes {' and '.join(told)} such wake-ups, brokers included."
+    ]
+
+
 def verdict(cells: Sequence[Cell]) -> list[str]:
     """Plain sentences; what was not measured is not spoken of."""
-    ways = {(cell.variant, str(cell.params["load"])): cell for cell in cells if _is_judged(cell)}
+    ways = _judged(cells)
     said = ["40 B at 200 Hz, one way, medians unless p99 is named; in brackets the 99 % interval of the ratio."]
     said += _against_mqtt(ways, NONE, 50) + _against_mqtt(ways, MEDIA, 99) + _pictures(ways)
     said += _pair(ways, (HUB, NONE), (P2P, NONE), 50)
@@ -105,6 +133,10 @@ def verdict(cells: Sequence[Cell]) -> list[str]:
     said += _pair(ways, ("mqtt5", NONE), ("mqtt-nodelay", NONE), 50)
     said = said if len(said) > 1 else []
     return said + _doubts(cells) + _aims({key: _with_lost(cell) for key, cell in ways.items()})
+
+
+def _judged(cells: Sequence[Cell]) -> _Ways:
+    return {(cell.variant, str(cell.params["load"])): cell for cell in cells if _is_judged(cell)}
 
 
 def _is_judged(cell: Cell) -> bool:

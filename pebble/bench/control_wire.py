@@ -18,6 +18,7 @@ class Exchange(NamedTuple):
     t2: int
     t3: int
     t4: int
+    came: int = 0  # before t4: when the near transport's thread had it
 
 
 def request(number: int, t1: int, size: int) -> bytes:

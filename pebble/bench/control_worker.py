@@ -38,10 +38,14 @@ class Place(msgspec.Struct, frozen=True, kw_only=True):
 class Answer(msgspec.Struct, frozen=True, kw_only=True):
     """What became of a slice, µs."""
 
-    sent: int
+    trips: int  # all that were sent
+    sent: int  # those that count
     late: int
     one_way: list[float]
     round_trip: list[float]
+    call: list[float]  # the publish calls of this end
+    fabric: list[float]  # from the echo's publish call until this end's transport had the reply
+    inbox: list[float]  # from there until its handler ran
 
 
 def main(arguments: list[str]) -> int:
@@ -100,10 +104,14 @@ def _send(link: Link, inbox: Inbox) -> None:
 def _run(sender: Sender, line: str) -> Answer:
     sent, late, exchanges = sender.run(msgspec.json.decode(line, type=Order))
     return Answer(
+        trips=sender.trips,
         sent=sent,
         late=late,
         one_way=[(exchange.t2 - exchange.t1) / 1000 for exchange in exchanges],
         round_trip=[(exchange.t4 - exchange.t1) / 1000 for exchange in exchanges],
+        call=[ns / 1000 for ns in sender.calls_ns],
+        fabric=[(exchange.came - exchange.t3) / 1000 for exchange in exchanges],
+        inbox=[(exchange.t4 - exchange.came) / 1000 for exchange in exchanges],
     )
 
 

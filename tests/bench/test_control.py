@@ -74,6 +74,10 @@ def test_pictures_flow_beside_the_messages_and_replies_take_longer_than_the_way_
     assert all(float(cell.figures["pictures_hz"] or 0) > 0 for cell in cells)
     for there, back in zip(cells[:2], cells[2:], strict=True):
         assert all(a < b for a, b in zip(there.samples, back.samples, strict=True))
+        hops = [float(there.figures[name] or 0) for name in ("call_us", "fabric_us", "inbox_us")]
+        assert min(hops) > 0
+        assert hops[1] + hops[2] < max(back.samples)
+        assert float(there.figures["wake_ups"] or 0) >= 4  # a service has two threads at least that take part
 
 
 def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:

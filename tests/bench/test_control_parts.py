@@ -41,6 +41,8 @@ def test_messages_have_the_size_that_was_asked_for_both_ways(size: int) -> None:
 class Loop:
     """A link to an echo in this very process; what ``spoil`` says is done to replies on their way."""
 
+    came_ns = 0
+
     def __init__(self, spoil: Callable[[bytes], list[bytes]] = lambda payload: [payload]) -> None:
         self._handlers: dict[str, Handler] = {}
         self._spoil = spoil
@@ -159,8 +161,11 @@ class FakeCast:
     def run(self, role: str, order: Order, load: str) -> Slice:
         self.calls.append((role, order, load))
         times = [100.0 + order.slowed * order.work_us + number for number in range(10)]
-        answer = Answer(sent=10, late=0, one_way=times, round_trip=[2 * one for one in times])
-        return Slice(answer=answer, cpu=1.0, backbone_cpu=0.5, pictures_hz=None)
+        answer = Answer(
+            trips=12, sent=10, late=0, one_way=times, round_trip=[2 * one for one in times],
+            call=[50.0] * 10, fabric=[70.0] * 10, inbox=[30.0] * 10,
+        )  # fmt: skip
+        return Slice(answer=answer, cpu=1.0, backbone_cpu=0.5, wake_ups=7.0, backbone_wake_ups=3.5)
 
 
 @pytest.fixture
@@ -187,6 +192,8 @@ def test_every_other_round_goes_backwards_and_one_that_fails_is_left_out_for_all
     assert all(len(cell.rounds) == 3 for cell in results.cells)
     assert results.verdict[0] == "1 of 4 rounds failed and were left out: mqtt: echo said nothing"
     assert {cell.lost for cell in results.cells} == {0}
+    assert "50.0 70.0 30.0 7.00 3.50" in " ".join(said.getvalue().split())
+    assert "10.5 with mqtt and 10.5 with zenoh-p2p such wake-ups" in results.verdict[1]
 
 
 @pytest.mark.usefixtures("fake")

@@ -9,7 +9,8 @@ import pytest
 
 from pebble.bench import usage
 from pebble.bench.frames_process import Worker
-from pebble.bench.usage import children, cpu_s, pss_mb
+from pebble.bench.usage import children, cpu_s, pss_mb, wake_ups
+from pebble.bench.wake import wake_up_us
 from pebble.errors import PebbleError
 from tests.support import Child
 
@@ -21,6 +22,20 @@ def test_cpu_time_is_finer_than_ticks() -> None:
     while time.process_time() < end:
         pass
     assert 0.003 <= cpu_s([os.getpid(), GONE]) - before < 5
+
+
+def test_who_waits_is_woken_up() -> None:
+    before = wake_ups([os.getpid(), GONE])
+    for _ in range(5):
+        time.sleep(0.001)
+    assert wake_ups([os.getpid(), GONE]) - before >= 5
+
+
+def test_a_wake_up_takes_its_time_and_leaves_this_thread_all_its_cores() -> None:
+    cores, children_ = os.sched_getaffinity(0), children(os.getpid())
+    assert all(0 < us < 1e6 for us in wake_up_us())
+    assert os.sched_getaffinity(0) == cores
+    assert children(os.getpid()) == children_
 
 
 def test_a_child_is_found_by_its_parent() -> None:

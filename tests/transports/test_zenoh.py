@@ -20,6 +20,7 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
+from pebble.transports import zenoh as zenoh_transport
 from pebble.transports import zenoh_wire as wire
 from pebble.transports.zenoh_hub import ZenohHub, run_hub
 from tests.support import ROOT, free_port, until
@@ -310,6 +311,17 @@ def test_a_stopped_sibling_blocks_a_flood_once_and_for_a_bounded_time(robot: Rob
     assert max(times) < 1.5  # 0.3 s, and what a loaded machine adds
     assert sum(seconds > 0.25 for seconds in times) <= 2
     stopped.resume()
+
+
+def test_more_topics_than_publishers_are_heard_in_order(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_transport, "_PUBLISHERS", 3)
+    heard: dict[str, list[int]] = {}
+    robot.client("receiver").subscribe("many/+", lambda m: heard.setdefault(m.topic, []).append(int(m.payload)))
+    sender = robot.client("sender")
+    for number in range(70):
+        assert sender.publish(f"many/{number % 7}", b"%d" % number, qos=QoS(number % 2), urgent=number % 3 == 0)
+    assert until(lambda: sum(map(len, heard.values())) == 70)
+    assert heard == {f"many/{topic}": list(range(topic, 70, 7)) for topic in range(7)}
 
 
 def test_a_hub_that_stands_still_holds_up_no_flood_it_does_not_listen_to(robot: Robot) -> None:
