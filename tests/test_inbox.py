@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import signal
 import threading
+import time
 
 from pebble.inbox import Inbox
 from tests.support import until
@@ -39,7 +41,6 @@ def test_beyond_the_limit_the_oldest_is_dropped_and_counted() -> None:
     drain(inbox)
     assert ran == [8, 9, 101]
     assert inbox.dropped == 8
-    assert inbox._wakes.qsize() == 0, "as many wake-ups as jobs: the one is bounded if the other is"
 
 
 def test_internal_jobs_are_first_in_line_and_never_dropped() -> None:
@@ -72,3 +73,35 @@ def test_a_waiting_thread_is_woken() -> None:
 
 def test_take_gives_up_after_its_timeout() -> None:
     assert Inbox().take(0.01) is None
+
+
+def test_a_timeout_that_ends_while_it_is_looked_at_is_no_wait_for_ever() -> None:
+    """queue.SimpleQueue would hang here within a second."""
+    inbox, done = Inbox(), threading.Event()
+
+    def work() -> None:
+        for number in range(30_000):
+            inbox.take(1e-6)
+            inbox.post(lambda: None)
+            inbox.take(None)
+            inbox.take(number % 60 / 1e7)
+        done.set()
+
+    threading.Thread(target=work, daemon=True).start()
+    assert done.wait(60)
+
+
+def test_a_signal_handler_may_post_while_its_own_thread_waits_or_posts() -> None:
+    inbox, taken = Inbox(), 0
+    before = signal.signal(signal.SIGALRM, lambda *_: inbox.post_internal(lambda: None))
+    signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001)
+    try:
+        end = time.monotonic() + 20
+        while taken < 300 and time.monotonic() < end:
+            inbox.post(lambda: None, newest_of="one")
+            taken += inbox.take(0.002) is not None
+            taken += inbox.take(None) is not None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert taken >= 300

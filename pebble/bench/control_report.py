@@ -66,8 +66,8 @@ def _hops(cells: Sequence[Cell]) -> Table:
     heads = ["publish\ncall", "thread\nhas it", "handler\nruns", "wake-ups:\nends", "broker\nor hub"]
     table = plain_table("where the time goes: 40 B at 200 Hz, unloaded, medians, us", ["variant", *heads])
     for cell in cells:
-        names = ("call_us", "fabric_us", "inbox_us", "wake_ups", "broker_wake_ups")
-        table.add_row(cell.variant, *(figure(float(cell.figures.get(name) or math.nan)) for name in names))
+        known = (cell.figures.get(name) for name in ("call_us", "fabric_us", "inbox_us", "wake_ups", "broker_wake_ups"))
+        table.add_row(cell.variant, *(figure(math.nan if value is None else float(value)) for value in known))
     return table
 
 

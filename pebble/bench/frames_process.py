@@ -23,7 +23,7 @@ class Worker:
 
     def __init__(self, name: str, command: Sequence[str], log: Path) -> None:
         self.name, self._log = name, log
-        self._said: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        self._said: queue.Queue[dict[str, Any] | None] = queue.Queue()
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
                 command,

@@ -25,7 +25,7 @@ _CHUNK = 4096
 def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
     """Wait for a live heartbeat; the kept one is an older life's. Raises LinkError that says what to look at."""
     broker = config.local_mqtt
-    heard: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    heard: queue.Queue[Message] = queue.Queue()
     settings = mqtt_settings(broker, reconnect_max_s=LOCAL_RECONNECT_S)
     transport = create("mqtt", f"{config.base}-flash", settings)
     with closing(transport.open(BROKER_S)):
