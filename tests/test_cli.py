@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import itertools
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -51,6 +52,13 @@ class Run:
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     return Run(monkeypatch, capsys)
+
+
+def test_a_command_leaves_logging_as_it_was(run: Run) -> None:
+    before = list(logging.getLogger("pebble").handlers)
+    assert run("--version") == 0
+    assert run("nonsense") == 2
+    assert logging.getLogger("pebble").handlers == before
 
 
 def config_file(folder: Path, **changes: Any) -> Path:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Annotated
 
@@ -29,7 +31,11 @@ _HELP = """Runs Pebble robots, and looks at them.
 
 def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code, 2 for one that makes no sense. Raises PebbleError."""
-    _set_up_logging()
+    with _errors_in_threads_are_said():
+        return _run(arguments)
+
+
+def _run(arguments: list[str]) -> int:
     wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
     app = typer.Typer(rich_markup_mode=None, add_completion=False)
     app.callback(help=_HELP)(_options)
@@ -47,12 +53,17 @@ def run(arguments: list[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _set_up_logging() -> None:
+@contextmanager
+def _errors_in_threads_are_said() -> Iterator[None]:
     """Commands say themselves what went wrong; what they cannot know of is an error in a thread."""
     handler = logging.StreamHandler()
     handler.setLevel(logging.ERROR)
     handler.setFormatter(logging.Formatter("pebble: %(message)s"))
     logging.getLogger("pebble").addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger("pebble").removeHandler(handler)
 
 
 def _say_version(wanted: bool) -> None:

@@ -30,7 +30,7 @@ from pebble.launcher.stop_signals import StopSignals
 from pebble.launcher.supervisor import Life
 from pebble.links import check_kinds
 from pebble.payloads import Capabilities, LogRecord, ServiceState, Status
-from pebble.transports import Message, QoS
+from pebble.transports import Message, QoS, segments
 
 _STATUS_PAUSE_S = 0.05  # changes this close together are told in one message
 _REAP_S = 2.0  # the kernel needs this long at most to end what was killed
@@ -83,6 +83,7 @@ class Launcher:
                 self._end(self._keepers)
                 self._news.close()
                 self._reactor.close()
+                segments.sweep()  # Zenoh leaves its files in /dev/shm even when its processes end politely
         return 0 if self._signals.received <= 1 else 1
 
     # -- starting

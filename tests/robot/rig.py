@@ -23,6 +23,12 @@ PROGRAMS = (
     *("zenoh_hub", "announcer", "serial_mcu_bridge", "av_daemon", "mqtt_bridge", "mqtt_mirror"),
     *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream"),
 )
+#: A camera and a microphone for ``av_daemon``.
+DEVICES = {
+    "enabled": True,
+    "video": {"backend": "synthetic", "width": 320, "height": 240, "fps": 15},
+    "audio": {"source": "synthetic"},
+}
 
 
 class Mcu:

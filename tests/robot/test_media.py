@@ -14,7 +14,7 @@ from pebble.media.scene import read_counter
 from pebble.media.sound import SoundDecoder
 from pebble.media.video import VIDEO_ENCODINGS
 from tests.robot.operator import Operator, Seen
-from tests.robot.rig import BASE, Rig
+from tests.robot.rig import BASE, DEVICES, Rig
 from tests.support import until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
@@ -22,11 +22,6 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 CAMERA, AUDIO = "outgoing/front-camera", "outgoing/audio"
 VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
 ASK_VIDEO, ASK_AUDIO = "incoming/front-camera", "incoming/audio"
-DEVICES = {
-    "enabled": True,
-    "video": {"backend": "synthetic", "width": 320, "height": 240, "fps": 15},
-    "audio": {"source": "synthetic"},
-}
 
 
 def make_rig(kind: str, **more: Any) -> Rig:
