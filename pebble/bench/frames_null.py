@@ -17,7 +17,7 @@ from pebble.errors import PebbleError
 
 def plan(*, quick: bool = False, **given: Any) -> Plan:
     """The usual plan, or the one for the impatient, except for what is given."""
-    usual = {"rounds": 2, "seconds": 0.3} if quick else {"rounds": 30, "seconds": 0.4}
+    usual = {"rounds": 2, "seconds": 0.4} if quick else {"rounds": 30, "seconds": 0.4}
     only = {"sizes": SIZES[:1], "readers": READERS[:1], "variants": (OURS,)}
     return Plan(quick=quick, **{**usual, **only, **given})
 

@@ -30,7 +30,7 @@ from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Results
 from pebble.bench.tables import base_of
 
-_LEAST = 20  # samples: fewer are no distribution
+LEAST = 20  # samples: fewer are no distribution
 _POINTS = 400  # of a curve
 #: What is written at an axis of ratios: for a span of less than so many times, these.
 _RATIOS = {
@@ -46,7 +46,7 @@ _WHOLE = "all the way"  # comes after its parts
 def distributions(results: Results, title: str) -> list[Picture]:
     """For each measure the share of messages within a time, one panel per condition."""
     found = []
-    for measure, cells in by_measure(results.cells, least=_LEAST).items():
+    for measure, cells in by_measure(results.cells, least=LEAST).items():
         about = title if measure in title.lower() else f"{title}: {measure}"
         caption = f"{about}. Share of all messages that took no longer than the time below"
         if any(_never(cell) for cell in cells):

@@ -8,8 +8,10 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import frames, frames_null, null
+from pebble.bench.frames_loop import RATE_HZ
 from pebble.bench.frames_report import Round
 from pebble.bench.frames_variants import Case, Size
+from pebble.bench.plots_latency import LEAST
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 
@@ -115,6 +117,12 @@ def test_frames_against_themselves(
 def test_one_thing_is_tested_at_a_time(tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match="one variant, one size"):
         frames_null.run(frames_null.plan(variants=["mqtt", "memcpy"], output=tmp_path))
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_frames_gives_enough_for_a_distribution(quick: bool) -> None:
+    plan = frames_null.plan(quick=quick)
+    assert plan.rounds * plan.seconds * RATE_HZ >= 1.1 * LEAST
 
 
 def test_a_writer_that_is_held_up_is_seen_in_every_latency() -> None:
