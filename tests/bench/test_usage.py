@@ -12,7 +12,7 @@ from pebble.bench.frames_process import Worker
 from pebble.bench.usage import children, cpu_s, pss_mb, wake_ups
 from pebble.bench.wake import wake_up_us
 from pebble.errors import PebbleError
-from tests.support import Child
+from tests.support import Child, until
 
 GONE = 1 << 22  # above the largest pid
 
@@ -25,10 +25,19 @@ def test_cpu_time_is_finer_than_ticks() -> None:
 
 
 def test_who_waits_is_woken_up() -> None:
-    before = wake_ups([os.getpid(), GONE])
+    """A process of its own: of a thread that ends meanwhile its count goes, too, and ours has many."""
+    child = Child([sys.executable, "-c", "while not input(): print(flush=True)"], stdin=-1, stdout=-1)
+    child.stdin.write(b"\n")
+    child.stdin.flush()
+    child.stdout.readline()  # it has started, and will wait
+    before = wake_ups([child.pid, GONE])
     for _ in range(5):
-        time.sleep(0.001)
-    assert wake_ups([os.getpid(), GONE]) - before >= 5
+        child.stdin.write(b"\n")
+        child.stdin.flush()
+        child.stdout.readline()
+        time.sleep(0.02)
+    assert until(lambda: wake_ups([child.pid, GONE]) - before >= 4)  # the first wait may be older
+    child.communicate()
 
 
 def test_a_wake_up_takes_its_time_and_leaves_this_thread_all_its_cores() -> None:
