@@ -32,7 +32,7 @@ from pebble.links import check_kinds
 from pebble.payloads import Capabilities, LogRecord, ServiceState, Status
 from pebble.transports import Message, QoS, segments
 
-_STATUS_PAUSE_S = 0.05  # changes this close together are told in one message
+_STATUS_PAUSE_S = 0.2  # changes this close together are told in one message: a service starts in about 0.1 s
 _REAP_S = 2.0  # the kernel needs this long at most to end what was killed
 
 log = logging.getLogger(__name__)

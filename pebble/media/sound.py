@@ -38,6 +38,10 @@ class SoundEncoder(Protocol):
     def channels(self) -> int:
         """Of what is sent."""
 
+    @property
+    def part_way(self) -> bool:
+        """Is sound already encoded that a packet still to come will hold?"""
+
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
         """No, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
 
@@ -111,6 +115,7 @@ class _PcmEncoder:
     """Codec 1: the samples as they are."""
 
     name = "pcm"
+    part_way = False
 
     def __init__(self, intake: _Intake, chunk_ms: int, numbers: Iterator[int]) -> None:
         self.rate, self.channels = intake.rate, intake.channels
@@ -137,6 +142,10 @@ class _OpusPackets:
         self._encoder = OpusEncoder(self.rate, self.channels, frame_ms=frame_ms, bitrate=bitrate)
         self._ready: list[bytes] = []
         self._ready_ms = 0  # when the first of them was captured
+
+    @property
+    def part_way(self) -> bool:
+        return bool(self._ready)
 
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
         packets = []

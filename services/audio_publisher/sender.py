@@ -44,7 +44,7 @@ class Sender:
         self._thrift = Thrift(len(self._steps) - 1, now)
         self._under_way = UnderWay()
         self._encoder: SoundEncoder | None = None
-        self._made_for: object = None
+        self._made_for: tuple[object, ...] = ()  # encoding, rate, channels and step
 
     def take(self, info: FrameInfo, pcm: bytes, now: float) -> None:
         """One chunk as the microphone gave it, at the monotonic time ``now``."""
@@ -77,10 +77,11 @@ class Sender:
         self.counters.add("bytes", len(packet))
 
     def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
-        """The present encoder, or a new one if anything about it has to change."""
+        """The present one, or a new one if anything about it has to change; another step waits for a packet's end."""
         level = self._thrift.level if self.wanted == "opus" else 0
         needed = (self.wanted, rate, channels, level)
-        if self._encoder is None or needed != self._made_for:
+        same_sound = needed[:-1] == self._made_for[:-1]
+        if self._encoder is None or (needed != self._made_for and not (same_sound and self._encoder.part_way)):
             self._made_for = needed
             self._encoder = self._make(*needed)
             self._tell(self._encoder, level)

@@ -11,7 +11,7 @@ LEAST_BITRATE: Final = 16_000  # of Opus: below it speech gets hard to follow
 _SLOW_S = 0.12  # packets wait for longer than this: the link cannot carry what we send
 _FAST_S = 0.08  # a confirmation may be held back for 40 ms and is noticed only 20 ms later: less says nothing
 _PATIENCE_S = 0.3  # of slowness, before something is done
-_PAUSE_S = 1.0  # until one may see what it did
+_PAUSE_S = 0.4  # before more is done: what waits already takes longer to leave, and commands wait behind it
 _CALM_S = 10.0  # of fastness, before the next step back is tried; twice that after each try that failed
 _CALMEST_S = 300.0
 

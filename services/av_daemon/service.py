@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
+
+from msgspec.structs import replace
 
 from pebble.contract import MEDIA_REPORT, MEDIA_STATUS
 from pebble.payloads import MediaReport, MediaStatus
@@ -13,6 +16,8 @@ from pebble.services.av_daemon.stream import Stream
 from pebble.transports.frames import FrameWriter
 
 CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
+_FIGURES_S = 5.0  # between messages that differ in figures alone: once a second they filled a tenth of a 64 kbit/s link
+_NUMBER = re.compile(r"[0-9.]+")
 
 
 class AvDaemon(Service):
@@ -26,6 +31,7 @@ class AvDaemon(Service):
         now = time.monotonic()
         self._board = Board()
         self._said: dict[str, MediaReport] | None = None
+        self._said_at = float("-inf")
         self._writers: list[FrameWriter] = []
         self._streams: list[Stream] = []
         if options.video.enabled:
@@ -60,14 +66,17 @@ class AvDaemon(Service):
 
     @every(1.0)
     def say(self) -> None:
-        """Tell what has changed, at most once a second."""
+        """Tell what has changed, at most once a second, and every few seconds if that is but figures."""
         now = time.monotonic()
         own = {stream.name: stream.report(now) for stream in self._streams}
         self._say(self._board.heard(now) | own)
 
     def _say(self, value: dict[str, MediaReport]) -> None:
-        if value != self._said:
-            self._said = value
+        now = time.monotonic()
+        if value == self._said:
+            return
+        if self._said is None or _states(value) != _states(self._said) or now - self._said_at >= _FIGURES_S:
+            self._said, self._said_at = value, now
             self.publish(MEDIA_STATUS, MediaStatus(t=int(time.time() * 1000), value=value))
 
     def _add(self, name: str, size: int, open_source: sources.Opener) -> None:
@@ -76,3 +85,11 @@ class AvDaemon(Service):
         self._writers.append(writer)
         delay = self.config.services.av_daemon.restart_delay_seconds
         self._streams.append(Stream(name, writer, open_source, restart_delay_s=delay))
+
+
+def _states(value: dict[str, MediaReport]) -> dict[str, MediaReport]:
+    """Without what changes all the time while nothing happens."""
+    return {
+        name: replace(report, doing=_NUMBER.sub("", report.doing or ""), rate=None, bitrate=None, dropped=None)
+        for name, report in value.items()
+    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pebble.config.later import AudioPublisher as Options
+from pebble.packets import Sound
 from pebble.services.audio_publisher.sender import Sender
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.base import Subscription
@@ -23,6 +24,7 @@ class Stuck(Transport):
     def __init__(self) -> None:
         super().__init__("stuck")
         self.accepted = 0
+        self.packets: list[bytes] = []
 
     @property
     def outgoing(self) -> Outgoing:
@@ -35,11 +37,20 @@ class Stuck(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:
         self.accepted += len(message.payload) + 60
+        self.packets.append(message.payload)
         return True
 
     def _declare(self, subscription: Subscription) -> None: ...
 
     def _undeclare(self, subscription: Subscription) -> None: ...
+
+
+class Slow(Stuck):
+    """Confirms each packet only after six newer ones."""
+
+    @property
+    def outgoing(self) -> Outgoing:
+        return Outgoing(waiting=sum(len(packet) + 60 for packet in self.packets[-7:]))
 
 
 @pytest.mark.parametrize(("encoding", "most_s"), [("pcm", 0.2), ("opus", 0.5)])
@@ -55,3 +66,18 @@ def test_sound_waits_for_so_long_and_then_the_newest_is_dropped(encoding: str, m
             break
     assert dropped_at == pytest.approx(most_s, abs=4 * CHUNK_S)  # Opus may wait for a bundle
     assert sender.encoding == encoding
+
+
+def test_no_sound_is_lost_when_it_gets_smaller() -> None:
+    counters, transport = Counters(), Slow().open()
+    sender = Sender(Options(encoding="opus", bundle=2), transport, "sound", QoS.LATEST, counters, 0.0)  # type: ignore[arg-type]
+    steps = []
+    for number in range(1, 200):
+        info = FrameInfo(format="s16le", rate=16_000, channels=1, captured_ms=20 * number)  # of its end
+        sender.take(info, CHUNK, number * CHUNK_S)
+        steps += [sender.reduced] if sender.reduced not in steps else []
+    assert steps == ["", "3 parts a packet", "3 parts a packet, 16 kbit/s"]
+    heard = [Sound.unpack(packet) for packet in transport.packets]
+    ends_ms = [sound.captured_ms + sound.samples // 16 for sound in heard]
+    assert [sound.captured_ms for sound in heard] == [0, *ends_ms[:-1]]
+    assert counters["dropped"] == 0

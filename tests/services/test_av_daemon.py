@@ -155,6 +155,23 @@ def test_whoever_comes_later_is_told_too(running: Robot) -> None:
     other.close()
 
 
+def test_figures_alone_are_told_rarely_and_everything_else_soon(robot: Robot) -> None:
+    def sent(kbits: int, **more: Any) -> None:
+        doing = f"h264 640x480, {kbits} kbit/s"
+        robot.report("other", MediaReport(running=True, doing=doing, bitrate=1000 * kbits, **more))
+
+    assert until(lambda: robot.status)
+    sent(200)
+    assert until(lambda: "other" in robot.status)
+    told = len(robot.said)
+    for kbits in range(201, 211):
+        sent(kbits)
+        time.sleep(0.3)
+    assert len(robot.said) - told <= 1
+    sent(100, reduced="size 1/2")
+    assert until(lambda: robot.status.get("other", {}).get("reduced") == "size 1/2", 3)
+
+
 def test_devices_rest_and_silent_programs_are_forgotten(robot: Robot) -> None:
     assert until(lambda: robot.status.get("camera", {}).get("doing") == "rests: nobody reads")
     with FrameReader(robot.run_dir, "camera") as reader:
