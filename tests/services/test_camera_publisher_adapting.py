@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
+from math import ceil
 
 import pytest
 
@@ -18,12 +19,13 @@ KILOBIT = 125.0  # bytes
 @dataclass
 class Run:
     """A publisher, a link of ``kbits(now)`` and ``delay_s`` each way; a full frame has ``full`` bytes, every third
-    one is a full picture and twice that."""
+    one is a full picture and twice that. Confirmations wait for the next multiple of ``beacon_s``."""
 
     kbits: Callable[[float], float]
     full: int = 9_000
     fps: float = 10.0
     delay_s: float = 0.01
+    beacon_s: float = 0.0
     ages: list[tuple[float, float]] = field(default_factory=list)  # when a frame had arrived whole, and its age then
     levels: list[tuple[float, int]] = field(default_factory=list)
 
@@ -37,7 +39,8 @@ class Run:
             went = min(unsent, self.kbits(now) * KILOBIT * step_s)
             unsent -= went
             if went:
-                confirmed.append((now + 2 * self.delay_s, went))
+                back = now + 2 * self.delay_s
+                confirmed.append((self.beacon_s * ceil(back / self.beacon_s) if self.beacon_s else back, went))
             while confirmed and confirmed[0][0] <= now:
                 waiting -= confirmed.pop(0)[1]
             while went and frames:
@@ -107,6 +110,20 @@ def test_a_long_way_is_not_a_slow_link() -> None:
     run = Run(lambda _now: 20_000, delay_s=0.4).run(60)
     assert not run.levels
     assert run.rate(2, 60) == pytest.approx(10, rel=0.02)
+
+
+@pytest.mark.parametrize("beacon_s", [0.05, 0.0666, 0.09, 0.1024])
+@pytest.mark.parametrize("fps", [10.0, 15.0, 30.0])
+def test_confirmations_that_are_held_back_are_not_a_slow_link(fps: float, beacon_s: float) -> None:
+    run = Run(lambda _: 20_000, full=4_000, fps=fps, delay_s=0.002, beacon_s=beacon_s).run(30)
+    assert run.rate(2, 30) > 0.95 * fps
+    assert run.level_at(20) == 0  # the first second may be misunderstood
+
+
+@pytest.mark.parametrize("kbits", [64, 256])
+def test_a_slow_link_is_noticed_behind_confirmations_that_are_held_back(kbits: int) -> None:
+    run = Run(lambda _: kbits, delay_s=0.002, beacon_s=0.1024).run(40)
+    assert run.worst_age(5) < 0.8
 
 
 def test_a_link_that_recovers_gets_everything_back() -> None:
