@@ -12,7 +12,8 @@ _SLOW_S = 0.12  # packets wait for longer than this: the link cannot carry what 
 _FAST_S = 0.08  # a confirmation may be held back for 40 ms and is noticed only 20 ms later: less says nothing
 _PATIENCE_S = 0.3  # of slowness, before something is done
 _PAUSE_S = 0.4  # before more is done: what waits already takes longer to leave, and commands wait behind it
-_CALM_S = 10.0  # of fastness, before the next step back is tried; twice that after each try that failed
+_FIRST_CALM_S = 1.0  # of fastness, before a step up is tried while the link has never been slow
+_CALM_S = 10.0  # the same once it was; twice that after each try that failed
 _CALMEST_S = 300.0
 
 
@@ -37,16 +38,17 @@ def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
 
 
 class Thrift:
-    """Goes down the steps while packets wait, and up again, ever more carefully, while they do not."""
+    """Begins with the last step, for nobody knows the link yet. Goes up while packets do not wait, ever more carefully,
+    and down while they do.
+    """
 
     def __init__(self, last: int, now: float) -> None:
-        self.level = 0  # which step; 0 is as configured
-        self._last = last
+        self.level = self._last = last  # which step; 0 is as configured
         self._slow_since: float | None = None
         self._fast_since: float | None = now
         self._changed_at = now
         self._raised_at = float("-inf")
-        self._calm_s = _CALM_S
+        self._calm_s = _FIRST_CALM_S
 
     def look(self, age_s: float, now: float) -> bool:
         """The oldest packet has waited for ``age_s``; True if the level changes."""
@@ -55,8 +57,8 @@ class Thrift:
         if now - self._changed_at < _PAUSE_S:
             return False
         if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:
-            if now - self._raised_at < 2 * self._calm_s:
-                self._calm_s = min(2 * self._calm_s, _CALMEST_S)
+            failed = now - self._raised_at < 2 * self._calm_s
+            self._calm_s = min(max(_CALM_S, (1 + failed) * self._calm_s), _CALMEST_S)
             return self._change(1, now)
         if self.level and self._fast_since is not None and now - max(self._fast_since, self._changed_at) > self._calm_s:
             self._raised_at = now

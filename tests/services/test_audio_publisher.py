@@ -60,10 +60,10 @@ def test_every_form_in_turn_and_it_is_what_was_said(local: Broker, remote: Broke
         assert median(b.captured_ms - a.captured_ms for a, b in pairwise(pcm)) == pytest.approx(20, abs=2)
         robot.ask(encoding="opus")
         ear.wait_for("opus")
+        assert robot.reported(encoding="opus", running=True, last_error=None, reduced=None)
         opus = ear.wait(40)
         assert {(one.encoding, one.rate, len(one.samples)) for one in opus} == {("opus", 16000, 640)}
         assert until(lambda: opus_likeness(ear.heard[-40:]) > 0.9, 20, step=0.1)
-        assert robot.reported(encoding="opus", running=True, last_error=None, reduced=None)
         robot.ask(encoding="smoke signals")
         ear.wait_for("pcm")
         assert is_whole(ear.heard)

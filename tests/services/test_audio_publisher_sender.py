@@ -45,12 +45,14 @@ class Stuck(Transport):
     def _undeclare(self, subscription: Subscription) -> None: ...
 
 
-class Slow(Stuck):
-    """Confirms each packet only after six newer ones."""
+class Behind(Stuck):
+    """Confirms everything but the newest packets, ``behind`` of them."""
+
+    behind = 0
 
     @property
     def outgoing(self) -> Outgoing:
-        return Outgoing(waiting=sum(len(packet) + 60 for packet in self.packets[-7:]))
+        return Outgoing(waiting=sum(len(packet) + 60 for packet in self.packets[len(self.packets) - self.behind :]))
 
 
 @pytest.mark.parametrize(("encoding", "most_s"), [("pcm", 0.2), ("opus", 0.5)])
@@ -68,15 +70,18 @@ def test_sound_waits_for_so_long_and_then_the_newest_is_dropped(encoding: str, m
     assert sender.encoding == encoding
 
 
-def test_no_sound_is_lost_when_it_gets_smaller() -> None:
-    counters, transport = Counters(), Slow().open()
+def test_sound_gets_larger_and_smaller_and_none_is_lost() -> None:
+    counters, transport = Counters(), Behind()
+    transport.open()
     sender = Sender(Options(encoding="opus", bundle=2), transport, "sound", QoS.LATEST, counters, 0.0)  # type: ignore[arg-type]
     steps = []
-    for number in range(1, 200):
+    for number in range(1, 300):
+        transport.behind = 7 if number > 150 else 0
         info = FrameInfo(format="s16le", rate=16_000, channels=1, captured_ms=20 * number)  # of its end
         sender.take(info, CHUNK, number * CHUNK_S)
-        steps += [sender.reduced] if sender.reduced not in steps else []
-    assert steps == ["", "3 parts a packet", "3 parts a packet, 16 kbit/s"]
+        steps += [sender.reduced] if steps[-1:] != [sender.reduced] else []
+    three, least = "3 parts a packet", "3 parts a packet, 16 kbit/s"
+    assert steps == [least, three, "", three, least]
     heard = [Sound.unpack(packet) for packet in transport.packets]
     ends_ms = [sound.captured_ms + sound.samples // 16 for sound in heard]
     assert [sound.captured_ms for sound in heard] == [0, *ends_ms[:-1]]

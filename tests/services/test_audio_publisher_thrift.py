@@ -24,13 +24,33 @@ def test_steps_save_headers_first_and_then_bits() -> None:
     assert steps(3, 12_000) == (Step(3, 12_000),)
 
 
-def test_a_link_that_is_fast_changes_nothing() -> None:
+def at_ease() -> Thrift:
+    """One that has found out, by 5.0, that the link takes everything."""
     thrift = Thrift(2, 0.0)
-    assert watch(thrift, 0.06, 0.0, 600) == []
+    watch(thrift, 0.0, 0.0, 5.0)
+    assert thrift.level == 0
+    return thrift
+
+
+def test_it_begins_small_and_has_everything_soon() -> None:
+    thrift = Thrift(2, 0.0)
+    assert thrift.level == 2
+    assert len(watch(thrift, 0.06, 0.0, 2.5)) == 2
+    assert thrift.level == 0
+
+
+def test_a_link_that_is_fast_changes_nothing() -> None:
+    thrift = at_ease()
+    assert watch(thrift, 0.06, 5.0, 600) == []
+
+
+def test_on_a_link_that_begins_slow_it_stays_small() -> None:
+    thrift = Thrift(2, 0.0)
+    assert watch(thrift, 0.18, 0.0, 60) == []
 
 
 def test_slowness_goes_down_step_by_step() -> None:
-    thrift = Thrift(2, 0.0)
+    thrift = at_ease()
     changes = watch(thrift, 0.18, 10.0, 10)
     assert len(changes) == 2
     assert changes[-1] < 10 + 1, "commands wait behind what waits"
@@ -38,14 +58,14 @@ def test_slowness_goes_down_step_by_step() -> None:
 
 
 def test_a_moment_of_slowness_is_nothing() -> None:
-    thrift = Thrift(2, 0.0)
+    thrift = at_ease()
     for begin in range(10, 100):
         assert watch(thrift, 0.19, begin, 0.2) == []
         assert watch(thrift, 0.0, begin + 0.2, 0.8) == []
 
 
 def test_steps_back_are_tried_ever_more_rarely() -> None:
-    thrift = Thrift(2, 0.0)
+    thrift = at_ease()
     watch(thrift, 0.18, 10.0, 3.0)
     tries, at = [], 13.0
     for _ in range(4):
@@ -57,12 +77,13 @@ def test_steps_back_are_tried_ever_more_rarely() -> None:
         while thrift.level == 1:
             at += 0.02
             thrift.look(0.18, at)
+    assert tries[0] > 5
     assert tries == sorted(tries)
     assert tries[-1] > 4 * tries[0]
 
 
 def test_all_is_as_before_in_the_end() -> None:
-    thrift = Thrift(2, 0.0)
+    thrift = at_ease()
     watch(thrift, 0.18, 10.0, 5.0)
     watch(thrift, 0.0, 15.0, 100)
     assert thrift.level == 0
