@@ -90,6 +90,17 @@ class AvDaemon(Service):
 def _states(value: dict[str, MediaReport]) -> dict[str, MediaReport]:
     """Without what changes all the time while nothing happens."""
     return {
-        name: replace(report, doing=_NUMBER.sub("", report.doing or ""), rate=None, bitrate=None, dropped=None)
+        name: replace(
+            report,
+            doing=_words(report.doing),
+            last_error=_words(report.last_error),
+            rate=None,
+            bitrate=None,
+            dropped=None,
+        )
         for name, report in value.items()
     }
+
+
+def _words(text: str | None) -> str | None:
+    return text and _NUMBER.sub("", text)

@@ -158,7 +158,8 @@ def test_whoever_comes_later_is_told_too(running: Robot) -> None:
 def test_figures_alone_are_told_rarely_and_everything_else_soon(robot: Robot) -> None:
     def sent(kbits: int, **more: Any) -> None:
         doing = f"h264 640x480, {kbits} kbit/s"
-        robot.report("other", MediaReport(running=True, doing=doing, bitrate=1000 * kbits, **more))
+        trouble = f"no picture for {kbits} s"
+        robot.report("other", MediaReport(running=True, doing=doing, bitrate=1000 * kbits, last_error=trouble, **more))
 
     assert until(lambda: robot.status)
     sent(200)
