@@ -2,6 +2,7 @@
 
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
@@ -24,7 +25,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionfinish() -> None:
-    """Zenoh leaves files of shared memory behind, however its processes end."""
+    """Zenoh leaves files of shared memory behind, however its processes end, and keeps those of this one locked."""
+    for _, _, path in segments.mappings():
+        Path(path).unlink(missing_ok=True)
     if any(segments.SHM.glob("*.zenoh")):
         time.sleep(segments.YOUNG_S)
         segments.sweep()
