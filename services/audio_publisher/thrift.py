@@ -10,6 +10,8 @@ from pebble.media.opus import BUNDLE_LIMIT
 LEAST_BITRATE: Final = 16_000  # of Opus: below it speech gets hard to follow
 _SLOW_S = 0.12  # packets wait for longer than this: the link cannot carry what we send
 _FAST_S = 0.08  # a confirmation may be held back for 40 ms and is noticed only 20 ms later: less says nothing
+_EMPTY_S = 0.03  # nothing waits
+_HELD_S = 0.15  # so often at least where an access point holds confirmations until its next beacon (102.4 ms as a rule)
 _PATIENCE_S = 0.3  # of slowness, before something is done
 _PAUSE_S = 0.4  # before more is done: what waits already takes longer to leave, and commands wait behind it
 _FIRST_CALM_S = 1.0  # of fastness, before a step up is tried while the link has never been slow
@@ -46,6 +48,7 @@ class Thrift:
         self.level = self._last = last  # which step; 0 is as configured
         self._slow_since: float | None = None
         self._fast_since: float | None = now
+        self._empty_at = now
         self._changed_at = now
         self._raised_at = float("-inf")
         self._calm_s = _FIRST_CALM_S
@@ -53,7 +56,9 @@ class Thrift:
     def look(self, age_s: float, now: float) -> bool:
         """The oldest packet has waited for ``age_s``; True if the level changes."""
         self._slow_since = (self._slow_since or now) if age_s > _SLOW_S else None
-        self._fast_since = (self._fast_since or now) if age_s < _FAST_S else None
+        self._empty_at = now if age_s < _EMPTY_S else self._empty_at
+        fast = age_s < _FAST_S or now - self._empty_at < _HELD_S
+        self._fast_since = (self._fast_since or now) if fast else None
         if now - self._changed_at < _PAUSE_S:
             return False
         if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:

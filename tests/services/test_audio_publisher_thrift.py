@@ -39,6 +39,19 @@ def test_it_begins_small_and_has_everything_soon() -> None:
     assert thrift.level == 0
 
 
+def test_confirmations_that_are_held_back_are_not_a_slow_link() -> None:
+    thrift = Thrift(2, 0.0)
+    for number in range(250):
+        now = 0.02 * number
+        thrift.look(0.01 + now % 0.1024, now)
+    assert thrift.level == 0
+
+
+def test_what_stands_in_a_queue_earns_nothing() -> None:
+    thrift = Thrift(2, 0.0)
+    assert watch(thrift, 0.09, 0.0, 60) == []
+
+
 def test_a_link_that_is_fast_changes_nothing() -> None:
     thrift = at_ease()
     assert watch(thrift, 0.06, 5.0, 600) == []
