@@ -17,6 +17,7 @@ _PAUSE_S = 0.4  # before more is done: what waits already takes longer to leave,
 _FIRST_CALM_S = 1.0  # of fastness, before a step up is tried while the link has never been slow
 _CALM_S = 10.0  # the same once it was; twice that after each try that failed
 _CALMEST_S = 300.0
+_GAP_S = 2.0  # without a look, for want of a connection or of Opus: what was seen before says nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +48,17 @@ class Thrift:
     def __init__(self, last: int, now: float) -> None:
         self.level = self._last = last  # which step; 0 is as configured
         self._slow_since: float | None = None
-        self._fast_since: float | None = now
-        self._empty_at = now
+        self._fast_since: float | None = None
+        self._looked_at = self._empty_at = float("-inf")
         self._changed_at = now
         self._raised_at = float("-inf")
         self._calm_s = _FIRST_CALM_S
 
     def look(self, age_s: float, now: float) -> bool:
         """The oldest packet has waited for ``age_s``; True if the level changes."""
+        if now - self._looked_at > _GAP_S:
+            self._slow_since = self._fast_since = None
+        self._looked_at = now
         self._slow_since = (self._slow_since or now) if age_s > _SLOW_S else None
         self._empty_at = now if age_s < _EMPTY_S else self._empty_at
         fast = age_s < _FAST_S or now - self._empty_at < _HELD_S

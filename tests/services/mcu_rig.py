@@ -33,7 +33,7 @@ from tests.transports.zenoh_net import HubProcess
 ROBOT = "rover"
 BASE = f"pebble/robots/{ROBOT}"
 STEP_S = 0.002
-BOOT_S = 0.05  # until it greets: opening a port throws away what was said before, and no board greets sooner
+BOOT_S = 0.05  # until one that greets does: whoever opens a port first throws away what came before
 
 
 class ScriptedMcu:

@@ -39,6 +39,14 @@ def test_it_begins_small_and_has_everything_soon() -> None:
     assert thrift.level == 0
 
 
+def test_time_in_which_nothing_was_seen_earns_nothing() -> None:
+    thrift = Thrift(2, 1.0)  # and no connection until 20.0
+    assert watch(thrift, 0.0, 20.0, 0.9) == []
+    assert len(watch(thrift, 0.0, 20.9, 2.0)) == 2
+    watch(thrift, 0.18, 60.0, 2.0)
+    assert watch(thrift, 0.0, 200.0, 9.0) == []
+
+
 def test_confirmations_that_are_held_back_are_not_a_slow_link() -> None:
     thrift = Thrift(2, 0.0)
     for number in range(250):
