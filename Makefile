@@ -1,20 +1,21 @@
-# Everything a target needs it sets up by itself, inside this folder. Only `make test` and `make report` install Debian
-# packages, and only those that are missing.
+# Each target sets up what it needs inside this folder. Only `make test`, `make firmware` and `make report` install Debian
+# packages, and only missing ones.
 
 VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check firmware report clean
+.PHONY: help demo test stops check firmware report clean
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
-	@echo "make demo SECONDS=20  the same, ending by itself; succeeds only if every robot moved and stopped as commanded"
+	@echo "make demo SECONDS=20  ends by itself; succeeds only if every robot moved and stopped as commanded"
 	@echo "make test             all checks and tests"
-	@echo "make check            lint, types and imports only"
-	@echo "make firmware         what the firmware costs of each board, measured in the real MicroPython; into docs/firmware.md"
-	@echo "make report           every comparison and the bad links, an hour; writes docs/results"
-	@echo "make report QUICK=1   the same from fewer cases, under five minutes; writes build/report-quick"
-	@echo "make clean            remove what the other targets made"
+	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
+	@echo "make check            lint, types, imports and names only"
+	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
+	@echo "make report           run every comparison and pebble impair, one hour; writes docs/results"
+	@echo "make report QUICK=1   fewer cases, less than five minutes; writes build/report-quick"
+	@echo "make clean            remove what the other targets created"
 
 demo: .venv/.ready-demo
 	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS))
@@ -23,20 +24,26 @@ test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
 	@$(VENV) -m pytest --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone"
-	@echo "pebble: whole robots and lines, two at a time because their deadlines are checked"
+	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines"
 	@$(VENV) -m pytest --numprocesses 2 --dist loadscope -m alone tests/robot tests/services tests/test_demo.py
+
+# What violates a rule is described in build/stops; the seed in its name repeats it.
+stops: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@$(VENV) -m tests.robot.stop_schedules --transport zenoh --log build/stops
+	@$(VENV) -m tests.robot.stop_schedules --transport mqtt --log build/stops
 
 firmware: .venv/.ready-dev
 	@sh tools/debian-packages.sh node=nodejs
 	@$(VENV) -m tests.firmware.sizes
 
-# What is missing for a part of it and cannot be installed is left out, and the report says so; it takes a broker, though.
+# Parts whose packages cannot be installed are left out, and the report says so; only a broker is required.
 report: .venv/.ready-bench
 	@sh tools/debian-packages.sh mosquitto=mosquitto
-	@sh tools/debian-packages.sh ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them a proxy is the bad link"
+	@sh tools/debian-packages.sh ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them a proxy impairs the network"
 	@$(VENV) -c "import sys; from pebble.bench.frames_variants import missing; sys.exit(missing('gstreamer-shm') is not None)" || \
 		sh tools/debian-packages.sh =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad =gir1.2-gst-plugins-base-1.0 \
-		=python3-gst-1.0 =python3-numpy || echo "pebble: going on without GStreamer"
+		=python3-gst-1.0 =python3-numpy || echo "pebble: continuing without GStreamer"
 	@$(VENV) -m pebble.cli bench report $(if $(QUICK),--quick build/report-quick,docs/results)
 
 check: .venv/.ready-dev
@@ -48,6 +55,8 @@ check: .venv/.ready-dev
 	@$(VENV) -m tests.firmware.types
 	@echo "pebble: imports"
 	@.venv/bin/lint-imports --no-logo
+	@echo "pebble: retired identifiers"
+	@$(VENV) tools/retired_names.py
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """`from pebble import camera`: what that needs is imported by those who use it."""
+    """`from pebble import camera` imports what it needs only when it is used."""
     if name == "camera":
         from pebble.cameras import camera
 

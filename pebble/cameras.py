@@ -1,4 +1,4 @@
-"""A robot's camera in three lines of anybody's Python: `for picture in camera("goob"): …`."""
+"""A robot's camera in three lines of Python: `for picture in camera("goob"): …`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 
 from pebble.config import default_run_folder, load
 from pebble.config.tree import Robot
-from pebble.errors import ConfigError, LinkError, PayloadError, PebbleError
-from pebble.identity import Identity
+from pebble.contract.identity import Identity
+from pebble.errors import ConfigError, DeviceError, PayloadError, PebbleError
 from pebble.transports.frames import Frame, FrameReader
 
 log = logging.getLogger(__name__)
@@ -32,14 +32,15 @@ def camera(
     timeout: float | None = None,
     env: Mapping[str, str] = os.environ,
 ) -> Camera:
-    """The pictures of a robot on this machine, as the camera makes them: the newest, never a queue of old ones.
+    """Iterate over the pictures of a robot on this machine: always the newest, never a queue of old ones.
 
     ``robot`` is its id (``"goob"``), its base topic (``"pebble/robots/goob"``), its config file, or its run directory.
-    Pictures are arrays of (height, width, 3) bytes, blue first; they are yours. With ``width`` they are scaled to that
-    many pixels, which for a JPEG camera also saves most of the decoding. With ``views`` they may look straight into
-    the camera's memory: use them at once, and throw the result away if ``Camera.frame.valid()`` is false afterwards.
+    Pictures are arrays of (height, width, 3) bytes, blue first, and may be changed. With ``width`` they are scaled
+    to that many pixels, which for a JPEG camera also saves most of the decoding. With ``views`` they may
+    be views of the camera's memory: use them at once, and discard the result if ``Camera.frame.valid()`` is false
+    afterwards.
 
-    Raises LinkError if no such robot runs here, and while waiting if no picture comes for ``timeout`` seconds.
+    Raises DeviceError if no such robot runs here, and while waiting if no picture comes for ``timeout`` seconds.
     """
     if width is not None and width <= 0:
         raise PebbleError(f"camera: a width of {width} pixels shows nothing")
@@ -50,7 +51,7 @@ class Camera:
     """Iterate over it; close it, or use it in a ``with`` statement, when you are done."""
 
     def __init__(self, run_dir: Path, *, width: int | None, views: bool, timeout: float | None) -> None:
-        self.frame: Frame | None = None  # what the last picture was made of: when, by whom, and whether still valid
+        self.frame: Frame | None = None  # of the last picture: its time, its writer, and whether it is still valid
         self._width = width
         self._timeout = timeout
         self._run_dir = run_dir
@@ -58,7 +59,7 @@ class Camera:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What became of the frames so far: see `FrameReader`."""
+        """How many frames were read, skipped and lost so far: see `FrameReader`."""
         return self._reader.counters.snapshot()
 
     def __iter__(self) -> Self:
@@ -84,7 +85,7 @@ class Camera:
     def _nothing_came(self) -> None:
         if self._reader.closed:
             raise StopIteration
-        raise LinkError(f"no picture for {self._timeout:g} s from the camera in {self._run_dir}")
+        raise DeviceError(f"no picture for {self._timeout:g} s from the camera in {self._run_dir}")
 
     def close(self) -> None:
         """Ends the iteration, from any thread."""
@@ -110,14 +111,14 @@ def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
         if place.is_dir():
             return place
     looked = ", ".join(map(str, places))
-    raise LinkError(
+    raise DeviceError(
         f"no robot {text} runs on this machine (no {looked}): is it up, and does its config name a run_dir? "
         "Then give its config file instead of its name"
     )
 
 
 def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
-    """Where it would be if started like us, and without a login's folder."""
+    """Where its run directory is if it was started in the same environment, or in one without a login's folder."""
     levels = robot.split("/")
     if len(levels) not in (1, 3):
         raise ConfigError(f"camera: {robot} is neither a robot's id nor a base topic nor a config file")

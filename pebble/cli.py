@@ -1,11 +1,10 @@
-"""The ``pebble`` command: turns errors into one line each and an exit code.
+"""The ``pebble`` command: turns errors into lines on stderr and an exit code.
 
-0: done. 1: it did not work, or what was asked for was not there. 2: the command line is wrong. 130: Ctrl-C.
+0: success. 1: failure, or no result. 2: the command line is wrong. 130: Ctrl-C.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
@@ -23,17 +22,20 @@ def main() -> int:
         return 1
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # the reader has gone (`pebble topics | head`): what is left to say goes nowhere
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader has ended (`pebble topics | head`)
+        from pebble.commands.show import discard_output
+
+        discard_output(sys.stdout)
         return 1
     return code
 
 
 def _run(arguments: list[str]) -> int:
     if len(arguments) == 2 and arguments[0] == "up" and not arguments[1].startswith("-"):
-        from pebble.commands import robot  # without typer: the launcher stays in memory as long as the robot runs
+        from pebble.config import load  # without typer: this process becomes the launcher, which stays in memory
+        from pebble.launcher.launcher import Launcher
 
-        return robot.run(Path(arguments[1]))
+        return Launcher(load(Path(arguments[1]))).run()
     from pebble.commands import app
 
     return app.run(arguments)

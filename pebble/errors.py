@@ -1,8 +1,8 @@
-"""Every exception Pebble raises on purpose."""
+"""The exceptions that Pebble raises."""
 
 
 class PebbleError(Exception):
-    """Base of them all. Only the CLI and a process's outermost line catch it; its text is the message a user reads."""
+    """Base class. Only the CLI and the outermost lines of a process catch it; its text is the message a user reads."""
 
 
 class ConfigError(PebbleError):
@@ -17,9 +17,9 @@ class ConfigError(PebbleError):
 
 
 class TransportError(PebbleError):
-    """A topic, filter or payload no transport may carry, or a transport that cannot be set up at all.
+    """A topic, filter or payload that no transport may carry, or a transport that cannot be set up at all.
 
-    A lost connection is *not* an error: transports reconnect by themselves and say so through their state.
+    A lost connection is *not* an error: transports reconnect by themselves, and their state shows it.
     """
 
 
@@ -27,5 +27,5 @@ class PayloadError(PebbleError):
     """A payload does not follow its channel's contract. Example: ``drive-values: x is NaN``."""
 
 
-class LinkError(PebbleError):
-    """A serial line, camera or other device could not be opened or stopped answering."""
+class DeviceError(PebbleError):
+    """A serial line, camera or other device cannot be opened or stopped answering."""

@@ -1,3 +1,3 @@
-"""The one place that says which Pebble this is."""
+"""The version of Pebble; the only place that defines it."""
 
 __version__ = "0.1.0"

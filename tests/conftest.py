@@ -1,6 +1,9 @@
 """What holds for every test."""
 
+import os
+import shutil
 import signal
+import tempfile
 import time
 from pathlib import Path
 
@@ -12,11 +15,25 @@ from pebble.transports import segments
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-#: Modules of few tests that take long. They begin first: whoever began one of them last would be waited for.
+# What robots save belongs to the run, not to the user who runs it.
+_STATE = tempfile.mkdtemp(prefix="pebble-tests-")
+os.environ.pop("STATE_DIRECTORY", None)
+os.environ["XDG_STATE_HOME"] = _STATE
+
+#: Modules of few tests that take long. They begin first: begun last, they would delay the end of the run.
 _LONG = (
-    *("robot/test_hostile.py", "test_demo.py", "firmware/test_deadman_virtual.py", "transports/test_frames_faults.py"),
-    *("services/test_camera_publisher.py", "services/test_bridge_media.py", "services/test_mcu_private.py"),
-    *("bench/test_frames.py", "transports/test_views.py"),
+    *(
+        "robot/test_hostile.py",
+        "test_demo.py",
+        "firmware/test_deadman_virtual.py",
+        "transports/frames/test_frames_faults.py",
+    ),
+    *(
+        "services/camera_publisher/test_service.py",
+        "services/mqtt_bridge/test_bridge_media.py",
+        "services/serial_mcu_bridge/test_mcu_private.py",
+    ),
+    *("bench/test_frames.py", "transports/frames/test_views.py"),
 )
 
 
@@ -25,6 +42,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionfinish() -> None:
+    shutil.rmtree(_STATE, ignore_errors=True)
+    _remove_segments()
+
+
+def _remove_segments() -> None:
     """Zenoh leaves files of shared memory behind, however its processes end, and keeps those of this one locked."""
     for _, _, path in segments.mappings():
         Path(path).unlink(missing_ok=True)

@@ -1,7 +1,8 @@
-"""What many tests need: waiting for a condition, free ports, a real broker, programs that surely end."""
+"""Helpers of many tests: wait for a condition, free ports, real brokers, child processes that end with pytest."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -13,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pebble.launched import tied
+from pebble.runtime.parent import tied_to_parent
 
 #: The checkout: tests that start programs of ours start them here.
 ROOT = Path(__file__).resolve().parent.parent
@@ -30,14 +31,14 @@ def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float
 
 
 def free_port() -> int:
-    """A TCP port of the loopback address that nobody listens on just now."""
+    """A TCP port of the loopback address that is not in use now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def gone(pid: int) -> bool:
-    """Has this process ended? A container without init may have nobody who collects it."""
+    """Has this process ended? A zombie counts: a container without init does not reap it."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except (FileNotFoundError, ProcessLookupError):
@@ -45,14 +46,14 @@ def gone(pid: int) -> bool:
 
 
 class Child(subprocess.Popen[Any]):
-    """A program that a killed pytest leaves not behind."""
+    """A child process that the kernel ends when pytest is killed."""
 
     def __init__(self, command: Sequence[str], **options: Any) -> None:
-        super().__init__(tied(command), **options)
+        super().__init__(tied_to_parent(command), **options)
 
 
 def listening(port: int) -> bool:
-    """Does somebody take connections on this loopback port?"""
+    """Does a server accept connections on this loopback port?"""
     try:
         socket.create_connection(("127.0.0.1", port), 0.2).close()
     except OSError:
@@ -61,7 +62,7 @@ def listening(port: int) -> bool:
 
 
 def mosquitto_path() -> str:
-    """Debian puts the broker where users' PATH does not look."""
+    """Where mosquitto is; Debian installs it in a folder outside users' PATH."""
     found = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
     assert found, "mosquitto is not installed: `make test` installs it"
     return found
@@ -74,7 +75,7 @@ class Broker:
         self.port = port or free_port()
         lines = [f"listener {self.port} 127.0.0.1", "allow_anonymous true", *options]
         if os.geteuid() == 0:
-            lines.append("user root")  # it would become a user who may not enter our folders
+            lines.append("user root")  # else it changes to a user without access to our folders
         self._store = folder / f"store-{self.port}"
         if persistence:
             self._store.mkdir(parents=True, exist_ok=True)
@@ -108,7 +109,7 @@ class Broker:
         assert until(self._answers, 10), f"mosquitto did not start with {self._config.read_text()}"
 
     def stop(self) -> None:
-        """A polite end (SIGTERM): persistence is written."""
+        """SIGTERM: persistence is written."""
         self._end(lambda process: process.terminate())
 
     def kill(self) -> None:
@@ -116,19 +117,19 @@ class Broker:
         self._end(lambda process: process.kill())
 
     def save(self) -> None:
-        """Make it write its persistence now, and wait until it has."""
+        """Make it write its persistence now, and wait until it has done so."""
         file = self._store / "mosquitto.db"
         before = file.stat().st_mtime_ns if file.exists() else 0
         os.kill(self.pid, signal.SIGUSR1)
         assert until(lambda: file.exists() and file.stat().st_mtime_ns != before), "mosquitto did not save"
 
     def forget(self) -> None:
-        """Wipe what a stopped broker saved."""
+        """Delete what a stopped broker saved."""
         for file in self._store.glob("*"):
             file.unlink()
 
     def freeze(self) -> None:
-        """It keeps its connections, and answers nothing."""
+        """SIGSTOP: it keeps its connections and answers nothing."""
         os.kill(self.pid, signal.SIGSTOP)
 
     def thaw(self) -> None:
@@ -146,6 +147,41 @@ class Broker:
         return listening(self.port)
 
 
+def refusal(rules: Path, filters: Sequence[str]) -> list[str]:
+    """The options of a mosquitto that refuses subscriptions to ``filters``, spelled exactly so; writes ``rules``.
+
+    It does so in its SUBACK. With an `acl_file` it would grant them, and deliver nothing.
+    """
+    acls = [{"acltype": "subscribeLiteral", "topic": filter_, "allow": False} for filter_ in filters]
+    allowed = ("publishClientSend", "publishClientReceive", "subscribe", "unsubscribe")
+    security = {
+        "defaultACLAccess": dict.fromkeys(allowed, True),
+        "clients": [],
+        "groups": [{"groupname": "all", "roles": [{"rolename": "all"}]}],
+        "roles": [{"rolename": "all", "acls": acls}],
+        "anonymousGroup": "all",
+    }
+    rules.write_text(json.dumps(security))
+    rules.chmod(0o600)
+    plugin = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"))
+    return [f"plugin {plugin}", f"plugin_opt_config_file {rules}"]
+
+
+class RefusingBroker(Broker):
+    """A broker that refuses subscriptions, others at each :meth:`refuse`."""
+
+    def __init__(self, folder: Path) -> None:
+        port = free_port()
+        self._rules = folder / f"rules-{port}.json"
+        super().__init__(folder, *refusal(self._rules, ()), port=port)
+
+    def refuse(self, *filters: str) -> None:
+        """From now on refuse these filters and no others; restarts it."""
+        self.stop()
+        refusal(self._rules, filters)
+        self.start()
+
+
 class AmqttBroker:
     """amqtt in a process of its own: no bridge mode, no MQTT 5."""
 
@@ -155,7 +191,7 @@ class AmqttBroker:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "pebble.demo.embedded_broker", str(self.port)]
+        command = [sys.executable, "-m", "pebble.demo.broker", str(self.port)]
         self._process = Child(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         assert until(lambda: listening(self.port), 20), "amqtt did not start"
 

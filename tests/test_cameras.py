@@ -109,7 +109,7 @@ def test_no_such_robot_is_one_clear_sentence(env: dict[str, str]) -> None:
         camera("fred", width=0)
 
 
-def test_a_robot_without_a_picture_is_said_after_the_timeout(env: dict[str, str]) -> None:
+def test_a_robot_without_a_picture_raises_after_the_timeout(env: dict[str, str]) -> None:
     folder = default_run_folder("pebble/robots/goob", env)
     folder.mkdir(parents=True)
     with pytest.raises(PebbleError, match=r"no picture for 0\.1 s"):

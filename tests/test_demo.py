@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from pebble.demo.main import SHORTEST_S
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
-from pebble.demo.script import ROUND_S
 from tests.support import ROOT, until
 
 pytestmark = pytest.mark.alone
@@ -42,7 +42,7 @@ class Demo:
             )
 
     @property
-    def said(self) -> str:
+    def output(self) -> str:
         return self.log.read_text()
 
     def leftovers(self) -> list[str]:
@@ -66,7 +66,7 @@ def _pids() -> list[str]:
 def _read(pid: str, name: str) -> bytes:
     try:
         return Path("/proc", pid, name).read_bytes()
-    except OSError:  # it ended while we looked
+    except OSError:  # it has ended meanwhile
         return b""
 
 
@@ -76,14 +76,14 @@ def _command(pid: str) -> str:
 
 @pytest.fixture
 def temporary() -> Iterator[Path]:
-    """Short: the robots' unix sockets live below, and their paths end at 108 bytes."""
+    """A short path: the robots' unix sockets are below it, and their paths are limited to 108 bytes."""
     with tempfile.TemporaryDirectory(prefix="pebble-", dir="/tmp") as folder:
         yield Path(folder)
 
 
 @pytest.fixture
 def demos(temporary: Path) -> Iterator[list[Demo]]:
-    """Whatever is put in here surely ends."""
+    """Ends every demo that a test appends."""
     running: list[Demo] = []
     yield running
     for demo in running:
@@ -96,16 +96,16 @@ def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None 
     return demos[-1]
 
 
-@pytest.mark.parametrize(("broker", "seconds"), [("MOSQUITTO", MEDIA_ROUND_S + 3.0), ("EMBEDDED", ROUND_S + 1.0)])
-def test_all_robots_do_what_they_are_told(demos: list[Demo], temporary: Path, broker: str, seconds: float) -> None:
+@pytest.mark.parametrize(("broker", "seconds"), [("MOSQUITTO", MEDIA_ROUND_S + 3.0), ("EMBEDDED", SHORTEST_S + 1.0)])
+def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Path, broker: str, seconds: float) -> None:
     demo = start(demos, temporary, f"{seconds}, broker=BrokerKind.{broker}")
-    assert demo.process.wait(START_S + seconds + END_S) == 0, demo.said
-    seen_and_heard, _, driven = demo.said.partition("Seen by the MCUs")
-    assert driven.count("ok ") == 16, demo.said  # four steps, four robots
-    looks = {"MOSQUITTO": 12, "EMBEDDED": 6}[broker]  # two robots; four encodings of pictures, two of sound
-    assert seen_and_heard.partition("Seen and heard")[2].count("ok ") >= looks, demo.said
-    assert " zenoh " in demo.said
-    assert " mqtt " in demo.said
+    assert demo.process.wait(START_S + seconds + END_S) == 0, demo.output
+    media, _, driven = demo.output.partition("Measured by the MCUs")
+    assert driven.count("ok ") == 20, demo.output  # four steps and an emergency stop, four robots
+    encodings = {"MOSQUITTO": 12, "EMBEDDED": 6}[broker]  # two robots; four encodings of pictures, two of sound
+    assert media.partition("Received by the operator")[2].count("ok ") >= encodings, demo.output
+    assert " zenoh " in demo.output
+    assert " mqtt " in demo.output
     assert demo.leftovers() == []
     assert demo.folders() == []
 
@@ -113,17 +113,17 @@ def test_all_robots_do_what_they_are_told(demos: list[Demo], temporary: Path, br
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_everything_within_five_seconds(demos: list[Demo], temporary: Path, sign: signal.Signals) -> None:
     demo = start(demos, temporary, "")
-    assert until(lambda: "forward, stop" in demo.said, START_S), demo.said
+    assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
     demo.process.send_signal(sign)
     began = time.monotonic()
-    assert demo.process.wait(30) == 0, demo.said
+    assert demo.process.wait(30) == 0, demo.output
     assert time.monotonic() - began <= END_S
     assert demo.leftovers() == []
     assert demo.folders() == []
 
 
 def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demos: list[Demo], temporary: Path) -> None:
-    """To make, for example, if that leads the session: it only waits for us."""
+    """SIGHUP reaches the session leader, for example make, which only waits."""
     ours, terminal = pty.openpty()
     demo = start(demos, temporary, "", terminal)
     os.close(terminal)
@@ -137,15 +137,15 @@ def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demo
         assert until(lambda: shows(b"forward, stop"), START_S), shown
     finally:
         os.close(ours)
-    assert demo.process.wait(END_S) == 0, demo.said
-    assert demo.said == ""
+    assert demo.process.wait(END_S) == 0, demo.output
+    assert demo.output == ""
     assert demo.leftovers() == []
     assert demo.folders() == []
 
 
 def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Path) -> None:
     demo = start(demos, temporary, "")
-    assert until(lambda: "forward, stop" in demo.said, START_S), demo.said
+    assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
     assert len(demo.leftovers()) >= 12  # the demo, two brokers, four MCUs, two launchers and what they launched
     demo.process.kill()
     demo.process.wait(10)
@@ -156,13 +156,13 @@ def test_a_robot_that_does_not_come_up_is_a_failure_with_a_place_to_look(demos: 
     code = """
 import sys
 import pebble.demo.main as main
-import pebble.demo.robot as robot
+import pebble.demo.testbed as testbed
 main._DISCOVERY_S = 1.0
-robot.LinuxRobot.start = lambda self, ending: None
-sys.exit(main.run(10))
+testbed.LinuxRobot.start = lambda self, ending: None
+sys.exit(main.run(main.SHORTEST_S))
 """
     demos.append(Demo(temporary, code))
     assert demos[0].process.wait(START_S) == 1
-    assert "goob did not become ready to drive" in demos[0].said
+    assert "goob did not become ready to drive" in demos[0].output
     (folder,) = demos[0].folders()
-    assert str(folder) in demos[0].said
+    assert str(folder) in demos[0].output

@@ -1,4 +1,4 @@
-"""What `make test` fetches is checked, and fetched once."""
+"""`make test` checks its downloads, and downloads once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PATH = "/@micropython/micropython-webassembly-pyscript/-/micropython-webassembly
 
 
 class Registry(http.server.BaseHTTPRequestHandler):
-    """Has something else under every name."""
+    """Serves the same wrong content at every path."""
 
     asked: list[str]
 
@@ -53,7 +53,7 @@ def test_a_micropython_that_is_another_one_is_refused(tmp_path: Path, registry: 
     url, asked = registry
     done = fetch(tmp_path / "there", url)
     assert done.returncode == 1
-    assert done.stderr == f"{url}{PATH} is not what it was when this project chose it\n"
+    assert done.stderr == f"{url}{PATH} does not have the expected checksum\n"
     assert asked == [PATH]
     assert not list(tmp_path.rglob("*.wasm"))
 

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Installs Debian packages whose programs are missing: debian-packages.sh PROGRAM=PACKAGE …
-# An empty PROGRAM always installs. Users' PATH lacks the sbin folders, where Debian puts brokers: look there too.
+# An empty PROGRAM always installs. Also looks in the sbin folders, where Debian puts brokers and which users' PATH lacks.
 set -eu
 PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
 
@@ -16,15 +16,15 @@ give_up() {
     exit 1
 }
 
-command -v apt-get >/dev/null || give_up "missing:$missing. This is no Debian: install them with your package manager, or"
+command -v apt-get >/dev/null || give_up "missing:$missing. This is not Debian: install them with your package manager, or"
 if [ "$(id -u)" = 0 ]; then
     sudo=
 elif ! command -v sudo >/dev/null; then
-    give_up "missing:$missing. Neither root nor sudo is at hand;"
+    give_up "missing:$missing. Neither root nor sudo is available;"
 elif [ -t 0 ]; then
     sudo=sudo
 else
-    sudo="sudo -n" # nobody is there to type a password
+    sudo="sudo -n" # no terminal to type a password
 fi
 
 printf 'pebble: installing%s\n' "$missing"

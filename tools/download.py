@@ -1,4 +1,4 @@
-"""Downloads over https for the scripts beside it; proxies and SSL_CERT_FILE of the environment count."""
+"""Downloads over https for the other tools, with the proxies and SSL_CERT_FILE of the environment."""
 
 import os
 import ssl
@@ -10,7 +10,7 @@ ATTEMPTS = 3
 
 
 def fetch(url: str) -> bytes:
-    """What is at ``url``; ends the program with one line when it cannot be had."""
+    """The content of ``url``; ends the program with one line if the download fails."""
     problem: OSError | None = None
     for _ in range(ATTEMPTS):
         try:
@@ -22,7 +22,7 @@ def fetch(url: str) -> bytes:
 
 
 def _context() -> ssl.SSLContext:
-    """SSL_CERT_FILE is Python's own; whoever told only pip of an authority means this as well."""
+    """Python reads SSL_CERT_FILE itself; an authority that is configured only for pip is trusted here, too."""
     if "SSL_CERT_FILE" in os.environ:
         return ssl.create_default_context()
     return ssl.create_default_context(cafile=os.environ.get("PIP_CERT"))

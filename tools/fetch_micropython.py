@@ -1,6 +1,6 @@
-"""Puts MicroPython's WebAssembly build, the real interpreter for Node.js, into the folder given, unless it is there.
+"""Downloads MicroPython's WebAssembly build, the real interpreter for Node.js, into a folder unless it is there.
 
-It comes from npm's registry, without npm; $NPM_CONFIG_REGISTRY names another one.
+The source is npm's registry, or the one in $NPM_CONFIG_REGISTRY; npm is not needed.
 """
 
 import base64
@@ -30,16 +30,16 @@ def main(folder: Path) -> None:
         for name in FILES:
             member = archive.extractfile(f"package/{name}") or sys.exit(f"{PACKAGE} has no {name}")
             (folder / name).write_bytes(member.read())
-    there.write_text(VERSION)  # last: an interrupted run is done again
+    there.write_text(VERSION)  # last: an interrupted run is repeated
 
 
 def _tarball() -> bytes:
-    spellings = ("npm_config_registry", "NPM_CONFIG_REGISTRY")  # npm takes both, and sets the first for its scripts
+    spellings = ("npm_config_registry", "NPM_CONFIG_REGISTRY")  # npm accepts both, and sets the first for its scripts
     registry = next(filter(None, map(os.environ.get, spellings)), REGISTRY)
     url = f"{registry.rstrip('/')}/{PACKAGE}/-/{PACKAGE.partition('/')[2]}-{VERSION}.tgz"
     content = fetch(url)
     if base64.b64encode(hashlib.sha512(content).digest()).decode() != SHA512:
-        sys.exit(f"{url} is not what it was when this project chose it")
+        sys.exit(f"{url} does not have the expected checksum")
     return content
 
 

@@ -1,4 +1,4 @@
-"""Downloads pip's newest wheel from PyPI into the folder given, and prints its path: for Pythons without ensurepip."""
+"""Downloads pip's newest wheel from PyPI into the given folder, and prints its path: for Pythons without ensurepip."""
 
 import hashlib
 import json
@@ -17,7 +17,7 @@ def main(folder: Path) -> None:
     url = urljoin(INDEX, wheel["url"])
     content = fetch(url)
     if hashlib.sha256(content).hexdigest() != wheel["digests"]["sha256"]:
-        sys.exit(f"{url} is not what the index says it is")
+        sys.exit(f"{url} does not have the checksum of the index")
     target = folder / wheel["filename"]
     target.write_bytes(content)
     print(target)

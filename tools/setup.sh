@@ -1,6 +1,6 @@
 #!/bin/sh
 # Makes .venv and installs this checkout into it, with the extra named by the argument (demo, bench or dev).
-# Needs no root and no compiler. make calls it whenever pyproject.toml is newer than what it left behind.
+# Needs no root and no compiler. make runs it whenever pyproject.toml is newer than its last run.
 set -eu
 cd "$(dirname "$0")/.."
 extra=$1
@@ -12,8 +12,8 @@ fail() {
     exit 1
 }
 
-# The first Python that can run us and has every module named. The system's comes first: every user may run it, which is
-# not so with one in somebody's home. $PYTHON overrides the search.
+# The first suitable Python that has every module named. The system's comes first: every user can run it, unlike one in
+# a home folder. $PYTHON overrides the search.
 find_python() {
     for name in ${PYTHON:-/usr/bin/python3 python3.11 python3.12 python3.13 python3.14 python3}; do
         if "$name" -c "import sys, $1; sys.exit(sys.version_info < (3, 11))" 2>/dev/null; then
@@ -24,7 +24,7 @@ find_python() {
     return 1
 }
 
-# Debian leaves ensurepip out of its python3; pip's wheel from the index can install itself.
+# Debian's python3 has no ensurepip; pip's wheel from the index can install itself.
 fetch_pip() {
     wheel=$(.venv/bin/python tools/fetch_pip.py .venv) && .venv/bin/python "$wheel/pip" install --quiet "$wheel" && rm "$wheel"
 }
@@ -52,14 +52,14 @@ make_venv() {
 # A user without a home (nobody, a service account) has no place for pip's cache.
 [ -w "${HOME:-/nonexistent}" ] || export PIP_NO_CACHE_DIR=1
 .venv/bin/python -m pip --version >/dev/null 2>&1 || make_venv
-say "installing Pebble and what it needs for '$extra' into .venv; the first time takes a minute"
+say "installing Pebble and its dependencies for '$extra' into .venv; the first time takes a minute"
 .venv/bin/python -m pip install --disable-pip-version-check --editable ".[$extra]" >.venv/pip.log 2>&1 || {
     cat .venv/pip.log >&2
-    fail "pip could not install what Pebble needs, see above"
+    fail "pip could not install the dependencies, see above"
 }
 
-# The real MicroPython for Node.js, and what type checkers need to know of each board's own modules. The ports' stubs
-# contradict each other, so each has a folder of its own.
+# The real MicroPython for Node.js, and type stubs of each board's own modules. The ports' stubs
+# contradict each other, so each has its own folder.
 fetch_micropython() {
     .venv/bin/python tools/fetch_micropython.py .venv/micropython || fail "without it the firmware cannot be tested"
     for port in samd esp32 esp8266; do

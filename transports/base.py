@@ -1,6 +1,6 @@
-"""The one pub/sub interface, and everything about it that does not depend on how bytes move.
+"""The pub/sub interface, and all of its behaviour that does not depend on the backend.
 
-docs/transports.md numbers the promises (T1 to T19) that every backend keeps; the tests carry the same numbers.
+docs/transports.md numbers the promises (T1 to T21) of every backend; the tests have the same numbers.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from enum import Enum, IntEnum
 from types import TracebackType
 from typing import Self
@@ -19,16 +20,15 @@ import msgspec
 
 from pebble.errors import TransportError
 from pebble.transports.counters import Counters
-from pebble.transports.outgoing import Outgoing
 from pebble.transports.topics import check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
 
-QUEUE_LIMIT = 1000  # messages waiting for one slow handler before the oldest is dropped
-_OWN_LIMIT = 10_000  # kept topics a transport can say again; strangers may invent as many as they like
-_SETTLED_LIMIT = 65_536  # topics one subscription remembers having delivered, per connection
+QUEUE_LIMIT = 1000  # messages waiting for a slow handler before the oldest is dropped
+_OWN_LIMIT = 10_000  # retained topics a transport can send again; the names of topics may come from other programs
+_DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
-_QUIET_S = 5.0  # between two log lines about the same overflowing subscription
+_WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
 
 class QoS(IntEnum):
@@ -45,18 +45,29 @@ class State(Enum):
 
 
 class Message(msgspec.Struct, frozen=True):
-    """What travels. ``retain`` and ``keep`` differ: a *kept copy* is old news, a message *to be kept* is fresh.
+    """One message, published or received.
 
-    Published: ``retain`` asks for a kept copy. Received: ``retain`` marks the kept copy itself; on a connection opened
-    ``as_published`` it means "kept, or published to be kept". ``keep`` tells whether the publisher of a live message
-    asked for a kept copy; None where the broker hides it (T5, T7).
+    Published: ``retain`` asks the broker to retain it. Received: ``retain`` marks a retained message, an old value; on
+    a connection opened ``as_published`` it means "retained, or published with retain". ``retain_requested`` says
+    whether the publisher of a live message set ``retain``; None where the broker hides it (T5, T7).
     """
 
     topic: str
     payload: bytes
     qos: QoS = QoS.LATEST
     retain: bool = False
-    keep: bool | None = None
+    retain_requested: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """The bytes that a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
+
+    Zero from a backend that cannot measure it (T20).
+    """
+
+    waiting: int = 0  # bytes that the other machine has not confirmed, including some overhead of the protocols
+    round_trip_s: float = 0.0  # the shortest of this connection: what has waited for less is merely travelling
 
 
 Handler = Callable[[Message], None]
@@ -64,46 +75,48 @@ Watcher = Callable[[State], None]
 
 
 class Subscription:
-    """A filter, its handler and the bounded queue between them. Made by :meth:`Transport.subscribe`."""
+    """A filter, its handler and the bounded queue between them; :meth:`Transport.subscribe` makes it."""
 
     def __init__(
         self, transport: Transport, filter_: str, handler: Handler, *, qos: QoS, echo: bool, direct: bool, limit: int
     ) -> None:
         self.filter, self.qos, self.echo, self.direct = filter_, qos, echo, direct
-        self.dropped = 0  # messages lost because the handler was slower than its queue is long
+        self.dropped = 0  # messages lost because the handler was too slow
+        self.refused = False  # by the other end, on the newest connection; its transport sets it (T21)
         self._transport, self._handler, self._limit = transport, handler, limit
         self._lock = threading.RLock()
         self._arrived = threading.Condition(self._lock)
         self._queue: deque[Message] = deque()
-        self._settled: dict[str, None] = {}
+        self._delivered_topics: dict[str, None] = {}
         self._closed = False
-        self._said_at = float("-inf")
+        self._warned_at = float("-inf")
         self._thread: threading.Thread | None = None
         if not direct:
             self._thread = threading.Thread(target=self._run, name=f"pebble-sub {filter_}", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
-        """Stop delivery: once this returns no handler call starts any more. Safe from inside the handler."""
+        """Stop delivery: no handler call starts after this has returned. Safe from inside the handler."""
         self._stop()
         self._transport._forget(self)
-        self._join(_HANDLER_END_S)  # a handler that is running, or just about to, ends before we return if it is quick
+        self._join(_HANDLER_END_S)  # a quick handler that runs now ends before this returns
 
     # -- for transports
 
     def offer(self, message: Message, *, repeat: bool = False) -> None:
-        """Queue ``message``, unless it is a kept copy of something this connection has already delivered (T5, T8).
+        """Queue ``message``, unless it is a retained message of a topic this connection has already delivered (T5, T8).
 
-        As-published connections cannot tell kept from fresh; their backend says when a copy is surely a ``repeat``.
+        As-published connections cannot distinguish retained from live; their backend sets ``repeat`` when it is sure
+        that the message is a repetition.
         """
         with self._lock:
             if self._closed:
                 return
-            kept = repeat if self._transport.as_published else message.retain
-            if kept and message.topic in self._settled:
+            retained = repeat if self._transport.as_published else message.retain
+            if retained and message.topic in self._delivered_topics:
                 self._transport.counters.add("stale")
                 return
-            self._settle(message.topic)
+            self._note_delivered(message.topic)
             if self.direct:
                 self._call(message)
                 return
@@ -113,23 +126,23 @@ class Subscription:
             self._arrived.notify()
 
     def renew(self) -> None:
-        """A new connection began: kept copies are due again."""
+        """Start a new connection: retained messages are delivered again."""
         with self._lock:
-            self._settled.clear()
+            self._delivered_topics.clear()
 
-    def _settle(self, topic: str) -> None:
-        if topic in self._settled:
+    def _note_delivered(self, topic: str) -> None:
+        if topic in self._delivered_topics:
             return
-        if len(self._settled) >= _SETTLED_LIMIT:
-            self._settled.pop(next(iter(self._settled)))
-        self._settled[topic] = None
+        if len(self._delivered_topics) >= _DELIVERED_TOPICS_LIMIT:
+            self._delivered_topics.pop(next(iter(self._delivered_topics)))
+        self._delivered_topics[topic] = None
 
     def _overflow(self, lost: Message) -> None:
         self.dropped += 1
         self._transport.counters.add("dropped")
         now = time.monotonic()
-        if lost.qos is QoS.DELIVERED and now - self._said_at >= _QUIET_S:
-            self._said_at = now
+        if lost.qos is QoS.DELIVERED and now - self._warned_at >= _WARNING_PERIOD_S:
+            self._warned_at = now
             log.warning("handler of %s is too slow: %d messages dropped, oldest first", self.filter, self.dropped)
 
     def _run(self) -> None:
@@ -162,14 +175,14 @@ class Subscription:
 
 
 class Transport(ABC):
-    """One client of a fabric of topics. Shared semantics live here; a backend supplies the primitives at the end.
+    """One client of a publish/subscribe network: the shared behaviour; a backend supplies the abstract methods.
 
     All methods may be called from any thread, and from inside handlers.
     """
 
-    #: ``subscribe(echo=False)`` is kept exactly (T16). A backend that cannot promise it sets False when it knows.
+    #: Whether ``subscribe(echo=False)`` is exact (T16). A backend that cannot provide it sets False once it knows.
     exact_echo: bool = True
-    #: Received ``retain`` means "kept, or published to be kept"; own publishes never come back (T7).
+    #: Received ``retain`` means "retained, or published with retain"; own messages never come back (T7).
     as_published: bool = False
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
@@ -177,7 +190,7 @@ class Transport(ABC):
             check_topic(will.topic)
         self.client_id, self.will = client_id, will
         self.counters = Counters()
-        #: One line that says why there is no connection; empty while there is one.
+        #: One line that explains why there is no connection; empty while there is one.
         self.problem = ""
         self._state = State.CLOSED
         self._state_lock = threading.RLock()
@@ -185,10 +198,10 @@ class Transport(ABC):
         self._watchers: list[Watcher] = []
         self._subscriptions: list[Subscription] = []
         self._lock = threading.RLock()  # guards the list of subscriptions
-        self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order on the wire
-        self._own: dict[str, Message] = {}  # our newest message to be kept, by topic; empty payloads included
-        self._parked: dict[str, None] = {}  # topics in _own that the other side has not been told yet, oldest first
-        self._announcing = False  # guarded by _publishing
+        self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
+        self._own: dict[str, Message] = {}  # our newest retained message, by topic; empty payloads included
+        self._pending: dict[str, None] = {}  # topics in _own whose message is not sent yet, oldest first
+        self._syncing = False  # guarded by _publishing
 
     # -- what services call
 
@@ -198,7 +211,7 @@ class Transport(ABC):
 
     @property
     def outgoing(self) -> Outgoing:
-        """What was accepted and is still on its way, where the backend can tell (T20)."""
+        """What was accepted and is not delivered yet, where the backend can measure it (T20)."""
         return Outgoing()
 
     def on_state(self, watcher: Watcher) -> None:
@@ -208,7 +221,7 @@ class Transport(ABC):
     def open(self, timeout: float = 5.0) -> Self:
         """Start connecting and wait up to ``timeout`` seconds for success.
 
-        Returns in any case: a robot lives without its broker. Look at ``state`` and ``problem`` to know.
+        Returns in any case: a robot works without its broker. ``state`` and ``problem`` hold the result.
         Raises TransportError only for settings that can never work.
         """
         if self._state is not State.CLOSED:
@@ -223,7 +236,7 @@ class Transport(ABC):
         return self
 
     def close(self) -> None:
-        """Say goodbye (the will is spoken here too, so that others hear one story), and leave nothing behind."""
+        """Disconnect and free all resources. The will is published here too, so that others receive it either way."""
         with self._state_lock:
             if self._state is State.CLOSED:
                 return
@@ -241,11 +254,12 @@ class Transport(ABC):
     def publish(
         self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False, urgent: bool = False
     ) -> bool:
-        """Hand over one message; returns whether it was accepted.
+        """Publish one message; return whether it was accepted.
 
-        A message that is not kept is refused while there is no connection and never delivered late. A kept one is
-        always accepted: its newest value goes out when the connection is back (T4). ``urgent`` puts commands and
-        flags in front where the backend can. Raises TransportError for a topic that no transport may carry.
+        A live message is refused while there is no connection, and never delivered late. A retained one is accepted
+        unless the transport is closed: its newest value is stored, for at most 10,000 topics, and sent when the
+        connection is back (T4). ``urgent`` gives commands and flags priority where the backend can. Raises
+        TransportError for a topic that is not allowed.
         """
         check_topic(topic)
         if not isinstance(payload, bytes):
@@ -257,7 +271,8 @@ class Transport(ABC):
                 return False
             accepted = self._send(message, urgent)
             if retain:
-                self._remember(message, told=accepted and self._state is State.CONNECTED)
+                self._remember(message, sent=accepted and self._state is State.CONNECTED)
+            # "parked" is the published name of the counter of pending messages.
             self.counters.add("sent" if accepted else "parked" if retain else "refused")
             return accepted or retain
 
@@ -271,11 +286,11 @@ class Transport(ABC):
         direct: bool = False,
         limit: int = QUEUE_LIMIT,
     ) -> Subscription:
-        """Deliver kept copies and live messages that match ``filter_`` to ``handler``, until closed.
+        """Deliver retained and live messages that match ``filter_`` to ``handler``, until closed.
 
         Survives reconnects. ``echo=False`` leaves out what this transport itself publishes (T16). Each subscription
         has a thread and a queue of ``limit`` messages of its own (T13, T14); ``direct=True`` saves both for a handler
-        that only ever hands the message on: it then runs on the receiving thread and must neither block nor subscribe.
+        that only forwards the message: it then runs on the receiving thread and must neither block nor subscribe.
         Messages published after this returned are received (T3), if there is a connection.
         """
         check_filter(filter_)
@@ -303,7 +318,7 @@ class Transport(ABC):
             return [subscription for subscription in self._subscriptions if matches(subscription.filter, topic)]
 
     def _set_state(self, state: State) -> None:
-        """Tell everybody, once per change. A closed transport stays closed unless it is opened again."""
+        """Notify the watchers, once per change. A closed transport stays closed unless it is opened again."""
         with self._state_lock:
             if state is self._state or (self._state is State.CLOSED and state is State.CONNECTED):
                 return
@@ -318,7 +333,7 @@ class Transport(ABC):
             for watcher in list(self._watchers):
                 try:
                     watcher(state)
-                except Exception:  # somebody else's code on our thread
+                except Exception:  # foreign code on our thread
                     log.exception("a state watcher of %s failed", self.client_id)
 
     def _renew(self) -> None:
@@ -328,38 +343,38 @@ class Transport(ABC):
         for subscription in subscriptions:
             subscription.renew()
 
-    def _remember(self, message: Message, *, told: bool) -> None:
+    def _remember(self, message: Message, *, sent: bool) -> None:
         if message.topic not in self._own and len(self._own) >= _OWN_LIMIT:
             self.counters.add("forgotten")
             return
         self._own[message.topic] = message
-        self._parked.pop(message.topic, None)
-        if not told:
-            self._parked[message.topic] = None
+        self._pending.pop(message.topic, None)
+        if not sent:
+            self._pending[message.topic] = None
         elif not message.payload:
             del self._own[message.topic]
 
-    def _announce(self, known: Collection[str]) -> None:
-        """Send the kept messages a new connection owes: those changed while away, then those ``known`` lacks (T9)."""
+    def _sync_retained(self, known: Collection[str]) -> None:
+        """Send the pending retained messages, then our others that are not in ``known`` (T9)."""
         with self._publishing:
-            changed = [self._own[topic] for topic in self._parked]
-            missing = [m for topic, m in self._own.items() if topic not in self._parked and topic not in known]
-            self._announcing = True
+            changed = [self._own[topic] for topic in self._pending]
+            missing = [m for topic, m in self._own.items() if topic not in self._pending and topic not in known]
+            self._syncing = True
             try:
                 for message in changed + missing:
-                    self._remember(message, told=self._send(message, False))
+                    self._remember(message, sent=self._send(message, False))
             finally:
-                self._announcing = False
+                self._syncing = False
 
-    def _settle_in(self, known: Collection[str]) -> None:
-        """A new connection has its subscriptions: send the kept messages it owes, and be connected.
+    def _initial_sync(self, known: Collection[str]) -> None:
+        """Finish a new connection that has its subscriptions: send the retained messages it lacks, and be connected.
 
-        Before that a backend's ``_send`` goes only while ``_announcing``: what is published meanwhile is parked, and
-        sent last.
+        Until then a backend's ``_send`` accepts messages only while ``_syncing``: retained messages published
+        meanwhile are pending, and sent last.
         """
-        self._announce(known)
+        self._sync_retained(known)
         self._set_state(State.CONNECTED)
-        self._announce(self._own.keys())
+        self._sync_retained(self._own.keys())
 
     def _forget(self, subscription: Subscription) -> None:
         with self._lock:
@@ -370,19 +385,19 @@ class Transport(ABC):
 
     @abstractmethod
     def _open(self, timeout: float) -> None:
-        """Start connecting; call ``_set_state(CONNECTED)`` once subscriptions are in place and kept state is sent."""
+        """Start connecting; call ``_initial_sync`` once subscriptions are in place."""
 
     @abstractmethod
     def _close(self, will: Message | None) -> None:
-        """Send ``will`` if given, leave politely, and release every thread, socket and file."""
+        """Send ``will`` if given, disconnect, and release every thread, socket and file."""
 
     @abstractmethod
     def _send(self, message: Message, urgent: bool) -> bool:
-        """Hand one message over without blocking longer than a bounded time; False if it cannot go now."""
+        """Send one message within a bounded time; False if it cannot be sent now."""
 
     @abstractmethod
     def _declare(self, subscription: Subscription) -> None:
-        """Make ``subscription`` (already listed) live; wait, bounded, until it surely is."""
+        """Activate ``subscription`` (already listed); wait, bounded, until it surely is active."""
 
     @abstractmethod
     def _undeclare(self, subscription: Subscription) -> None:

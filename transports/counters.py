@@ -1,4 +1,4 @@
-"""Numbers a transport or service keeps about itself."""
+"""Named counters of a transport or service."""
 
 from __future__ import annotations
 

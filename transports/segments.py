@@ -1,4 +1,4 @@
-"""Shared memory that dead processes have left in /dev/shm: Zenoh's segments are files that their users keep locked."""
+"""Zenoh's shared memory segments: files in /dev/shm, locked by each process that uses them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import time
 from pathlib import Path
 
 SHM = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory is on Linux
-YOUNG_S = 1.0  # between making a segment and locking it: never a second
+YOUNG_S = 1.0  # a segment is locked within a second after its creation
 
 
 def sweep(folder: Path = SHM) -> int:
-    """Remove our user's segments that nobody uses any more; returns how many there were."""
+    """Remove the segments of this user that no process uses any more; return how many there were."""
     return sum(map(_remove_if_unused, folder.glob("*.zenoh")))
 
 
 def mappings() -> list[tuple[int, int, str]]:
-    """Where this process has segments mapped: first address, the one after the last, and the file."""
+    """The mapped segments of this process: first address, the one after the last, and the file."""
     found = []
     for line in Path("/proc/self/maps").read_text().splitlines():
         place, *_, path = line.split(maxsplit=5)
@@ -35,7 +35,7 @@ def mapped() -> int:
 def _remove_if_unused(segment: Path) -> bool:
     try:
         descriptor = os.open(segment, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except OSError:  # somebody else's, or gone
+    except OSError:  # of another user, or gone
         return False
     try:
         status = os.fstat(descriptor)

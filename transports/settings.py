@@ -1,4 +1,4 @@
-"""What a backend needs to know to connect; plain data, so that reading a config imports no client library."""
+"""The connection settings of the backends: plain data, so that reading a config imports no client library."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TlsSettings:
-    """Certificates of one link. Paths are absolute by the time they get here."""
+    """The certificates of one connection; all paths are absolute."""
 
     ca_cert: Path | None = None  # None: the system's authorities
     client_cert: Path | None = None
@@ -28,21 +28,21 @@ class MqttSettings:
     password: str | None = field(default=None, repr=False)
     tls: TlsSettings | None = None
     protocol: str = "3.1.1"  # or "5"
-    #: Ask the broker for exact ``echo=False`` and for the retain flag of live messages (bridge mode on 3.1.1,
+    #: Request exact ``echo=False`` and the retain flag of live messages from the broker (bridge mode on 3.1.1,
     #: noLocal and retain-as-published on 5). See T7 and T16 in docs/transports.md.
     as_published: bool = False
     reconnect_max_s: float = 0.5  # 0.5 inside the robot, 2.0 towards a remote broker
-    silence_s: float = 2.0  # a connection that does not answer for this long is opened anew (T19)
+    silence_s: float = 2.0  # a connection that does not answer for this long is replaced (T19)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZenohSettings:
-    """One peer of a robot's Zenoh fabric; ``run_dir`` holds the unix sockets of the hub and of all peers."""
+    """One peer of a robot's Zenoh network; ``run_dir`` contains the unix sockets of the hub and of all peers."""
 
     run_dir: Path
     listen: tuple[str, ...] = ()  # extra endpoints beyond the unix socket; never a default
     connect: tuple[str, ...] = ()
     tls: TlsSettings | None = None
     lease_ms: int = 2000
-    client: bool = False  # a short-lived tool: talks through the hub only, opens no socket of its own
-    journal: Path | None = None  # where the hub remembers kept copies and wills across restarts; only the hub reads it
+    client: bool = False  # a short-lived tool: connects to the hub only, opens no socket of its own
+    journal: Path | None = None  # where the hub stores retained messages and wills; only the hub reads it

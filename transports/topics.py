@@ -59,7 +59,7 @@ def check_filter(filter_: str) -> str:
 
 
 def is_pattern(filter_: str) -> bool:
-    """Does this filter have wildcards?"""
+    """Whether this filter has wildcards."""
     return "+" in filter_ or "#" in filter_
 
 

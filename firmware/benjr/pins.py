@@ -6,6 +6,6 @@ MOTOR_SHIELD = 0x30  # I2C address: both jumpers, AD0 and AD1, closed
 BATTERY = 0  # A0
 
 # The battery's voltage at a full reading. The ADC measures 1 V; the D1 mini puts 220 over 100 kOhm in front of it, the
-# battery shield another 130 (its jumper J2 closed): 4.5 V. Measure yours: what the robot reports against a meter is the
-# factor by which to change this.
+# battery shield another 130 (its jumper J2 closed): 4.5 V. To calibrate, multiply this by the voltage of a meter over
+# the voltage that the robot reports.
 BATTERY_FULL_V = 4.5

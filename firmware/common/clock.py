@@ -1,15 +1,14 @@
-"""The time of day on a board without a clock: asks a time server now and then, without waiting. A driver."""
+"""The time of day on a board without a clock, from a time server, without blocking. A driver."""
 
 import random
 
 from micropython import const
 
 from common import sntp
-from common.sockets import Question, ask_name
+from common.sockets import Query, query_name
 from common.ticks import add, diff
-from common.wall import Wall
 
-_WAIT_MS = const(900)  # half of the way there and back is added: of more than this, half would be a guess
+_WAIT_MS = const(900)  # half of the round trip is added; for longer ones that would be too inaccurate
 _LOOKUP_MS = const(3500)
 _RETRY_MS = const(10_000)
 _AGAIN_MS = const(3_600_000)  # a crystal that is 20 ppm off loses 72 ms in an hour
@@ -19,16 +18,16 @@ class Clock:
     """``step`` every turn; ``read`` gives epoch milliseconds, or those since boot until a server answered."""
 
     def __init__(self, host: str, now: int) -> None:
-        """``host`` "": nobody is asked."""
+        """``host`` is the time server; "": none."""
         self._host = host
-        self._wall = Wall(now)
+        self._wall = sntp.WallClock(now)
         self.read = self._wall.read
-        self._open: Question | None = None  # a server's name being looked up; with a nonce, the server being asked
+        self._open: Query | None = None  # the DNS query for the server's name; with a nonce, the request to it
         self._nonce: bytes | None = None
         self._due = now
 
     def step(self, now: int, server: str) -> None:
-        """``server`` knows names; "": there is no network. What fails is tried again later."""
+        """``server`` is the DNS server; "": there is no network. Failures are retried later."""
         if not server or not self._host:
             self._close(now)
             return
@@ -41,11 +40,11 @@ class Clock:
         if not self._open:
             if age >= 0:
                 self._due = now
-                self._open = ask_name(self._host, server, now)
+                self._open = query_name(self._host, server, now)
         elif self._nonce:
-            told = sntp.epoch_ms(self._open.step(now), self._nonce)
-            if told is not None:
-                self._wall.set(told + age // 2, now)
+            epoch = sntp.epoch_ms(self._open.step(now), self._nonce)
+            if epoch is not None:
+                self._wall.set(epoch + age // 2, now)
                 self._close(add(now, _AGAIN_MS))
             elif age >= _WAIT_MS:
                 self._close(add(now, _RETRY_MS))
@@ -54,13 +53,13 @@ class Clock:
             if address:
                 self._close(now)
                 self._nonce = random.getrandbits(32).to_bytes(4, "big") * 2
-                self._open = Question(address, 123, sntp.request(self._nonce), now)
+                self._open = Query(address, 123, sntp.request(self._nonce), now)
             elif address is not None or age >= _LOOKUP_MS:
                 self._close(add(now, _RETRY_MS))
 
     def _close(self, due: int) -> None:
-        """Nothing is open until ``due``; once it is, ``_due`` is when that began."""
-        self.read(due)  # now and then, or it loses count
+        """Close the socket until ``due``; while one is open, ``_due`` is when the request began."""
+        self.read(due)  # regularly, because ticks wrap
         self._due = due
         if self._open:
             self._open.socket.close()

@@ -1,8 +1,8 @@
 """The USB serial port of a board whose MicroPython has no select: lines of text only. The driver in place of usb.py.
 
-There, reading always waits. So the program waits for bytes (``listen``), and a timer makes the robot's turns meanwhile:
-MicroPython runs its callbacks while it waits (ports/samd/mphalport.c, mp_hal_stdin_rx_chr). Writing waits up to half a
-second for a host that has the port open but reads nothing; one such wait, and nothing is written for a second.
+Without select, reading always blocks. So the program blocks on input (``listen``), and a timer runs the robot's turns:
+MicroPython runs timer callbacks while it waits (ports/samd/mphalport.c, mp_hal_stdin_rx_chr). Writing blocks up to half
+a second for a host that has the port open but reads nothing; after one such wait, nothing is written for a second.
 """
 
 import sys
@@ -21,17 +21,17 @@ _CR = const(13)
 
 
 class Port:
-    """``read`` bytes, and ``pump`` often what waits in the ring of ``out``. Ctrl-C is a byte like any other."""
+    """``read`` returns bytes; ``send``, called often, sends the ring of ``out``. Ctrl-C is an ordinary byte."""
 
     def __init__(self, out) -> None:
         kbd_intr(-1)
         self._out = out
         self._ring = bytearray(_RING)
-        self._put = self._got = 0  # each is moved by one side only
+        self._put = self._got = 0  # each is changed by one side only
         self._stuck_at: int | None = None
 
     def listen(self, robot, watchdog) -> None:
-        """For ever: take in what the host sends, and let the robot have a turn every 5 ms."""
+        """Receive from the host for ever, while the robot has a turn every 5 ms."""
         self._robot, self._watchdog = robot, watchdog
         self._timer = machine.Timer(-1, period=_TURN_MS, callback=self._turn)
         byte = bytearray(1)
@@ -44,11 +44,11 @@ class Port:
             self._put = after
 
     def _turn(self, _timer) -> None:
-        """As in common/run.py, which hears nothing of what goes wrong in a callback."""
+        """Run a turn and handle errors as common/run.py does, which does not see exceptions of a callback."""
         try:
             self._robot.step()
             self._watchdog.feed()
-        except Exception:  # noqa: BLE001 - whatever it is: stop and start anew
+        except Exception:  # noqa: BLE001 - on any error: stop and reset
             self._robot.stop()
             machine.reset()
 
@@ -60,8 +60,8 @@ class Port:
         self._got = (self._got + 1) % _RING
         return byte
 
-    def pump(self) -> None:
-        """Pass on what waits; the port makes CR LF of each LF by itself."""
+    def send(self) -> None:
+        """Send the ring to the host; the port itself makes CR LF of each LF."""
         out = self._out
         size = len(out.ring)
         while out.used:

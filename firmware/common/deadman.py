@@ -1,10 +1,10 @@
-"""The dead-man's switch: motion lasts only as long as somebody keeps asking for it. Pure."""
+"""The dead-man's switch: motion ends a limited time after the last command. Pure."""
 
 from common.ticks import diff
 
 
 class DeadMan:
-    """``feed`` at every command that moves something, ``rest`` when nothing moves, ``expired`` at every turn."""
+    """Call ``feed`` at every command that moves something, ``rest`` when nothing moves, ``expired`` at every turn."""
 
     def __init__(self, limit_ms: int) -> None:
         self.limit_ms = limit_ms
@@ -20,7 +20,7 @@ class DeadMan:
         self._armed = False
 
     def expired(self, now: int) -> bool:
-        """True once, when the limit is over since the last ``feed``: stop the motors."""
+        """True once, when the limit has passed since the last ``feed``: the motors must stop."""
         if not self._armed or diff(now, self._fed) < self.limit_ms:
             return False
         self._armed = False

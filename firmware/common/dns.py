@@ -1,9 +1,9 @@
-"""Finding the IPv4 address of a name (RFC 1035; one-shot mDNS, RFC 6762 section 5.1): bytes out, bytes in. Pure."""
+"""DNS queries for IPv4 addresses (RFC 1035; one-shot mDNS, RFC 6762 section 5.1): bytes out, bytes in. Pure."""
 
 
 def query(host: str, ident: bytes) -> bytes:
-    """The question for ``host``; ``ident`` are two random bytes. ValueError: no name."""
-    # recursion wanted; one question
+    """Make the query for ``host``; ``ident`` is two random bytes. Raises ValueError for an invalid name."""
+    # recursion desired; one question
     data = ident + b"\1\0\0\1\0\0\0\0\0\0"
     for label in host.lower().encode().rstrip(b".").split(b"."):
         if not 0 < len(label) < 64:
@@ -13,7 +13,7 @@ def query(host: str, ident: bytes) -> bytes:
 
 
 def answer(data: bytes, asked: bytes) -> str | None:
-    """The address in ``data``, "" if it says that there is none, None if it does not answer what was ``asked``."""
+    """Return the address in ``data``, "" if there is none, None if it is not the answer to the query ``asked``."""
     at = len(asked)
     if len(data) < at or data[:2] != asked[:2] or data[12:at].lower() != asked[12:]:
         return None

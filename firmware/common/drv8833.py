@@ -19,7 +19,7 @@ class Motor:
         if duty == self._duty:
             return
         self._duty = duty
-        # the input that goes low goes first: both high would be the brake
+        # the input that goes low is set first: both high would brake
         if duty > 0:
             self._back.duty_u16(0)
             self._ahead.duty_u16(duty)

@@ -1,4 +1,4 @@
-"""Frames of pebble_serial_v1 as an MCU speaks it: COBS around a header, a payload and a CRC-16. Pure.
+"""Frames of pebble_serial_v1 on the MCU's side: COBS around a header, a payload and a CRC-16. Pure.
 
 A frame is COBS(version, type, flags, interface u16, sequence u32, milliseconds u32, payload, crc u16), then a zero
 byte; little-endian. The CRC is CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, nothing reflected.
@@ -22,7 +22,7 @@ _CRC = (
 
 
 def crc16(data: bytes | bytearray, size: int) -> int:
-    """Of the first ``size`` bytes."""
+    """CRC-16/CCITT-FALSE of the first ``size`` bytes."""
     crc, table = 0xFFFF, _CRC
     for index in range(size):
         crc ^= data[index] << 8
@@ -32,9 +32,9 @@ def crc16(data: bytes | bytearray, size: int) -> int:
 
 
 class Sender:
-    """Frames on their way to the host, in ``ring``: ``used`` bytes from ``first`` on, around its end.
+    """Frames for the host, queued in ``ring``: ``used`` bytes from ``first`` on, wrapping around its end.
 
-    They are stuffed where they wait, so a long manifest is never there twice.
+    They are COBS-encoded in place, so a long manifest needs no second buffer.
     """
 
     def __init__(self, size: int) -> None:
@@ -43,7 +43,7 @@ class Sender:
         self._header = bytearray(_HEADER_SIZE)
 
     def send(self, kind: int, interface: int, sequence: int, now: int, data: bytes | bytearray) -> bool:
-        """False: there is no room, and nothing of it was taken. ``now`` is its time in milliseconds."""
+        """Queue a frame with the time ``now`` in milliseconds. False: no room, and the frame is dropped."""
         ring, header, table = self.ring, self._header, _CRC
         size, end = len(ring), _HEADER_SIZE + len(data)
         if len(data) + _AROUND > size - self.used:
@@ -80,7 +80,7 @@ class Sender:
 
 
 class Decoder:
-    """``take`` the host's bytes; after each that completes a sound frame, its parts are here until the next one."""
+    """Decodes the host's bytes. After a byte that completes a valid frame, the attributes hold its parts."""
 
     def __init__(self) -> None:
         self.kind = self.interface = self.sequence = 0
@@ -88,7 +88,7 @@ class Decoder:
         self._length = 0
 
     def take(self, byte: int) -> bool:
-        """Whether ``byte`` ends a frame that is whole, not longer than 160 bytes and of our version."""
+        """Whether ``byte`` completes a valid frame of at most 160 bytes and of our version."""
         length = self._length
         if byte:
             if length < _LIMIT:
@@ -99,7 +99,7 @@ class Decoder:
         return 0 < length <= _LIMIT and self._parse(self._unstuff(length) - 2)
 
     def _unstuff(self, size: int) -> int:
-        """Decode in place; the length of what is left, 0 if a run goes beyond the end."""
+        """Decode in place; returns the decoded length, 0 if a run exceeds the frame."""
         buffer = self._buffer
         source = target = 0
         while source < size:
@@ -118,7 +118,7 @@ class Decoder:
         return target
 
     def _parse(self, size: int) -> bool:
-        """``size``: of all before the CRC."""
+        """Check and parse a decoded frame; ``size`` is that of all before the CRC."""
         buffer = self._buffer
         if size < _HEADER_SIZE or buffer[0] != _VERSION:
             return False

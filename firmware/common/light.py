@@ -1,4 +1,4 @@
-"""What a light shows now: a steady colour, or one that fades from dark to it and back for ever. Pure."""
+"""The present state of a light: a steady colour, or one that fades in and out for ever. Pure."""
 
 from micropython import const
 
@@ -13,7 +13,7 @@ class Light:
     """``colour`` = (blue, green, red), each 0..1. ``period_ms`` = 0 glows, else one fade up and down."""
 
     def __init__(self, now: int) -> None:
-        self.flash(0.0, 0.0, 1.0, 2.0, now)  # what Goob and Fred show before anybody says otherwise
+        self.flash(0.0, 0.0, 1.0, 2.0, now)  # of Goob and Fred before the first command
 
     def glow(self, blue: float, green: float, red: float) -> None:
         self.colour = (blue, green, red)
@@ -25,7 +25,7 @@ class Light:
         self._began = now
 
     def level(self, now: int) -> int:
-        """How much of the colour is to be seen, 0..512."""
+        """Return the brightness, 0..512."""
         if not self.period_ms:
             return _STEPS
         into = diff(now, self._began)

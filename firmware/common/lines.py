@@ -1,12 +1,15 @@
-"""The text protocol goob_base_v1 as a motor board speaks it: bytes in, commands and lines out. Pure.
+"""The text protocol goob_base_v1 on a motor board: bytes in, commands and lines out. Pure.
 
-``M <left> <right>``, ``L <b> <g> <r>``, ``F <b> <g> <r> <period_s>``. The first letter of a line decides, in either
-case; of up to five numbers the needed ones are taken and the rest of the line is not looked at.
+``M <left> <right>``, ``L <b> <g> <r>``, ``F <b> <g> <r> <period_s>``. The first letter of a line is the command, in
+either case; up to five numbers are read, and the rest of the line is ignored.
 """
 
 from micropython import const
 
-_LIMIT = const(256)  # bytes of a line without its LF; the longest that makes sense has under 60
+from common.ticks import diff
+
+_LIMIT = const(256)  # bytes of a line without its LF; the longest useful one has under 60
+_SILENCE_MS = const(200)  # a host writes a line at once; one that is unfinished by then is from a killed host
 _NUMBERS = const(5)
 _RING = const(128)  # bytes for the host
 _LF = const(10)
@@ -15,21 +18,23 @@ _MANY = const(100_000_000)  # nine digits are enough, and still a small integer
 
 
 class Lines:
-    """``take`` the host's bytes: ``obey(letter, numbers)`` is called for each good command, with the letter's code and
-    five floats. What is ``say`` and the answers wait in ``ring``: ``used`` bytes from ``first`` on, around its end.
+    """Pass the host's bytes to ``take``, and call ``rest`` when there are none. ``act(letter, numbers)`` is called for
+    each valid command, with the letter's code and five floats. ``length`` is that of the unfinished line.
+    Answers and lines of ``put`` are queued in ``ring``: ``used`` bytes from ``first`` on, wrapping around its end.
     """
 
-    def __init__(self, obey) -> None:
+    def __init__(self, act) -> None:
         self.numbers = [0.0] * _NUMBERS
         self.ring = bytearray(_RING)
         self.first = self.used = 0
-        self._obey = obey
+        self._act = act
         self._line = bytearray(_LIMIT)
-        self._length = 0
+        self.length = 0
         self._skipping = False
+        self._silent_at: int | None = None  # since when no byte was received
 
-    def say(self, line: bytes) -> None:
-        """Without its CR LF. It is lost as a whole if the host reads too slowly."""
+    def put(self, line: bytes) -> None:
+        """Queue a line, without its CR LF. A line that does not fit is dropped."""
         size = len(line) + 2
         if size > _RING - self.used:
             return
@@ -42,17 +47,26 @@ class Lines:
         self.used += size
 
     def take(self, byte: int) -> None:
+        self._silent_at = None
         if byte == _LF:
             if not self._skipping:
-                self._end(self._length)
+                self._end(self.length)
             self._skipping = False
-            self._length = 0
-        elif self._length < _LIMIT:
-            self._line[self._length] = byte
-            self._length += 1
+            self.length = 0
+        elif self.length < _LIMIT:
+            self._line[self.length] = byte
+            self.length += 1
         elif not self._skipping:
             self._skipping = True
-            self.say(b"WARN line too long")
+            self.put(b"WARN line too long")
+
+    def rest(self, now: int) -> None:
+        """Drop an unfinished line after 200 ms without a byte. A pause in reading does not count."""
+        if self._silent_at is None:
+            self._silent_at = now
+        elif self.length and diff(now, self._silent_at) >= _SILENCE_MS:
+            self.length = 0
+            self._skipping = False
 
     def _end(self, length: int) -> None:
         line = self._line
@@ -64,7 +78,7 @@ class Lines:
             letter -= 32
         wanted = 2 if letter == 77 else 3 if letter == 76 else 4 if letter == 70 else 0  # M, L, F
         if not wanted:
-            self.say(b"ERR unknown command")
+            self.put(b"ERR unknown command")
             return
         count = 0
         while count < _NUMBERS:
@@ -74,21 +88,21 @@ class Lines:
             self.numbers[count] = number(line, at, length)
             count += 1
         if count < wanted:
-            self.say(b"ERR %c needs %d values" % (letter, wanted))
+            self.put(b"ERR %c needs %d values" % (letter, wanted))
             return
-        self._obey(letter, self.numbers)
-        self.say(b"OK %c" % letter)
+        self._act(letter, self.numbers)
+        self.put(b"OK %c" % letter)
 
 
 def _after(line: bytearray, at: int, end: int, blanks: bool) -> int:
-    """Where the run of blanks, or of anything else, that starts at ``at`` is over."""
+    """Return the end of the run of blanks, or of other bytes, that starts at ``at``."""
     while at < end and (line[at] == _BLANK or 9 <= line[at] <= 13) == blanks:
         at += 1
     return at
 
 
 def number(line: bytes | bytearray, at: int, end: int) -> float:
-    """The decimal number at ``at``. What follows it does not count; anything else, nan and inf too, is 0."""
+    """Return the decimal number at ``at``, whatever follows it; 0 for anything else, including nan and inf."""
     negative = line[at] == 45
     if negative or line[at] == 43:
         at += 1
@@ -109,5 +123,5 @@ def number(line: bytes | bytearray, at: int, end: int) -> float:
 
 
 def clamp(value: float, lowest: float) -> float:
-    """``value`` within ``lowest`` .. 1."""
+    """Limit ``value`` to ``lowest`` .. 1."""
     return lowest if value < lowest else 1.0 if value > 1.0 else value

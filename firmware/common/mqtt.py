@@ -1,30 +1,32 @@
 """An MQTT 3.1.1 client: bytes in, bytes out, no socket, no clock. Pure.
 
-Memory is fixed: one packet that comes in, and a little that goes out. What is too long is skipped without being kept.
-A broker that refuses us, or sends what no broker may send, is a ValueError: close the connection. Section numbers are
-those of the OASIS standard of 2014.
+Memory is fixed: one incoming packet and a small output buffer. Longer packets are skipped without being stored. A
+ValueError means that the broker refused the connection or violated the protocol: close it. Section numbers are those
+of the OASIS standard of 2014.
 """
 
 
 class Client:
-    """``space`` and ``take`` for what comes in; ``send``, ``out``, ``waiting`` and ``sent`` for what goes out."""
+    """``space`` and ``take`` are for input; ``send``, ``out``, ``waiting`` and ``sent`` for output."""
 
-    def __init__(self, incoming: int, outgoing: int) -> None:
-        """Sizes in bytes: the longest packet to read, and what is handed to the socket at once."""
+    def __init__(self, incoming: int, outgoing: int, topics: tuple) -> None:
+        """Sizes in bytes: of the longest packet to read, and of the output buffer. ``topics``: to subscribe to."""
         self.data = memoryview(bytearray(incoming))
         self.out = memoryview(bytearray(outgoing))
-        self.skipped = 0  # publications too long for us
+        self.topics = topics
+        self.topic = -1  # of the publication: its place in ``topics``, -1: it is none of them
+        self.first = self.last = self.retained = 0  # of the publication
         self.restart()
 
     def restart(self) -> None:
-        """A new connection begins: forget what was under way."""
+        """Discard all state for a new connection."""
         self.waiting = self._at = self._end = self._skip = 0
         self._more: list[bytes | memoryview] = []
 
     # -- in
 
     def space(self) -> memoryview:
-        """Where the next bytes go; tell ``take`` how many came."""
+        """Return the buffer for the next bytes; pass their number to ``take``."""
         left = self._end - self._at
         if left and self._at:
             self.data[:left] = bytes(self.data[self._at : self._end])
@@ -33,10 +35,11 @@ class Client:
         return self.data[left:]
 
     def take(self, count: int = 0) -> str:
-        """What the next packet is: "welcome", "subscribed", "publication" or "pong"; "": there is none.
+        """Return the kind of the next packet: "welcome", "subscribed", "publication" or "pong"; "": there is none.
 
-        ``count`` bytes came since the last call. A publication is of the one topic there is, and ``retained`` or not;
-        its payload is ``data[first:last]`` until ``space`` is asked for.
+        ``count`` bytes were received since the last call. A publication is on ``topics[topic]``, ``retained`` or not;
+        its payload is ``data[first:last]`` until the next call of ``space``. The kind of one whose payload is too long
+        to be stored is "too long". "subscribed": that range has a byte for each topic, above 127 if it is refused.
         """
         data = self.data
         self._end += count
@@ -62,25 +65,24 @@ class Client:
             self._skip = stop - self._at  # of one that is too long
             first = data[start]
             if first >> 4 == 3:
-                if self._publication(first, at + 1, stop):
-                    return "publication"
-                continue
+                self._publication(first, at + 1, stop)
+                return "too long" if self._skip else "publication"
             code = data[self._at - 1]
             if first == 0x20 and length == 2:  # CONNACK
                 if code:  # 3.2.2.3: 1 protocol, 2 client id, 3 broker unavailable, 4 user or password, 5 rights
                     raise ValueError("refused by the broker: %d" % code)
                 return "welcome"
-            if first == 0x90 and length == 3:  # SUBACK
-                if code > 127:
-                    raise ValueError("subscription refused")
+            if first == 0x90 and length == 2 + len(self.topics):  # SUBACK
+                self.first = at + 3
+                self.last = stop
                 return "subscribed"
             if first == 0xD0 and not length:  # PINGRESP
                 return "pong"
             raise ValueError("packet %02x" % first)
         return ""
 
-    def _publication(self, first: int, at: int, stop: int) -> bool:
-        """Acknowledge it, even if it is too long to be kept: the broker would hold back those behind it."""
+    def _publication(self, first: int, at: int, stop: int) -> None:
+        """Acknowledge it, even if it is too long to be stored: the broker would hold back the following ones."""
         data = self.data
         topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1
         body = topic + (first & 6)  # behind a packet id of two bytes if its QoS is 1, whose flag is a 2 as well
@@ -88,23 +90,23 @@ class Client:
             raise ValueError("publication")
         if body > topic:
             out, end = self.out, self.waiting
-            out[end] = 0x40  # PUBACK, by hand: a flood of it shall leave no garbage
+            out[end] = 0x40  # PUBACK, written in place: a flood of them must not allocate memory
             out[end + 1] = 2
             out[end + 2] = data[topic]
             out[end + 3] = data[topic + 1]
             self.waiting = end + 4
-        if self._skip:
-            self.skipped += 1
-            return False
+        name = data[at + 2 : topic]
+        self.topic = len(self.topics) - 1
+        while self.topic >= 0 and name != self.topics[self.topic]:
+            self.topic -= 1
         self.first = body
         self.last = stop
         self.retained = first & 1
-        return True
 
     # -- out
 
     def send(self, first: int, *parts: bytes) -> bool:
-        """A packet of these parts; False: others wait, and there is no room for it behind them."""
+        """Queue a packet of these parts; False: there is no room for it behind others."""
         length = sum(map(len, parts))
         size = len(self.out)
         if self._more or size - self.waiting < length + 3 <= size:
@@ -115,11 +117,11 @@ class Client:
         return True
 
     def publish(self, retain: int, topic: bytes, payload: bytes) -> bool:
-        """With QoS 0; ``retain`` 1: to be kept. False: there is no room for it now."""
+        """Publish with QoS 0; ``retain`` 1: as a retained message. False: there is no room for it now."""
         return self.send(0x30 | retain, bytes((len(topic) >> 8, len(topic) & 255)), topic, payload)
 
     def sent(self, count: int) -> None:
-        """The first ``count`` bytes of ``out`` are gone; what did not fit follows."""
+        """Remove the first ``count`` bytes of ``out``, which were sent, and refill it."""
         left = self.waiting - count
         if count and left:
             self.out[:left] = bytes(self.out[count : self.waiting])
@@ -136,20 +138,20 @@ class Client:
 
 
 def text(data: bytes) -> bytes:
-    """As it goes into a packet: behind its length (1.5.3)."""
+    """Encode a string of a packet: its length, then its bytes (1.5.3)."""
     return bytes((len(data) >> 8, len(data) & 255)) + data
 
 
 def login(name: bytes, user: bytes, password: bytes, topic: bytes, will: bytes, alive_s: int) -> tuple:
-    """What to ``send`` first: a clean session, and a ``will`` of QoS 1 that is kept at ``topic`` (3.1)."""
+    """CONNECT for ``send``: a clean session, and a retained ``will`` of QoS 1 on ``topic`` (3.1)."""
     # clean session 2, will 4, its QoS 8, its retain flag 32, password 64, user 128
-    # and no password without a user, though he may have no name (3.1.2.9)
+    # a password needs a user, whose name may be empty (3.1.2.9)
     flags = 0x2E | (0xC0 if password else 0x80 if user else 0)
     head = b"\x00\x04MQTT\x04" + bytes((flags, alive_s >> 8, alive_s & 255))
     secrets = (text(user) if user or password else b"") + (text(password) if password else b"")
     return 0x10, head, text(name), text(topic), text(will), secrets
 
 
-def subscription(topic: bytes) -> tuple:
-    """What to ``send`` second, as packet 1: ``topic``, please, with QoS 1 (3.8)."""
-    return 0x82, b"\x00\x01", text(topic), b"\x01"
+def subscription(topics: tuple) -> tuple:
+    """SUBSCRIBE for ``send``: packet 1, each of ``topics`` with QoS 1, in this order (3.8)."""
+    return (0x82, b"\x00\x01") + tuple([text(topic) + b"\x01" for topic in topics])

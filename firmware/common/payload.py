@@ -1,52 +1,106 @@
-"""What a drive-values message asks for (paper A.8.3): the meaning of pebble/codec.py in a few hundred bytes. Pure."""
+"""Drive-values messages and the wheel speeds they ask for (paper A.8.3), in a few hundred bytes. Pure."""
 
 import json
 
 from micropython import const
 
-from common.wheels import clamp
+from common.arbiter import PERSON, UNKNOWN_RUN
 
-_MAX_BYTES = const(1024)
-_MAX_BRACKETS = const(32)  # a parser's memory grows with depth, so nobody may ask for more
+_MAX_BYTES = const(512)
+_MAX_BRACKETS = const(32)  # limits the parser's memory, which grows with depth
 
 
-def wanted(raw: memoryview | bytes) -> tuple[float, float, float] | None:
-    """``(x, z, y)`` within -1..1 from bare or wrapped JSON; missing axes are 0. None: refused."""
+_LAST_RUN = const((1 << 30) - 1)
+_WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because they would need memory
+
+_NUMBERS = int, float
+
+
+def load(raw: memoryview | bytes):
+    """Parse JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError."""
     if len(raw) > _MAX_BYTES:
-        return None
+        raise ValueError
     brackets = highest = 0
     for byte in raw:
         highest = max(highest, byte)
         if byte == 0x5B or byte == 0x7B:  # [ or {
             brackets += 1
     if brackets > _MAX_BRACKETS:
-        return None
+        raise ValueError
+    if highest > 127:
+        bytes(raw).decode()  # parsers of boards do not check for UTF-8
+    return json.loads(raw)  # type: ignore[type-var]  # any buffer will do (extmod/modjson.c)
+
+
+def parse(raw: memoryview | bytes) -> tuple[float, float, float, int, int] | None:
+    """Return ``(x, z, y, run, valid_ms)`` from bare or wrapped JSON. None: refused.
+
+    Axes are within -1..1, missing ones 0. ``run`` and ``valid_ms`` are as the arbiter needs them. Wrong ones, or a
+    wrong ``source``, refuse a command that moves anything, but never a stop.
+    """
     try:
-        if highest > 127:
-            bytes(raw).decode()  # parsers of boards do not look whether it is UTF-8
-        body = json.loads(raw)  # type: ignore[type-var]  # any buffer will do (extmod/modjson.c)
+        body = load(raw)
         if isinstance(body, dict):
             inner = body.get("value")
             if isinstance(inner, dict):
                 body = inner
-            return _axis(body, "x"), _axis(body, "z"), _axis(body, "y")
+            x, z, y = _axis(body, "x"), _axis(body, "z"), _axis(body, "y")
+            stops = x == 0.0 and z == 0.0 and y == 0.0
+            run, valid_ms = _run(body, stops), _valid_ms(body, stops)
+            return x, z, y, run, valid_ms
     except (ValueError, OverflowError, MemoryError):  # not UTF-8, no JSON, no number
         pass
     return None
+
+
+def _run(body: dict, stops: bool) -> int:
+    source = body.get("source")
+    run = body.get("run")
+    if run is not None and not (type(run) is int and 1 <= run <= _LAST_RUN):
+        run = UNKNOWN_RUN
+    if not stops and (run == UNKNOWN_RUN or not (source is None or isinstance(source, str))):
+        raise ValueError
+    if source != "autonomy":  # any other source is a person
+        return PERSON
+    if run is None:
+        if not stops:
+            raise ValueError
+        run = UNKNOWN_RUN
+    return run
+
+
+def _valid_ms(body: dict, stops: bool) -> int:
+    value = body.get("valid_ms")
+    if value is not None:
+        if type(value) in _NUMBERS and 0 <= value < 1e12 and (stops or value >= 1):
+            return int(min(value, _WATCHDOG_MS))
+        if not stops:
+            raise ValueError
+    return -1
 
 
 def _axis(body: dict, name: str) -> float:
     value = body.get(name, 0)
     if isinstance(value, str):
         value = value.strip().lower()
-        if not value.split("e")[0].strip("+-."):  # a board's float() takes "." and "e5" for 0
+        if not value.split("e")[0].strip("+-."):  # a board's float() reads "." and "e5" as 0
             raise ValueError
         for char in value:
-            if char not in "0123456789+-.e":  # it would also take nan, inf and 1_0
+            if char not in "0123456789+-.e":  # it would also accept nan, inf and 1_0
                 raise ValueError
-    elif isinstance(value, bool) or not isinstance(value, (int, float)):
+    elif type(value) not in _NUMBERS:
         raise ValueError
     value = float(value)
-    if value - value != 0.0:  # NaN or infinite
+    if not -1e999 < value < 1e999:  # NaN or infinite; arithmetic would allocate memory
         raise ValueError
     return clamp(value)
+
+
+def clamp(value: float) -> float:
+    """Limit ``value`` to -1..1."""
+    return -1.0 if value < -1.0 else 1.0 if value > 1.0 else value
+
+
+def mix(x: float, z: float) -> tuple[float, float]:
+    """Left and right wheel, -1..1, + = forward, for steering ``x`` (+ = right) and throttle ``z`` (+ = forward)."""
+    return clamp(z + x), clamp(z - x)

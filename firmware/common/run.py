@@ -1,4 +1,4 @@
-"""The endless loop on a board. The only place that catches everything: whatever happens, the motors stop first."""
+"""The main loop of a board. The only place that catches every exception: the motors stop first in any case."""
 
 import time
 
@@ -6,18 +6,18 @@ import machine
 from micropython import kbd_intr
 
 _WATCHDOG_MS = 2000
-_DOOR_MS = 1000
+_INTERRUPT_MS = 1000
 
 
 def run(build, settings: dict) -> None:
-    """``build(settings)`` makes the robot, motors off. Its errors reach the prompt: nothing moves yet."""
+    """Make the robot with ``build(settings)``, motors off, and run it. Errors of ``build`` reach the prompt."""
     robot = build(settings)
-    if getattr(robot, "door", True):
-        _leave_door_open()
+    if getattr(robot, "ctrl_c", True):
+        _allow_interrupt()
     watchdog = _watchdog()
     try:
         listen = getattr(getattr(robot, "port", None), "listen", None)
-        if listen:  # where reading waits, a timer makes the turns: common/console.py
+        if listen:  # where reading blocks, a timer runs the turns: common/console.py
             listen(robot, watchdog)
         while True:
             robot.step()
@@ -25,22 +25,22 @@ def run(build, settings: dict) -> None:
     except KeyboardInterrupt:
         robot.stop()
         raise
-    except Exception:  # noqa: BLE001 - whatever it is: stop and start anew
+    except Exception:  # noqa: BLE001 - on any error: stop and reset
         try:
             robot.stop()
         finally:
             machine.reset()
 
 
-def _leave_door_open() -> None:
-    """One second in which Ctrl-C leads to the prompt, and no watchdog runs: so `pebble flash` gets in after a reset."""
+def _allow_interrupt() -> None:
+    """Allow Ctrl-C for one second without a watchdog, so that `pebble flash` reaches the prompt after a reset."""
     kbd_intr(3)
-    time.sleep_ms(_DOOR_MS)
+    time.sleep_ms(_INTERRUPT_MS)
     kbd_intr(-1)
 
 
 def _watchdog():
     try:
         return machine.WDT(timeout=_WATCHDOG_MS)
-    except (TypeError, ValueError):  # an ESP8266 has one time only, about three seconds
+    except (TypeError, ValueError):  # an ESP8266 has one fixed timeout, about three seconds
         return machine.WDT()

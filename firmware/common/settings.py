@@ -1,4 +1,4 @@
-"""The robot's identity, its Wi-Fi and its broker: /private_config.json, which never leaves the board. A driver."""
+"""The robot's identity, Wi-Fi and broker, from /private_config.json, which never leaves the board. A driver."""
 
 import json
 
@@ -6,7 +6,7 @@ _PATH = "/private_config.json"
 
 
 def load() -> dict:
-    """What the file says; {} if there is none that can be read: the robot stops its motors before it complains."""
+    """Read the file; {} if that fails: the robot must stop its motors before it reports missing settings."""
     try:
         with open(_PATH) as file:
             return json.load(file)
@@ -15,8 +15,17 @@ def load() -> dict:
 
 
 def get(settings: dict, section: str, name: str, default=None):
-    """One setting; ValueError if it is missing and has no default."""
+    """Return one setting. Raises ValueError if it is missing and has no default."""
     value = settings.get(section, {}).get(name, default)
     if value is None:
         raise ValueError("private_config.json lacks " + section + "." + name)
     return value
+
+
+def base(system: str, kind: str, name: str) -> bytes:
+    """Return the base of the robot's topics (paper A.4.1), before /incoming/{metric} and /outgoing/{metric}."""
+    for part in (system, kind, name):
+        for char in part or "/":
+            if char in '/+#"\\' or char < " ":
+                raise ValueError("not a name for a topic: " + repr(part))
+    return b"%s/%s/%s" % (system.encode(), kind.encode(), name.encode())

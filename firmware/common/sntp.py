@@ -1,18 +1,20 @@
-"""Asking a time server once (SNTP, RFC 4330): bytes out, bytes in. Pure."""
+"""The time of day: requests to a time server and its answers (SNTP, RFC 4330), and the clock they set. Pure."""
 
 import struct
+
+from common.ticks import diff
 
 _TO_UNIX_S = 2208988800  # from 1900, where NTP counts from, to 1970
 _ERA_S = 1 << 32  # NTP's seconds start again in 2036
 
 
 def request(nonce: bytes) -> bytes:
-    """48 bytes: version 4, client; the 8 random bytes come back in the answer and tell it from a forged one."""
+    """Make the 48-byte request, version 4, client; the answer repeats the 8 random bytes, a forged one cannot."""
     return b"\x23" + bytes(39) + nonce
 
 
 def epoch_ms(packet: bytes, nonce: bytes) -> int | None:
-    """When the server sent ``packet``, in epoch milliseconds; None if it is no good answer to our request."""
+    """Return when the server sent ``packet``, in epoch milliseconds; None for an invalid answer to our request."""
     if len(packet) < 48 or packet[24:32] != nonce:
         return None
     first, stratum = packet[0], packet[1]
@@ -24,3 +26,24 @@ def epoch_ms(packet: bytes, nonce: bytes) -> int | None:
     if not seconds >> 31:
         seconds += _ERA_S
     return (seconds - _TO_UNIX_S) * 1000 + (fraction * 1000 >> 32)
+
+
+class WallClock:
+    """The time of day. Before the first ``set`` it counts from 0, which readers treat as an unknown time.
+
+    Call ``read`` at least once in six days, because ticks wrap.
+    """
+
+    def __init__(self, now: int) -> None:
+        self._epoch_ms = 0
+        self._at = now
+
+    def set(self, epoch_ms: int, now: int) -> None:
+        """Set the time to ``epoch_ms`` at tick ``now``."""
+        self._epoch_ms = epoch_ms
+        self._at = now
+
+    def read(self, now: int) -> int:
+        self._epoch_ms += diff(now, self._at)
+        self._at = now
+        return self._epoch_ms

@@ -1,7 +1,7 @@
-"""Arithmetic on the milliseconds of time.ticks_ms(), which start again after 2**30. Pure.
+"""Arithmetic on the milliseconds of time.ticks_ms(), which wrap after 2**30. Pure.
 
-The same as time.ticks_diff and time.ticks_add of every MicroPython port; here so that cores need no clock module.
-All steps stay within 31-bit integers, which MicroPython keeps without memory of their own.
+The same as time.ticks_diff and time.ticks_add of every MicroPython port; here so that pure modules need no clock
+module. All intermediate values are 31-bit integers, for which MicroPython allocates no memory.
 """
 
 from micropython import const
@@ -11,7 +11,7 @@ _HALF = const(1 << 29)
 
 
 def diff(later: int, earlier: int) -> int:
-    """Milliseconds from ``earlier`` to ``later``; right while they are less than 6.2 days apart."""
+    """Milliseconds from ``earlier`` to ``later``; correct while they are less than 6.2 days apart."""
     ahead = (later - earlier) & _MASK
     return ahead if ahead < _HALF else ahead - _HALF - _HALF
 
@@ -22,9 +22,9 @@ def add(moment: int, ms: int) -> int:
 
 
 class Grid:
-    """Moments at a fixed distance: what a pause missed is not made up for, and being late once delays nothing later.
+    """Times at a fixed period: missed ones are skipped, and a late one does not delay the following ones.
 
-    ``due`` says True once per ``period``, for the first time one period after ``now``.
+    ``due`` returns True once per ``period``, for the first time one period after ``now``.
     """
 
     def __init__(self, period: int, now: int) -> None:

@@ -1,7 +1,7 @@
 """TLS around a connected socket, for boards whose MicroPython has it. A driver.
 
-The handshake is left to the reads and writes that follow, so nothing waits for the network. Its arithmetic still takes
-the processor for some hundred milliseconds: it is only done while the motors rest.
+Later reads and writes perform the handshake, so nothing blocks on the network. Its arithmetic still takes some hundred
+milliseconds of processor time: it only happens while the motors are off.
 """
 
 import ssl
@@ -11,16 +11,16 @@ import machine
 
 
 class Wrapper:
-    """``options``: true, or {"ca": a file in DER form on the board, "server_name": ...}. Called with a socket."""
+    """Wraps a socket in TLS. ``options``: true, or {"ca": a DER file on the board, "server_name": ...}."""
 
     def __init__(self, options: bool | dict, host: str) -> None:
         self._ca = None if options is True else options.get("ca")  # type: ignore[union-attr]  # not False
         self._name = host if options is True else options.get("server_name", host)  # type: ignore[union-attr]
 
-    def tell(self, epoch_ms: int) -> None:
-        """What time it is, if that is known: a certificate is good only in its time (docs, library/ssl).
+    def set_time(self, epoch_ms: int) -> None:
+        """Set the board's clock, if the time is known: certificates have a validity period (docs, library/ssl).
 
-        A server that says 2065 or later is wrong, and gmtime of some ports fails from 2068 on.
+        A time server that reports 2065 or later is wrong, and gmtime of some ports fails from 2068 on.
         """
         if self._ca and 1_000_000_000_000 < epoch_ms < 3_000_000_000_000:
             since = 946684800 if time.gmtime(0)[0] == 2000 else 0  # ports count from 2000 or from 1970

@@ -1,8 +1,8 @@
-"""The USB serial port of a board as single bytes, in and out, that never block. A driver.
+"""The USB serial port of a board: non-blocking reads and writes of single bytes. A driver.
 
-MicroPython reads exactly as many bytes as it is asked for and waits for the missing ones; and it waits half a second
-for a host that has the port open but reads nothing (shared/tinyusb/mp_usbd_cdc.c). So each byte is polled for, and
-what leaves goes byte by byte; a board on which such a wait hurts nobody may set a larger ``piece``.
+MicroPython reads exactly as many bytes as requested and blocks for missing ones; a write blocks half a second for a
+host that has the port open but reads nothing (shared/tinyusb/mp_usbd_cdc.c). So each byte is polled for, and sent by
+itself; a board on which such a wait is harmless may set a larger ``chunk``.
 """
 
 import sys
@@ -15,9 +15,9 @@ if not hasattr(sys.stdin, "buffer"):
 
 
 class Port:
-    """``read`` bytes, and ``pump`` often what waits in the ring of ``out``. Ctrl-C is a byte like any other."""
+    """``read`` returns bytes; ``send``, called often, sends the ring of ``out``. Ctrl-C is an ordinary byte."""
 
-    piece = 1
+    chunk = 1
 
     def __init__(self, out) -> None:
         kbd_intr(-1)
@@ -34,8 +34,8 @@ class Port:
             return self._byte[0]
         return -1
 
-    def pump(self) -> None:
-        """Pass on what the host takes."""
+    def send(self) -> None:
+        """Send as much as the host accepts."""
         out = self._out
         size = len(out.ring)
         while out.used:
@@ -43,6 +43,6 @@ class Port:
                 break
             else:
                 return
-            sent = sys.stdout.buffer.write(out.ring, out.first, min(self.piece, out.used, size - out.first)) or 0
+            sent = sys.stdout.buffer.write(out.ring, out.first, min(self.chunk, out.used, size - out.first)) or 0
             out.first = (out.first + sent) % size
             out.used -= sent

@@ -1,4 +1,4 @@
-"""Being on the Wi-Fi, and getting back to it, without waiting. A driver."""
+"""Joins the Wi-Fi, and rejoins it after a loss, without blocking. A driver."""
 
 import network
 from micropython import const
@@ -9,19 +9,19 @@ _AGAIN_MS = const(15_000)  # a port's own attempt may take ten seconds
 
 
 class Wifi:
-    """``step`` every turn."""
+    """The station interface. Call ``step`` every turn."""
 
     def __init__(self, ssid: str, password: str) -> None:
         self._login = ssid, password
         self._tried: int | None = None
         self._server = ""
-        network.WLAN(network.AP_IF).active(False)  # an ESP8266 starts with an open door
+        network.WLAN(network.AP_IF).active(False)  # an ESP8266 starts an open access point
         self._wlan = network.WLAN(network.STA_IF)
         self._wlan.active(True)
-        self._wlan.config(pm=network.WLAN.PM_NONE)  # a sleeping receiver lets commands wait for 100 ms and more
+        self._wlan.config(pm=network.WLAN.PM_NONE)  # power save would delay commands by 100 ms and more
 
     def step(self, now: int) -> str:
-        """The address of the server that knows names; "": not on the Wi-Fi."""
+        """Return the address of the DNS server; "": not connected to the Wi-Fi."""
         if self._wlan.isconnected():
             self._tried = now
             self._server = self._server or self._wlan.ifconfig()[3]

@@ -1,4 +1,4 @@
-"""Fred's gears: a trimmed left wheel, a slow reverse, and no way back right after a way ahead. Pure."""
+"""Fred's speed limits: a trimmed left wheel, a slow reverse, and no reverse right after driving ahead. Pure."""
 
 from micropython import const
 
@@ -14,8 +14,8 @@ class Gears:
     def __init__(self) -> None:
         self._ahead_at: int | None = None
 
-    def spare(self, left: float, right: float, now: int) -> tuple[float, float]:
-        """What the motors get for wheel speeds -1..1. Turning stays possible while the way back is blocked."""
+    def limit(self, left: float, right: float, now: int) -> tuple[float, float]:
+        """Return the motor speeds for wheel speeds -1..1. Turning remains possible while reverse is blocked."""
         linear, turn = (left + right) / 2, (left - right) / 2
         if linear > abs(turn):
             self._ahead_at = now

@@ -1,9 +1,9 @@
 """Where Fred's motor board, a Seeed XIAO SAMD21, is wired: all eleven pins. Names are the MCU's own.
 
 Fred needs seven PWM signals and the header has six timer channels. So the two inputs of a motor, of which only one
-is ever driven, share one: PA04 and PA08 are both on channel 0 of TCC0, PA05 and PA09 on channel 1 (see motor.py).
-MicroPython gives a pin the first of its timers that nobody uses yet, else its first timer at all (ports/samd/pin_af.c,
-get_pwm_config). So the order in which robot.py makes the signals counts: red, green, blue, then the motors.
+is ever driven, share one: PA04 and PA08 are both on channel 0 of TCC0, PA05 and PA09 on channel 1 (see robot.py).
+MicroPython assigns the first timer of a pin that is unused, else its first timer (ports/samd/pin_af.c, get_pwm_config).
+So the order in which robot.py makes the signals matters: red, green, blue, then the motors.
 
     D10 PA06 TCC1 channel 0    red
     D2  PA10 TCC0 channel 2    green

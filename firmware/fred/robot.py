@@ -1,4 +1,4 @@
-"""Fred's motor board: two motors, an RGB light, three touch pads; the host commands it over USB, by goob_base_v1."""
+"""Fred's motor board: two motors, an RGB light, three touch pads; commanded over USB by goob_base_v1."""
 
 import time
 
@@ -20,7 +20,7 @@ except ImportError:  # the official image of the board lacks select and sys.stdi
 _FAILSAFE_MS = const(1000)
 _SENSORS_MS = const(500)
 _FADE_MS = const(20)
-_AT_ONCE = const(32)  # bytes from the host per turn: a flood must not keep the failsafe waiting
+_AT_ONCE = const(32)  # bytes from the host per turn: a flood must not delay the failsafe
 _DRIVE = const(77)  # M
 _GLOW = const(76)  # L
 
@@ -28,8 +28,8 @@ _GLOW = const(76)  # L
 class Motor:
     """One half of a DRV8833. ``pins`` = (in1, in2) share a timer channel: only the driven one is connected to it.
 
-    The released one is an output at 0 again (ports/samd/machine_pwm.c, mp_machine_pwm_deinit). It is in this file
-    because one more costs 350 bytes of RAM.
+    The released one is an output at 0 again (ports/samd/machine_pwm.c, mp_machine_pwm_deinit). The class is in this
+    file because another file costs 350 bytes of RAM.
     """
 
     def __init__(self, pins: tuple[str, str], freq_hz: int) -> None:
@@ -59,25 +59,25 @@ class Motor:
 
 
 class Robot:
-    """``step`` often; every turn looks at the failsafe first."""
+    """Call ``step`` often; every turn checks the failsafe first."""
 
     def __init__(self) -> None:
-        # before anything else the motors stand still; their PWM comes last, as pins.py says
+        # before anything else: motors off; their PWM is made last, see pins.py
         self._left, self._right = Motor(pins.LEFT, pins.PWM_HZ), Motor(pins.RIGHT, pins.PWM_HZ)
         red, green, blue = [PWM(Pin(pin, Pin.OUT, value=0), freq=pins.PWM_HZ, duty_u16=0) for pin in reversed(pins.LED)]
         self._led = (blue, green, red)
-        now = time.ticks_ms()
+        self._now = now = time.ticks_ms()
         self.deadman = DeadMan(_FAILSAFE_MS)
         self.gears = Gears()
         self.light = Light(now)
-        self.lines = Lines(self._obey)
+        self.lines = Lines(self._act)
         self.port = Port(self.lines)
         self._sensors = [ADC(Pin(pin)) for pin in pins.SENSORS]
         self._charge = Pin(pins.CHARGE, Pin.IN, Pin.PULL_DOWN)
         self._sensors_grid, self._fade_grid = Grid(_SENSORS_MS, now), Grid(_FADE_MS, now)
         self._level = -1
-        self.lines.say(b"Starting setup...")
-        self.lines.say(b"Done!")
+        self.lines.put(b"Starting setup...")
+        self.lines.put(b"Done!")
 
     def step(self) -> None:
         self._now = now = time.ticks_ms()
@@ -87,25 +87,26 @@ class Robot:
         for _ in range(_AT_ONCE):
             byte = port.read()
             if byte < 0:
+                lines.rest(now)
                 break
             lines.take(byte)
-            port.pump()
+            port.send()
         if self._fade_grid.due(now):
             self._shine(now)
         if self._sensors_grid.due(now):
             t0, t1, t2 = self._sensors
             values = (t0.read_u16() >> 6, t1.read_u16() >> 6, t2.read_u16() >> 6, self._charge.value())
-            lines.say(b"T t0=%d t1=%d t2=%d chg=%d" % values)
-        port.pump()
+            lines.put(b"T t0=%d t1=%d t2=%d chg=%d" % values)
+        port.send()
 
     def stop(self) -> None:
         self._left.stop()
         self._right.stop()
 
-    def _obey(self, letter: int, numbers: list[float]) -> None:
+    def _act(self, letter: int, numbers: list[float]) -> None:
         if letter == _DRIVE:
             self.deadman.feed(self._now)
-            left, right = self.gears.spare(clamp(numbers[0], -1.0), clamp(numbers[1], -1.0), self._now)
+            left, right = self.gears.limit(clamp(numbers[0], -1.0), clamp(numbers[1], -1.0), self._now)
             self._left.set(left)
             self._right.set(right)
             return

@@ -1,8 +1,8 @@
 """Where Goob's motor board, a Seeed XIAO SAMD21, is wired. Names are the MCU's own, valid for every MicroPython.
 
-A PWM pin shows one channel of a timer, and pins on one channel show the same signal. MicroPython gives a pin the
-first of its timers that nobody uses yet, else its first timer at all (ports/samd/pin_af.c, get_pwm_config). So the
-order in which robot.py makes the signals counts: right motor, headlights, left motor.
+A PWM pin outputs one channel of a timer, and pins on one channel output the same signal. MicroPython assigns the
+first timer of a pin that is unused, else its first timer (ports/samd/pin_af.c, get_pwm_config). So the order in which
+robot.py makes the signals matters: right motor, headlights, left motor.
 
     D10 PA06 TCC1 channel 0    D8 PA07 TCC1 channel 1    right motor
     D2  PA10 TCC0 channel 2 (TCC1 channel 0 is its first choice, but the right motor has TCC1)    headlights

@@ -1,4 +1,4 @@
-"""From an MPU-6050's raw numbers to acceleration, turning and attitude; and what to do when it fails. Pure.
+"""Acceleration, angular rate and attitude from an MPU-6050's raw data, and recovery from its failures. Pure.
 
 x ahead, y to the left, z up. Roll is about x, pitch about y, both 0 when it lies flat.
 """
@@ -12,15 +12,15 @@ from common.ticks import add, diff
 
 _RETRY_MS = const(1000)
 _FAILURES = const(5)  # in a row
-_SETTLING = const(10)  # samples after power on that are not like the later ones
+_INACCURATE = const(10)  # samples after power on that are not accurate yet
 _CALIBRATION = const(200)  # samples
-_STILL = const(500)  # 0.01 degrees/s around the first sample: more is no rest
-_ZERO = const(2500)  # 0.01 degrees/s: the data sheet allows +-20 degrees/s for what it says at rest
-_GRAVITY = 0.02  # share of its answer in a sample's attitude: 0.5 s at 100 Hz
-_GAP_MS = const(500)  # after a longer one nobody knows how it turned
+_STILL = const(500)  # 0.01 degrees/s around the first sample: more is motion
+_ZERO = const(2500)  # 0.01 degrees/s: the data sheet allows a bias of +-20 degrees/s
+_GRAVITY = 0.02  # weight of gravity in a sample's attitude: 0.5 s at 100 Hz
+_GAP_MS = const(500)  # after a longer one the angular rate cannot be integrated
 
-# the wire has 0.001 m/s2 and 0.01 degrees/s in 16 bits: +-3.3 g and +-327 degrees/s, so the next larger ranges are
-# set and what goes beyond is cut off. Factors are over 2**14, so that products are small integers.
+# the protocol has 0.001 m/s2 and 0.01 degrees/s in 16 bits: +-3.3 g and +-327 degrees/s, so the next larger ranges of
+# the sensor are used and values are limited. Factors are over 2**14, so that products are small integers.
 _MM_S2 = const(19613)  # 9806.65 / 8192 LSB per g
 _CENTI_DPS = const(25013)  # 100 / 65.5 LSB per degree/s
 _HALF = const(8192)
@@ -30,10 +30,10 @@ _UPRIGHT = const(9000)
 
 
 class Imu:
-    """``read`` at every sample's time. ``device``: see mpu6050.py; ``log(text)`` hears of its ups and downs.
+    """Call ``read`` at every sample's time. ``device``: see mpu6050.py; ``log(text)`` reports failures and recovery.
 
     ``values``: ax ay az in mm/s2, gx gy gz in 0.01 degrees/s without ``bias``, 0.01 degrees C, roll and pitch in 0.01
-    degrees. ``calibrated`` is how many samples of 200 went into the bias.
+    degrees. ``calibrated`` is how many of the 200 samples for the bias there are.
     """
 
     def __init__(self, device, log) -> None:
@@ -42,7 +42,8 @@ class Imu:
         self.good = self.failed = self.calibrated = 0
         self._device, self._log = device, log
         self._data = bytearray(14)
-        self._settled = 0
+        self._skip = 0
+        self._first = self._sums = self.bias  # lists of their own when a calibration starts; two more cost 100 bytes
         self._working = False
         self._in_a_row = 0
         self._retry_at: int | None = None
@@ -50,7 +51,7 @@ class Imu:
         self._roll = self._pitch = 0.0
 
     def read(self, now: int) -> bool:
-        """Whether there are new values."""
+        """Read a sample; returns whether there are new values."""
         try:
             if not self._working:
                 if self._retry_at is None or diff(now, self._retry_at) >= 0:
@@ -58,14 +59,14 @@ class Imu:
                 return False
             self._device.read(self._data)
             if not any(self._data):
-                raise OSError  # it sleeps, as after a dip of its supply
+                raise OSError  # the sensor sleeps, as after a drop of its supply voltage
         except OSError:
             self._fail(now)
             return False
         self._in_a_row = 0
         self.good += 1
-        self._take()
-        self._lean(_GAP_MS if self._read_at is None else diff(now, self._read_at))
+        self._scale()
+        self._tilt(_GAP_MS if self._read_at is None else diff(now, self._read_at))
         self._read_at = now
         return True
 
@@ -89,22 +90,22 @@ class Imu:
             self._working = False
             self._retry_at = add(now, _RETRY_MS)
 
-    def _take(self) -> None:
+    def _scale(self) -> None:
         raw = struct.unpack(">7h", self._data)
         values = self.values
-        learning = self.calibrated < _CALIBRATION
+        calibrating = self.calibrated < _CALIBRATION
         for axis in range(3):
             values[axis] = max(-32768, min(32767, raw[axis] * _MM_S2 + _HALF >> 14))
             turning = raw[axis + 4] * _CENTI_DPS + _HALF >> 14
             values[axis + 3] = max(-32768, min(32767, turning - self.bias[axis]))
         values[6] = raw[3] * 5 // 17 + 3653  # page 30: raw / 340 + 36.53 degrees C
-        if learning:
+        if calibrating:
             self._learn()
 
     def _learn(self) -> None:
-        """The mean of 200 samples at rest is the bias. Motion begins the count anew."""
-        if self._settled < _SETTLING:
-            self._settled += 1
+        """Take the mean of 200 samples at rest as the bias. Motion restarts the count."""
+        if self._skip < _INACCURATE:
+            self._skip += 1
             return
         values = self.values
         if not self.calibrated:
@@ -121,13 +122,13 @@ class Imu:
             for axis in range(3):
                 self.bias[axis] = (self._sums[axis] + _CALIBRATION // 2) // _CALIBRATION
 
-    def _lean(self, ms: int) -> None:
-        """A complementary filter: turning at once, gravity in the long run. ``ms`` after the sample before."""
+    def _tilt(self, ms: int) -> None:
+        """A complementary filter of angular rate and gravity; ``ms`` is the time since the last sample."""
         values = self.values
         ax, ay, az = values[0], values[1], values[2]
         across = sqrt(ay * ay + az * az)
         if not ax and not across:
-            return  # in free fall nobody knows up from down
+            return  # free fall: no direction of gravity
         roll, pitch = atan2(ay, az) * _CENTI_DEG, atan2(-ax, across) * _CENTI_DEG
         if ms < _GAP_MS:
             turned = self._roll + values[3] * ms / 1000
@@ -139,5 +140,5 @@ class Imu:
 
 
 def _around(value: float) -> float:
-    """The same angle within half a turn."""
+    """Return the same angle within half a turn."""
     return value - _TURN if value > _TURN // 2 else value + _TURN if value < -_TURN // 2 else value

@@ -1,4 +1,4 @@
-"""What Goob's IMU tells about itself: the payload of DESCRIBE, whose beginning is that of HELLO. A constant.
+"""The manifest of Goob's IMU: the payload of DESCRIBE, whose beginning is that of HELLO. A constant.
 
 u8 schema version, u8 number of interfaces, strings: schema hash, device uid, firmware version, model. Per interface:
 u16 id, u8 direction (2 out), u8 kind (1 sample, 2 state), u8 flags (2 local only), u16 rate, strings: name, channel,

@@ -1,7 +1,7 @@
 """The MPU-6050 on I2C. A driver.
 
 Registers: InvenSense RM-MPU-6000A-00 revision 4.2, sections 4.2 to 4.5 (pages 11 to 15), 4.17 to 4.19 (29 to 31),
-4.28 (40), 4.32 (45). All transfers may raise OSError; the device is then set up anew.
+4.28 (40), 4.32 (45). All transfers may raise OSError; the device must then be started again.
 """
 
 from machine import Pin, SoftI2C
@@ -21,7 +21,7 @@ class Mpu6050:
         self._address = pins.IMU
 
     def start(self) -> bool:
-        """Set it up. False: there is another device at its address."""
+        """Configure the device. False: there is another device at its address."""
         if self._i2c.readfrom_mem(self._address, _WHO_AM_I, 1) != b"\x68":
             return False
         # no sleep, clock from the X gyroscope as the manual recommends

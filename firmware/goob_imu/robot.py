@@ -1,4 +1,4 @@
-"""Goob's second board: an MPU-6050 that tells the host about itself and sends its samples, by pebble_serial_v1."""
+"""Goob's second board: describes its MPU-6050 to the host and sends its samples, by pebble_serial_v1."""
 
 import struct
 import time
@@ -16,17 +16,17 @@ from goob_imu.mpu6050 import Mpu6050
 try:
     from common.usb import Port
 
-    _DOOR = False
+    _CTRL_C = False
 except ImportError:  # the official image of the board lacks select and sys.stdin.buffer
     from goob_imu.uart import Port  # type: ignore[assignment]
 
-    _DOOR = True
+    _CTRL_C = True
 
 _SAMPLE_MS = const(10)
 _STATE_EVERY = const(20)  # samples: 5 Hz
 _AT_ONCE = const(64)  # bytes from the host per turn
 _RING = const(512)  # bytes for the host; a DESCRIBE has 506
-_PIECE = const(32)  # to the host: if it does not read, nothing here suffers from a wait
+_PIECE = const(32)  # to the host: a blocking write is harmless on this board
 _G_MM_S2 = 9806.65
 
 _IMU_FAST = const(1)  # interfaces, as in the manifest
@@ -46,24 +46,24 @@ _PONG = const(0x32)
 
 
 class Robot:
-    """Nothing on it moves. ``step`` often, at least every 10 ms. Its milliseconds start again after 2**30."""
+    """A board without motors. Call ``step`` at least every 10 ms. Its milliseconds wrap after 2**30."""
 
     def __init__(self) -> None:
         self._now = now = time.ticks_ms()
         self.out = Sender(_RING)
-        self.out.used = 1  # a zero: it ends what was on the line before a reset
+        self.out.used = 1  # a zero: it ends a frame that a reset has interrupted
         self.port = Port(self.out)
-        self.port.piece = _PIECE
-        self.door = _DOOR  # a DESCRIBE_REQ begins with 3, which is Ctrl-C: see common/run.py
+        self.port.chunk = _PIECE
+        self.ctrl_c = _CTRL_C  # a DESCRIBE_REQ begins with 3, which is Ctrl-C: see common/run.py
         self.decoder = Decoder()
         self.imu = Imu(Mpu6050(pins), self._log)
         self._grid = Grid(_SAMPLE_MS, now)
         self._until_state = _STATE_EVERY
         self._payload = bytearray(18)
-        self._samples = self._states = self._others = 0  # sequence numbers: a gap shows what was lost
+        self._samples = self._states = self._others = 0  # sequence numbers: a gap shows lost frames
         self._lost = 0  # frames for which there was no room
         self._asked = False  # for a DESCRIBE
-        self._tell(_HELLO, MANIFEST[:_HELLO_SIZE])
+        self._notify(_HELLO, MANIFEST[:_HELLO_SIZE])
 
     def step(self) -> None:
         self._now = now = time.ticks_ms()
@@ -73,7 +73,7 @@ class Robot:
                 self._log(b"frames_lost=%d" % lost)
             elif self._asked:
                 self._asked = False
-                self._tell(_DESCRIBE, MANIFEST)
+                self._notify(_DESCRIBE, MANIFEST)
         for _ in range(_AT_ONCE):
             byte = self.port.read()
             if byte < 0:
@@ -82,15 +82,15 @@ class Robot:
                 self._answer()
         if self._grid.due(now):
             self._sample()
-        self.port.pump()
+        self.port.send()
 
     def stop(self) -> None:
-        """Nothing to stop."""
+        """Nothing: the board has no motors."""
 
     def _answer(self) -> None:
         frame, kind = self.decoder, self.decoder.kind
         if kind == _DESCRIBE_REQ:
-            self._tell(_HELLO, MANIFEST[:_HELLO_SIZE])
+            self._notify(_HELLO, MANIFEST[:_HELLO_SIZE])
             self._asked = True
         elif kind == _PING:
             self._send(_PONG, 0, frame.sequence, b"")
@@ -114,10 +114,10 @@ class Robot:
         self._send(_STATE, _IMU, self._states, self._payload)
 
     def _log(self, data: bytes) -> None:
-        self._tell(_LOG, data)
+        self._notify(_LOG, data)
 
-    def _tell(self, kind: int, data: bytes) -> None:
-        """Send what belongs to no interface."""
+    def _notify(self, kind: int, data: bytes) -> None:
+        """Send a frame that belongs to no interface."""
         self._others += 1
         self._send(kind, 0, self._others, data)
 

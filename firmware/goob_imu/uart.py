@@ -1,4 +1,4 @@
-"""A serial port on two pins as single bytes, in and out, that never block: the driver in place of common/usb.py."""
+"""A serial port on two pins, with non-blocking reads and writes: the driver in place of common/usb.py."""
 
 from machine import UART, Pin
 from micropython import const
@@ -9,7 +9,7 @@ _BUFFER = const(64)
 
 
 class Port:
-    """``read`` bytes, and ``pump`` often what waits in the ring of ``out``."""
+    """``read`` returns bytes; ``send`` sends the ring of ``out`` and must be called often."""
 
     def __init__(self, out) -> None:
         self._out = out
@@ -23,8 +23,8 @@ class Port:
         self._uart.readinto(self._byte)
         return self._byte[0]
 
-    def pump(self) -> None:
-        """Pass on what there is room for. A full buffer is EAGAIN, which is None here."""
+    def send(self) -> None:
+        """Send as much as fits the buffer. A full buffer is EAGAIN, which write() returns as None."""
         out = self._out
         size = len(out.ring)
         while out.used:

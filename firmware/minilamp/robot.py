@@ -1,13 +1,12 @@
-"""MiniLAMP: two wheels and a pair of grousers, all either on or off, on a XIAO ESP32C6."""
+"""MiniLAMP: two wheels and a pair of grousers, all either on or off, on a XIAO ESP32-C6."""
 
 from machine import ADC, Pin
 
-from common.battery import Battery
 from common.drv8833 import Motor
 from common.network_robot import NetworkRobot
+from common.payload import mix
 from common.settings import get
 from common.tls import Wrapper
-from common.wheels import mix
 from minilamp import pins
 
 _THRESHOLD = 0.25  # below it a motor stays off
@@ -16,7 +15,7 @@ _THRESHOLD = 0.25  # below it a motor stays off
 class Body:
     def __init__(self) -> None:
         self._motors = [Motor(pair) for pair in (pins.LEFT, pins.RIGHT, pins.GROUSERS)]
-        self._battery = Battery(ADC(Pin(pins.BATTERY), atten=ADC.ATTN_11DB), pins.BATTERY_FULL_V)
+        self._battery = ADC(Pin(pins.BATTERY), atten=ADC.ATTN_11DB)
         for pin in pins.ANTENNA:
             Pin(pin, Pin.OUT, value=0)
 
@@ -32,11 +31,12 @@ class Body:
         for motor in self._motors:
             motor.stop()
 
-    def keep(self) -> None:
-        """Nothing to do every turn."""
+    def refresh(self) -> None:
+        """Nothing: the motors need no refresh."""
 
-    def report(self, say) -> None:
-        say(b"charging-level", b'{"value": %.3f, "unit": "v"}' % self._battery.volts())
+    def report(self, publish) -> None:
+        volts = self._battery.read_u16() * (pins.BATTERY_FULL_V / 65535)
+        publish(b"charging-level", b'{"value": %.3f, "unit": "v"}' % volts)
 
 
 def build(settings: dict) -> NetworkRobot:

@@ -1,4 +1,5 @@
-"""The commands of ``pebble``: one module per group, imported only when its command is asked for.
+"""The commands of ``pebble``: one module per group, imported only when one of its commands runs.
 
-A module's ``register(app)`` adds its command. What is heavy (rich, a client library) is imported where it is used.
+A module's ``register(app)`` adds its commands. Heavy libraries (rich, MQTT, Zenoh) are imported where they
+are used.
 """

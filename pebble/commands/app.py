@@ -13,25 +13,41 @@ import typer
 
 from pebble.version import __version__
 
-COMMANDS = ("up", "check", "doctor", "topics", "topic", "sim", "demo", "watch", "snapshot", "flash", "bench", "impair")
+#: Each command, and the module of this package that registers it.
+COMMANDS = {
+    "up": "up",
+    "check": "check",
+    "doctor": "doctor",
+    "topics": "topics",
+    "topic": "topic",
+    "estop": "estop",
+    "sim": "sim",
+    "demo": "sim",
+    "watch": "watch",
+    "snapshot": "watch",
+    "flash": "flash",
+    "bench": "bench",
+    "impair": "impair",
+}
 
-_HELP = """Runs Pebble robots, and looks at them.
+_HELP = """Runs and inspects Pebble robots.
 
 \b
-    pebble demo                four simulated robots, nothing else needed
-    pebble check goob.json     is this config right, and what does it come to?
-    pebble doctor goob.json    is this machine ready for it?
+    pebble demo                run four simulated robots; needs nothing else
+    pebble check goob.json     validate a config and summarise it
+    pebble doctor goob.json    check that this machine is ready for the robot
     pebble up goob.json        run the robot
-    pebble watch goob.json     see its camera and hear its microphone
-    pebble flash lamp.json     put a robot's firmware onto its board
+    pebble estop goob.json     stop the robot until it is reset
+    pebble watch goob.json     show its camera and play its microphone
+    pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine
-    pebble impair              a robot behind a bad link
+    pebble impair              measure robots behind an impaired network
 """
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command line; returns the exit code, 2 for one that makes no sense. Raises PebbleError."""
-    with _errors_in_threads_are_said():
+    """Run one command line; returns the exit code, 2 for a wrong command line. Raises PebbleError."""
+    with _thread_errors_on_stderr():
         return _run(arguments)
 
 
@@ -39,8 +55,8 @@ def _run(arguments: list[str]) -> int:
     wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
     app = typer.Typer(rich_markup_mode=None, add_completion=False)
     app.callback(help=_HELP)(_options)
-    for name in wanted or COMMANDS:
-        import_module(f"pebble.commands.{name}").register(app)
+    for module in dict.fromkeys(COMMANDS[name] for name in wanted or COMMANDS):
+        import_module(f"pebble.commands.{module}").register(app)
     line = [*arguments, "--help"] if arguments in ([], ["topic"], ["bench"], ["sim"]) else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
@@ -54,8 +70,8 @@ def _run(arguments: list[str]) -> int:
 
 
 @contextmanager
-def _errors_in_threads_are_said() -> Iterator[None]:
-    """Commands say themselves what went wrong; what they cannot know of is an error in a thread."""
+def _thread_errors_on_stderr() -> Iterator[None]:
+    """Log errors to stderr: a command raises its own errors, but not those of threads."""
     handler = logging.StreamHandler()
     handler.setLevel(logging.ERROR)
     handler.setFormatter(logging.Formatter("pebble: %(message)s"))
@@ -66,7 +82,7 @@ def _errors_in_threads_are_said() -> Iterator[None]:
         logging.getLogger("pebble").removeHandler(handler)
 
 
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"pebble {__version__}")
         raise typer.Exit
@@ -74,8 +90,8 @@ def _say_version(wanted: bool) -> None:
 
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", help="Say which Pebble this is.", callback=_say_version, is_eager=True)
+        bool, typer.Option("--version", help="Print the version of Pebble.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """What stands before a command."""
+    """Options before the command."""
     _ = version

@@ -9,6 +9,7 @@ from typing import Annotated, TypeVar
 import typer
 
 from pebble.bench.output import FOLDER
+from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
 from pebble.transports import MqttSettings
 
@@ -16,9 +17,7 @@ _Number = TypeVar("_Number", int, float)
 _Variants = Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")]
 _Sizes = Annotated[str | None, typer.Option(help="Bytes, for example 40,1024.", metavar="BYTES")]
 _Rates = Annotated[str | None, typer.Option(help="Messages a second, for example 20,200.", metavar="HZ")]
-_Loads = Annotated[str | None, typer.Option(help="Of none, media and hog.", metavar="NAMES")]
-_Password = Annotated[Path | None, typer.Option(help="Holds the broker's password.", metavar="FILE")]
-_Ca = Annotated[Path | None, typer.Option(help="Certificate authority of an mqtts broker.", metavar="FILE")]
+_Loads = Annotated[str | None, typer.Option(help="Some of none, media and hog.", metavar="NAMES")]
 
 
 def control(
@@ -26,24 +25,24 @@ def control(
     sizes: _Sizes = None,
     rates: _Rates = None,
     loads: _Loads = None,
-    seconds: Annotated[float | None, typer.Option(help="Length of one slice of a round.")] = None,
-    rounds: Annotated[int | None, typer.Option(min=1, help="How often everything is run. [default: 10]")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Few conditions and short slices.")] = False,
+    seconds: Annotated[float | None, typer.Option(help="Duration of one case in a round.")] = None,
+    rounds: Annotated[int | None, typer.Option(min=1, help="Rounds of all cases. [default: 10]")] = None,
+    quick: Quick = False,
     null: Annotated[
-        bool, typer.Option("--null", help="One variant against itself, and against itself made a fifth slower.")
+        bool, typer.Option("--null", help="One variant against itself, and against itself slowed by a fifth.")
     ] = False,
     far: Annotated[
-        str | None, typer.Option(help="Against `pebble bench echo` on another machine.", metavar="URL")
+        str | None, typer.Option(help="Measure against `pebble bench echo` on another machine.", metavar="URL")
     ] = None,
-    password_file: _Password = None,
-    ca_cert: _Ca = None,
-    output: Annotated[Path, typer.Option(help="Folder for results and plots.", metavar="FOLDER")] = FOLDER,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+    output: Output = FOLDER,
 ) -> int:
-    """Messages from one service to another and back: MQTT and Zenoh, alone, beside pictures, beside a busy process.
+    """Round trips between two services: MQTT and Zenoh, on an idle machine, with camera frames, with a busy process.
 
-    Two processes for each variant, a broker or hub of its own, all of them new in every round. Needs mosquitto.
-    With --null: one variant (zenoh-p2p), 40 B at 200 Hz. It fails if the comparison sees a difference where there is
-    none, or misses the one that was planted.
+    Each round starts two processes and a broker or hub for each variant. Needs mosquitto.
+    With --null: one variant (zenoh-p2p), 40 B at 200 Hz. The run fails if it finds a difference where there is none,
+    or misses the planted one.
 
     \b
         pebble bench control
@@ -60,10 +59,10 @@ def control(
         plan = FarPlan.of(sizes=numbers, rates=speeds, seconds=seconds, rounds=rounds, quick=quick, output=output)
         return measure(plan, _settings(far, password_file, ca_cert))
     from pebble.bench.control import run
-    from pebble.bench.control_plan import Plan
+    from pebble.bench.control_plan import ControlPlan
 
     return run(
-        Plan.of(
+        ControlPlan.of(
             variants=_names(variants),
             sizes=numbers,
             rates=speeds,
@@ -79,8 +78,8 @@ def control(
 
 def echo(
     url: Annotated[str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", show_default=False)],
-    password_file: _Password = None,
-    ca_cert: _Ca = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
     """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine.
 
@@ -93,12 +92,12 @@ def echo(
 
 
 def _settings(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
-    from pebble.commands.connection import password
-    from pebble.commands.url import settings_of
+    from pebble.client.connection import password
+    from pebble.client.url import settings_of
 
     _, settings = settings_of(url, password=password(password_file), ca_cert=ca_cert)
     if not isinstance(settings, MqttSettings):
-        raise PebbleError(f"{url}: another machine is reached over MQTT: mqtt://HOST[:PORT] or mqtts://HOST[:PORT]")
+        raise PebbleError(f"{url}: between machines only MQTT is measured: mqtt://HOST[:PORT] or mqtts://HOST[:PORT]")
     return settings
 
 
@@ -109,17 +108,14 @@ def _refuse_with_far(**options: str | bool | None) -> None:
 
 
 def _names(text: str | None) -> list[str] | None:
-    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    return None if text is None else split_names(text)
 
 
 def _number(text: str, kind: Callable[[str], _Number], option: str) -> _Number:
     try:
         return kind(text)
     except ValueError:
-        raise PebbleError(f"{option}: {text} is no such number") from None
+        raise PebbleError(f"{option}: {text} is not a number of this kind") from None
 
 
-def register(group: typer.Typer) -> None:
-    """Add the commands of this file."""
-    group.command("control")(control)
-    group.command("echo")(echo)
+COMMANDS = (control, echo)

@@ -1,53 +1,102 @@
-"""``pebble bench startup`` and ``pebble bench cost``: whole robots, both transports side by side."""
+"""``pebble bench bridge``, ``startup``, ``cost`` and ``estop``: whole robots, both transports side by side."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pebble.bench.output import FOLDER
+from pebble.commands.options import Output, Quick, split_names
 
 _Variants = Annotated[
     str | None, typer.Option(help="mqtt or zenoh. [default: both, in turn]", metavar="NAMES", show_default=False)
 ]
-_Quick = Annotated[bool, typer.Option("--quick", help="Fewer and shorter rounds, marked as quick.")]
-_Output = Annotated[Path, typer.Option(help="Where results and plots go.", metavar="FOLDER")]
+
+
+def bridge(
+    with_media: Annotated[
+        bool, typer.Option("--with-media", help="Also with 1080p pictures and sound, and compare.")
+    ] = False,
+    rounds: Annotated[
+        int | None, typer.Option(min=1, help="How often robots are started. [default: 10; --quick: 4]")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Driving time per robot and round. [default: 4; --quick: 0.5]")
+    ] = None,
+    variants: Annotated[
+        str | None,
+        typer.Option(help="mqtt, zenoh or mqtt,zenoh. [default: both; --null: zenoh]", metavar="NAMES"),
+    ] = None,
+    quick: Quick = False,
+    null: Annotated[
+        bool, typer.Option("--null", help="One robot against itself, and against itself slowed down by a fifth.")
+    ] = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Latency of a command hop by hop.")] = False,
+    output: Output = FOLDER,
+) -> int:
+    """Drive commands from an operator to the wheels of a whole simulated robot, and its telemetry back.
+
+    Latency at 20 commands and 50 reports a second, on MQTT and on Zenoh, compared with one hop through a stock
+    broker. With --with-media also while a program on the robot reads 1920x1080 frames at 30 Hz and an operator
+    receives video and audio. Needs mosquitto.
+
+    \b
+        pebble bench bridge
+        pebble bench bridge --with-media --output results
+        pebble bench bridge --profile
+    """
+    from pebble.bench import bridge_null, bridge_profile
+    from pebble.bench.bridge import run
+    from pebble.bench.bridge_plan import Mode, plan
+    from pebble.errors import PebbleError
+
+    modes = [mode for mode, wanted in ((Mode.MEDIA, with_media), (Mode.NULL, null), (Mode.PROFILE, profile)) if wanted]
+    if len(modes) > 1:
+        raise PebbleError(f"{' and '.join(modes)} are different runs: give one of them")
+    mode = modes[0] if modes else Mode.COMPARE
+    given = {
+        "rounds": rounds,
+        "seconds": seconds,
+        "kinds": None if variants is None else split_names(variants),
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    wanted = plan(mode, quick=quick, output=output, **given)
+    return {Mode.NULL: bridge_null.run, Mode.PROFILE: bridge_profile.run}.get(mode, run)(wanted)
 
 
 def startup(
     rounds: Annotated[
-        int | None, typer.Option(min=1, help="Launches of each. [default: 10, quick 3]", show_default=False)
+        int | None, typer.Option(min=1, help="Launches of each variant. [default: 10, quick 3]", show_default=False)
     ] = None,
     variants: _Variants = None,
-    quick: _Quick = False,
-    output: _Output = FOLDER,
+    quick: Quick = False,
+    output: Output = FOLDER,
 ) -> int:
-    """How soon a robot is there: heartbeat, all services ready, first drive command obeyed.
+    """How fast a robot starts: first heartbeat, all services ready, first drive command executed.
 
-    And how soon an operator, or a service, who comes late knows all that the robot keeps. Every launch is a whole
-    simulated robot of its own; needs mosquitto.
+    And how fast an operator or a service that connects later receives all retained messages. Every launch is a new
+    simulated robot. Needs mosquitto.
 
     \b
         pebble bench startup
         pebble bench startup --quick
     """
-    from pebble.bench.startup import Plan, run
+    from pebble.bench.startup import StartupPlan, run
 
-    return run(Plan(rounds=rounds, kinds=_kinds(variants), quick=quick, output=output))
+    return run(StartupPlan(rounds=rounds, kinds=_kinds(variants), quick=quick, output=output))
 
 
 def cost(
     rounds: Annotated[
-        int | None, typer.Option(min=1, help="Robots of each. [default: 8, quick 1]", show_default=False)
+        int | None, typer.Option(min=1, help="Robots of each variant. [default: 8, quick 1]", show_default=False)
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(min=0.5, help="Length of each phase. [default: 1.5, quick 0.7]", show_default=False)
     ] = None,
     variants: _Variants = None,
-    quick: _Quick = False,
-    output: _Output = FOLDER,
+    quick: Quick = False,
+    output: Output = FOLDER,
 ) -> int:
     """What a robot costs: memory, CPU and threads of each of its processes.
 
@@ -58,18 +107,37 @@ def cost(
         pebble bench cost
         pebble bench cost --variants zenoh --seconds 10
     """
-    from pebble.bench.cost import Plan, run
+    from pebble.bench.cost import CostPlan, run
 
-    return run(Plan(rounds=rounds, seconds=seconds, kinds=_kinds(variants), quick=quick, output=output))
+    return run(CostPlan(rounds=rounds, seconds=seconds, kinds=_kinds(variants), quick=quick, output=output))
+
+
+def estop(
+    rounds: Annotated[
+        int | None, typer.Option(min=1, help="How often robots are started. [default: 10, quick 2]", show_default=False)
+    ] = None,
+    boards: Annotated[int, typer.Option(min=0, help="Boards with Wi-Fi that are stopped together.")] = 50,
+    quick: Quick = False,
+    output: Output = FOLDER,
+) -> int:
+    """The emergency stop: until the wheels are at rest, and until it is confirmed.
+
+    Of a Linux robot on either transport, compared with a plain zero; of two of them and 50 boards together; and a stop
+    that is held for robots which are switched on later. All robots are driven meanwhile. Needs mosquitto.
+
+    \b
+        pebble bench estop
+        pebble bench estop --quick --boards 10
+    """
+    from pebble.bench.estop import EstopPlan, run
+
+    return run(EstopPlan(rounds=rounds, boards=boards, quick=quick, output=output))
 
 
 def _kinds(variants: str | None) -> list[str]:
     from pebble.bench.bridge_robot import KINDS
 
-    return list(KINDS) if variants is None else [name.strip() for name in variants.split(",")]
+    return list(KINDS) if variants is None else split_names(variants)
 
 
-def register(group: typer.Typer) -> None:
-    """Add the commands of this file."""
-    for command in (startup, cost):
-        group.command(command.__name__)(command)
+COMMANDS = (bridge, startup, cost, estop)

@@ -1,25 +1,39 @@
-"""``pebble check``: every problem of a config at once, or what it comes to."""
+"""``pebble check``: all problems of a config at once, or a summary of it."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 
-from pebble.config import Config, load, resolved
+from pebble.config import Config, Mqtt, RemoteConnection, load, resolved
+from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
-from pebble.links import check_kinds
+from pebble.launcher.programs import programs
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.connections import check_kinds
+from pebble.runtime.process import view_of
 
-SCHEMA = "schema.json"  # stands beside the configs, where `configs/*.json` finds it
+SCHEMA = "schema.json"  # in the folder of configs, so `configs/*.json` includes it
+_LAUNCHER = "launcher"
+_MEDIA = {
+    "camera_publisher": "video_publisher",
+    "audio_publisher": "audio_publisher",
+    "audio_receiver": "audio_receiver",
+}
+#: Channels that no config can rename.
+_FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
 def check(
     configs: Annotated[list[Path], typer.Argument(help="Config files.", show_default=False)],
-    as_json: Annotated[bool, typer.Option("--json", help="Every key with its value, and nothing else.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print only the keys and their values.")] = False,
 ) -> int:
-    """Every mistake of a config at once, or what it comes to.
+    """Report all mistakes of a config at once, or print a summary of it.
 
     \b
         pebble check configs/goob.json
@@ -36,7 +50,7 @@ def register(app: typer.Typer) -> None:
 
 def _check(path: Path, *, as_json: bool, first: bool) -> bool:
     if path.name == SCHEMA:
-        typer.echo(f"pebble: {path.name}: describes the other files for editors; it is no robot's", err=True)
+        typer.echo(f"pebble: {path.name}: the JSON Schema of configs, not a config", err=True)
         return True
     try:
         config = load(path)
@@ -60,8 +74,6 @@ def _print(config: Config, path: Path) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from pebble.commands.summary import facts, topics_of
-
     console = Console(highlight=False)
     console.print(Text.assemble((config.base, "bold"), f"  {path}"))
     grid = Table.grid(padding=(0, 2))
@@ -69,19 +81,19 @@ def _print(config: Config, path: Path) -> None:
         grid.add_row(Text(name, style="dim"), Text(fact))
     console.print(Padding(grid, (0, 0, 0, 2)))
     if config.robot.platform == "linux":
-        table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+        table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
         for name in ("process", "", "topic"):
             table.add_column(name, overflow="fold")
         table.add_column("qos", justify="right")
-        table.add_column("kept")
+        table.add_column("retained")
         for process, lines in topics_of(config):
             for number, line in enumerate(lines):
                 table.add_row(
                     "" if number else Text(process, style="bold"),
-                    "hears" if line.channel.direction == "incoming" else "says",
+                    "subscribes" if line.channel.direction == "incoming" else "publishes",
                     Text(line.topic, style="yellow") if line.renamed else Text(line.channel.suffix),
                     str(line.qos),
-                    "yes" if line.kept else "",
+                    "yes" if line.retained else "",
                 )
         console.print(Padding(table, (1, 0, 0, 2)))
     if config.warnings:
@@ -89,3 +101,102 @@ def _print(config: Config, path: Path) -> None:
         for warning in config.warnings:
             grid.add_row(Text("warning", style="yellow"), Text(warning))
         console.print(Padding(grid, (1, 0, 0, 2)))
+
+
+class TopicLine(NamedTuple):
+    """One channel of one process, under the name that the config gives it."""
+
+    channel: Channel
+    topic: str
+    qos: int
+    retained: bool
+    renamed: bool
+
+
+def facts(config: Config) -> list[tuple[str, str]]:
+    """The transport, the connections and the processes, line by line, without secrets."""
+    if config.robot.platform != "linux":
+        firmware = f"runs on its own MCU ({config.robot.platform}), not with `pebble up`"
+        return [("platform", firmware), ("broker", _mqtt(config.local_mqtt))]
+    found = [("transport", _transport(config))]
+    if config.transport.mqtt_mirror is not None:
+        found.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
+    if config.services.mqtt_bridge.enabled:
+        found.append(("uplink", _uplink(config)))
+    found += [("serial", line) for line in _serial_lines(config)]
+    table = programs(config)
+    found.append(("processes", ", ".join([_LAUNCHER, *(program.name for program in table if not program.on_demand)])))
+    on_request = ", ".join(program.name for program in table if program.on_demand)
+    return [*found, ("on request", on_request)] if on_request else found
+
+
+def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
+    """The processes with topics, each with its topics."""
+    for name in (_LAUNCHER, *(program.name for program in programs(config))):
+        service, _, instance = name.partition(":")
+        lines = _lines(view_of(config, instance), service)
+        if lines:
+            yield name, lines
+
+
+def _lines(config: Config, service: str) -> list[TopicLine]:
+    addresses = Addresses(config)
+    mine = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _FIXED.get(service)]
+    if service == "serial_mcu_bridge":
+        mine = [channel for channel in mine if _is_of_serial_line(channel, config)]
+    return [
+        TopicLine(channel, topic, qos, retained, topic != channel.topic(config.base))
+        for channel in mine
+        for topic, qos, retained in [addresses[channel]]
+    ]
+
+
+def _is_of(channel: Channel, service: str) -> bool:
+    """Does the channel belong to the service? The config path that renames it begins with the service's name."""
+    path = "" if channel.override is None else channel.override.topic
+    if service in _MEDIA:
+        return path == f"services.mqtt_bridge.media.{_MEDIA[service]}.topic"
+    return path.startswith(f"services.{service}.") and ".media." not in path
+
+
+def _is_of_serial_line(channel: Channel, config: Config) -> bool:
+    line = config.services.serial_mcu_bridge
+    if channel is TOUCH_SENSORS and not line.telemetry.publish_touch_sensors:
+        return False
+    return channel.metric.startswith("sensors/") == (not SERIAL_PROTOCOLS[line.protocol].drives)
+
+
+def _transport(config: Config) -> str:
+    kind = config.transport.kind
+    if kind == "mqtt":
+        return f"mqtt, {_mqtt(config.local_mqtt)}"
+    journal = config.transport.journal
+    retained = "retained messages in memory" if journal is None else f"retained messages in {journal}"
+    return f"{kind}, run directory {config.run_dir()}, {retained}"
+
+
+def _uplink(config: Config) -> str:
+    bridge = config.services.mqtt_bridge
+    if bridge.remote is not None and bridge.remote.kind != "mqtt":
+        return _remote_connection(bridge.remote)
+    return f"mqtt, {_mqtt(bridge.remote_mqtt)}"
+
+
+def _remote_connection(remote: RemoteConnection) -> str:
+    ways = [f"listens on {one}" for one in remote.listen] + [f"connects to {one}" for one in remote.connect]
+    return ", ".join([remote.kind, *ways])
+
+
+def _mqtt(mqtt: Mqtt) -> str:
+    user = "anonymous" if mqtt.username is None else f"user {mqtt.username}"
+    password = "" if mqtt.username is None or mqtt.password is None else ", password ***"
+    tls = "TLS" if mqtt.tls.enabled else "not encrypted"
+    return f"{mqtt.host}:{mqtt.port}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
+
+
+def _serial_lines(config: Config) -> Iterator[str]:
+    for name, line in config.serial_instances().items():
+        own = f"{name}: " if name else ""
+        drives = SERIAL_PROTOCOLS[line.protocol].drives
+        stop = f", stops {line.safety.drive_timeout_seconds:g} s after the last command" if drives else ""
+        yield f"{own}{line.protocol} at {line.serial.port}, {line.serial.baud} baud{stop}"

@@ -1,4 +1,4 @@
-"""``pebble doctor``: is this machine ready for the robot? Prints the findings of :mod:`pebble.doctor.checks`."""
+"""``pebble doctor``: prints the findings of :mod:`pebble.doctor.checks`."""
 
 from __future__ import annotations
 
@@ -10,28 +10,26 @@ from typing import Annotated
 import typer
 
 from pebble.config import load
-from pebble.doctor.checks import examine
-from pebble.doctor.finding import Finding, Level
+from pebble.doctor import Finding, Level
+from pebble.doctor.checks import run_checks
 
 _COLOURS = {Level.OK: typer.colors.GREEN, Level.WARN: typer.colors.YELLOW, Level.FAIL: typer.colors.RED}
 _INDENT = " " * 6
 
 
 def doctor(
-    config: Annotated[
-        Path | None, typer.Argument(help="Also look at what this robot needs.", show_default=False)
-    ] = None,
+    config: Annotated[Path | None, typer.Argument(help="Also check what this robot needs.", show_default=False)] = None,
 ) -> int:
-    """Is this machine ready for the robot?
+    """Check that this machine is ready for the robot.
 
-    Each finding comes with the command that fixes it. Exits 1 if anything fails; warnings alone do not.
+    Each problem is printed with the command that fixes it. Exits 1 if a check fails, but not for warnings.
 
     \b
         pebble doctor
         pebble doctor configs/goob.json
     """
     counts = dict.fromkeys(Level, 0)
-    for finding in examine(None if config is None else load(config)):
+    for finding in run_checks(None if config is None else load(config)):
         counts[finding.level] += 1
         _print(finding)
     failed, warned = counts[Level.FAIL], counts[Level.WARN]
@@ -48,5 +46,5 @@ def _print(finding: Finding) -> None:
     typer.secho(f"{finding.level.value:<4}  ", fg=_COLOURS[finding.level], nl=False)
     text = textwrap.fill(f"{finding.what}: {finding.text}", width, initial_indent=_INDENT, subsequent_indent=_INDENT)
     typer.echo(text.removeprefix(_INDENT))
-    if finding.fix:  # on one line, however long: it is there to be copied
+    if finding.fix:  # always on one line: it is to be copied
         typer.secho(f"{_INDENT}fix: {finding.fix}", bold=True)

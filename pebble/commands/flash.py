@@ -1,4 +1,4 @@
-"""``pebble flash``: a robot's firmware onto its board, step by step."""
+"""``pebble flash``: installs a robot's firmware on its board, step by step."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pebble.config import Config, load
 from pebble.errors import PebbleError
 from pebble.flash import ports
 from pebble.flash.boards import FIRMWARE, Firmware, firmware_named
-from pebble.flash.plan import Plan, carry_out, show
-from pebble.flash.private import Private, check_broker, private_files
+from pebble.flash.private import PrivateFiles, check_broker, private_files
+from pebble.flash.steps import FlashOptions, execute, show_steps
 from pebble.flash.tools import Tools
 
 WIFI_PASSWORD = "PEBBLE_WIFI_PASSWORD"  # noqa: S105 - the name of an environment variable
@@ -35,21 +35,21 @@ def flash(
         typer.Option(help="Erase the board and install this MicroPython first (.bin or .uf2).", show_default=False),
     ] = None,
     wifi: Annotated[
-        str | None, typer.Option(help="Name of the Wi-Fi, for robots on one.", metavar="SSID", show_default=False)
+        str | None, typer.Option(help="Name of the Wi-Fi, for robots with Wi-Fi.", metavar="SSID", show_default=False)
     ] = None,
     wifi_password_file: Annotated[
         Path | None,
-        typer.Option(help=f"File with its password; else ${WIFI_PASSWORD}, else you are asked.", show_default=False),
+        typer.Option(help=f"File with its password; else ${WIFI_PASSWORD}, else a prompt.", show_default=False),
     ] = None,
     firmware: Annotated[
-        str | None, typer.Option(help="Which firmware, where the config does not tell.", show_default=False)
+        str | None, typer.Option(help="The firmware, if the config does not determine it.", show_default=False)
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show every step, do none.")] = False,
-    verify: Annotated[bool, typer.Option(help="Wait until the robot gives a sign of life.")] = True,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print every step without executing it.")] = False,
+    verify: Annotated[bool, typer.Option(help="Wait until the robot publishes.")] = True,
 ) -> int:
     """Install a robot's firmware on its board.
 
-    Robots on Wi-Fi get their identity and broker from their config; passwords go to the board and nowhere else.
+    Robots with Wi-Fi get identity and broker from their config; passwords are stored only on the board.
 
     \b
         pebble flash goob --port /dev/ttyACM0 --dry-run
@@ -57,8 +57,8 @@ def flash(
     """
     kind, config = _target(robot, firmware)
     if port is None:
-        raise PebbleError(f"--port: which one? {ports.hint()}")
-    plan = Plan(
+        raise PebbleError(f"--port is missing: {ports.hint()}")
+    options = FlashOptions(
         firmware=kind,
         port=port,
         config=config,
@@ -67,9 +67,9 @@ def flash(
         verify=verify,
     )
     if dry_run:
-        show(plan, Tools(), typer.echo)
+        show_steps(options, Tools(), typer.echo)
         return 0
-    carry_out(plan, Tools(), typer.echo)
+    execute(options, Tools(), typer.echo)
     typer.echo(f"{robot}: done")
     return 0
 
@@ -79,7 +79,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
-    """The firmware, and the config where there is one; robots on Wi-Fi need one."""
+    """The firmware, and the config if there is one; robots with Wi-Fi need one."""
     if robot in FIRMWARE:
         kind = firmware_named(firmware or robot)
         shipped = Path(str(files("pebble")), "configs", f"{robot}.json")
@@ -91,19 +91,19 @@ def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
         return firmware_named(firmware), config
     name = _OF_PLATFORM.get(config.robot.platform, config.robot.id)
     if name not in FIRMWARE:
-        raise PebbleError(f"{robot} does not tell which firmware its MCU needs: --firmware {'|'.join(FIRMWARE)}")
+        raise PebbleError(f"{robot} does not determine the firmware of its MCU: --firmware {'|'.join(FIRMWARE)}")
     return firmware_named(name), config
 
 
 def _private(
     config: Config | None, firmware: Firmware, ssid: str | None, password_file: Path | None, dry_run: bool
-) -> Private:
+) -> PrivateFiles:
     if config is None:
         raise PebbleError(f"{firmware.name} needs its config file: it names the broker")
     if dry_run:
         return private_files(config, firmware, ssid=ssid or "(--wifi)", wifi_password="")
     if ssid is None:
-        raise PebbleError(f"--wifi: {config.robot.id} needs a Wi-Fi; say its name")
+        raise PebbleError(f"--wifi: {config.robot.id} needs the name of its Wi-Fi")
     check_broker(config)
     return private_files(config, firmware, ssid=ssid, wifi_password=_wifi_password(ssid, password_file))
 
@@ -120,6 +120,6 @@ def _wifi_password(ssid: str, file: Path | None) -> str:
         return os.environ[WIFI_PASSWORD]
     if not sys.stdin.isatty():
         raise PebbleError(
-            f"the password of {ssid}: --wifi-password-file FILE or ${WIFI_PASSWORD}, nobody is here to ask"
+            f"the password of {ssid}: use --wifi-password-file FILE or ${WIFI_PASSWORD}, stdin is not a terminal"
         )
     return str(typer.prompt(f"password of {ssid} (empty: none)", default="", hide_input=True, show_default=False))

@@ -1,13 +1,13 @@
-"""``pebble impair``: a robot behind a bad link."""
+"""``pebble impair``: robots behind an impaired network."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pebble.bench.output import FOLDER
+from pebble.commands.options import Output, split_names
 
 
 def impair(
@@ -18,7 +18,7 @@ def impair(
         str | None,
         typer.Option(help='Such as "mqtt original,zenoh h264 opus". [default: all four]', metavar="NAMES"),
     ] = None,
-    both_ways: Annotated[bool, typer.Option("--both-ways", help="Impair the way to the robot, too.")] = False,
+    both_ways: Annotated[bool, typer.Option("--both-ways", help="Impair the direction to the robot, too.")] = False,
     link: Annotated[str, typer.Option(help="auto, namespaces (needs root) or proxy.", metavar="KIND")] = "auto",
     window: Annotated[
         float | None, typer.Option(help="Seconds of video, and of audio, per trial. [default: 8; quick: 4]")
@@ -26,28 +26,28 @@ def impair(
     quick: Annotated[
         bool, typer.Option("--quick", help="Four trials, short windows, all robots at the same time.")
     ] = False,
-    output: Annotated[Path, typer.Option(help="Where the results go.", metavar="FOLDER")] = FOLDER,
+    output: Output = FOLDER,
 ) -> int:
-    """A robot behind a bad link: the impairment trials of the paper, chapter 4.2.
+    """Robots behind an impaired network: the trials of the paper's section 4.2.
 
-    Simulated robots on MQTT and on Zenoh, with the original's encodings and with H.264 and Opus, each behind a link of
-    its own to its broker. In each trial the link gets slow, loses packets, or both; the robot is driven, watched and
-    listened to. Needs mosquitto; without root, a proxy stands in for the link.
+    Simulated robots on MQTT and on Zenoh, with the original's encodings and with H.264 and Opus, each with its own
+    network to its broker. In each trial the network has a low rate, loses packets, or both; an operator drives the
+    robot and receives its video and audio. Needs mosquitto; without root, a proxy replaces network namespaces.
 
     \b
         pebble impair --quick
         pebble impair --trials base-start,256k,64k+5%
         pebble impair --link proxy --subjects "mqtt h264 opus"
     """
-    from pebble.impair.plan import NAMES, Plan
-    from pebble.impair.run import run
+    from pebble.bench.impair.plan import NAMES, ImpairPlan
+    from pebble.bench.impair.run import run
 
     return run(
-        Plan(
-            trials=_names(trials) or (),
-            subjects=_names(subjects) if subjects is not None else NAMES,
+        ImpairPlan(
+            trials=() if trials is None else split_names(trials),
+            subjects=NAMES if subjects is None else split_names(subjects),
             both_ways=both_ways,
-            link=link,
+            network=link,
             window_s=window,
             quick=quick,
             output=output,
@@ -57,7 +57,3 @@ def impair(
 
 def register(app: typer.Typer) -> None:
     app.command("impair")(impair)
-
-
-def _names(text: str | None) -> list[str]:
-    return [name.strip() for name in (text or "").split(",") if name.strip()]

@@ -1,4 +1,4 @@
-"""Where pictures and sound are shown: a window where there is a screen, files where there is none."""
+"""Outputs for pictures and sound: a window where there is a screen, files where there is none."""
 
 from __future__ import annotations
 
@@ -17,34 +17,35 @@ import cv2
 import numpy as np
 import typer
 
+from pebble.client.media_receiver import MediaReceiver
+from pebble.commands import show
 from pebble.errors import PebbleError
-from pebble.media.audience import Audience
-from pebble.media.sound import Heard
+from pebble.media.sound import ReceivedSound
 
 _PICTURE_EVERY_S = 1.0
 
 
 class Screen(ABC):
-    """Shows an audience's newest picture each time it is asked to. ``open``: does anybody still look?"""
+    """Shows a receiver's newest picture on each call. ``open``: is the window still open?"""
 
     open = True
-    can_hear = True  # is there any use in asking for sound?
+    can_play = True  # can it play or store sound?
 
     @abstractmethod
-    def show(self, audience: Audience) -> None: ...
+    def show(self, receiver: MediaReceiver) -> None: ...
 
     @abstractmethod
     def summary(self) -> str:
-        """What was shown, or where it is now, in a line."""
+        """One line: what was shown, or where it was written."""
 
     @abstractmethod
     def close(self) -> None:
-        """Leave nothing open."""
+        """Close files, processes and windows."""
 
 
 @contextmanager
 def best(name: str, folder: Path | None) -> Iterator[Screen]:
-    """A window if there is a screen and no folder was asked for; else files. Raises PebbleError if none can be made."""
+    """A window if there is a screen and no ``folder``, else files. Raises PebbleError if neither can be created."""
     screen = None if folder is not None else _window(name)
     if screen is None:
         screen = Files(folder or Path(f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"))
@@ -55,7 +56,7 @@ def best(name: str, folder: Path | None) -> Iterator[Screen]:
 
 
 def save_picture(picture: np.ndarray[Any, Any], file: Path) -> None:
-    """Write a BGR picture; the name's ending says as what. Raises PebbleError when that is not possible."""
+    """Write a BGR picture in the format of the file's suffix. Raises PebbleError if that fails."""
     try:
         written = cv2.imwrite(str(file), picture)
     except cv2.error:
@@ -65,7 +66,7 @@ def save_picture(picture: np.ndarray[Any, Any], file: Path) -> None:
 
 
 class Files(Screen):
-    """A PNG once a second, and all of the sound as one WAV: another one when its format changes."""
+    """Writes a PNG once a second and the sound to a WAV file, with a new file for each change of format."""
 
     def __init__(self, folder: Path) -> None:
         try:
@@ -79,19 +80,19 @@ class Files(Screen):
         self._wave: wave.Wave_write | None = None
         self._format = (0, 0)
 
-    def show(self, audience: Audience) -> None:
-        for heard in audience.take_sounds():
-            self._write(heard)
+    def show(self, receiver: MediaReceiver) -> None:
+        for received in receiver.take_sounds():
+            self._write(received)
         now = time.monotonic()
         if now < self._due:
             return
         self._due = now + _PICTURE_EVERY_S
-        if audience.newest is not None:
+        if receiver.newest is not None:
             self._pictures += 1
-            save_picture(audience.newest.picture, self._folder / f"{self._pictures:04}.png")
+            save_picture(receiver.newest.picture, self._folder / f"{self._pictures:04}.png")
         typer.echo(
-            f"video  {audience.summary('video', now) or 'nothing yet'}   "
-            f"audio  {audience.summary('audio', now) or 'nothing yet'}"
+            f"video  {receiver.summary('video', now) or 'nothing yet'}   "
+            f"audio  {receiver.summary('audio', now) or 'nothing yet'}{_stop(receiver)}"
         )
 
     def summary(self) -> str:
@@ -102,26 +103,26 @@ class Files(Screen):
             self._wave.close()
             self._wave = None
 
-    def _write(self, heard: Heard) -> None:
-        if self._wave is None or self._format != (heard.rate, heard.channels):
-            self._begin(heard)
+    def _write(self, received: ReceivedSound) -> None:
+        if self._wave is None or self._format != (received.rate, received.channels):
+            self._begin(received)
         if self._wave is not None:
-            self._wave.writeframes(heard.pcm)
-            self._seconds += len(heard.samples) / heard.rate
+            self._wave.writeframes(received.pcm)
+            self._seconds += len(received.samples) / received.rate
 
-    def _begin(self, heard: Heard) -> None:
+    def _begin(self, received: ReceivedSound) -> None:
         self.close()
         self._waves += 1
         name = "sound.wav" if self._waves == 1 else f"sound-{self._waves}.wav"
         self._wave = wave.open(str(self._folder / name), "wb")  # noqa: SIM115  (closed by close())
-        self._wave.setnchannels(heard.channels)
+        self._wave.setnchannels(received.channels)
         self._wave.setsampwidth(2)
-        self._wave.setframerate(heard.rate)
-        self._format = (heard.rate, heard.channels)
+        self._wave.setframerate(received.rate)
+        self._format = (received.rate, received.channels)
 
 
 class Window(Screen):
-    """A window by Tk, which comes with Python: OpenCV's wheel for servers has none."""
+    """A window by Tk, which comes with Python; OpenCV's headless wheel has no windows."""
 
     def __init__(self, name: str) -> None:
         import tkinter
@@ -135,15 +136,15 @@ class Window(Screen):
         self._line = tkinter.Label(self._root, anchor="w")
         self._line.pack(fill="x")
         self._loudspeaker = Loudspeaker()
-        self.can_hear = self._loudspeaker.installed
-        self._image: Any = None  # Tk shows it only as long as somebody holds it
+        self.can_play = self._loudspeaker.installed
+        self._image: Any = None  # Tk shows it only while it is referenced
         self._shown: object = None
         self._count = 0
 
-    def show(self, audience: Audience) -> None:
-        newest, now = audience.newest, time.monotonic()
-        for heard in audience.take_sounds():
-            self._loudspeaker.play(heard)
+    def show(self, receiver: MediaReceiver) -> None:
+        newest, now = receiver.newest, time.monotonic()
+        for received in receiver.take_sounds():
+            self._loudspeaker.play(received)
         if newest is not None and newest is not self._shown:
             self._shown = newest
             self._count += 1
@@ -151,7 +152,7 @@ class Window(Screen):
             if ok:
                 self._image = self._tk.PhotoImage(data=data.tobytes(), format="PPM")
                 self._label.configure(image=self._image)
-        self._line.configure(text=audience.summary("video", now) or "no picture yet")
+        self._line.configure(text=(receiver.summary("video", now) or "no picture yet") + _stop(receiver))
         with suppress(self._tk.TclError):  # closed a moment ago
             self._root.update()
 
@@ -168,7 +169,7 @@ class Window(Screen):
 
 
 class Loudspeaker:
-    """Plays through aplay as it comes; what it does not take at once is dropped, so that nothing lags behind."""
+    """Plays through aplay; drops sound that aplay does not accept at once, so that playback does not lag."""
 
     def __init__(self) -> None:
         self._program = shutil.which("aplay")
@@ -179,12 +180,12 @@ class Loudspeaker:
     def installed(self) -> bool:
         return self._program is not None
 
-    def play(self, heard: Heard) -> None:
-        if self._process is None or self._format != (heard.rate, heard.channels):
-            self._begin(heard.rate, heard.channels)
+    def play(self, received: ReceivedSound) -> None:
+        if self._process is None or self._format != (received.rate, received.channels):
+            self._begin(received.rate, received.channels)
         if self._process is not None and self._process.stdin is not None:
             with suppress(OSError):  # full, or aplay has ended
-                os.write(self._process.stdin.fileno(), heard.pcm)
+                os.write(self._process.stdin.fileno(), received.pcm)
 
     def close(self) -> None:
         process, self._process = self._process, None
@@ -203,11 +204,17 @@ class Loudspeaker:
             os.set_blocking(self._process.stdin.fileno(), False)
 
 
+def _stop(receiver: MediaReceiver) -> str:
+    """What to show beside the rates if the robot is stopped by an emergency stop."""
+    line = show.stopped_line(receiver.estop, time.time())
+    return line and f"   EMERGENCY STOP: {line}"
+
+
 def _window(name: str) -> Screen | None:
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return None
     try:
         return Window(name)
-    except Exception as error:  # noqa: BLE001  (no Tk in this Python, or no screen after all: files will do)
+    except Exception as error:  # noqa: BLE001  (no Tk in this Python, or no screen: write files instead)
         typer.echo(f"no window: {error}", err=True)
         return None

@@ -1,14 +1,25 @@
-"""A message as a person reads it: JSON in a readable form, bytes as a hex dump, nothing that upsets a terminal."""
+"""What ``pebble topic`` prints: messages, rates and lists of topics, without characters that control the terminal."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
 import re
-from typing import Any
+import statistics
+from itertools import pairwise
+from typing import Any, TextIO
 
-from pebble import codec
+from pebble.client.estop_states import RobotEstop
+from pebble.client.names import Names, id_of
+from pebble.contract import codec
+from pebble.contract.identity import parse_topic
+from pebble.contract.payloads import EstopState
+from pebble.media.rate_meter import RateMeter
 from pebble.transports import Message
 
+_TOPIC_LIMIT = 10_000  # topics in one listing
+_WINDOW = 1000
 _DUMPED = 32  # bytes of a binary payload that are shown
 #: Binary payloads by their first bytes.
 RECOGNISERS = {b"PBAT": "PBAT sound", b"PBVD": "PBVD picture", b"\xff\xd8": "JPEG picture"}
@@ -16,14 +27,19 @@ _control = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\u
 
 
 def printable(text: str) -> str:
-    """``text`` without control characters, which a stranger's payload could use to rewrite the terminal."""
+    """``text`` with control characters escaped: a payload must not control the terminal."""
     return _control(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def discard_output(stream: TextIO) -> None:
+    """Discard what is still written to ``stream``: its reader has ended, or a disk is full."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def body(payload: bytes, width: int) -> str:
     """JSON on one line where it fits and indented where not; text as it is; the rest as a hex dump."""
     if not payload:
-        return "(empty: removes the kept copy)"
+        return "(empty: removes the retained message)"
     plain = parsed(payload)
     if plain is not None:
         line = json.dumps(plain, ensure_ascii=False)
@@ -35,7 +51,7 @@ def body(payload: bytes, width: int) -> str:
 
 
 def parsed(payload: bytes) -> Any:
-    """The JSON value, or None for what is no JSON (or is ``null``)."""
+    """The JSON value; None if it is not JSON (or is ``null``)."""
     if codec.too_deep(payload):
         return None
     try:
@@ -45,7 +61,7 @@ def parsed(payload: bytes) -> Any:
 
 
 def recognised(payload: bytes) -> str | None:
-    """What a binary payload is, by its first bytes."""
+    """The name of a binary format, by its first bytes."""
     return next((name for start, name in RECOGNISERS.items() if payload.startswith(start)), None)
 
 
@@ -61,12 +77,12 @@ def hex_dump(raw: bytes, width: int) -> str:
 
 
 def headline(message: Message, now: float) -> str:
-    """Topic, whether it is a kept copy, size, and how old the payload says it is. ``now``: epoch seconds."""
+    """Topic, size, QoS, whether it is retained, and its age by the payload's stamp. ``now``: epoch seconds."""
     parts = [printable(message.topic), f"{len(message.payload)} B", f"qos {int(message.qos)}"]
     if message.retain:
-        parts.append("kept copy")
-    elif message.keep:
-        parts.append("to be kept")
+        parts.append("retained")
+    elif message.retain_requested:
+        parts.append("to be retained")
     stamp = codec.stamp_of(parsed(message.payload))
     if stamp is not None:
         parts.append(f"stamped {age(now - stamp)}")
@@ -79,7 +95,7 @@ def age(seconds: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds in a form a person reads at a glance."""
+    """Seconds with a unit: ``12 ms``, ``3.2 s``, ``2 h``."""
     if seconds < 1:
         return f"{seconds * 1000:.0f} ms"
     if seconds < 100:
@@ -97,8 +113,140 @@ def size(count: float) -> str:
     return f"{count / 1e3:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
 
 
+def frequency_line(meter: RateMeter, now: float) -> str | None:
+    """How often messages come, as ``ros2 topic hz`` prints it; None before the second message."""
+    hz, arrivals = meter.rate(now), meter.arrivals(now)
+    if not hz:
+        return None
+    gaps = [later.at - earlier.at for earlier, later in pairwise(arrivals)]
+    limits = f"min {min(gaps):.4f} s  max {max(gaps):.4f} s"
+    return f"{hz:.3f} Hz  {limits}  std dev {statistics.pstdev(gaps):.5f} s  window {len(gaps)}"
+
+
+def bandwidth_line(meter: RateMeter, now: float) -> str | None:
+    """How many bytes come per second, as ``ros2 topic bw`` prints it; None before the second message."""
+    hz, sizes = meter.rate(now), [arrival.size for arrival in meter.arrivals(now)]
+    if not hz:
+        return None
+    mean = statistics.fmean(sizes)
+    return (
+        f"{size(mean * hz)}/s ({mean * hz * 8 / 1000:.1f} kbit/s)  mean {size(mean)}  "
+        f"min {size(min(sizes))}  max {size(max(sizes))}  window {len(sizes)}"
+    )
+
+
 def _is_text(payload: bytes) -> bool:
     try:
         return not any(ord(character) < 9 for character in payload.decode())
     except UnicodeDecodeError:
         return False
+
+
+class TopicRecord:
+    """The newest message of one topic, and the rate of live ones."""
+
+    def __init__(self) -> None:
+        self.retained = False
+        self.last: Message | None = None
+        self.arrived = 0.0
+        self.meter = RateMeter(window_s=math.inf, limit=_WINDOW)
+
+    def add(self, message: Message, now: float) -> None:
+        self.retained = self.retained or message.retain or bool(message.retain_requested)
+        self.last, self.arrived = message, now
+        if not message.retain:
+            self.meter.add(now, len(message.payload))
+
+
+class Listing:
+    """Topics by name. ``add`` takes monotonic seconds."""
+
+    def __init__(self, names: Names) -> None:
+        self.names = names
+        self.records: dict[str, TopicRecord] = {}
+        self.omitted = 0  # messages of topics beyond the limit
+
+    def add(self, message: Message, now: float) -> None:
+        if message.topic not in self.records and len(self.records) >= _TOPIC_LIMIT:
+            self.omitted += 1
+            return
+        self.records.setdefault(message.topic, TopicRecord()).add(message, now)
+
+
+def print_listing(listing: Listing, now: float, wall: float) -> None:
+    """Print the topics, grouped by component: the first three levels are the same for many lines."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    if not listing.records:
+        console.print("no topics received; a longer --seconds may show slower ones")
+        return
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("topic", overflow="fold")
+    table.add_column("retained")
+    for name in ("rate", "size", "age"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("kind", no_wrap=True)
+    base = None
+    for topic in sorted(listing.records):
+        address = parse_topic(topic)
+        if address is not None and address.identity.base != base:
+            base = address.identity.base
+            table.add_row(Text(printable(base), style="bold"))
+        shown = topic if address is None else f"  {address.direction}/{address.metric}"
+        kind, style = _kind(listing.names, topic)
+        table.add_row(Text(printable(shown)), *_cells(listing.records[topic], now, wall), Text(kind, style=style))
+    console.print(table)
+    if listing.omitted:
+        console.print(f"omitted: {listing.omitted} messages of further topics")
+
+
+def stopped_robots(listing: Listing, wall: float) -> list[str]:
+    """A line for each robot in the listing that is stopped."""
+    robots: dict[str, RobotEstop] = {}
+    for topic, record in listing.records.items():
+        address = parse_topic(topic)
+        if address is not None and record.last is not None:
+            base = address.identity.base
+            robots.setdefault(base, RobotEstop(base)).receive(record.last)
+    return [stopped_line(robots[base], wall) for base in sorted(robots) if robots[base].latched]
+
+
+def stopped_line(robot: RobotEstop, wall: float) -> str:
+    """``goob is stopped by ann@desk, 3 min ago: a dog``; empty if it is not stopped."""
+    state = robot.stopped_by
+    return "" if state is None else f"{printable(id_of(robot.base))} is {stopped(state, wall)}"
+
+
+def stopped(state: EstopState, wall: float) -> str:
+    """Who stopped a motor owner, when and why, from its cleaned state."""
+    when = f", {age(wall - state.since / 1000)}" if state.since else ""
+    return f"stopped by {state.by or 'unknown'}{when}" + (f": {state.why}" if state.why else "")
+
+
+def _cells(record: TopicRecord, now: float, wall: float) -> tuple[str, str, str, str]:
+    retained = "yes" if record.retained else ""
+    if record.last is None:
+        return retained, "", "", ""
+    hz = record.meter.rate(now)
+    rate = f"{hz:.1f} Hz" if hz else "once" if record.meter.count else ""
+    return retained, rate, size(len(record.last.payload)), _age(record, record.last, now, wall)
+
+
+def _age(record: TopicRecord, last: Message, now: float, wall: float) -> str:
+    """Since arrival for a live message; by the payload's stamp for a retained one."""
+    if not last.retain:
+        return duration(now - record.arrived)
+    stamp = codec.stamp_of(parsed(last.payload))
+    return "?" if stamp is None else duration(max(0.0, wall - stamp))
+
+
+def _kind(names: Names, topic: str) -> tuple[str, str]:
+    """The kind of a topic's channel, and the style to print it in."""
+    channel = names.channel(topic)
+    if channel is None:
+        return "not in the contract", "dim"
+    synonym = f" (like {channel.synonym_of})" if channel.synonym_of else ""
+    return f"{channel.kind.name.lower()}{synonym}", ""

@@ -1,4 +1,4 @@
-"""``pebble sim``: the real firmware of a robot's MCU on simulated pins, in the foreground."""
+"""``pebble sim`` and ``pebble demo``: simulated robots; their MCUs run the real firmware on simulated pins."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pebble.commands.options import CaCert, PasswordFile
+
 if TYPE_CHECKING:
-    from pebble.identity import Identity
+    from pebble.contract.identity import Identity
     from pebble.simulation.wireless import BrokerAddress
 
 _GROUP_HELP = """The real firmware of a robot's MCU on simulated pins.
 
-Goob and Fred have theirs on a serial port, MiniLAMP and BenJr on Wi-Fi.
+Goob's and Fred's is on a serial port, MiniLAMP's and BenJr's on Wi-Fi.
 
 \b
     pebble sim goob --link /tmp/goob
@@ -24,21 +26,17 @@ _BROKER_HELP = "mqtt://[USER@]HOST[:PORT], mqtts://… or a robot's config file.
 
 _Link = Annotated[
     Path | None,
-    typer.Option("--link", help="Where the serial port shall appear. [default: /tmp/pebble-…]", metavar="PATH"),
+    typer.Option("--link", help="Path of the serial port. [default: /tmp/pebble-…]", metavar="PATH"),
 ]
-_Charging = Annotated[bool, typer.Option("--charging", help="Start on the charger.")]
+_Charging = Annotated[bool, typer.Option("--charging", help="Start with the charger connected.")]
 _Broker = Annotated[str, typer.Option("--broker", "-b", help=_BROKER_HELP, metavar="URL", show_default=False)]
-_PasswordFile = Annotated[
-    Path | None, typer.Option(help="File with the password of USER; else $PEBBLE_PASSWORD.", metavar="FILE")
-]
-_CaCert = Annotated[Path | None, typer.Option(help="Authority to trust with mqtts://.", metavar="FILE")]
 _Id = Annotated[str | None, typer.Option("--id", help="The robot's id. [default: its kind]", metavar="ID")]
 
 
 def goob(link: _Link = None, charging: _Charging = False) -> int:
     """Goob's motor MCU on a pseudo terminal, until Ctrl-C.
 
-    Write the path of its link into serial.port of the robot's config.
+    Set serial.port in the robot's config to the path of the link.
 
     \b
         pebble sim goob --link /tmp/goob
@@ -49,7 +47,7 @@ def goob(link: _Link = None, charging: _Charging = False) -> int:
 def fred(link: _Link = None, charging: _Charging = False) -> int:
     """Fred's motor MCU on a pseudo terminal, until Ctrl-C.
 
-    Write the path of its link into serial.port of the robot's config.
+    Set serial.port in the robot's config to the path of the link.
 
     \b
         pebble sim fred --link /tmp/fred
@@ -60,7 +58,7 @@ def fred(link: _Link = None, charging: _Charging = False) -> int:
 def goob_imu(link: _Link = None) -> int:
     """Goob's IMU board on a pseudo terminal, until Ctrl-C.
 
-    Write the path of its link into serial.port of an instance in the config.
+    Set serial.port of an instance in the config to the path of the link.
 
     \b
         pebble sim goob_imu --link /tmp/goob-imu
@@ -68,7 +66,7 @@ def goob_imu(link: _Link = None) -> int:
     return _serial("goob_imu", link, False)
 
 
-def minilamp(broker: _Broker, id_: _Id = None, password_file: _PasswordFile = None, ca_cert: _CaCert = None) -> int:
+def minilamp(broker: _Broker, id_: _Id = None, password_file: PasswordFile = None, ca_cert: CaCert = None) -> int:
     """A whole MiniLAMP on a real broker, until Ctrl-C.
 
     \b
@@ -78,7 +76,7 @@ def minilamp(broker: _Broker, id_: _Id = None, password_file: _PasswordFile = No
     return _wireless("minilamp", id_, broker, password_file, ca_cert)
 
 
-def benjr(broker: _Broker, id_: _Id = None, password_file: _PasswordFile = None) -> int:
+def benjr(broker: _Broker, id_: _Id = None, password_file: PasswordFile = None) -> int:
     """A whole BenJr on a real broker, until Ctrl-C.
 
     \b
@@ -93,24 +91,44 @@ def fleet(
     kind: Annotated[
         list[str] | None, typer.Option(help="May be given several times. [default: minilamp, benjr]")
     ] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=1, help="End after so long.")] = None,
-    password_file: _PasswordFile = None,
-    ca_cert: _CaCert = None,
+    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=1, help="End after this long.")] = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
     """Many whole robots on a real broker, until Ctrl-C.
 
-    They are called minilamp-001, benjr-001, minilamp-002 and so on. With --seconds it exits 0 only if all
+    Their ids are minilamp-001, benjr-001, minilamp-002 and so on. With --seconds it exits 0 only if all
     were online at the end.
 
     \b
         pebble sim fleet --robots 200 --broker mqtt://127.0.0.1:1883
         pebble sim fleet -n 3 --kind minilamp --broker mqtts://broker.lan --seconds 60
     """
-    from pebble.simulation.fleet_program import Plan, run
+    from pebble.simulation.fleet_program import FleetOptions, run
     from pebble.simulation.wireless import KINDS
 
     address = _address(broker, password_file, ca_cert)[0]
-    return run(Plan(robots=robots, broker=address, kinds=kind or KINDS, seconds=seconds))
+    return run(FleetOptions(robots=robots, broker=address, kinds=kind or KINDS, seconds=seconds))
+
+
+def demo(
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", "-s", min=1, help="End after this long of driving.", show_default=False),
+    ] = None,
+) -> int:
+    """Four simulated robots, driven by a scripted operator through one broker, until Ctrl-C.
+
+    Goob on Zenoh, Fred on MQTT, MiniLAMP and BenJr on MCUs with their own firmware; needs no hardware.
+    With --seconds it exits 0 only if every robot moved and stopped as commanded.
+
+    \b
+        pebble demo
+        pebble demo --seconds 20
+    """
+    from pebble.demo.main import run
+
+    return run(seconds)
 
 
 def _serial(kind: str, link: Path | None, charging: bool) -> int:
@@ -119,29 +137,29 @@ def _serial(kind: str, link: Path | None, charging: bool) -> int:
     from pebble.simulation.mcu import main
 
     path = Path(tempfile.gettempdir(), f"pebble-{kind}") if link is None else link
-    typer.echo(f"{kind} answers at {path}; Ctrl-C ends it")
+    typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
     return main(["--kind", kind, "--link", str(path), *(["--charging"] if charging else [])])
 
 
 def _wireless(kind: str, id_: str | None, broker: str, password_file: Path | None, ca_cert: Path | None) -> int:
-    from pebble.identity import Identity
+    from pebble.contract.identity import Identity
     from pebble.simulation.networked import run
 
     address, named = _address(broker, password_file, ca_cert)
     identity = named or Identity("pebble", "robots", id_ or kind)
     if named is not None and id_ is not None:
         identity = Identity(named.system, named.type, id_)
-    typer.echo(f"{identity} is on its way to the broker at {address}; Ctrl-C ends it")
+    typer.echo(f"{identity} connects to the broker at {address}; Ctrl-C ends it")
     return run(kind, identity, address)
 
 
 def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Identity | None]:
     """The broker that a URL or a config file names, and the robot of the config. Raises PebbleError."""
-    from pebble.commands.connection import password
-    from pebble.commands.url import UrlError, settings_of
+    from pebble.client.connection import password
+    from pebble.client.url import UrlError, settings_of
     from pebble.config import load
     from pebble.errors import PebbleError
-    from pebble.links import LOCAL_RECONNECT_S, mqtt_settings
+    from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
     from pebble.simulation.wireless import BrokerAddress
     from pebble.transports import MqttSettings, ZenohSettings
 
@@ -156,7 +174,7 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
         except UrlError as error:
             raise UrlError(str(error).replace("--url", "--broker")) from None
     if not isinstance(settings, MqttSettings):
-        raise PebbleError("--broker: robots with Wi-Fi speak MQTT only, use mqtt://HOST[:PORT]")
+        raise PebbleError("--broker: robots with Wi-Fi use MQTT only: mqtt://HOST[:PORT]")
     tls = settings.tls
     return (
         BrokerAddress(
@@ -176,3 +194,4 @@ def register(app: typer.Typer) -> None:
     for command in (goob, fred, goob_imu, minilamp, benjr, fleet):
         group.command(command.__name__)(command)
     app.add_typer(group, name="sim")
+    app.command("demo")(demo)

@@ -1,7 +1,8 @@
-"""``pebble topic``: see and send what travels, on either transport."""
+"""``pebble topic``: list, print, publish and measure messages, on either transport."""
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import time
@@ -10,43 +11,36 @@ from typing import Annotated
 
 import typer
 
+from pebble.client.connection import Listener, Target, connected
+from pebble.client.estop_states import RobotEstop
+from pebble.client.names import Names, id_of
 from pebble.commands import show
-from pebble.commands.connection import PASSWORD, Listener, Target, connected
-from pebble.commands.outgoing import draft
-from pebble.commands.rates import Rates
-from pebble.errors import TransportError
-from pebble.transports import QoS
+from pebble.commands.draft import Draft, draft
+from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.contract import DRIVE, codec
+from pebble.contract.identity import parse_topic
+from pebble.errors import PayloadError, PebbleError, TransportError
+from pebble.media.rate_meter import RateMeter
+from pebble.transports import QoS, Transport
+from pebble.transports.topics import is_pattern
 
 _TICK_S = 0.2
-_SAY_EVERY_S = 1.0
+_REPORT_PERIOD_S = 1.0
 
 Name = Annotated[
     str,
     typer.Argument(
-        help="A metric (drive-values, outgoing/online) or a whole topic; all but pub take + and # too.",
+        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.",
         show_default=False,
     ),
 ]
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", "-c", help="A robot's config file: use its own transport.", metavar="CONFIG")
-]
-UrlOption = Annotated[
-    str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL")
-]
 RobotOption = Annotated[
-    str | None, typer.Option("--robot", "-r", help="Whose topics short names mean.", metavar="[SYSTEM/TYPE/]ID")
+    str | None, typer.Option("--robot", "-r", help="The robot that short names refer to.", metavar="[SYSTEM/TYPE/]ID")
 ]
-RemoteOption = Annotated[
-    bool, typer.Option("--remote", help="With --config: the broker where operators are, not the robot's own side.")
-]
-PasswordOption = Annotated[
-    Path | None, typer.Option(help=f"File with the password for --url; else ${PASSWORD}.", metavar="FILE")
-]
-CaOption = Annotated[Path | None, typer.Option(help="Authority to trust with mqtts://.", metavar="FILE")]
 SecondsOption = Annotated[float | None, typer.Option("--seconds", "-s", min=0.1, help="Stop after this long.")]
-WindowOption = Annotated[int, typer.Option("--window", "-w", min=2, help="Messages that the figures are about.")]
+WindowOption = Annotated[int, typer.Option("--window", "-w", min=2, help="Number of newest messages to measure.")]
 
-_GROUP_HELP = """See and send messages, on either transport.
+_GROUP_HELP = """List, print, publish and measure messages, on either transport.
 
 \b
     pebble topic list -c goob.json
@@ -65,49 +59,50 @@ def register(app: typer.Typer) -> None:
 
 def list_(
     filter_: Annotated[str | None, typer.Argument(help="Only topics that match.", metavar="FILTER")] = None,
-    seconds: Annotated[float, typer.Option("--seconds", "-s", min=0.1, help="How long to listen.")] = 2.0,
+    seconds: Annotated[float, typer.Option("--seconds", "-s", min=0.1, help="How long to receive.")] = 2.0,
     config: ConfigOption = None,
     url: UrlOption = None,
     robot: RobotOption = None,
     remote: RemoteOption = False,
-    password_file: PasswordOption = None,
-    ca_cert: CaOption = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
-    """Topics seen within some seconds: kept or not, rate, size and age.
+    """List topics: whether retained, rate, size and age.
 
     \b
         pebble topic list -c goob.json
         pebble topic list 'pebble/+/+/outgoing/#' --url mqtt://127.0.0.1 -s 5
     """
-    from pebble.commands.listing import Listing, print_listing
-
     with connected(_target(config, url, robot, remote, password_file, ca_cert)) as (transport, names):
-        listing = Listing(names)
+        listing = show.Listing(names)
         listener = Listener(transport, [filter_ or ("#" if robot is None else f"{names.base}/#")])
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             message = listener.next(left)
             if message is not None:
                 listing.add(message, time.monotonic())
-        print_listing(listing, time.monotonic(), time.time())
-    return 0 if listing.seen else 1
+        show.print_listing(listing, time.monotonic(), time.time())
+        for line in show.stopped_robots(listing, time.time()):
+            typer.echo(line)
+    return 0 if listing.records else 1
 
 
 def echo(
     topic: Name,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after this many.")] = None,
     seconds: SecondsOption = None,
-    raw: Annotated[bool, typer.Option("--raw", help="Payloads as they are, one per line.")] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="Only unchanged payloads, one per line.")] = False,
     config: ConfigOption = None,
     url: UrlOption = None,
     robot: RobotOption = None,
     remote: RemoteOption = False,
-    password_file: PasswordOption = None,
-    ca_cert: CaOption = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
-    """Print messages as they come.
+    """Print messages as they arrive.
 
-    JSON is printed readably, binary payloads as a hex dump of their beginning.
+    JSON is formatted; of a binary payload the first bytes are printed as a hex dump. If the robot is stopped by an
+    emergency stop, the first line shows it.
 
     \b
         pebble topic echo drive-values -c goob.json
@@ -116,6 +111,7 @@ def echo(
     """
     printed = 0
     with connected(_target(config, url, robot, remote, password_file, ca_cert)) as (transport, names):
+        _warn_of_stop(transport, names, topic)
         listener = Listener(transport, names.filters(topic))
         end = _end(seconds)
         while time.monotonic() < end and printed != count:
@@ -129,7 +125,7 @@ def echo(
             else:
                 typer.secho(show.headline(message, time.time()), dim=True)
                 typer.echo(show.body(message.payload, shutil.get_terminal_size().columns))
-        _tell_dropped(listener)
+        _warn_of_dropped(listener)
     return 0 if printed else 1
 
 
@@ -138,10 +134,12 @@ def pub(
     payload: Annotated[str, typer.Argument(help="JSON, any text, or @FILE.", show_default=False)],
     retain: Annotated[
         bool | None,
-        typer.Option("--retain/--no-retain", help="Keep it for later subscribers. [default: the contract's rule]"),
+        typer.Option("--retain/--no-retain", help="Retain it for later subscribers. [default: the contract's rule]"),
     ] = None,
     qos: Annotated[int | None, typer.Option(min=0, max=1, help="[default: the contract's rule]")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Send even a kept command.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish even a retained command, and to a stopped robot.")
+    ] = False,
     rate: Annotated[float | None, typer.Option("--rate", min=0.01, help="Repeat this many times a second.")] = None,
     count: Annotated[
         int | None, typer.Option("--count", "-n", min=1, help="Stop after this many, with --rate.")
@@ -150,13 +148,13 @@ def pub(
     url: UrlOption = None,
     robot: RobotOption = None,
     remote: RemoteOption = False,
-    password_file: PasswordOption = None,
-    ca_cert: CaOption = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
-    """Send one message, or the same one again and again.
+    """Publish a message once, or repeatedly.
 
-    A robot stops 0.75 s after the last drive command: repeat it with --rate. An empty payload with --retain removes
-    a kept copy.
+    A robot stops 0.75 s after the last drive command: repeat it with --rate. A robot that is stopped by an emergency
+    stop is not driven. An empty payload with --retain removes the retained message.
 
     \b
         pebble topic pub drive-values '{"z": 0.5}' -c goob.json --rate 10 -n 20
@@ -165,13 +163,17 @@ def pub(
     """
     with connected(_target(config, url, robot, remote, password_file, ca_cert)) as (transport, names):
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
-        for doubt in message.doubts:
-            typer.echo(f"pebble: warning: {doubt}", err=True)
+        for warning in message.warnings:
+            typer.echo(f"pebble: warning: {warning}", err=True)
+        estop = None if force else _estop_of_driven(transport, names, message)
         for number in range(1 if rate is None else count or sys.maxsize):
             if number:
                 time.sleep(1 / (rate or 1))
+            _refuse_stopped(estop)
             if not transport.publish(message.topic, message.payload, qos=QoS(message.qos), retain=message.retain):
-                raise TransportError(f"{message.topic} was not sent: {transport.problem or 'the connection was lost'}")
+                raise TransportError(
+                    f"{message.topic} was not published: {transport.problem or 'the connection was lost'}"
+                )
     return 0
 
 
@@ -183,10 +185,10 @@ def hz(
     url: UrlOption = None,
     robot: RobotOption = None,
     remote: RemoteOption = False,
-    password_file: PasswordOption = None,
-    ca_cert: CaOption = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
-    """How often messages come, once a second. Kept copies do not count.
+    """Print once a second how often messages arrive. Retained messages do not count.
 
     \b
         pebble topic hz online -c goob.json --remote
@@ -202,10 +204,10 @@ def bw(
     url: UrlOption = None,
     robot: RobotOption = None,
     remote: RemoteOption = False,
-    password_file: PasswordOption = None,
-    ca_cert: CaOption = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
-    """How many payload bytes come per second, once a second. Kept copies do not count.
+    """Print once a second how many payload bytes arrive per second. Retained messages do not count.
 
     \b
         pebble topic bw front-camera --url mqtt://127.0.0.1 -r goob
@@ -214,33 +216,71 @@ def bw(
 
 
 def _measure(what: str, topic: str, window: int, seconds: float | None, target: Target) -> int:
-    rates = Rates(window)
+    meter = RateMeter(window_s=math.inf, limit=window + 1)
     with connected(target) as (transport, names):
         listener = Listener(transport, names.filters(topic))
-        end, say_at, said = _end(seconds), time.monotonic() + _SAY_EVERY_S, 0
+        end, report_at, reported = _end(seconds), time.monotonic() + _REPORT_PERIOD_S, 0
         while time.monotonic() < end:
-            message = listener.next(min(end, say_at) - time.monotonic())
+            message = listener.next(min(end, report_at) - time.monotonic())
             if message is not None and not message.retain:
-                rates.add(time.monotonic(), len(message.payload))
-            if time.monotonic() >= min(end, say_at):
-                say_at += _SAY_EVERY_S
-                _say(rates, what, silent=rates.count == said)
-                said = rates.count
-        _tell_dropped(listener)
-    return 0 if rates.count else 1
+                meter.add(time.monotonic(), len(message.payload))
+            if time.monotonic() >= min(end, report_at):
+                report_at += _REPORT_PERIOD_S
+                _print_rate(meter, what, silent=meter.count == reported)
+                reported = meter.count
+        _warn_of_dropped(listener)
+    return 0 if meter.count else 1
 
 
-def _say(rates: Rates, what: str, *, silent: bool) -> None:
-    line = rates.frequency_line() if what == "hz" else rates.bandwidth_line()
+def _print_rate(meter: RateMeter, what: str, *, silent: bool) -> None:
+    now = time.monotonic()
+    line = show.frequency_line(meter, now) if what == "hz" else show.bandwidth_line(meter, now)
     if silent or line is None:
-        line = "no new messages" if rates.count != 1 else "one message so far"
+        line = "no new messages" if meter.count != 1 else "one message so far"
     typer.echo(line)
     sys.stdout.flush()
 
 
-def _tell_dropped(listener: Listener) -> None:
+def _estop_of_driven(transport: Transport, names: Names, message: Draft) -> RobotEstop | None:
+    """The emergency stop of the robot that ``message`` would move; None if it moves none."""
+    if names.channel(message.topic) is not DRIVE:
+        return None
+    try:
+        if not codec.decode(DRIVE, message.payload).moves:
+            return None
+    except PayloadError:  # robots refuse it, or have other rules: treat it as a command that moves
+        pass
+    return _estop(transport, names, message.topic)
+
+
+def _refuse_stopped(robot: RobotEstop | None) -> None:
+    if robot is not None and robot.stopped_by is not None:
+        raise PebbleError(
+            f"{show.stopped_line(robot, time.time())}; it is not driven (--force publishes anyway). "
+            f"To end the stop: pebble estop reset {show.printable(id_of(robot.base))}, with the same --url or --config"
+        )
+
+
+def _warn_of_stop(transport: Transport, names: Names, topic: str) -> None:
+    robot = _estop(transport, names, topic)
+    if robot is not None and robot.stopped_by is not None:
+        typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
+
+
+def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:
+    """The emergency stop of the one robot that ``topic`` belongs to, as retained; None for several robots."""
+    address = parse_topic(topic)
+    base = names.base if address is None else address.identity.base
+    if is_pattern(base):
+        return None
+    robot = RobotEstop(base)
+    robot.subscribe(transport)
+    return robot
+
+
+def _warn_of_dropped(listener: Listener) -> None:
     if listener.dropped:
-        typer.echo(f"pebble: warning: {listener.dropped} messages came faster than they could be shown", err=True)
+        typer.echo(f"pebble: warning: {listener.dropped} messages arrived faster than they were printed", err=True)
 
 
 def _end(seconds: float | None) -> float:

@@ -7,19 +7,19 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.commands.names import base_of
+from pebble.client.names import base_of
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel
-from pebble.topic_docs import authority, payload_name, rate, travels
+from pebble.contract.docs import authority, payload_name, rate, travels
 
 
 def topics(
     base: Annotated[
-        str | None, typer.Option("--base", help="Write whole topics of this robot.", metavar="[SYSTEM/TYPE/]ID")
+        str | None, typer.Option("--base", help="Print the whole topics of this robot.", metavar="[SYSTEM/TYPE/]ID")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The contract as JSON, for programs.")] = False,
-    json_schema: Annotated[bool, typer.Option("--json-schema", help="JSON Schemas of all payloads.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the contract as JSON.")] = False,
+    json_schema: Annotated[bool, typer.Option("--json-schema", help="Print the JSON Schemas of all payloads.")] = False,
 ) -> int:
-    """The contract: every topic, and how it is delivered.
+    """Print the contract: every topic, and how it is delivered.
 
     \b
         pebble topics
@@ -29,7 +29,7 @@ def topics(
     """
     prefix = "" if base is None else f"{base_of(base)}/"
     if json_schema:
-        from pebble.topic_schemas import schemas
+        from pebble.contract.schemas import schemas
 
         typer.echo(json.dumps(schemas(), indent=2))
     elif as_json:
@@ -72,9 +72,9 @@ def _print_table(prefix: str) -> None:
     table.add_column("topic", no_wrap=True)
     table.add_column("kind")
     table.add_column("qos", justify="right")
-    table.add_column("kept")
+    table.add_column("retained")
     table.add_column("rate", justify="right", no_wrap=True)
-    table.add_column("what it is", ratio=1)
+    table.add_column("description", ratio=1)
     for direction in (INCOMING, OUTGOING):
         table.add_row(Text(f"{prefix}{direction}/" if prefix else direction, style="bold"))
         for channel in CHANNELS:

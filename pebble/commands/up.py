@@ -1,4 +1,4 @@
-"""``pebble up`` for those who ask for its help; ``pebble.cli`` goes straight to the robot."""
+"""``pebble up`` with options, and its help; ``pebble.cli`` runs a plain ``pebble up CONFIG`` without this module."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from pebble.commands.options import ConfigArgument
 def up(config: ConfigArgument) -> int:
     """Run the robot that CONFIG describes, until Ctrl-C or SIGTERM.
 
-    Starts every enabled service (first the hub, where the robot uses Zenoh) and restarts what falls over.
+    Starts every enabled service (on Zenoh robots the hub first), and restarts processes that end unexpectedly.
 
     \b
         pebble up configs/goob.json
     """
-    from pebble.commands.robot import run
+    from pebble.config import load
+    from pebble.launcher.launcher import Launcher
 
-    return run(config)
+    return Launcher(load(config)).run()
 
 
 def register(app: typer.Typer) -> None:

@@ -1,4 +1,4 @@
-"""``pebble watch`` and ``pebble snapshot``: see and hear a robot, as an operator does."""
+"""``pebble watch`` and ``pebble snapshot``: receive a robot's pictures and sound, as an operator does."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pebble.commands.connection import PASSWORD, Target, connected
+from pebble.client.connection import Target, connected
+from pebble.commands.options import CaCert, PasswordFile
 from pebble.errors import PebbleError
-from pebble.signals import interrupted_by_signals
+from pebble.runtime.signals import interrupted_by_signals
 
 if TYPE_CHECKING:
-    from pebble.media.audience import Audience
+    from pebble.client.media_receiver import MediaReceiver
 
-_KNOWN_S = 5.0  # for the robot to say what it can do
-_FIRST_PICTURE_S = 15.0  # a camera that rests takes a moment to open
+_CAPABILITIES_TIMEOUT_S = 5.0  # for the robot's retained capabilities to arrive
+_FIRST_PICTURE_S = 15.0  # a camera that is off takes a moment to open
 _TICK_S = 0.1
 
 RobotArgument = Annotated[
@@ -31,29 +32,25 @@ UrlOption = Annotated[
 EncodingOption = Annotated[
     str | None, typer.Option("--encoding", "-e", help="json, pbvd, pbvz or h264. [default: the robot's]")
 ]
-PasswordOption = Annotated[
-    Path | None, typer.Option(help=f"File with the password for --url; else ${PASSWORD}.", metavar="FILE")
-]
-CaOption = Annotated[Path | None, typer.Option(help="Authority to trust with mqtts://.", metavar="FILE")]
 
 
 def watch(
     robot: RobotArgument,
     url: UrlOption = None,
     encoding: EncodingOption = None,
-    sound: Annotated[bool, typer.Option("--sound/--no-sound", help="Listen, too.")] = True,
+    sound: Annotated[bool, typer.Option("--sound/--no-sound", help="Play audio.")] = True,
     seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=0.5, help="Stop after this long.")] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Write pictures and sound into this folder, even with a screen.", metavar="FOLDER"),
     ] = None,
-    password_file: PasswordOption = None,
-    ca_cert: CaOption = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
-    """See a robot's camera and hear its microphone, until Ctrl-C.
+    """Show a robot's camera and play its microphone, until Ctrl-C.
 
-    Opens a window, and plays the sound through aplay; without a screen a picture a second (PNG) and the sound (WAV) go
-    into a folder.
+    Opens a window, and plays sound through aplay. Without a screen it writes a picture per second (PNG) and the sound
+    (WAV) into a folder.
 
     \b
         pebble watch goob.json
@@ -63,15 +60,15 @@ def watch(
 
     end = float("inf") if seconds is None else time.monotonic() + seconds
     with ExitStack() as stack:
-        stack.enter_context(interrupted_by_signals())  # else the camera would go on with nobody watching
-        audience = stack.enter_context(_audience(robot, url, password_file, ca_cert))
-        screen = stack.enter_context(screens.best(audience.name, out))
-        audience.begin(encoding, sound=sound and screen.can_hear)
+        stack.enter_context(interrupted_by_signals())  # else the camera would continue without a viewer
+        receiver = stack.enter_context(_receiver(robot, url, password_file, ca_cert))
+        screen = stack.enter_context(screens.best(receiver.name, out))
+        receiver.request(encoding, sound=sound and screen.can_play)
         while time.monotonic() < end and screen.open:
-            audience.keep_going()
-            screen.show(audience)
+            receiver.poll()
+            screen.show(receiver)
             time.sleep(_TICK_S)
-        seen = audience.pictures.total
+        seen = receiver.pictures.count
     typer.echo(screen.summary())
     return 0 if seen else 1
 
@@ -81,8 +78,8 @@ def snapshot(
     file: Annotated[Path, typer.Argument(help="PNG or JPEG to write.", metavar="FILE", show_default=False)],
     url: UrlOption = None,
     encoding: EncodingOption = None,
-    password_file: PasswordOption = None,
-    ca_cert: CaOption = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
 ) -> int:
     """Write one picture of a robot's camera into a file.
 
@@ -92,40 +89,41 @@ def snapshot(
     """
     from pebble.commands.screens import save_picture
 
-    with interrupted_by_signals(), _audience(robot, url, password_file, ca_cert) as audience:
-        audience.begin(encoding, sound=False)
+    with interrupted_by_signals(), _receiver(robot, url, password_file, ca_cert) as receiver:
+        receiver.request(encoding, sound=False)
         end = time.monotonic() + _FIRST_PICTURE_S
-        while audience.newest is None:
+        while receiver.newest is None:
             if time.monotonic() > end:
-                raise PebbleError(f"no picture came from {audience.name} within {_FIRST_PICTURE_S:.0f} s")
-            audience.keep_going()
+                raise PebbleError(f"no picture came from {receiver.name} within {_FIRST_PICTURE_S:.0f} s")
+            receiver.poll()
             time.sleep(_TICK_S)
-        save_picture(audience.newest.picture, file)
-        height, width = audience.newest.picture.shape[:2]
+        save_picture(receiver.newest.picture, file)
+        height, width = receiver.newest.picture.shape[:2]
     typer.echo(f"{file}: {width}×{height}")
     return 0
 
 
 @contextmanager
-def _audience(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Iterator[Audience]:
-    from pebble.media.audience import Audience
+def _receiver(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Iterator[MediaReceiver]:
+    from pebble.client.media_receiver import MediaReceiver
 
     with connected(_target(robot, url, password_file, ca_cert)) as (transport, names):
-        audience = Audience(transport, names.base)
+        receiver = MediaReceiver(transport, names.base)
         try:
-            audience.wait_known(_KNOWN_S)
-            yield audience
+            receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
+            yield receiver
         finally:
-            audience.end()
+            receiver.close()
 
 
 def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Target:
     if url is not None:
         return Target(url=url, robot=robot, password_file=password_file, ca_cert=ca_cert)
     if not Path(robot).is_file():
-        raise PebbleError(f"{robot} is no config file: name one, or say with --url where the robot {robot} is heard")
+        raise PebbleError(f"{robot} is not a config file: name one, or add --url with the broker of the robot {robot}")
     return Target(config=Path(robot), remote=True)
 
 
 def register(app: typer.Typer) -> None:
     app.command("watch")(watch)
+    app.command("snapshot")(snapshot)

@@ -1,4 +1,4 @@
-"""What must hold between the keys of a section, and what only the machine can tell: files and passwords."""
+"""Checks between the keys of a section, and of what only the machine knows: files and passwords."""
 
 import os
 import re
@@ -8,9 +8,9 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from pebble.config.links import Mqtt, Tls
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
+from pebble.config.transport import Mqtt, Tls
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
 
@@ -42,13 +42,13 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote = reader.notes, bridge.remote
     if remote is not None and remote.kind != "mqtt":
         if bridge.remote_mqtt.host:
-            notes.warning((*path, "remote_mqtt"), f'not used: remote says "{remote.kind}"')
+            notes.warning((*path, "remote_mqtt"), f'not used: remote.kind is "{remote.kind}"')
         if remote.kind == "zenoh" and not remote.connect:
-            notes.doubt((*path, "remote", "connect"), "is missing, name the endpoint of the operators' hub")
+            notes.doubt((*path, "remote", "connect"), "is missing, write the endpoint of the operators' hub")
         if remote.kind == "zenoh" and remote.listen:
             notes.problem((*path, "remote", "listen"), "an uplink only connects: leave it out")
     elif bridge.enabled and not bridge.remote_mqtt.host:
-        notes.doubt((*path, "remote_mqtt", "host"), "is missing, write the name of the broker where operators are")
+        notes.doubt((*path, "remote_mqtt", "host"), "is missing, write the name of the remote broker")
     return bridge
 
 
@@ -63,6 +63,8 @@ def _serial(reader: Reader, serial: SerialBridges, path: Path) -> SerialBridges:
     for name in serial.instances:
         if not _INSTANCE_NAME(name):
             reader.notes.problem((*path, "instances", name), "must be named with 1 to 32 of A-Z a-z 0-9 _ . -")
+    if path in lines and "serial" in serial.instances:
+        reader.notes.problem((*path, "instances", "serial"), "is what the line of this section is called, rename it")
     return serial
 
 
@@ -77,11 +79,11 @@ def _serial_line(reader: Reader, line: SerialBridge, path: Path, ports: dict[str
 
 
 def _safety(reader: Reader, safety: SerialSafety, path: Path) -> SerialSafety:
-    """Two keys of the original that nobody can switch off here: the motors stop, and old news moves nothing."""
+    """Two keys of the original that have no effect: the motors always stop, and stale commands never move them."""
     if not safety.ignore_retained_drive:
-        reader.notes.warning((*path, "ignore_retained_drive"), "false has no effect: a kept drive command never moves")
+        reader.notes.warning((*path, "ignore_retained_drive"), "false has no effect: a retained one is never executed")
     if not safety.stop_on_shutdown:
-        reader.notes.warning((*path, "stop_on_shutdown"), "false has no effect: a stop is always the last line")
+        reader.notes.warning((*path, "stop_on_shutdown"), "false has no effect: the last line is always a stop")
     return safety
 
 
@@ -90,7 +92,7 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
     named = {key: file for key, file in files.items() if file is not None}
     if not tls.enabled:
         if named:
-            reader.notes.warning((*path, "enabled"), f"is false: the link is not encrypted, {', '.join(named)} unused")
+            reader.notes.warning((*path, "enabled"), f"is false: nothing is encrypted, {', '.join(named)} unused")
         return tls
     for key, file in named.items():
         _contents(reader, file, (*path, key))

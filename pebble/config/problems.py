@@ -1,4 +1,4 @@
-"""What is wrong or worth knowing about a config file: collected while it is read, told all at once."""
+"""Problems of and warnings about a config file: collected while it is read, reported all at once."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -28,7 +28,7 @@ class Notes:
         self.problems.append(Note(path, text))
 
     def doubt(self, path: Path, text: str) -> None:
-        """A problem that may only follow from another: not told where one is known, at this place or around it."""
+        """A problem that may follow from another: not reported if one is known at this place or around it."""
         if not any(known.path == path[: len(known.path)] for known in self.problems):
             self.problem(path, text)
 
@@ -36,16 +36,16 @@ class Notes:
         self.warnings.append(Note(path, text))
 
     def forget_inherited(self, own: Any, merged: Any) -> None:
-        """Leave out what concerns values that ``merged`` holds but ``own`` does not: they are told where they stand."""
+        """Remove notes about values in ``merged`` that are not in ``own``: they are reported where they are written."""
         for notes in (self.problems, self.warnings, self.retired):
             notes[:] = [note for note in notes if holds(own, note.path) or not holds(merged, note.path)]
 
     def warning_lines(self) -> tuple[str, ...]:
         """One line per warning; keys that are replaced by the same thing share a line."""
-        return (*_told_together(self.retired), *map(str, self.warnings))
+        return (*_grouped(self.retired), *map(str, self.warnings))
 
 
-def _told_together(retired: list[Note]) -> Iterator[str]:
+def _grouped(retired: list[Note]) -> Iterator[str]:
     """Example: ``video.{socket_path, shm_size}: no longer used, …``."""
     for text in dict.fromkeys(note.text for note in retired):
         groups: dict[Path, list[str]] = {}
@@ -66,7 +66,7 @@ def show_path(path: Path) -> str:
 
 
 def holds(raw: Any, path: Path) -> bool:
-    """Is there something at ``path``?"""
+    """True if there is a value at ``path``."""
     for step in path:
         known = range(len(raw)) if isinstance(raw, list) else raw if isinstance(raw, Mapping) else ()
         if step not in known:
@@ -76,7 +76,7 @@ def holds(raw: Any, path: Path) -> bool:
 
 
 def nearest(key: str, known: Iterable[str]) -> str:
-    """What to say after "unknown key": the known key that looks most like it, and all of them where none does."""
+    """The text after "unknown key": the most similar known key, and all of them if none is similar."""
     from difflib import get_close_matches  # only a file with a mistake pays for this import
 
     names = sorted(known)

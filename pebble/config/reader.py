@@ -1,4 +1,4 @@
-"""Turns plain data into config sections; goes on after a mistake, so that all of them are told at once."""
+"""Turns plain data into config sections; continues after a mistake, so that all are reported at once."""
 
 import types
 from collections.abc import Callable, Iterator, Mapping
@@ -13,10 +13,10 @@ from pebble.config import problems
 from pebble.config.types import Secret, Section
 
 S = TypeVar("S", bound=Section)
-#: Looks at a finished section of its class; returns it, completed where it needs to be.
+#: Checks a finished section of its class; returns it, completed if necessary.
 Check = Callable[["Reader", Any, problems.Path], Any]
 
-_WRONG = object()  # what a value that was refused reads as: the key's default takes its place
+_WRONG = object()  # in place of a refused value: the key gets its default
 
 
 class Reader:
@@ -118,18 +118,18 @@ class Reader:
     def _refuse(self, kind: Any, metas: list[Meta], raw: Any, path: problems.Path) -> Any:
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
         if kind in (bool, int, float) and isinstance(raw, str):
-            shown = f"the text {shown}"  # 1883 and "1883" look alike to a person
+            shown = f"the text {shown}"  # 1883 and "1883" look alike
         self.notes.problem(path, f"must be {expected(kind, metas)}, not {shown}")
         return _WRONG
 
 
 def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
-    """The bare type behind ``Annotated`` and ``| None``, and all that was said about it on the way."""
+    """The bare type behind ``Annotated`` and ``| None``, and the annotations around it."""
     metas: list[Meta] = []
     while True:
         if get_origin(annotation) is Annotated:
-            annotation, *said = get_args(annotation)
-            metas += said
+            annotation, *more = get_args(annotation)
+            metas += more
         elif get_origin(annotation) in (Union, types.UnionType) and types.NoneType in get_args(annotation):
             others = tuple(kind for kind in get_args(annotation) if kind is not types.NoneType)
             annotation = Union[others]  # noqa: UP007 - of a tuple made at run time
@@ -138,9 +138,9 @@ def unwrap(annotation: Any) -> tuple[Any, list[Meta]]:
 
 
 def expected(kind: Any, metas: list[Meta]) -> str:
-    """What would be right, in words, to follow "must be"."""
-    if said := _extra(metas, "expected"):
-        return str(said)
+    """A correct value in words, to follow "must be"."""
+    if text := _extra(metas, "expected"):
+        return str(text)
     if get_origin(kind) is Literal:
         *most, last = map(_shown, get_args(kind))
         return f"{', '.join(most)} or {last}" if most else last

@@ -22,7 +22,7 @@ _BEGIN, _END = "<!-- generated: keys -->\n", "<!-- end of generated: keys -->\n"
 
 
 def schema_text() -> str:
-    """The JSON Schema of a config file. Stricter than the reader in one thing: an empty string is not "not set"."""
+    """The JSON Schema of a config file. Unlike the reader, it refuses an empty string for "not set"."""
     _, definitions = msgspec.json.schema_components(
         [Root], schema_hook=lambda _kind: {"type": "string"}, ref_template="#/$defs/{name}"
     )
@@ -39,7 +39,7 @@ def schema_text() -> str:
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
-    """Comments and keys of the original are allowed; a section's default is what its own keys default to."""
+    """Allow comments and keys of the original; a section's default consists of the defaults of its keys."""
     properties = definition["properties"]
     for value in properties.values():
         if "$ref" in value or value.get("default", 0) is None:
@@ -48,11 +48,11 @@ def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
             value["type"] = ["array", "string"]  # words, or one line of them
     patterns: dict[str, Any] = {"^//": {"description": "A comment."}}
     for key, replacement in kind.retired.items():
-        told = {"deprecated": True, "description": f"No longer used: {replacement}."}
+        deprecated = {"deprecated": True, "description": f"No longer used: {replacement}."}
         if key.endswith("*"):
-            patterns[f"^{key[:-1]}"] = told
+            patterns[f"^{key[:-1]}"] = deprecated
         else:
-            properties[key] = properties.get(key, {}) | told
+            properties[key] = properties.get(key, {}) | deprecated
     definition["patternProperties"] = patterns
 
 
@@ -63,15 +63,15 @@ def _subclasses(kind: type[Section]) -> Iterator[type[Section]]:
 
 
 def docs_text(current: str) -> str:
-    """``current`` with its generated part written anew."""
+    """``current`` with its generated part replaced."""
     before, _, rest = current.partition(_BEGIN)
     _, _, after = rest.partition(_END)
     return f"{before}{_BEGIN}\n{''.join(_chapters(Root, '', {}))}{_END}{after}"
 
 
-def _chapters(kind: type[Section], path: str, told: dict[type[Section], str]) -> Iterator[str]:
-    """One table per section, depth first; a kind of section that stands in several places is told at the first."""
-    told[kind] = path
+def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:
+    """One table per section, depth first; a kind of section used in several places has its table at the first."""
+    places[kind] = path
     inner: list[tuple[type[Section], str]] = []
     rows = []
     for field in sorted(fields(kind), key=lambda field: not field.required):
@@ -80,10 +80,10 @@ def _chapters(kind: type[Section], path: str, told: dict[type[Section], str]) ->
             rows.append(_row(field))
             continue
         place += {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
-        like = f"keys as in `{told[section]}`" if section in told else "keys below"
+        like = f"keys as in `{places[section]}`" if section in places else "keys below"
         rows.append(f"| `{field.encode_name}` | | {_meaning(field)} ({like}) |\n")
-        if section not in told:
-            told[section] = place
+        if section not in places:
+            places[section] = place
             inner.append((section, place))
     yield f"### {f'`{path}`' if path else 'The whole file'}\n\n"
     yield f"{kind.__doc__}\n\n| key | default | meaning |\n|---|---|---|\n{''.join(rows)}\n"
@@ -91,7 +91,7 @@ def _chapters(kind: type[Section], path: str, told: dict[type[Section], str]) ->
         keys = ", ".join(f"`{key}`" for key, replacement in kind.retired.items() if replacement == text)
         yield f"No longer used: {keys}; {text}.\n\n"
     for section, place in inner:
-        yield from _chapters(section, place, told)
+        yield from _chapters(section, place, places)
 
 
 def _section_of(field: FieldInfo) -> type[Section] | None:
@@ -110,7 +110,7 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _allowed(field: FieldInfo) -> str:
-    """The kind of value, in words, where the meaning alone does not tell."""
+    """The kind of value, in words, where the meaning does not show it."""
     kind, metas = unwrap(field.type)
     if get_origin(kind) is tuple:
         return " A list."
@@ -118,7 +118,7 @@ def _allowed(field: FieldInfo) -> str:
         return " An object."
     if kind in (bool, str) and not any(meta.extra for meta in metas):
         return ""
-    text = expected(kind, metas).partition(":")[0]  # the rules of topics are told once, in the text
+    text = expected(kind, metas).partition(":")[0]  # the rules of topics are in the text above
     return f" {text[:1].upper()}{text[1:]}."
 
 

@@ -1,20 +1,12 @@
-"""The tree of a robot's config file: every key of what runs today, with its default, its limits and its meaning."""
+"""The sections of a robot's config file: every key with its default, its limits and its meaning."""
 
 from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.later import (
-    AutonomyManager,
-    AvDaemon,
-    Media,
-    Ros1Bridge,
-    SoundboardHandler,
-    VideoStream,
-    WebHandler,
-    WebInterface,
-)
-from pebble.config.links import Mqtt, RemoteLink, RemoteMqtt, TransportSection
+from pebble.config.media import AvDaemon, Media, VideoStream
+from pebble.config.planned import AutonomyManager, Ros1Bridge, SoundboardHandler, WebHandler, WebInterface
+from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
     EMPTY,
     Command,
@@ -25,14 +17,15 @@ from pebble.config.types import (
     Qos,
     Seconds,
     Section,
-    Service,
+    ServiceSection,
     Topic,
     doc,
 )
+from pebble.contract.serial_protocols import SerialProtocolName
 
 
 class Robot(Section, frozen=True, kw_only=True):
-    """Who the robot is: its topics begin with `{system}/{type}/{id}`."""
+    """The robot's identity: its topics begin with `{system}/{type}/{id}`."""
 
     id: Annotated[Level, doc("The robot's own name.")]
     system: Annotated[Level, doc("First level of all topics.")] = "pebble"
@@ -44,18 +37,18 @@ class Robot(Section, frozen=True, kw_only=True):
 
 
 class Defaults(Section, frozen=True, kw_only=True):
-    """What several services share."""
+    """Values for several services."""
 
-    retained_publish_interval_seconds: Annotated[Interval, doc("How often kept state is published again.")] = 3600.0
+    retained_publish_interval_seconds: Annotated[Interval, doc("How often retained state is published again.")] = 3600.0
 
 
 class CapabilitiesSection(Section, frozen=True, kw_only=True):
-    """The message that says what the robot can do."""
+    """The message that lists what the robot can do."""
 
     enabled: Annotated[bool, doc("Publish it.")] = True
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/capabilities`.")] = None
     qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
-    retain: Annotated[bool | None, doc("Instead of the contract's rule whether it is kept.")] = None
+    retain: Annotated[bool | None, doc("Instead of the contract's retain flag.")] = None
     publish_interval_seconds: Annotated[
         Interval, doc("How often it is published again; services.defaults' unless set.")
     ] = 3600.0
@@ -67,15 +60,15 @@ class LogsSection(Section, frozen=True, kw_only=True):
     enabled: Annotated[bool, doc("Publish them.")] = True
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/logs`.")] = None
     qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
-    retain: Annotated[bool | None, doc("Instead of the contract's rule whether they are kept.")] = None
+    retain: Annotated[bool | None, doc("Instead of the contract's retain flag.")] = None
     min_level: Annotated[LogLevel, doc("Lines below this level stay on the robot.")] = "INFO"
     max_message_chars: Annotated[
         int, Meta(ge=64, le=65536, description="Longer lines are cut and end in three dots.")
     ] = 2048
 
 
-class Launcher(Service, frozen=True, kw_only=True):
-    """Starts, watches and stops the other services."""
+class Launcher(ServiceSection, frozen=True, kw_only=True):
+    """Starts, supervises and stops the other services."""
 
     enabled: Annotated[bool, doc("Publish capabilities and logs.")] = True
     restart_delay_seconds: Annotated[
@@ -83,14 +76,14 @@ class Launcher(Service, frozen=True, kw_only=True):
         doc("Scales the waits between restarts: none, then a quarter of this, doubling up to 5 times it."),
     ] = 2.0
     shutdown_timeout_seconds: Annotated[
-        Seconds, doc("How long the whole robot may take to stop before what is left is killed.")
+        Seconds, doc("How long the whole robot may take to stop; then the remaining processes are killed.")
     ] = 8.0
     capabilities: Annotated[CapabilitiesSection, doc("What the robot can do.")] = CapabilitiesSection()
     logs: Annotated[LogsSection, doc("Log lines as messages.")] = LogsSection()
 
 
 class BridgeTopics(Section, frozen=True, kw_only=True):
-    """Other names for what the bridge listens to; unset: `{base}/incoming/…`."""
+    """Other topics for what the bridge subscribes to; unset: `{base}/incoming/…`."""
 
     remote_mirror: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/remote-mirror`.")] = None
     mqtt_audio: Annotated[Topic | None, doc("Instead of `{base}/incoming/flags/mqtt-audio`.")] = None
@@ -109,7 +102,7 @@ class Heartbeat(Section, frozen=True, kw_only=True):
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/online`.")] = None
     interval_seconds: Annotated[float, Meta(ge=0.05, le=3600, description="Seconds between two of them.")] = 0.25
     qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
-    retain: Annotated[bool | None, doc("Instead of the contract's rule whether it is kept.")] = None
+    retain: Annotated[bool | None, doc("Instead of the contract's retain flag.")] = None
 
 
 class SystemControl(Section, frozen=True, kw_only=True):
@@ -119,7 +112,7 @@ class SystemControl(Section, frozen=True, kw_only=True):
     cwd: Annotated[File | None, doc("Folder to run it in; unset: the service's own.")] = None
     env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
     cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 0.0
-    ignore_retained: Annotated[bool, doc("Refuse a kept request: it is old news.")] = True
+    ignore_retained: Annotated[bool, doc("Refuse a retained request, because it is stale.")] = True
 
 
 class RebootControl(SystemControl, frozen=True, kw_only=True):
@@ -140,11 +133,11 @@ class GitPullControl(SystemControl, frozen=True, kw_only=True):
     cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 60.0
 
 
-_MEDIA_PROGRAMS = "the media services know what to start by themselves, services.mqtt_bridge.media says how"
+_MEDIA_PROGRAMS = "the media services choose their programs, and services.mqtt_bridge.media configures them"
 
 
 class MediaControl(Section, frozen=True, kw_only=True):
-    """How the media programs are run on request."""
+    """How the media programs are run while they are requested."""
 
     retired: ClassVar = {
         key: _MEDIA_PROGRAMS
@@ -162,14 +155,14 @@ class MediaControl(Section, frozen=True, kw_only=True):
     )
 
 
-class MqttBridge(Service, frozen=True, kw_only=True):
-    """The robot's link to its operators: heartbeat, mirroring, flags and system commands."""
+class MqttBridge(ServiceSection, frozen=True, kw_only=True):
+    """The robot's connection to its operators: heartbeat, forwarding, flags and system commands."""
 
-    remote_mqtt: Annotated[RemoteMqtt, doc("The broker where operators are.")] = RemoteMqtt()
-    remote: Annotated[RemoteLink | None, doc("Used instead of remote_mqtt when set.")] = None
+    remote_mqtt: Annotated[RemoteMqtt, doc("The remote broker, which operators connect to.")] = RemoteMqtt()
+    remote: Annotated[RemoteConnection | None, doc("Used instead of remote_mqtt when set.")] = None
     topics: Annotated[BridgeTopics, doc("Other names for topics.")] = BridgeTopics()
     heartbeat: Annotated[Heartbeat, doc("Sign of life.")] = Heartbeat()
-    media: Annotated[Media, doc("Pictures and sound towards operators.")] = Media()
+    media: Annotated[Media, doc("Pictures and sound, to and from operators.")] = Media()
     video_control: Annotated[MediaControl, doc("Running the camera publisher.")] = MediaControl()
     audio_control: Annotated[MediaControl, doc("Running the audio programs.")] = MediaControl()
     reboot_control: Annotated[RebootControl, doc("What `flags/reboot` runs.")] = RebootControl()
@@ -202,17 +195,19 @@ class OdometryRing(Section, frozen=True, kw_only=True):
 
 
 class SerialSafety(Section, frozen=True, kw_only=True):
-    """When the wheels are told to stop."""
+    """When the wheels are stopped."""
 
+    # 5 s is the limit of the original's MCU firmware.
     drive_timeout_seconds: Annotated[
-        float, Meta(gt=0, le=5, description="No drive command for this long: stop. 5 s is the MCU's own limit.")
+        float,
+        Meta(gt=0, le=5, description="No drive command for this long: stop. Our MCUs stop by themselves after 1 s."),
     ] = 0.75
-    ignore_retained_drive: Annotated[bool, doc("A kept drive command is always refused: it is old news.")] = True
+    ignore_retained_drive: Annotated[bool, doc("Retained drive commands are always refused as stale.")] = True
     stop_on_shutdown: Annotated[bool, doc("A stop is always sent as the last line.")] = True
 
 
 class SerialTopics(Section, frozen=True, kw_only=True):
-    """Other names for what the MCU says and is told; unset: the contract's."""
+    """Other topics for the MCU's reports and commands; unset: the contract's."""
 
     drive_values: Annotated[Topic | None, doc("Instead of `{base}/incoming/drive-values`.")] = None
     lights_solid: Annotated[Topic | None, doc("Instead of `{base}/incoming/lights-solid`.")] = None
@@ -234,31 +229,29 @@ class ImuPublish(Section, frozen=True, kw_only=True):
 
 
 class SerialHealth(Section, frozen=True, kw_only=True):
-    """When the process gives up and is started again."""
+    """When the process exits and is restarted."""
 
     imu_sample_timeout_seconds: Annotated[
         Seconds | None, doc("No IMU sample for this long: exit; 0: never. Unset: 5 for an IMU, else 0.")
     ] = None
     exit_on_serial_error: Annotated[
-        bool | None, doc("Exit when a self-describing MCU or an IMU goes away. Unset: look for it again instead.")
+        bool | None, doc("Exit when a self-describing MCU or an IMU disappears. Unset: search for it again instead.")
     ] = None
 
 
-class SerialBridge(Service, frozen=True, kw_only=True):
+class SerialBridge(ServiceSection, frozen=True, kw_only=True):
     """One serial line to an MCU; one process each."""
 
     retired: ClassVar = {"odometry_shm": "raw hall samples travel through the robot's own transport"}
 
-    protocol: Annotated[
-        Literal["goob_base_v1", "imu_mpu6050_v1", "pebble_serial_v1"], doc("Which lines the MCU speaks.")
-    ] = "goob_base_v1"
+    protocol: Annotated[SerialProtocolName, doc("The serial protocol of the MCU.")] = "goob_base_v1"
     serial: Annotated[SerialPort, doc("The line.")] = SerialPort()
     telemetry: Annotated[SerialTelemetry, doc("What is published.")] = SerialTelemetry()
     odometry_shm: Annotated[OdometryRing, doc("No longer used.")] = OdometryRing()
     safety: Annotated[SerialSafety, doc("When to stop.")] = SerialSafety()
     topics: Annotated[SerialTopics, doc("Other names for topics.")] = SerialTopics()
     publish: Annotated[ImuPublish, doc("IMU samples.")] = ImuPublish()
-    health: Annotated[SerialHealth, doc("When to give up.")] = SerialHealth()
+    health: Annotated[SerialHealth, doc("When to exit.")] = SerialHealth()
 
 
 class SerialBridges(SerialBridge, frozen=True, kw_only=True):
@@ -272,26 +265,26 @@ class SerialBridges(SerialBridge, frozen=True, kw_only=True):
 class Services(Section, frozen=True, kw_only=True):
     """One section per service."""
 
-    defaults: Annotated[Defaults, doc("What several services share.")] = Defaults()
+    defaults: Annotated[Defaults, doc("Values for several services.")] = Defaults()
     launcher: Annotated[Launcher, doc("Starts the others.")] = Launcher()
     av_daemon: Annotated[AvDaemon, doc("Camera and microphone.")] = AvDaemon()
-    mqtt_bridge: Annotated[MqttBridge, doc("Link to operators.")] = MqttBridge()
-    ros1_bridge: Annotated[Ros1Bridge, doc("Link to ROS 1.")] = Ros1Bridge()
+    mqtt_bridge: Annotated[MqttBridge, doc("Connection to operators.")] = MqttBridge()
+    ros1_bridge: Annotated[Ros1Bridge, doc("Connection to ROS 1.")] = Ros1Bridge()
     serial_mcu_bridge: Annotated[SerialBridges, doc("Serial line to the motor MCU.")] = SerialBridges()
-    video_stream: Annotated[VideoStream, doc("Somebody else's video program.")] = VideoStream()
+    video_stream: Annotated[VideoStream, doc("A streaming program of a third party.")] = VideoStream()
     soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()
     autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()
     web_handler: Annotated[WebHandler, doc("Runs the web page.")] = WebHandler()
 
 
 class Root(Section, frozen=True, kw_only=True):
-    """What stands at the top of the file."""
+    """The top of the file."""
 
-    schema_: Annotated[str | None, doc("Where editors find the JSON Schema; nothing else reads it.")] = field(
+    schema_: Annotated[str | None, doc("Where editors find the JSON Schema; not used otherwise.")] = field(
         name="$schema", default=None
     )
     log_level: Annotated[LogLevel, doc("How much is logged.")] = "INFO"
-    robot: Annotated[Robot, doc("Who the robot is.")]
+    robot: Annotated[Robot, doc("The robot's identity.")]
     local_mqtt: Annotated[Mqtt, doc("The broker inside the robot; used where transport.kind is mqtt.")] = Mqtt()
     transport: Annotated[TransportSection, doc("How messages move inside the robot; absent: MQTT.")] = TransportSection(
         kind="mqtt"

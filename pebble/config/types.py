@@ -6,16 +6,21 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, Struct, field
 
-from pebble.identity import LEVEL, LEVEL_RULE
+from pebble.contract.identity import LEVEL, LEVEL_RULE
 
 # As pebble.transports.topics checks it: brokers close the connection on what is refused here.
 _BAD = r"+#\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
-_TOPIC = rf"^(?!\$)(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
+_ESTOP = "(?:[^/]+/){3}(?:incoming|outgoing)/estop"  # of any robot: nothing else may be published there
+_TOPIC = rf"^(?!\$)(?!{_ESTOP})(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
 
-# ``expected`` is how a problem says what would be right, in "must be …, not …".
+# ``expected`` completes a problem's text "must be …, not …".
 Level = Annotated[str, Meta(pattern=LEVEL, extra={"expected": LEVEL_RULE})]
 Topic = Annotated[
-    str, Meta(pattern=_TOPIC, extra={"expected": "a topic: 1 to 250 characters, no + or #, no $ at the start"})
+    str,
+    Meta(
+        pattern=_TOPIC,
+        extra={"expected": "a topic: 1 to 250 characters, no + or #, no $ at the start, not one of an emergency stop"},
+    ),
 ]
 Endpoint = Annotated[
     str, Meta(pattern=r"^[a-z0-9-]+/.+", extra={"expected": 'a Zenoh endpoint such as "tls/192.168.1.7:7447"'})
@@ -27,6 +32,8 @@ Count = Annotated[int, Meta(ge=1, le=1_000_000_000)]
 # A wait beyond 100 days is a typing mistake, and some clocks and locks of the system refuse it.
 Seconds = Annotated[float, Meta(ge=0, le=10_000_000)]
 Interval = Annotated[float, Meta(gt=0, le=10_000_000)]
+# A drive command that a silent connection delays for less is executed: the limit is that of drive_timeout_seconds.
+Silence = Annotated[float, Meta(gt=0, le=5)]
 Pixels = Annotated[int, Meta(ge=1, le=16384)]
 FramesPerSecond = Annotated[float, Meta(gt=0, le=1000)]
 Rotation = Literal[0, 90, 180, 270]
@@ -50,7 +57,7 @@ def doc(text: str) -> Meta:
 
 
 class Secret(str):
-    """Text that shows itself to nobody by accident: ``repr()`` hides it, ``str()`` does not."""
+    """Text that is not shown by accident: ``repr()`` hides it, ``str()`` does not."""
 
     __slots__ = ()
 
@@ -65,11 +72,11 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     retired: ClassVar[Mapping[str, str]] = {}
 
 
-class Service(Section, frozen=True, kw_only=True):
-    """What every service's section has."""
+class ServiceSection(Section, frozen=True, kw_only=True):
+    """The keys of every service's section."""
 
     enabled: Annotated[bool, doc("Start this service.")] = False
     log_level: Annotated[LogLevel, doc("How much this service logs; the root's log_level unless set.")] = "INFO"
     retained_publish_interval_seconds: Annotated[
-        Interval, doc("How often kept state is published again; services.defaults' unless set.")
+        Interval, doc("How often retained state is published again; services.defaults' unless set.")
     ] = 3600.0

@@ -1,1 +1,1 @@
-"""The demo: four simulated robots of different kinds, a scripted operator, and a judge of what they did."""
+"""The demo: four simulated robots of different kinds, a scripted operator, and an assessment of every step."""

@@ -1,4 +1,4 @@
-"""Four simulated robots, on Zenoh, on MQTT and on MCUs, driven by an operator who cannot tell which is which."""
+"""Four simulated robots, on Zenoh, on MQTT and on MCUs, driven by an operator through one broker."""
 
 from __future__ import annotations
 
@@ -13,76 +13,81 @@ from types import FrameType
 
 from rich.console import Console
 
+from pebble.contract.encodings import ALL_VIDEO
+from pebble.demo import emergency
 from pebble.demo.broker import BrokerKind, best_kind
-from pebble.demo.judge import Verdict, judge
+from pebble.demo.emergency import CompletedStop, Result
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
-from pebble.demo.media import VIDEO, MediaShow
-from pebble.demo.media_judge import MediaVerdict
+from pebble.demo.media import MediaCheck
+from pebble.demo.media_assessment import MediaResult
 from pebble.demo.operator import Operator
-from pebble.demo.script import ROUND_S, SCRIPT, Done
-from pebble.demo.stage import ROBOTS, Stage
+from pebble.demo.steps import ROUND_S, SCRIPT, CompletedStep, assess
+from pebble.demo.testbed import ROBOTS, Testbed
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
 
+SHORTEST_S = ROUND_S + emergency.DURATION_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
-_LOOK_S = 0.1
-_SETTLED_S = 0.3  # an MCU reports ten times a second: how a step ended is known a little later
-_REMEMBERED = 200  # verdicts
+_POLL_S = 0.1
+_REPORTED_S = 0.3  # an MCU reports ten times a second: the end of a step is reported a little later
+_RESULTS = 200
 
 
 def run(seconds: float | None = None, *, broker: BrokerKind | None = None, console: Console | None = None) -> int:
-    """Show the demo until Ctrl-C, or for ``seconds`` of driving; 0 if every robot did what it was told.
+    """Run the demo until Ctrl-C, or for ``seconds`` of driving; 0 if every robot moved and stopped as commanded.
 
-    With ``seconds`` at least one whole round of the script must have been driven. ``broker`` asks for a kind instead of
-    the best one there is. Nothing is left running; a folder with logs stays only after a failure. Raises PebbleError if
-    the demo cannot be set up.
+    With ``seconds`` at least one whole round of the script must have been driven. ``broker`` selects
+    a kind instead of the best one available. Every process ends with the demo; its folder of logs stays only after a
+    failure. Raises PebbleError if the demo cannot be set up.
     """
     console = console or Console()
-    if seconds is not None and seconds < ROUND_S:
-        raise PebbleError(f"one round of driving takes {ROUND_S:.0f} s: give it at least that many seconds")
+    if seconds is not None and seconds < SHORTEST_S:
+        raise PebbleError(f"one round of driving takes {SHORTEST_S:.0f} s: give it at least that many seconds")
     kind = broker or best_kind()
-    with _ending_on_signals() as ending, Stage(ending) as stage:
-        verdicts, media, problems = _play(stage, kind, seconds, ending, console)
-        with_media = [robot.name for robot in stage.robots if robot.has_media]
+    with _ending_on_signals() as ending, Testbed(ending) as testbed:
+        results, media, problems = _run_demo(testbed, kind, seconds, ending, console)
+        with_media = [robot.name for robot in testbed.robots if robot.has_media]
         if seconds is not None:
-            problems += _not_driven(verdicts)
+            problems += _steps_not_done(results)
         if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
-            problems += _not_seen(with_media, media)
-        problems += [f"{verdict.robot}, {verdict.step}: {wrong}" for verdict in verdicts for wrong in verdict.wrong]
-        problems += [f"{verdict.robot}: {wrong}" for verdict in media for wrong in verdict.wrong]
-        stage.keep = bool(problems)
+            problems += _encodings_not_checked(with_media, media)
+        problems += [f"{result.robot}, {result.step}: {wrong}" for result in results for wrong in result.wrong]
+        problems += [f"{result.robot}: {wrong}" for result in media for wrong in result.wrong]
+        testbed.keep = bool(problems)
         show_media_results(console, with_media, media)
-        show_results(console, ROBOTS, verdicts, problems)
+        show_results(console, ROBOTS, results, problems)
         if problems:
-            console.print(f"Logs, configs and traces: {stage.folder}", soft_wrap=True)
+            console.print(f"Logs, configs and traces: {testbed.folder}", soft_wrap=True)
     return 1 if problems else 0
 
 
-def _play(
-    stage: Stage, kind: BrokerKind, seconds: float | None, ending: threading.Event, console: Console
-) -> tuple[list[Verdict], list[MediaVerdict], list[str]]:
-    """Set up, drive and watch. Returns what the steps and the media came to, and what went wrong besides."""
+def _run_demo(
+    testbed: Testbed, kind: BrokerKind, seconds: float | None, ending: threading.Event, console: Console
+) -> tuple[list[Result], list[MediaResult], list[str]]:
+    """Set up, drive and observe. Returns the results of the steps and of the media, and all other problems."""
     console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
-    stage.start_brokers(kind)
+    testbed.start_brokers(kind)
     console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU, camera and microphone;")
     console.print("Goob also with an inertial sensor that describes itself.")
-    console.print("MiniLAMP and BenJr are MCUs that speak MQTT themselves: their firmware, on simulated pins.")
-    stage.start_robots()
-    operator = Operator(stage.remote_port)
+    console.print("MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on simulated pins.")
+    testbed.start_robots()
+    operator = Operator(testbed.remote_port)
     operator.connect()
-    show = MediaShow(stage.remote_port)
+    media_check = MediaCheck(testbed.remote_port)
     try:
-        with View(console, operator, show, stage.robots, ending) as view:
+        with View(console, operator, media_check, testbed.robots, ending) as view:
             if not _discovered(operator, view, ending):
-                return [], [], [] if ending.is_set() else [*_unseen(operator), *stage.fallen()]
+                return [], [], [] if ending.is_set() else [*_not_ready(operator), *testbed.unexpected_exits()]
             operator.begin()
-            show.begin([seen for seen in operator.discovery.everybody() if seen.offers("video")])
-            verdicts = _watch(stage, operator, view, math.inf if seconds is None else seconds, ending)
-        unfelt = [] if ending.is_set() else _unfelt(stage, operator)  # who ends it early has not seen everything
-        return verdicts, list(show.verdicts), [*stage.fallen(), *unfelt]
+            media_check.begin([seen for seen in operator.discovery.all_robots() if seen.offers("video")])
+            results = _watch(testbed, operator, view, math.inf if seconds is None else seconds, ending)
+        problems = testbed.unexpected_exits()
+        if not ending.is_set():  # a demo that is ended early may not have received everything
+            problems += _without_imu(testbed, operator)
+        return results, list(media_check.results), problems
     finally:
-        show.end()
+        media_check.end()
         operator.end()
 
 
@@ -90,67 +95,73 @@ def _discovered(operator: Operator, view: View, ending: threading.Event) -> bool
     end = time.monotonic() + _DISCOVERY_S
     while not operator.ready(len(ROBOTS)):
         view.update()
-        if time.monotonic() > end or ending.wait(_LOOK_S):
+        if time.monotonic() > end or ending.wait(_POLL_S):
             return False
     return True
 
 
-def _unseen(operator: Operator) -> list[str]:
+def _not_ready(operator: Operator) -> list[str]:
     now = time.monotonic()
-    ready = [seen.name for seen in operator.discovery.everybody() if seen.ready(now)]
+    ready = [seen.name for seen in operator.discovery.all_robots() if seen.ready(now)]
     return [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in ROBOTS if name not in ready]
 
 
-def _unfelt(stage: Stage, operator: Operator) -> list[str]:
-    heard = {seen.name for seen in operator.discovery.everybody() if seen.attitude is not None}
-    wanted = [robot.name for robot in stage.robots if robot.has_imu]
-    return [f"{name}: nothing came of its inertial sensor" for name in wanted if name not in heard]
+def _without_imu(testbed: Testbed, operator: Operator) -> list[str]:
+    received = {seen.name for seen in operator.discovery.all_robots() if seen.attitude is not None}
+    wanted = [robot.name for robot in testbed.robots if robot.has_imu]
+    return [f"{name}: its inertial sensor published nothing" for name in wanted if name not in received]
 
 
-def _watch(stage: Stage, operator: Operator, view: View, seconds: float, ending: threading.Event) -> list[Verdict]:
-    """Judge each step once its traces are complete."""
-    verdicts: deque[Verdict] = deque(maxlen=_REMEMBERED)
+def _watch(testbed: Testbed, operator: Operator, view: View, seconds: float, ending: threading.Event) -> list[Result]:
+    """Drive for ``seconds``, and assess each step once its traces are complete."""
+    results: deque[Result] = deque(maxlen=_RESULTS)
     end = time.monotonic() + seconds
-    while time.monotonic() < end and not ending.wait(_LOOK_S) and not stage.fallen():
+    while time.monotonic() < end and not ending.wait(_POLL_S) and not testbed.unexpected_exits():
         view.update()
-        _judge_settled(stage, operator, verdicts, time.monotonic() - _SETTLED_S)
+        _assess_completed(testbed, operator, results, time.monotonic() - _REPORTED_S)
     operator.end()
-    time.sleep(_SETTLED_S)
-    _judge_settled(stage, operator, verdicts, math.inf)
-    return list(verdicts)
+    time.sleep(_REPORTED_S)
+    _assess_completed(testbed, operator, results, math.inf)
+    return list(results)
 
 
-def _judge_settled(stage: Stage, operator: Operator, verdicts: deque[Verdict], until: float) -> None:
-    while operator.done and operator.done[0].ended < until:
-        verdicts.append(_judge(stage, operator, operator.done.popleft()))
+def _assess_completed(testbed: Testbed, operator: Operator, results: deque[Result], until: float) -> None:
+    while operator.completed and operator.completed[0].ended < until:
+        results.append(_assess(testbed, operator, operator.completed.popleft()))
 
 
-def _judge(stage: Stage, operator: Operator, done: Done) -> Verdict:
-    robot = next(robot for robot in stage.robots if robot.name == done.robot)
-    seen = next(seen for seen in operator.discovery.everybody() if seen.name == done.robot)
+def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop) -> Result:
+    robot = next(robot for robot in testbed.robots if robot.name == completed.robot)
+    if isinstance(completed, CompletedStop):
+        return emergency.assess(completed, robot.entries())
+    seen = next(seen for seen in operator.discovery.all_robots() if seen.name == completed.robot)
     has_lights = seen.lights_topic(flash=False) is not None
-    return judge(done, list(robot.looks), robot.entries(), stop_s=robot.stop_s, has_lights=has_lights)
+    return assess(completed, list(robot.mcu_reports), robot.entries(), stop_s=robot.stop_s, has_lights=has_lights)
 
 
-def _not_driven(verdicts: list[Verdict]) -> list[str]:
-    driven = {(verdict.robot, verdict.step) for verdict in verdicts}
-    return [f"{name}, {step.name}: not done" for name in ROBOTS for step in SCRIPT if (name, step.name) not in driven]
+def _steps_not_done(results: list[Result]) -> list[str]:
+    driven = {(result.robot, result.step) for result in results}
+    steps = [*(step.name for step in SCRIPT), emergency.NAME]
+    return [f"{name}, {step}: not done" for name in ROBOTS for step in steps if (name, step) not in driven]
 
 
-def _not_seen(names: Sequence[str], media: list[MediaVerdict]) -> list[str]:
-    judged = {(verdict.robot, verdict.encoding) for verdict in media}
+def _encodings_not_checked(names: Sequence[str], media: list[MediaResult]) -> list[str]:
+    checked = {(result.robot, result.encoding) for result in media}
     return [
-        f"{name}: no {encoding} was looked at" for name in names for encoding in VIDEO if (name, encoding) not in judged
+        f"{name}: {encoding} was not checked"
+        for name in names
+        for encoding in ALL_VIDEO
+        if (name, encoding) not in checked
     ]
 
 
 @contextmanager
 def _ending_on_signals() -> Iterator[threading.Event]:
-    """Ctrl-C, a closed terminal and SIGTERM only ask for the end: what was started is ended in order."""
+    """An event that Ctrl-C, a closed terminal and SIGTERM set, so that every process is ended in order."""
     ending = threading.Event()
 
     def ask(_signal: int, _frame: FrameType | None) -> None:
-        # Not from here: the signal may have interrupted this thread inside ending.wait(), where it holds the lock.
+        # In another thread: the signal may have interrupted this one inside ending.wait(), where it holds the lock.
         threading.Thread(target=ending.set, name="ending", daemon=True).start()
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}

@@ -1,4 +1,4 @@
-"""A scripted operator: knows a broker and the contract, finds robots, and drives all of them through the same steps."""
+"""A scripted operator: discovers robots on a broker, and drives all of them through the same steps."""
 
 from __future__ import annotations
 
@@ -6,93 +6,106 @@ import threading
 import time
 from collections import deque
 
-from pebble import codec
-from pebble.contract import DRIVE, LIGHTS_FLASH, LIGHTS_SOLID
-from pebble.demo.discovery import EVERYBODY, Discovery, Sighting
-from pebble.demo.script import COMMAND_PERIOD_S, SCRIPT, Done, Step
-from pebble.payloads import Drive, LightsFlash
+from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
+from pebble.contract import DRIVE, LIGHTS_FLASH, LIGHTS_SOLID, codec
+from pebble.contract.payloads import Drive, LightsFlash
+from pebble.demo.emergency import NAME as EMERGENCY_STOP
+from pebble.demo.emergency import CompletedStop, EmergencyStop
+from pebble.demo.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
 from pebble.transports import Message, MqttSettings, QoS, create
 
 STOP = Drive()
-_SCRIPT_LIMIT = 1000  # finished steps waiting for somebody to look at them
+_COMPLETED = 1000  # finished steps that wait to be assessed
 
 
 class Operator:
-    """Drives on a thread of its own, over its own connection. ``doing`` says in words what; ``done`` collects steps."""
+    """Drives on its own thread and connection. ``activity`` is for display; ``completed`` collects finished steps."""
 
     def __init__(self, port: int, name: str = "pebble-demo-operator") -> None:
         self.discovery = Discovery()
-        self.doing = "looking for robots"
+        self.activity = "discovering robots"
         self.rounds = 0
         self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when (monotonic)
-        self.done: deque[Done] = deque(maxlen=_SCRIPT_LIMIT)
+        self.completed: deque[CompletedStep | CompletedStop] = deque(maxlen=_COMPLETED)
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
-        self._enough = threading.Event()
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._drive, name=name, daemon=True)
 
     def connect(self) -> None:
-        """Start listening; returns at once."""
+        """Connect and subscribe; returns at once."""
         self._transport.open(timeout=0.0)
-        self._transport.subscribe(EVERYBODY, self._hear)
+        self._transport.subscribe(ALL_OUTGOING, self._receive)
 
     def ready(self, wanted: int) -> bool:
-        """Are that many robots alive and willing to be driven?"""
+        """Are that many robots online, with a drive topic?"""
         now = time.monotonic()
-        return sum(sighting.ready(now) for sighting in self.discovery.everybody()) >= wanted
+        return sum(robot.ready(now) for robot in self.discovery.all_robots()) >= wanted
 
     def begin(self) -> None:
-        """Drive everybody found so far, round after round."""
+        """Start driving all robots discovered so far, round after round."""
         self._thread.start()
 
     def end(self) -> None:
-        """Leave the step, stop everybody, go."""
-        self._enough.set()
+        """Interrupt the step, stop all robots and disconnect."""
+        self._stopping.set()
         if self._thread.is_alive():
             self._thread.join(1.0)
         self._transport.close()
 
-    def _hear(self, message: Message) -> None:
-        self.discovery.hear(message, time.monotonic(), time.time())
+    def _receive(self, message: Message) -> None:
+        self.discovery.receive(message, time.monotonic(), time.time())
 
     # -- the operator's thread
 
     def _drive(self) -> None:
-        robots = self.discovery.everybody()
-        while not self._enough.is_set():
+        robots = self.discovery.all_robots()
+        while not self._stopping.is_set():
             for step in SCRIPT:
-                self._do(step, robots)
-                if self._enough.is_set():
+                self._perform(step, robots)
+                if self._stopping.is_set():
                     break
             else:
+                if not self.rounds:
+                    self._stop_once(robots)
                 self.rounds += 1
         self._send(STOP, robots)
-        self.doing = "leaving"
+        self.activity = "disconnecting"
 
-    def _do(self, step: Step, robots: list[Sighting]) -> None:
-        self.doing = step.name
+    def _perform(self, step: Step, robots: list[DiscoveredRobot]) -> None:
+        self.activity = step.name
         began = due = released = time.monotonic()
-        self._shine(step, robots)
+        self._switch_lights(step, robots)
         while due < began + step.drive_s:
             self._send(step.drive, robots)
             released = time.monotonic()
             due += COMMAND_PERIOD_S
-            if self._enough.wait(max(0.0, due - released)):
+            if self._stopping.wait(max(0.0, due - released)):
                 return
-        if step.says_stop:
+        if step.sends_stop:
             self._send(STOP, robots)
             released = time.monotonic()
-        self.doing = f"{step.name}: watching"
-        if self._enough.wait(step.rest_s):
+        self.activity = f"{step.name}: observing"
+        if self._stopping.wait(step.rest_s):
             return
-        self.done.extend(Done(robot.name, step, began, released, time.monotonic()) for robot in robots)
+        self.completed.extend(CompletedStep(robot.name, step, began, released, time.monotonic()) for robot in robots)
 
-    def _send(self, drive: Drive, robots: list[Sighting]) -> None:
+    def _stop_once(self, robots: list[DiscoveredRobot]) -> None:
+        """Stop all robots, try to drive them, and reset them."""
+        self.activity = EMERGENCY_STOP
+        emergency = EmergencyStop(
+            self._transport, lambda drive: self._send(drive, robots), self._stopping.wait, by="the demo's operator"
+        )
+        subscription = self._transport.subscribe(ALL_OUTGOING, emergency.receive)  # brings retained capabilities again
+        self.completed.extend(emergency.perform(robots))
+        subscription.close()
+
+    def _send(self, drive: Drive, robots: list[DiscoveredRobot]) -> None:
         payload = codec.encode(DRIVE, drive)
         for robot in robots:
             self.commands[robot.base] = drive, time.monotonic()
             self._publish(robot.drive_topic, payload)
 
-    def _shine(self, step: Step, robots: list[Sighting]) -> None:
+    def _switch_lights(self, step: Step, robots: list[DiscoveredRobot]) -> None:
         flash = isinstance(step.lights, LightsFlash)
         payload = codec.encode(LIGHTS_FLASH if flash else LIGHTS_SOLID, step.lights)
         for robot in robots:

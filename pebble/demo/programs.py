@@ -1,4 +1,4 @@
-"""Child processes that surely end: each with its own log file, deadline, and a tie to the life of this process."""
+"""Child processes, each with a log file and a deadline to end; the kernel ends them when this process dies."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from pathlib import Path
 from typing import IO
 
 from pebble.errors import PebbleError
-from pebble.launched import tied
+from pebble.runtime.parent import tied_to_parent
 
 _STEP_S = 0.01
 
 
 class Program:
-    """One started program. It leads a session of its own: a Ctrl-C in the terminal is ours to act on, in order.
+    """One child process in its own session: Ctrl-C in a terminal reaches only this process, which ends them in order.
 
-    Start programs from the main thread: the kernel ties their life to the thread that started them.
+    Start programs from the main thread: the kernel ends them when the thread that started them ends.
     """
 
     def __init__(self, name: str, command: Sequence[str], log: Path, *, reports: bool = False) -> None:
         self.name, self.log = name, log
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
-                tied(command, signal.SIGTERM),
+                tied_to_parent(command, signal.SIGTERM),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE if reports else errors,
                 stderr=errors,
@@ -50,10 +50,7 @@ class Program:
         return self._process.poll() is not None
 
     def wait_until(self, condition: Callable[[], bool], timeout: float, ending: threading.Event) -> None:
-        """Wait for a sign of life, or until ``ending``.
-
-        Raises PebbleError if it does not come or the program ends first.
-        """
+        """Wait for ``condition``, or until ``ending``. Raises PebbleError on timeout or if the program ends first."""
         end = time.monotonic() + timeout
         while not condition() and not ending.wait(_STEP_S):
             if self.ended:
@@ -66,7 +63,7 @@ class Program:
             self._process.terminate()
 
     def end(self, deadline: float) -> None:
-        """Wait until ``deadline`` (monotonic), then end it and what it started the hard way."""
+        """Wait until ``deadline`` (monotonic), then kill the program and its children."""
         try:
             self._process.wait(max(0.0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
@@ -75,7 +72,7 @@ class Program:
 
 
 def end_all(programs: Iterable[Program], within_s: float) -> None:
-    """End these at the same time."""
+    """Send SIGTERM to all of them, and kill those that still run after ``within_s``."""
     programs = list(programs)
     deadline = time.monotonic() + within_s
     for program in programs:

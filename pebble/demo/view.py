@@ -1,11 +1,10 @@
-"""What the demo shows: a live table in a terminal, plain lines once a second elsewhere, and a table of results."""
+"""Output of the demo: a live table in a terminal, plain lines once a second elsewhere, and tables of results."""
 
 from __future__ import annotations
 
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Self, TypeVar
@@ -15,53 +14,40 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from pebble.demo.discovery import Sighting
-from pebble.demo.judge import Verdict
-from pebble.demo.media import AUDIO, VIDEO, MediaShow
-from pebble.demo.media_judge import MediaVerdict
+from pebble.client.discovery import DiscoveredRobot
+from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
+from pebble.demo.emergency import Result
+from pebble.demo.media import MediaCheck
+from pebble.demo.media_assessment import MediaResult
 from pebble.demo.operator import Operator
-from pebble.demo.robot import SimulatedRobot
+from pebble.demo.testbed import SimulatedRobot
 
 _LINE_PERIOD_S = 1.0
-_RATE_WINDOW = 20  # looks at a counter
-_COLUMN_WIDTH = 26  # characters, of the longest usual cell: a table that does not twitch
+_COLUMN_WIDTH = 26  # characters, of the longest usual cell: keeps the layout stable
 _COLUMN_EDGE = 3  # a line, and a space on each side
 _LABEL_WIDTH = 20  # the first column, with its edges
 
 T = TypeVar("T")
 
 
-class Rate:
-    """Messages per second over the last looks."""
-
-    def __init__(self) -> None:
-        self._looks: deque[tuple[float, int]] = deque(maxlen=_RATE_WINDOW)
-
-    def of(self, count: int, now: float) -> float:
-        self._looks.append((now, count))
-        (then, before), (_, after) = self._looks[0], self._looks[-1]
-        return (after - before) / (now - then) if now > then else 0.0
-
-
 class View:
-    """Shows the robots while they run. ``update`` may be called as often as one likes.
+    """Shows the robots while they run; call ``update`` at any rate.
 
-    ``ending`` is set when the terminal was closed: its signal reaches make, which only waits for us.
+    ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make.
     """
 
     def __init__(
         self,
         console: Console,
         operator: Operator,
-        show: MediaShow,
+        media: MediaCheck,
         robots: Sequence[SimulatedRobot],
         ending: threading.Event,
     ) -> None:
-        self._console, self._operator, self._show = console, operator, show
+        self._console, self._operator, self._media = console, operator, media
         self._robots, self._ending = robots, ending
         self._began = time.monotonic()
-        self._rates: dict[str, Rate] = {robot.name: Rate() for robot in robots}
-        self._said_at = -math.inf
+        self._printed_at = -math.inf
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
 
     def __enter__(self) -> Self:
@@ -78,13 +64,13 @@ class View:
         self._notice_closed_terminal()
         now = time.monotonic()
         rows = [self._row(robot, now) for robot in self._robots]
-        doing = f"{now - self._began:5.1f} s  operator: {self._operator.doing}"
+        activity = f"{now - self._began:5.1f} s  operator: {self._operator.activity}"
         if self._live is not None:
             tables = [_table(some) for some in _side_by_side(rows, self._console)]
-            self._live.update(Group(*tables, Text.assemble(doing, ("   Ctrl-C ends it", "dim"))), refresh=True)
-        elif now - self._said_at >= _LINE_PERIOD_S:
-            self._said_at = now
-            for line in (doing, *("  ".join(["       ", *row.values()]) for row in rows)):
+            self._live.update(Group(*tables, Text.assemble(activity, ("   Ctrl-C ends it", "dim"))), refresh=True)
+        elif now - self._printed_at >= _LINE_PERIOD_S:
+            self._printed_at = now
+            for line in (activity, *("  ".join(["       ", *row.values()]) for row in rows)):
                 self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _notice_closed_terminal(self) -> None:
@@ -93,78 +79,77 @@ class View:
             self._ending.set()
 
     def _row(self, robot: SimulatedRobot, now: float) -> dict[str, str]:
-        sighting = self._sighting(robot.name)
+        seen = self._discovered(robot.name)
         row = {"robot": f"{robot.name} ({robot.runs_on})"}
-        if sighting is None:
-            return row | {"transport": "not seen yet"}
-        row |= {"transport": sighting.transport, "heartbeat": _heartbeat(sighting, now)}
-        row["last command"] = self._command(sighting, now)
+        if seen is None:
+            return row | {"transport": "not discovered yet"}
+        row |= {"transport": seen.transport, "heartbeat": _heartbeat(seen, now)}
+        row["last command"] = self._command(seen, now)
         row |= _truth(robot)
-        row["battery"] = _battery(sighting)
+        row["battery"] = _battery(seen)
         if robot.has_imu:
-            row["attitude"] = _attitude(sighting)
+            row["attitude"] = _attitude(seen)
         if robot.has_media:
-            watched = self._show.watched.get(robot.name)
-            row["video"] = "" if watched is None else watched.summary("video", now)
-            row["audio"] = "" if watched is None else watched.summary("audio", now)
-        row["messages"] = f"{self._rates[robot.name].of(sighting.messages, now):3.0f}/s"
+            recorder = self._media.recorders.get(robot.name)
+            row["video"] = "" if recorder is None else recorder.summary("video", now)
+            row["audio"] = "" if recorder is None else recorder.summary("audio", now)
+        row["messages"] = f"{seen.messages.rate(now):3.0f}/s"
         return row
 
-    def _sighting(self, name: str) -> Sighting | None:
-        return next((seen for seen in self._operator.discovery.everybody() if seen.name == name), None)
+    def _discovered(self, name: str) -> DiscoveredRobot | None:
+        return next((seen for seen in self._operator.discovery.all_robots() if seen.name == name), None)
 
-    def _command(self, sighting: Sighting, now: float) -> str:
-        if sighting.base not in self._operator.commands:
+    def _command(self, seen: DiscoveredRobot, now: float) -> str:
+        if seen.base not in self._operator.commands:
             return "none yet"
-        drive, sent_at = self._operator.commands[sighting.base]
+        drive, sent_at = self._operator.commands[seen.base]
         return f"x {drive.x:+.2f} z {drive.z:+.2f}, {now - sent_at:3.1f} s ago"
 
 
-def show_results(console: Console, robots: Sequence[str], verdicts: Sequence[Verdict], problems: Sequence[str]) -> None:
-    """One row per step, one column per robot, of several rounds the worst; then every problem in words."""
-    steps = list(dict.fromkeys(verdict.step for verdict in verdicts))
-    for some in _side_by_side(robots, console) if verdicts else ():
-        table = Table(title="Seen by the MCUs: the way, and the time until the stop", title_justify="left")
+def show_results(console: Console, robots: Sequence[str], results: Sequence[Result], problems: Sequence[str]) -> None:
+    """One row per step, one column per robot, the worst of several rounds; then every problem."""
+    steps = list(dict.fromkeys(result.step for result in results))
+    for some in _side_by_side(robots, console) if results else ():
+        table = Table(title="Measured by the MCUs: distance, and time until the stop", title_justify="left")
         table.add_column("step")
         for name in some:
             table.add_column(name)
         for step in steps:
-            table.add_row(step, *(_cell(step, name, verdicts) for name in some))
+            table.add_row(step, *(_cell(step, name, results) for name in some))
         console.print(table)
     for problem in problems:
         console.print(problem, style="red", highlight=False, markup=False, soft_wrap=True)
-    if verdicts and not problems:
+    if results and not problems:
         console.print("Every robot moved and stopped as commanded.", style="green")
 
 
-def show_media_results(console: Console, robots: Sequence[str], verdicts: Sequence[MediaVerdict]) -> None:
-    """One row per encoding, one column per robot, of several looks the worst."""
-    table = Table(title="Seen and heard by the operator", title_justify="left")
+def show_media_results(console: Console, robots: Sequence[str], results: Sequence[MediaResult]) -> None:
+    """One row per encoding, one column per robot, the worst of several checks."""
+    table = Table(title="Received by the operator", title_justify="left")
     table.add_column("encoding")
     for name in robots:
         table.add_column(name)
-    for encoding in (*VIDEO, *AUDIO):
-        cells = [[one for one in verdicts if one.robot == name and one.encoding == encoding] for name in robots]
+    for encoding in (*ALL_VIDEO, *ALL_SOUND):
+        cells = [[one for one in results if one.robot == name and one.encoding == encoding] for name in robots]
         if any(cells):
             table.add_row(encoding, *(_media_cell(cell) for cell in cells))
-    if verdicts:
+    if results:
         console.print(table)
 
 
-def _media_cell(verdicts: Sequence[MediaVerdict]) -> str:
-    if not verdicts:
+def _media_cell(results: Sequence[MediaResult]) -> str:
+    if not results:
         return "not done"
-    worst = max(verdicts, key=lambda verdict: len(verdict.wrong))
+    worst = max(results, key=lambda result: len(result.wrong))
     return f"{'FAILED' if worst.wrong else 'ok'}  {worst.measured}"
 
 
-def _cell(step: str, name: str, verdicts: Sequence[Verdict]) -> str:
-    mine = [verdict for verdict in verdicts if verdict.step == step and verdict.robot == name]
+def _cell(step: str, name: str, results: Sequence[Result]) -> str:
+    mine = [result for result in results if result.step == step and result.robot == name]
     if not mine:
         return "not done"
-    worst = max(mine, key=lambda verdict: (len(verdict.wrong), verdict.stop_s))
-    way = f"{worst.ahead_mm:+.0f} mm" if worst.done.step.drive.z else f"{math.degrees(-worst.turned_rad):+.0f}° right"
-    return f"{'FAILED' if worst.wrong else 'ok'}  {way}, {worst.stop_s * 1000:.0f} ms"
+    worst = max(mine, key=lambda result: (len(result.wrong), result.stop_s))
+    return f"{'FAILED' if worst.wrong else 'ok'}  {worst.summary}"
 
 
 def _side_by_side(columns: Sequence[T], console: Console) -> Iterator[Sequence[T]]:
@@ -186,29 +171,29 @@ def _table(columns: Sequence[dict[str, str]]) -> Table:
     return table
 
 
-def _heartbeat(sighting: Sighting, now: float) -> str:
-    age, latency = sighting.liveness.age_s(now), sighting.liveness.latency_s
+def _heartbeat(seen: DiscoveredRobot, now: float) -> str:
+    age, latency = seen.liveness.age_s(now), seen.liveness.latency_s
     if age is None:
         return "none yet"
-    state = {True: "online", False: "OFFLINE", None: "new"}[sighting.liveness.online(now)]
+    state = {True: "online", False: "OFFLINE", None: "new"}[seen.liveness.online(now)]
     return f"{state}, {age:.2f} s ago" + ("" if latency is None else f" ({latency * 1000:.0f} ms)")
 
 
 def _truth(robot: SimulatedRobot) -> dict[str, str]:
-    if not robot.looks:
+    if not robot.mcu_reports:
         return {"wheels": "", "pose": ""}
-    board = robot.looks[-1].board
+    board = robot.mcu_reports[-1].board
     wheels = f"{board.left_mm_s:+4.0f} {board.right_mm_s:+4.0f} mm/s"
     degrees = math.degrees(board.pose.heading_rad)
     return {"wheels": wheels, "pose": f"{board.pose.x_mm:+5.0f} {board.pose.y_mm:+5.0f} mm {degrees:+4.0f}°"}
 
 
-def _attitude(sighting: Sighting) -> str:
-    attitude = sighting.attitude
+def _attitude(seen: DiscoveredRobot) -> str:
+    attitude = seen.attitude
     return "unknown" if attitude is None else f"roll {attitude.roll:+.1f}° pitch {attitude.pitch:+.1f}°"
 
 
-def _battery(sighting: Sighting) -> str:
-    if sighting.volts is not None:
-        return f"{sighting.volts:.2f} V"
-    return {True: "charging", False: "not charging", None: "unknown"}[sighting.charging]
+def _battery(seen: DiscoveredRobot) -> str:
+    if seen.volts is not None:
+        return f"{seen.volts:.2f} V"
+    return {True: "charging", False: "not charging", None: "unknown"}[seen.charging]

@@ -1,1 +1,22 @@
-"""What may be wrong with a robot's machine, and what to type about it."""
+"""Checks whether a machine is ready for a robot; each problem that is found comes with the command that fixes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Level(Enum):
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check: its subject, its state, and the command or config change that fixes it."""
+
+    level: Level
+    what: str
+    text: str
+    fix: str = ""

@@ -1,4 +1,4 @@
-"""One MQTT login by hand: does the broker answer, how fast, and whom does it let in? No client library needed."""
+"""Probes a broker with one MQTT login, without a client library: latency, accepted logins, certificate."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import time
 from dataclasses import dataclass
 
 from pebble.errors import TransportError
-from pebble.transports.mqtt_tls import make_context
+from pebble.transports.mqtt.tls import make_context
 from pebble.transports.settings import MqttSettings
 
 _CLEAN, _PASSWORD, _USER = 0x02, 0x40, 0x80
 _KEEPALIVE_S = 10
 _CONNACK, _DISCONNECT = 0x20, b"\xe0\x00"
-#: Return codes of CONNACK (MQTT 3.1.1, table 3.1) that are about who we are.
+#: Return codes of CONNACK (MQTT 3.1.1, table 3.1) that concern the login.
 REFUSED_LOGINS = {4: "user name or password is wrong", 5: "not authorised"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """What one attempt came to. ``code`` 0 is an open door; None means that nobody spoke MQTT, and ``problem`` why."""
+class ProbeResult:
+    """The result of one login. ``code`` is CONNACK's (0: accepted), None without one; ``problem`` is the reason."""
 
     code: int | None = None
     connect_ms: float = 0.0  # TCP alone
@@ -29,24 +29,24 @@ class Answer:
     expires: float | None = None  # the broker's certificate, in epoch seconds
 
 
-def knock(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> Answer:
-    """Connect and leave again, with the settings' user and password or (``login=False``) without."""
+def probe(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> ProbeResult:
+    """Connect and disconnect, with the settings' user and password or (``login=False``) anonymously."""
     before = time.monotonic()
     try:
         with socket.create_connection((settings.host, settings.port), timeout_s) as plain:
             connect_ms = (time.monotonic() - before) * 1000
             if settings.tls is None:
-                return Answer(code=_greet(plain, settings, login), connect_ms=connect_ms)
+                return ProbeResult(code=_log_in(plain, settings, login), connect_ms=connect_ms)
             with make_context(settings.tls).wrap_socket(plain, server_hostname=settings.host) as encrypted:
-                code, expires = _greet(encrypted, settings, login), _expiry(encrypted)
-                return Answer(code=code, connect_ms=connect_ms, expires=expires)
+                code, expires = _log_in(encrypted, settings, login), _expiry(encrypted)
+                return ProbeResult(code=code, connect_ms=connect_ms, expires=expires)
     except TransportError as error:
-        return Answer(problem=str(error))
+        return ProbeResult(problem=str(error))
     except OSError as error:  # TLS failures are some of these
-        return Answer(problem=getattr(error, "reason", None) or error.strerror or str(error))
+        return ProbeResult(problem=getattr(error, "reason", None) or error.strerror or str(error))
 
 
-def _greet(connection: socket.socket, settings: MqttSettings, login: bool) -> int:
+def _log_in(connection: socket.socket, settings: MqttSettings, login: bool) -> int:
     connection.sendall(connect_packet(settings, login=login))
     answer = b""
     while len(answer) < 4:

@@ -1,4 +1,4 @@
-"""Is this machine ready for a robot? Checks that only look, and return findings for somebody else to print."""
+"""Checks of a machine and of the robot on it. They change nothing, and return findings."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from importlib import metadata
 from pathlib import Path
 
 from pebble.config import Config, Mqtt
-from pebble.doctor.broker_probe import REFUSED_LOGINS, Answer, knock
-from pebble.doctor.finding import Finding, Level
+from pebble.doctor import Finding, Level
+from pebble.doctor.broker_probe import REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.media import media
-from pebble.links import REMOTE_RECONNECT_S, mqtt_settings
+from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
+from pebble.transports.peers import fits_socket
 from pebble.transports.settings import MqttSettings
 
-_SOCKET_PATH_LIMIT = 108  # bytes, sizeof(sun_path)
-_SOCKET_NAME = len("/0123456789abcdef.sock")
+_LONGEST_SOCKET = "0123456789abcdef.sock"
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set
 _SOON_S = 14 * 86400
 _TIMEDATECTL_S = 3.0
 
 
-def examine(config: Config | None) -> Iterator[Finding]:
-    """Everything about this machine, and about ``config``'s robot on it. Takes seconds when a broker is away."""
+def run_checks(config: Config | None) -> Iterator[Finding]:
+    """Check this machine, and ``config``'s robot on it. Takes seconds if a broker is unreachable."""
     yield python_version(sys.version_info[:3])
     for package in ("eclipse-zenoh", "paho-mqtt"):
         yield installed(package)
@@ -47,7 +47,8 @@ def examine(config: Config | None) -> Iterator[Finding]:
 def _robot(config: Config) -> Iterator[Finding]:
     run_dir = config.run_dir()
     yield run_directory(run_dir, os.geteuid())
-    yield leftover_sockets(run_dir, _answers)
+    yield leftover_sockets(run_dir, _is_listening)
+    yield state_directory(config.state_dir())
     for line in config.serial_instances().values():
         yield serial_port(Path(str(line.serial.port)))
     yield from media(config, Path("/dev"))
@@ -95,19 +96,19 @@ def memory_lock(limit: int, *, root: bool) -> Finding:
 
 
 def clock(now: float, synchronised: bool | None) -> Finding:
-    """``now`` in epoch seconds; ``synchronised`` None where nobody knows."""
+    """``now`` in epoch seconds; ``synchronised`` None if unknown."""
     if now < _BUILT:
         year = time.gmtime(now).tm_year
-        return Finding(Level.FAIL, "clock", f"says it is {year}: stamps will be wrong", "sudo timedatectl set-ntp true")
+        return Finding(Level.FAIL, "clock", f"is set to {year}: stamps will be wrong", "sudo timedatectl set-ntp true")
     if synchronised is False:
         return Finding(
             Level.WARN, "clock", "is not synchronised: latencies will be wrong", "sudo timedatectl set-ntp true"
         )
-    return Finding(Level.OK, "clock", "synchronised" if synchronised else "plausible; nobody here synchronises it")
+    return Finding(Level.OK, "clock", "synchronised" if synchronised else "plausible; not known to be synchronised")
 
 
 def synchronised() -> bool | None:
-    """What systemd knows about NTP; None without systemd."""
+    """Is the clock synchronised by NTP, according to systemd? None without systemd."""
     if shutil.which("timedatectl") is None:
         return None
     try:
@@ -124,7 +125,7 @@ def synchronised() -> bool | None:
 
 
 def leftover_segments(shm: Path, proc: Path) -> Finding:
-    """Zenoh's shared memory that belongs to us and that no living process has mapped."""
+    """Finds Zenoh's shared memory of this user that no process has mapped."""
     mine = {path for path in shm.glob("*.zenoh") if _owner(path) == os.geteuid()}
     if not mine:
         return Finding(Level.OK, "shared memory", "no segments left over")
@@ -145,7 +146,7 @@ def _mapped(proc: Path, paths: set[Path]) -> set[Path]:
     for maps in proc.glob("[0-9]*/maps"):
         try:
             text = maps.read_text(errors="replace")
-        except OSError:  # ended meanwhile, or somebody else's: ours are readable
+        except OSError:  # ended meanwhile, or of another user
             continue
         found |= {path for path in paths if str(path) in text}
     return found
@@ -163,7 +164,7 @@ def _owner(path: Path) -> int | None:
 
 def run_directory(path: Path, uid: int) -> Finding:
     what = "run directory"
-    if len(os.fsencode(path)) + _SOCKET_NAME >= _SOCKET_PATH_LIMIT:
+    if not fits_socket(path / _LONGEST_SOCKET):
         return Finding(
             Level.FAIL, what, f"{path} is too long for unix sockets", "set transport.run_dir to a shorter path"
         )
@@ -171,7 +172,7 @@ def run_directory(path: Path, uid: int) -> Finding:
         return _missing_run_directory(path)
     found = path.lstat()
     if not stat.S_ISDIR(found.st_mode):
-        return Finding(Level.FAIL, what, f"{path} is no directory", f"rm {path}")
+        return Finding(Level.FAIL, what, f"{path} is not a directory", f"rm {path}")
     if found.st_uid != uid:
         return Finding(
             Level.FAIL, what, f"{path} belongs to {_user(found.st_uid)}, not to you", f"sudo chown {_user(uid)} {path}"
@@ -186,13 +187,27 @@ def _missing_run_directory(path: Path) -> Finding:
     if not os.access(parent, os.W_OK | os.X_OK):
         owner = _user(os.geteuid())
         return Finding(
-            Level.FAIL, "run directory", f"{path} cannot be made", f"sudo install -d -m 700 -o {owner} {path}"
+            Level.FAIL, "run directory", f"{path} cannot be created", f"sudo install -d -m 700 -o {owner} {path}"
         )
-    return Finding(Level.OK, "run directory", f"{path} will be made")
+    return Finding(Level.OK, "run directory", f"{path} will be created")
+
+
+def state_directory(path: Path) -> Finding:
+    """Finds a place where an emergency stop cannot be saved: it would end with a power cut."""
+    what = "state directory"
+    existing = next(folder for folder in (path, *path.parents) if os.access(folder, os.F_OK))
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        return Finding(
+            Level.WARN,
+            what,
+            f"{path} cannot be written: an emergency stop ends with a power cut",
+            f"sudo install -d -m 700 -o {_user(os.geteuid())} {path}, or set transport.state_dir",
+        )
+    return Finding(Level.OK, what, str(path) if existing == path else f"{path} will be created")
 
 
 def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> Finding:
-    """Sockets that nobody listens on any more; harmless, the next start removes those it uses."""
+    """Finds sockets without a listening process; harmless, the next start removes those it uses."""
     sockets = sorted(run_dir.glob("*.sock")) if os.access(run_dir, os.R_OK) else []
     dead = [path for path in sockets if not answers(path)]
     if dead:
@@ -205,14 +220,14 @@ def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> Finding:
     return Finding(Level.OK, "sockets", f"{len(sockets)} in use" if sockets else "none: the robot is not up")
 
 
-def _answers(path: Path) -> bool:
+def _is_listening(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1.0)
         try:
             probe.connect(os.fspath(path))
         except (ConnectionRefusedError, FileNotFoundError):
             return False
-        except OSError:  # busy, or not ours to ask: then it is not dead
+        except OSError:  # busy, or of another user: in use
             return True
     return True
 
@@ -222,9 +237,9 @@ def serial_port(path: Path) -> Finding:
     try:
         found = path.stat()
     except OSError:
-        return Finding(Level.FAIL, what, "is not there: is the MCU plugged in?", "ls -l /dev/serial/by-id/")
+        return Finding(Level.FAIL, what, "does not exist: is the MCU plugged in?", "ls -l /dev/serial/by-id/")
     if not stat.S_ISCHR(found.st_mode):
-        return Finding(Level.FAIL, what, "is no device", "correct services.serial_mcu_bridge.serial.port")
+        return Finding(Level.FAIL, what, "is not a device", "correct services.serial_mcu_bridge.serial.port")
     if not os.access(path, os.R_OK | os.W_OK):
         group = _group(found.st_gid)
         return Finding(
@@ -240,11 +255,11 @@ def serial_port(path: Path) -> Finding:
 
 
 def broker(
-    name: str, settings: MqttSettings, attempt: Callable[..., Answer] = knock, now: float | None = None
+    name: str, settings: MqttSettings, probe_login: Callable[..., ProbeResult] = probe, now: float | None = None
 ) -> Iterator[Finding]:
-    """Does it answer, does it know us, and does it let strangers in?"""
+    """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted."""
     what = f"{name} {settings.host}:{settings.port}"
-    own = attempt(settings, login=True)
+    own = probe_login(settings, login=True)
     if own.code is None:
         start = (
             "sudo systemctl start mosquitto"
@@ -254,17 +269,17 @@ def broker(
         yield Finding(Level.FAIL, what, f"cannot be reached: {own.problem}", start)
         return
     yield _login(what, settings, own)
-    stranger = own if settings.username is None else attempt(settings, login=False)
-    yield _strangers(what, settings, stranger)
+    without_login = own if settings.username is None else probe_login(settings, login=False)
+    yield _anonymous_logins(what, settings, without_login)
     yield _encryption(what, settings, own, time.time() if now is None else now)
 
 
-def _login(what: str, settings: MqttSettings, answer: Answer) -> Finding:
+def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
     if answer.code == 0:
         return Finding(Level.OK, what, f"answers, connected in {answer.connect_ms:.1f} ms")
     why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
     if settings.username is None:
-        return Finding(Level.FAIL, what, f"refuses us: {why}", "set username and password_file of this broker")
+        return Finding(Level.FAIL, what, f"refuses the login: {why}", "set username and password_file of this broker")
     return Finding(
         Level.FAIL,
         what,
@@ -273,37 +288,39 @@ def _login(what: str, settings: MqttSettings, answer: Answer) -> Finding:
     )
 
 
-def _strangers(what: str, settings: MqttSettings, answer: Answer) -> Finding:
+def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) -> Finding:
     if answer.code != 0:
-        return Finding(Level.OK, what, "lets nobody in without a login")
+        return Finding(Level.OK, what, "refuses anonymous logins")
     if is_loopback(settings.host):
-        return Finding(Level.OK, what, "lets in anybody, seen from this machine")
+        return Finding(Level.OK, what, "accepts anonymous logins, from this machine")
     return Finding(
         Level.WARN,
         what,
-        "lets in anybody: whoever reaches it can drive the robot",
+        "accepts anonymous logins: every client that reaches it can drive the robot",
         "in mosquitto.conf: allow_anonymous false, password_file /etc/mosquitto/passwd",
     )
 
 
-def _encryption(what: str, settings: MqttSettings, answer: Answer, now: float) -> Finding:
+def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: float) -> Finding:
     if settings.tls is None:
         if is_loopback(settings.host):
-            return Finding(Level.OK, what, "not encrypted, and need not be on this machine")
+            return Finding(Level.OK, what, "not encrypted, which is fine on this machine")
         return Finding(
             Level.WARN,
             what,
-            "is not encrypted: commands and passwords can be read on the way",
+            "is not encrypted: commands and passwords can be read on the network",
             "set tls.enabled to true",
         )
     if answer.expires is not None and answer.expires - now < _SOON_S:
         days = (answer.expires - now) / 86400
-        return Finding(Level.WARN, what, f"its certificate ends in {days:.0f} days", "renew the broker's certificate")
+        return Finding(
+            Level.WARN, what, f"its certificate expires in {days:.0f} days", "renew the broker's certificate"
+        )
     return Finding(Level.OK, what, "encrypted")
 
 
 def is_loopback(host: str) -> bool:
-    """By its spelling: names are not looked up."""
+    """By its spelling, without name resolution."""
     if host == "localhost":
         return True
     try:

@@ -1,15 +1,16 @@
-"""Can this machine see, hear and speak as its config wants it to?"""
+"""Checks of camera, microphone, loudspeaker and codecs."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pebble.config import Config
-from pebble.doctor.finding import Finding, Level
+from pebble.contract.encodings import NEED_PYAV
+from pebble.doctor import Finding, Level
+from pebble.media import pyav
 
 _LIBCAMERA = ("rpicam-vid", "libcamera-vid")
 
@@ -17,7 +18,7 @@ Which = Callable[[str], str | None]
 
 
 def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterator[Finding]:
-    """Nothing for a robot without camera and microphone. ``devices``: where device files are."""
+    """No findings for a robot without camera and microphone. ``devices``: folder of device files."""
     daemon = config.services.av_daemon
     if not daemon.enabled:
         return
@@ -28,42 +29,40 @@ def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterato
             yield program("microphone", ("arecord",), "sudo apt install alsa-utils", which)
         command = config.services.mqtt_bridge.media.audio_receiver.command
         yield program("loudspeaker", command[:1], "sudo apt install alsa-utils", which, Level.WARN)
-    yield codecs(config, installed=importlib.util.find_spec("av") is not None)
+    yield codecs(config, installed=pyav.installed())
 
 
 def camera(backend: str, device: str, devices: Path, which: Which) -> Finding:
     if backend == "synthetic":
-        return Finding(Level.OK, "camera", "synthetic: needs nothing")
+        return Finding(Level.OK, "camera", "synthetic: needs no device")
     if backend != "v4l2":
         return program("camera", _LIBCAMERA, "sudo apt install rpicam-apps", which)
     path = devices / f"video{device}" if device.isdecimal() else Path(device)
     if "://" in device:
-        return Finding(Level.OK, "camera", "elsewhere: not looked at")
+        return Finding(Level.OK, "camera", "on the network: not checked")
     if not path.exists():
-        return Finding(Level.FAIL, "camera", f"{path} is not there: is it plugged in?", "ls -l /dev/v4l/by-id/")
+        return Finding(Level.FAIL, "camera", f"{path} does not exist: is it plugged in?", "ls -l /dev/v4l/by-id/")
     if not os.access(path, os.R_OK | os.W_OK):
         return Finding(
-            Level.FAIL, "camera", f"{path} may not be used by us", "sudo usermod -aG video $USER, log in again"
+            Level.FAIL, "camera", f"{path} is not accessible to this user", "sudo usermod -aG video $USER, log in again"
         )
     return Finding(Level.OK, "camera", f"{path} readable and writable")
 
 
 def program(what: str, names: tuple[str, ...], fix: str, which: Which, missing: Level = Level.FAIL) -> Finding:
-    """Any of ``names`` will do."""
+    """One of ``names`` must be installed."""
     found = next((name for name in names if which(name) is not None), None)
     if found is None:
         return Finding(missing, what, f"{' or '.join(names)} is not installed", fix)
-    return Finding(Level.OK, what, f"by {found}")
+    return Finding(Level.OK, what, f"uses {found}")
 
 
 def codecs(config: Config, *, installed: bool) -> Finding:
-    """H.264 and Opus: an error only where the config asks for them."""
+    """H.264 and Opus; missing codecs are an error only if the config selects them."""
     sent = config.services.mqtt_bridge.media
-    asked = [
-        name for name in (sent.video_publisher.encoding, sent.audio_publisher.encoding) if name in ("h264", "opus")
-    ]
+    asked = [name for name in (sent.video_publisher.encoding, sent.audio_publisher.encoding) if name in NEED_PYAV]
     if installed:
-        return Finding(Level.OK, "codecs", "H.264 and Opus can be offered")
+        return Finding(Level.OK, "codecs", "H.264 and Opus are available")
     fix = "pip install 'pebble-robot[media]'"
     if asked:
         return Finding(Level.FAIL, "codecs", f"PyAV is not installed, so there is no {' and no '.join(asked)}", fix)

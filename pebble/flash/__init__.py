@@ -1,1 +1,1 @@
-"""Putting MicroPython and a robot's firmware onto its board: what ``pebble flash`` does. docs/firmware.md tells how."""
+"""``pebble flash``: installs MicroPython and a robot's firmware on its board. Described in docs/firmware.md."""

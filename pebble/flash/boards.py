@@ -11,24 +11,24 @@ from pebble.errors import PebbleError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """One board, as MicroPython and its tools know it."""
+    """One board type, with its names in MicroPython, esptool and mpy-cross."""
 
     title: str  # what is printed on the package
-    build: str  # MicroPython's name for it, and of the page on micropython.org
-    variant: str = ""  # of that build, if it is not the plain one
-    machine: str  # occurs in ``sys.implementation._machine`` there
+    build: str  # MicroPython's name of the board, and of its download page on micropython.org
+    variant: str = ""  # of that build; "": the default one
+    machine: str  # part of ``sys.implementation._machine`` on this board
     port: str  # MicroPython's port, also the name of its type stubs
     arch: str  # mpy-cross -march
-    chip: str | None = None  # esptool --chip; None: the board shows a drive for UF2 files instead
-    chip_id: int | None = None  # in an ESP image's header; None: the header has none (ESP8266)
-    offset: str = "0x0"  # where its image starts in flash
-    baud: int = 460800  # esptool's, what every USB-serial chip of these boards can do
-    #: Plenty of memory? Else the code goes without line numbers, which are four per cent of it.
-    roomy: bool = False
+    chip: str | None = None  # esptool --chip; None: the boot loader is a USB drive that takes UF2 files
+    chip_id: int | None = None  # in the header of an ESP image; None: the header has none (ESP8266)
+    offset: str = "0x0"  # start address of the image in flash
+    baud: int = 460800  # for esptool; every USB-serial chip of these boards supports it
+    #: True: compiled code keeps its line numbers, which are four per cent of its size.
+    has_much_memory: bool = False
 
     @property
     def download(self) -> str:
-        """Where the right MicroPython is to be had, for people."""
+        """File name and download page of the right MicroPython, for messages."""
         file = "-".join(filter(None, (self.build, self.variant)))
         return f"{file} at https://micropython.org/download/{self.build}"
 
@@ -44,14 +44,14 @@ ESP32_C6 = Board(
     arch="rv32imc",
     chip="esp32c6",
     chip_id=13,
-    roomy=True,
+    has_much_memory=True,
 )
 ESP8266 = Board(
     title="Wemos D1 mini (ESP8266)",
     build="ESP8266_GENERIC",
     machine="ESP8266",
     port="esp8266",
-    variant="FLASH_2M_ROMFS",  # code runs from flash, and leaves 9 KB of 36 to the robot
+    variant="FLASH_2M_ROMFS",  # code runs from flash, which leaves more of the 36 KB of RAM free
     arch="xtensa",
     chip="esp8266",
 )
@@ -59,25 +59,25 @@ ESP8266 = Board(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Firmware:
-    """One folder of firmware/: the robot it makes out of a board."""
+    """The firmware of one robot: one folder of firmware/ and the board it runs on."""
 
     name: str
     board: Board
-    baud: int = 115200  # of the line to the host, for those on one
-    #: Does this, heard on that line, hold one of its reports? None: it talks to a broker.
+    baud: int = 115200  # of the serial line to the host
+    #: Whether bytes received from the serial line contain one of its reports; None: the robot connects to a broker.
     is_report: Callable[[bytes], bool] | None = None
-    #: Where it speaks instead of on USB, if the board lacks ``sys.stdin.buffer`` as the official SAMD21 image does.
-    elsewhere: str = ""
+    #: Serial port used instead of USB on an image without ``sys.stdin.buffer``, such as the official SAMD21 one.
+    fallback_port: str = ""
 
 
 def _lines(beginning: bytes) -> Callable[[bytes], bool]:
-    """Reports of goob_base_v1."""
-    return lambda heard: any(line.startswith(beginning) for line in heard.split(b"\n")[1:-1])
+    """Return a check for complete lines of goob_base_v1 that begin with ``beginning``."""
+    return lambda received: any(line.startswith(beginning) for line in received.split(b"\n")[1:-1])
 
 
-def _frames(heard: bytes) -> bool:
-    """Frames of pebble_serial_v1 end with a zero: COBS(body, CRC-16/CCITT-FALSE)."""
-    return any(_is_frame(frame) for frame in heard.split(b"\0")[1:-1])
+def _frames(received: bytes) -> bool:
+    """Whether a complete frame of pebble_serial_v1 was received: COBS(body, CRC-16/CCITT-FALSE), then a zero."""
+    return any(_is_frame(frame) for frame in received.split(b"\0")[1:-1])
 
 
 def _is_frame(cobs: bytes) -> bool:
@@ -97,13 +97,13 @@ FIRMWARE = {
         Firmware(name="benjr", board=ESP8266),
         Firmware(name="goob", board=SAMD21, baud=460800, is_report=_lines(b"T a0=")),
         Firmware(name="fred", board=SAMD21, is_report=_lines(b"T t0=")),
-        Firmware(name="goob_imu", board=SAMD21, is_report=_frames, elsewhere="D6 and D7, 115200 baud"),
+        Firmware(name="goob_imu", board=SAMD21, is_report=_frames, fallback_port="D6 and D7, 115200 baud"),
     )
 }
 
 
 def firmware_named(name: str) -> Firmware:
-    """Raises PebbleError that lists what there is."""
+    """Return the firmware of this name. Raises PebbleError, which lists the known names."""
     if name not in FIRMWARE:
-        raise PebbleError(f"there is no firmware called {name}, only {', '.join(sorted(FIRMWARE))}")
+        raise PebbleError(f"unknown firmware {name}; known: {', '.join(sorted(FIRMWARE))}")
     return FIRMWARE[name]

@@ -1,4 +1,4 @@
-"""Is a file the MicroPython for this board? Looks at its header, before anything is erased."""
+"""Checks the header of a MicroPython image against the board, before the board is erased."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _UF2_SAMD21 = 0x68ED2B88  # github.com/microsoft/uf2, utils/uf2families.json
 
 
 def check_image(path: Path, board: Board) -> None:
-    """Raise PebbleError, which says where the right file is to be had."""
+    """Raise PebbleError, with the right download page, unless ``path`` is an image for ``board``."""
     try:
         with path.open("rb") as file:
             header = file.read(512)
@@ -23,22 +23,22 @@ def check_image(path: Path, board: Board) -> None:
         raise PebbleError(f"--micropython {path}: {error.strerror}") from None
     problem = _uf2(header) if board.chip is None else _esp(header, board)
     if problem:
-        raise PebbleError(f"--micropython {path}: {problem}; the one for this board is {board.download}")
+        raise PebbleError(f"--micropython {path}: {problem}; download {board.download}")
 
 
 def _esp(header: bytes, board: Board) -> str:
     if len(header) < 16 or header[0] != _ESP_MAGIC:
-        return "is no image for an Espressif chip"
+        return "not an image for an Espressif chip"
     found = struct.unpack_from("<H", header, 12)[0]
     if board.chip_id is not None and found != board.chip_id:
-        return f"is for another chip than {board.chip}"
+        return f"an image for another chip than {board.chip}"
     return ""
 
 
 def _uf2(header: bytes) -> str:
     if len(header) < 512 or not header.startswith(_UF2_MAGIC):
-        return "is no UF2 file"
+        return "not a UF2 file"
     flags, family = struct.unpack_from("<I", header, 8)[0], struct.unpack_from("<I", header, 28)[0]
     if flags & _UF2_HAS_FAMILY and family != _UF2_SAMD21:
-        return "is for another chip than SAMD21"
+        return "an image for another chip than SAMD21"
     return ""

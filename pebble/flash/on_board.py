@@ -1,4 +1,4 @@
-"""What is asked of, and done on, a board by its own MicroPython; and what its answers mean."""
+"""Scripts that run on a board's MicroPython, and the interpretation of their output."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pebble.errors import PebbleError
 from pebble.flash.boards import Board
 
-#: What .mpy files of our mpy-cross are for: version 6, sub-version 3 (MicroPython 1.23 and newer).
+#: The .mpy version that our mpy-cross writes: version 6, sub-version 3 (MicroPython 1.23 and newer).
 MPY_VERSION = (6, 3)
 
-#: Printed: name, version, .mpy version, whether USB takes bytes, bytes of flash that code can run from, machine.
-WHO = """
+#: Prints name, version, .mpy version, whether stdin has a bytes buffer, size of the ROM file system, machine.
+IDENTIFY = """
 import sys
 rom = 0
 try:
@@ -27,8 +27,8 @@ print(i[0], i[1][:3], i._mpy, hasattr(sys.stdin, 'buffer'), rom, i._machine)
 """
 _ANSWER = re.compile(r"(\w+) \((\d+), (\d+), (\d+)\) (\d+) (True|False) (\d+) (.+)")
 
-#: Old modules go first: a .py left beside a new .mpy would be preferred. private_config.json stays.
-CLEAR = """
+#: Removes old modules: MicroPython prefers an old .py to a new .mpy. private_config.json stays.
+REMOVE_OLD = """
 import os
 def clear(path):
     try:
@@ -51,25 +51,27 @@ for folder in {folders}:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """What is on the board."""
+class BoardInfo:
+    """What a board reports about itself."""
 
-    text: str  # for people
-    binary: bool  # can it read and write bytes on USB?
-    rom: int  # bytes of flash from which .mpy files run without being loaded; 0: its image has no such thing
+    text: str  # version and machine, for messages
+    binary: bool  # whether USB carries bytes (``sys.stdin.buffer``)
+    rom: int  # size in bytes of the ROM file system, where code runs from flash; 0: the image has none
 
 
-def check_answer(answer: str, board: Board) -> Found:
-    """From what :data:`WHO` printed. Raises PebbleError if this is another board."""
+def check_answer(answer: str, board: Board) -> BoardInfo:
+    """Parse the output of :data:`IDENTIFY`. Raises PebbleError if it is not from ``board``."""
     found = _ANSWER.search(answer)
     if found is None:
-        raise PebbleError(f"the board's answer makes no sense: {answer.strip()[-200:]!r}")
+        raise PebbleError(f"unexpected answer from the board: {answer.strip()[-200:]!r}")
     name, *numbers, mpy_text, binary, rom, machine = found.groups()
     version, mpy = ".".join(numbers), int(mpy_text)
     if name != "micropython":
-        raise PebbleError(f"the board runs {name}; give MicroPython's file with --micropython")
+        raise PebbleError(f"the board runs {name}; install MicroPython with --micropython FILE")
     if board.machine not in machine:
-        raise PebbleError(f"this is a {machine.strip()}, and the firmware is for {board.title}")
+        raise PebbleError(f"the board is a {machine.strip()}, but the firmware is for {board.title}")
     if (mpy & 0xFF, mpy >> 8 & 3) != MPY_VERSION:
-        raise PebbleError(f"its MicroPython {version} does not take our .mpy files; --micropython: {board.download}")
-    return Found(f"MicroPython {version}, {machine.strip()}", binary == "True", int(rom))
+        raise PebbleError(
+            f"MicroPython {version} on the board cannot load our .mpy files; --micropython: {board.download}"
+        )
+    return BoardInfo(f"MicroPython {version}, {machine.strip()}", binary == "True", int(rom))

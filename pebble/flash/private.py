@@ -1,4 +1,4 @@
-"""private_config.json: who a board is, its Wi-Fi and its broker. Made from the robot's config; read by the firmware."""
+"""private_config.json: a board's identity, Wi-Fi and broker, made from the robot's config and read by the firmware."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ _NO_BROKER = (".example", ".invalid", ".test")  # RFC 2606
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Private:
-    """The files that are only for this one board."""
+class PrivateFiles:
+    """The files that belong to one board only."""
 
     settings: dict[str, Any] = field(default_factory=dict)
     ca: bytes | None = field(default=None, repr=False)  # an authority's certificate, DER
 
     def text(self) -> str:
-        """The file, passwords and all."""
+        """The content of private_config.json, including passwords."""
         return json.dumps(self.settings)
 
     def shown(self) -> str:
-        """The same for people: passwords as ***."""
+        """The same with passwords as ***, for messages."""
         return json.dumps(_hidden(self.settings))
 
 
-def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_password: str) -> Private:
-    """Raises PebbleError for what the board could not use."""
+def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_password: str) -> PrivateFiles:
+    """Make the files from the robot's config. Raises PebbleError for settings that the board cannot use."""
     if not 1 <= len(ssid.encode()) <= _WIFI_NAME:
-        raise PebbleError(f"--wifi: a network's name has 1 to {_WIFI_NAME} bytes")
+        raise PebbleError(f"--wifi: a network name has 1 to {_WIFI_NAME} bytes")
     if wifi_password and len(wifi_password.encode()) not in _WIFI_PASSWORD:
-        raise PebbleError("the Wi-Fi password has 8 to 63 characters, or none for an open network")
+        raise PebbleError("the Wi-Fi password must have 8 to 63 characters, or be empty for an open network")
     for key, name in (("system", config.robot.system), ("type", config.robot.type), ("id", config.robot.id)):
-        if '"' in name or "\\" in name:  # boards write their JSON by hand: firmware/common/topics.py
-            raise ConfigError(f'robot.{key}: a board takes no " and no \\ in its name')
+        if '"' in name or "\\" in name:  # the firmware does not escape JSON: firmware/common/settings.py
+            raise ConfigError(f'robot.{key}: " and \\ are not allowed on a board')
     broker = config.local_mqtt
     tls, ca = _tls(broker, firmware)
-    return Private(
+    return PrivateFiles(
         settings={
             "robot": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
             "wifi": {"ssid": ssid, "password": Secret(wifi_password)},
@@ -64,15 +64,13 @@ def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_passwor
 
 
 def check_broker(config: Config) -> None:
-    """Raise ConfigError for a broker that no board can reach."""
+    """Raise ConfigError for a broker address that no board can reach."""
     host = config.local_mqtt.host
     if host == "example" or host.endswith(_NO_BROKER):
         where = config.path or "the config"
-        raise ConfigError(
-            f"local_mqtt.host: {host} is only an example; write your broker's name into a copy of {where}"
-        )
+        raise ConfigError(f"local_mqtt.host: {host} is only an example; set your broker's address in a copy of {where}")
     if host == "localhost" or _is_loopback(host):
-        raise ConfigError(f"local_mqtt.host: to a board, {host} is the board itself; write how others reach the broker")
+        raise ConfigError(f"local_mqtt.host: on a board, {host} is the board itself; set the broker's network address")
 
 
 def _is_loopback(host: str) -> bool:
@@ -87,20 +85,20 @@ def _tls(broker: Mqtt, firmware: Firmware) -> tuple[Any, bytes | None]:
     if not tls.enabled:
         return False, None
     if firmware.board is ESP8266:
-        raise ConfigError("local_mqtt.tls: there is no room for it on an ESP8266; use a listener without TLS")
+        raise ConfigError("local_mqtt.tls: an ESP8266 has too little memory for TLS; use a listener without TLS")
     if tls.client_cert is not None:
         raise ConfigError("local_mqtt.tls.client_cert: boards log in with username and password only")
     if tls.ca_cert is None:
         if tls.insecure:
-            return True, None  # encrypted, to whoever answers
-        raise ConfigError("local_mqtt.tls.ca_cert: a board knows no authorities by itself; name the broker's")
+            return True, None  # encrypted, but the broker is not authenticated
+        raise ConfigError("local_mqtt.tls.ca_cert: a board has no certificates of its own; set the broker's authority")
     if tls.insecure:
-        raise ConfigError("local_mqtt.tls.insecure: a board that is given ca_cert checks the name too; leave out one")
+        raise ConfigError("local_mqtt.tls.insecure: a board with ca_cert checks the host name too; remove one of them")
     return {"ca": f"/{CA_FILE}", "server_name": broker.host}, _der(tls.ca_cert)
 
 
 def _der(path: Path) -> bytes:
-    """An authority's certificate as boards read it; a file of several has one too many."""
+    """Read the certificate of an authority as DER. Raises ConfigError for a file with several."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -108,7 +106,7 @@ def _der(path: Path) -> bytes:
     if not content.startswith(b"-----BEGIN") and b"-----BEGIN CERTIFICATE-----" not in content:
         return content
     if content.count(b"-----BEGIN CERTIFICATE-----") != 1:
-        raise ConfigError(f"local_mqtt.tls.ca_cert: {path} must hold exactly one certificate for a board")
+        raise ConfigError(f"local_mqtt.tls.ca_cert: {path} must contain exactly one certificate for a board")
     try:
         return ssl.PEM_cert_to_DER_cert(content[content.index(b"-----BEGIN CERT") :].decode("ascii").strip())
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Which files of firmware/ a robot needs, and how they are compiled."""
+"""Collects the files of firmware/ that a robot needs, and the command that compiles each."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from pebble.flash.boards import Firmware
 
 
 def firmware_folder() -> Path:
-    """firmware/ of the checkout or of the installed package."""
+    """The folder firmware/ of the checkout or of the installed package."""
     return Path(str(files("pebble"))) / "firmware"
 
 
 def main_file(firmware: Firmware, root: Path | None = None) -> Path:
-    """What becomes /main.py on the board."""
+    """The file that is installed as /main.py on the board."""
     return (root or firmware_folder()) / firmware.name / "main.py"
 
 
 def modules(firmware: Firmware, root: Path | None = None) -> list[Path]:
-    """All files that main.py needs, directly or not, relative to firmware/; raises PebbleError if there are none.
+    """All modules that main.py imports, directly or not, relative to firmware/; nothing else is copied.
 
-    A board has little room, so nothing else is copied.
+    Raises PebbleError if there is no main.py.
     """
     root = root or firmware_folder()
     main = main_file(firmware, root)
     if not main.is_file():
-        raise PebbleError(f"{firmware.name} has no firmware yet: there is no {main}")
+        raise PebbleError(f"{firmware.name} has no firmware yet: {main} does not exist")
     found: set[Path] = set()
     waiting = [main]
     while waiting:
@@ -49,16 +49,16 @@ def _imported(file: Path, root: Path) -> Iterator[Path]:
             names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         for name in names:
             path = Path(*name.split(".")).with_suffix(".py")
-            if (root / path).is_file():  # else MicroPython's own
+            if (root / path).is_file():  # else it is built into MicroPython
                 yield path
 
 
 def compile_command(firmware: Firmware, module: Path, root: Path, target: Path) -> list[str]:
-    """mpy-cross's arguments: ``module`` into ``target``/same/path.mpy.
+    """Return mpy-cross's arguments that compile ``module`` into ``target``/same/path.mpy.
 
-    What tracebacks call the file is the module's name: MicroPython keeps that one in memory anyway.
+    Tracebacks show the module's name instead of a path: MicroPython holds that name in memory anyway.
     """
-    level = "-O2" if firmware.board.roomy else "-O3"  # both leave out asserts, the latter line numbers too
+    level = "-O2" if firmware.board.has_much_memory else "-O3"  # both omit asserts, -O3 line numbers too
     return [
         f"-march={firmware.board.arch}",
         level,

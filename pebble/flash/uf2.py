@@ -1,4 +1,4 @@
-"""A SAMD21's boot loader shows a small drive; MicroPython is put there by copying a file onto it."""
+"""Installs MicroPython on a SAMD21 by copying a file to the USB drive of its boot loader."""
 
 from __future__ import annotations
 
@@ -10,45 +10,45 @@ from pathlib import Path
 
 import serial
 
-from pebble.errors import LinkError
+from pebble.errors import DeviceError
 
 _INFO = "INFO_UF2.TXT"  # every UF2 boot loader has it: github.com/microsoft/uf2
 _MOUNTS = Path("/proc/self/mounts")
 _LABELS = ("Arduino", "Seeed XIAO", "XIAO")  # of the drive, on boards of different years
 _TOUCH_BAUD = 1200
-_PATIENCE_S = 4.0
+_AUTOMATIC_S = 4.0  # then the user is asked for help
 
 
 def enter_boot_loader(port: str) -> None:
-    """Opening the port at 1200 baud and closing it asks for the boot loader; Arduino and MicroPython both know it."""
+    """Request the boot loader by opening the port at 1200 baud and closing it; Arduino and MicroPython support this."""
     with suppress(OSError, serial.SerialException), serial.Serial(port, _TOUCH_BAUD) as line:
         line.dtr = line.rts = False  # both: shared/tinyusb/mp_usbd_cdc.c, tud_cdc_line_state_cb
 
 
 def wait_for_drive(ask: Callable[[str], None], mounts: Path = _MOUNTS, timeout_s: float = 90.0) -> Path:
-    """Where the drive is mounted. Raises LinkError when it does not appear."""
+    """Return the folder where the drive is mounted. Raises DeviceError when it does not appear."""
     begin, asked = time.monotonic(), False
     while time.monotonic() < begin + timeout_s:
         for folder in _mounted(mounts):
             if _is_boot_loader(folder):
                 return folder
-        if not asked and time.monotonic() > begin + _PATIENCE_S:
+        if not asked and time.monotonic() > begin + _AUTOMATIC_S:
             asked = True
-            ask("waiting for its drive: reset twice, quickly (on a XIAO: join the two RST pads with a wire, twice)")
+            ask("waiting for the drive: reset twice, quickly (on a XIAO: join the two RST pads with a wire, twice)")
             for device in _unmounted():
-                ask(f"the drive is there, but nobody mounts it: sudo mount -o uid=$(id -u) {device} /mnt")
+                ask(f"the drive is not mounted: sudo mount -o uid=$(id -u) {device} /mnt")
         time.sleep(0.2)
-    raise LinkError("the boot loader's drive has not appeared; see docs/firmware.md, Seeed XIAO SAMD21")
+    raise DeviceError("the boot loader's drive did not appear; see docs/firmware.md, Seeed XIAO SAMD21")
 
 
 def copy(image: Path, drive: Path) -> None:
-    """Once the last block has arrived the board starts MicroPython, and takes the drive away under our hands."""
+    """Copy the image; errors are ignored once the board has started MicroPython, which removes the drive."""
     try:
         with image.open("rb") as source, (drive / image.name).open("wb") as target:
             shutil.copyfileobj(source, target)
     except OSError as error:
         if drive.exists() and _is_boot_loader(drive):
-            raise LinkError(f"copying {image.name} to {drive}: {error.strerror}") from None
+            raise DeviceError(f"copying {image.name} to {drive}: {error.strerror}") from None
 
 
 def _mounted(mounts: Path) -> Iterator[Path]:

@@ -1,1 +1,1 @@
-"""Carrying messages between a robot's own transport and another one: what the bridge and the mirror share."""
+"""Forwarding between a robot's own transport and another one: shared by the bridge and the mirror."""

@@ -1,8 +1,11 @@
-"""Carries messages between a robot's own transport and another one, by a routing table: what bridge and mirror share.
+"""Forwards messages between a robot's own transport and another one, by a routing table.
 
-Messages go straight from one side's receiving thread into the other side's `publish`, which takes a bounded time: no
-hop between threads on the way of a drive command. Everything that is to be kept passes under one lock, because two
-sides may change the same flag at once; commands and streams never wait for it.
+A message is published on the other side by the thread that received it, in a bounded time: a drive command never waits
+for another thread. All retained messages pass under one lock, because both sides may change the same flag at once;
+commands and streams never wait for it.
+
+Retained commands are stale. A live emergency stop passes even if it was published to be retained: a stop that does not
+arrive is worse than one that a later subscriber must recognise as old.
 """
 
 from __future__ import annotations
@@ -12,11 +15,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from enum import Enum
+from typing import NamedTuple
 
-from pebble.contract import Kind
-from pebble.forwarding.agreement import Agreement, Verdict
-from pebble.forwarding.echoes import Echoes
-from pebble.forwarding.outage import EventBuffer
+from pebble.contract import ESTOP, Kind
+from pebble.forwarding.event_buffer import EventBuffer
+from pebble.forwarding.loopback_filter import LoopbackFilter
+from pebble.forwarding.reconciliation import Reconciliation, Resolution
 from pebble.forwarding.routing import URGENT, Drop, Forward, Rules, Side, route
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.transports import Message, QoS, State, Transport
@@ -24,27 +28,38 @@ from pebble.transports.counters import Counters
 
 log = logging.getLogger(__name__)
 
-#: Kept copies follow a subscription's confirmation closely: by then they have come even over a slow link.
-SETTLE_S = 0.5
-#: On connections that mark live messages like kept copies, the first message of a topic within this time after
-#: :func:`barrier` counts as a copy.
-_COPIES_S = 0.05
-_EARLY = 4096  # kept topics that wait for the gate to open
+#: Retained messages closely follow the acknowledgement of a subscription: by then they are here even over a slow link.
+INITIAL_SYNC_S = 0.5
+#: On connections where live messages may have the retain flag, too, the first message of a topic within this time
+#: after :func:`barrier` counts as an old one.
+_RETAINED_S = 0.05
+#: A broker sends few retained messages at a time, so over a slow link the last ones arrive long after the first. While
+#: others with the retain flag keep arriving, a stop with it counts as an old one, but not for longer than this.
+_RETAINED_STOPS_S = 10.0
+_MAX_WAITING = 4096  # retained messages that wait for the gate to open
 
-_DROPS = {Verdict.KNOWN: Drop.KNOWN, Verdict.HOLD: Drop.HELD}
+_DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
 class Gate(Enum):
-    WAITING = "waiting"  # nothing passes yet; kept state and events wait
+    WAITING = "waiting"  # nothing passes yet; retained messages and events wait
     OPEN = "open"
     SHUT = "shut"  # nothing passes
 
 
-class Forwarder:
-    """Two transports and a table. Whoever owns it makes the subscriptions and says when a connection has settled.
+class Routed(NamedTuple):
+    """What became of a received message; ``subject`` is None for a topic that is not this robot's."""
 
-    ``winner`` is the side that is right about two-way kept topics when kept copies differ (see .agreement).
-    ``agreed(subject, payload)`` is told, on any thread and with a lock held, what a two-way kept topic says now.
+    subject: Subject | None
+    outcome: Forward | Drop
+
+
+class Forwarder:
+    """Forwards between two transports. Its owner subscribes, and calls :meth:`synchronize` after each subscription.
+
+    ``winner`` is the side whose retained messages count where they differ (see .reconciliation).
+    ``on_value(subject, payload)`` is called, on any thread and with a lock held, with each new value of a two-way
+    retained topic.
     """
 
     def __init__(
@@ -54,95 +69,114 @@ class Forwarder:
         transports: Mapping[Side, Transport],
         *,
         winner: Side,
-        agreed: Callable[[Subject, bytes], None] = lambda _subject, _payload: None,
+        on_value: Callable[[Subject, bytes], None] = lambda _subject, _payload: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.gate = Gate.WAITING
         self.mirroring = False
         self.counters = Counters()
         self._subjects, self._rules, self._transports = subjects, rules, transports
-        self._winner, self._agreed, self._clock = winner, agreed, clock
+        self._winner, self._on_value, self._clock = winner, on_value, clock
         self._lock = threading.RLock()
-        self._agreement = Agreement(winner)
-        self._early: dict[str, tuple[Message, Forward]] = {}
+        self._reconciliation = Reconciliation(winner)
+        self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
         self._events = {side: EventBuffer(transports[side], self.counters, clock=clock) for side in Side}
-        self._echoes = {side: Echoes(clock) for side in Side}
-        self._copies_until = {side: float("inf") for side in Side}
+        self._loopback = {side: LoopbackFilter(clock) for side in Side}
+        self._retained_until = {side: float("inf") for side in Side}
+        self._subscribed_at = {side: float("inf") for side in Side}
+        self._retained_at = {side: float("-inf") for side in Side}  # the newest of the messages that may be old
+        self._stops_retained_until = {side: float("inf") for side in Side}
         self._restarted: set[Side] = set()
         self._mirror_refused = False
 
-    # -- life of the connections
+    # -- connections
+
+    def subscribing(self, side: Side) -> None:
+        """The owner is about to subscribe to ``side``: its retained messages arrive from now on."""
+        self._retained_at[side] = float("-inf")
+        self._retained_until[side] = self._stops_retained_until[side] = float("inf")
 
     def watch(self, side: Side, state: State) -> None:
-        """To be called from the watcher of each side's state, before anything else is done about it."""
+        """Follow the state of ``side``; the owner calls this first in its own callback."""
         self._events[side].watch(state)
         if state is not State.CONNECTED:
-            self._copies_until[side] = float("inf")
+            self.subscribing(side)  # the transport does so at the next connection
             self._restarted.add(side)
 
     def subscribed(self, side: Side) -> None:
-        """``side`` is connected and subscribed to, and what it keeps has come."""
-        self._copies_until[side] = self._clock() + _COPIES_S
+        """``side`` is connected and subscribed to, and its retained messages have arrived."""
+        self._subscribed_at[side] = now = self._clock()
+        self._retained_until[side] = now + _RETAINED_S
+        self._stops_retained_until[side] = max(now + _RETAINED_S, self._retained_at[side] + INITIAL_SYNC_S)
         if self.gate is Gate.OPEN:
             self._events[side].flush()
 
-    def settle(self, side: Side) -> None:
-        """SETTLE_S after :meth:`subscribed`: settle what is open about kept topics."""
+    def synchronize(self, side: Side) -> None:
+        """Publish what retained messages have left open; to be called INITIAL_SYNC_S after :meth:`subscribed`."""
         with self._lock:
-            self._renew()
-            for to, topic, payload in self._agreement.settle(side):
-                self._say_agreed(topic)
-                self._tell(to, topic, payload)
+            self._begin_restarted()
+            for to, topic, payload in self._reconciliation.synchronize(side):
+                self._report_value(topic)
+                self._publish_value(to, topic, payload)
 
     @property
-    def settled(self) -> bool:
-        """Is nothing open about kept topics?"""
+    def synchronized(self) -> bool:
+        """Whether both sides are synchronized."""
         with self._lock:
-            self._renew()
-            return self._agreement.settled
+            self._begin_restarted()
+            return self._reconciliation.synchronized
 
     def open(self) -> None:
-        """From now on messages pass; first what has waited."""
+        """Forward from now on; first what has waited."""
         with self._lock:
             self.gate = Gate.OPEN
-            early, self._early = self._early, {}
-            for message, forward in early.values():
-                self._publish(Side.REMOTE, message, forward)
-        self._events[Side.REMOTE].flush()
+            waiting, self._waiting = self._waiting, {}
+            for subject, message, forward in waiting.values():
+                self._publish(Side.REMOTE, subject, message, forward)
+        for events in self._events.values():
+            events.flush()
 
     def shut(self) -> None:
-        """From now on nothing passes. Does not wait for anybody: a loop must end at once."""
+        """Forward nothing from now on. Takes no lock: a loop of messages must end at once."""
         self.gate = Gate.SHUT
-        self._early = {}
+        self._waiting = {}
         for events in self._events.values():
             events.clear()
 
+    def rearm(self) -> None:
+        """After :meth:`shut`: messages wait for :meth:`open` again, and the remote side is synchronized anew."""
+        if self.gate is Gate.SHUT:
+            self.subscribing(Side.REMOTE)
+            self._restarted.add(Side.REMOTE)
+            self.gate = Gate.WAITING
+
     # -- the receiving threads
 
-    def receive(self, side: Side, message: Message) -> Forward | Drop:
-        """Pass ``message`` on as the table says; returns what became of it."""
+    def receive(self, side: Side, message: Message) -> Routed:
+        """Forward ``message`` by the table."""
         subject = self._subjects[message.topic]
-        result = self._receive(side, subject, message)
-        if isinstance(result, Drop):
-            self.counters.add(f"{side.value}: {result.value}")
-        else:
-            self.counters.add(f"{side.value}: forwarded")
-        return result
+        outcome = self._receive(side, subject, message)
+        self.counters.add(f"{side.value}: {outcome.value if isinstance(outcome, Drop) else 'forwarded'}")
+        return Routed(subject, outcome)
 
     def _receive(self, side: Side, subject: Subject | None, message: Message) -> Forward | Drop:
+        if not _is_stop(subject):
+            self._note_retained(side, message)
+        elif not self._is_old_stop(side, message):
+            message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
         forward = route(self._rules, side, subject, message, mirroring=self._may_mirror())
         if isinstance(forward, Drop) or subject is None:
             return forward if isinstance(forward, Drop) else Drop.FOREIGN
         if self._is_echo(side, subject, message):
             return Drop.ECHO
         if forward.retain:
-            return self._pass_kept(side, subject, message, forward)
+            return self._pass_retained(side, subject, message, forward)
         if self.gate is not Gate.OPEN:
             return self._hold_event(side, subject, message)
         if _is_event(subject, message):
             self._events[side.other].send(message)
         else:
-            self._publish(side.other, message, forward)
+            self._publish(side.other, subject, message, forward)
         return forward
 
     def _hold_event(self, side: Side, subject: Subject, message: Message) -> Drop:
@@ -151,88 +185,104 @@ class Forwarder:
             return Drop.HELD
         return Drop.CLOSED
 
-    def _pass_kept(self, side: Side, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+    def _pass_retained(self, side: Side, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
         with self._lock:
-            self._renew()
+            self._begin_restarted()
             if self._rules.both_ways(subject.kind):
-                drop = self._disagreement(side, subject, message)
+                drop = self._reconcile(side, subject, message)
                 if drop is not None:
                     return drop
             if self.gate is Gate.OPEN:
-                self._publish(side.other, message, forward)
+                self._publish(side.other, subject, message, forward)
                 return forward
             if self.gate is Gate.WAITING and side is Side.LOCAL:
-                if message.topic in self._early or len(self._early) < _EARLY:
-                    self._early[message.topic] = message, forward
+                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:
+                    self._waiting[message.topic] = subject, message, forward
                 return Drop.HELD
             return Drop.CLOSED
 
-    # -- two-way kept topics, with the lock held
+    # -- two-way retained topics, with the lock held
 
-    def _disagreement(self, side: Side, subject: Subject, message: Message) -> Drop | None:
-        """Why a two-way kept message must not pass; None if it may."""
+    def _reconcile(self, side: Side, subject: Subject, message: Message) -> Drop | None:
+        """Why a two-way retained message must not pass; None if it may."""
         topic, payload = message.topic, message.payload
-        kept = self.gate is not Gate.SHUT and self._is_copy(side, message)
-        if not kept and not self._echo_is_exact(any) and self._agreement.value(topic) == payload:
+        retained = self.gate is not Gate.SHUT and self._is_retained(side, message)
+        if not retained and not self._echo_is_exact(any) and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN
         away = self._transports[side.other].state is not State.CONNECTED
-        verdict = self._agreement.hear(side, topic, payload, kept=kept, other_away=away)
-        if verdict is Verdict.PASS:
-            self._agreed(subject, payload)
+        resolution = self._reconciliation.receive(side, topic, payload, retained=retained, other_away=away)
+        if resolution is Resolution.PASS:
+            self._on_value(subject, payload)
             return None
-        if verdict is Verdict.RETELL:
-            self._tell(side, topic, self._agreement.value(topic) or b"")
-        return _DROPS.get(verdict, Drop.OVERRULED)
+        if resolution is Resolution.CORRECT:
+            self._publish_value(side, topic, self._reconciliation.value(topic) or b"")
+        return _DROPS.get(resolution, Drop.OVERRULED)
 
-    def _is_copy(self, side: Side, message: Message) -> bool:
+    def _is_retained(self, side: Side, message: Message) -> bool:
         if not message.retain:
             return False
         if not self._transports[side].as_published:
             return True
-        return self._clock() < self._copies_until[side] and not self._agreement.heard(side, message.topic)
+        return self._clock() < self._retained_until[side] and not self._reconciliation.has_received(side, message.topic)
 
-    def _renew(self) -> None:
+    # -- stops, without the lock
+
+    def _is_old_stop(self, side: Side, message: Message) -> bool:
+        if not message.retain:
+            return False
+        return not self._transports[side].as_published or self._clock() < self._stops_retained_until[side]
+
+    def _note_retained(self, side: Side, message: Message) -> None:
+        """Retained messages still arrive: a stop may be among them. Stops do not count, so that one can be repeated."""
+        if not message.retain:
+            return
+        now, until = self._clock(), self._stops_retained_until[side]
+        if now >= until:
+            return
+        self._retained_at[side] = now
+        if until < float("inf"):
+            end = self._subscribed_at[side] + _RETAINED_STOPS_S
+            self._stops_retained_until[side] = min(max(now + INITIAL_SYNC_S, until), end)
+
+    def _begin_restarted(self) -> None:
         while self._restarted:
-            self._agreement.begin(self._restarted.pop())
+            self._reconciliation.begin(self._restarted.pop())
 
-    def _say_agreed(self, topic: str) -> None:
-        subject, payload = self._subjects[topic], self._agreement.value(topic)
+    def _report_value(self, topic: str) -> None:
+        subject, payload = self._subjects[topic], self._reconciliation.value(topic)
         if subject is not None and payload is not None:
-            self._agreed(subject, payload)
+            self._on_value(subject, payload)
 
-    def _tell(self, side: Side, topic: str, payload: bytes) -> None:
+    def _publish_value(self, side: Side, topic: str, payload: bytes) -> None:
         subject = self._subjects[topic]
         if self.gate is Gate.OPEN and subject is not None:
-            self._publish(side, Message(topic, payload), Forward(QoS.DELIVERED, True, subject.kind in URGENT))
+            self._publish(side, subject, Message(topic, payload), Forward(QoS.DELIVERED, True, subject.kind in URGENT))
 
     # -- sending
 
-    def _publish(self, side: Side, message: Message, forward: Forward) -> None:
+    def _publish(self, side: Side, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, self._transports[side]
-        subject = self._subjects[topic]
-        if subject is None:
-            return
         echoing = not transport.exact_echo and _echo_matters(subject)
         if echoing:
-            self._echoes[side].expect(topic, payload)
+            self._loopback[side].expect(topic, payload)
         accepted = transport.publish(topic, payload, qos=forward.qos, retain=forward.retain, urgent=forward.urgent)
         if not accepted:
             self.counters.add(f"{side.value}: refused")
         if echoing and (not accepted or transport.state is not State.CONNECTED):
-            self._echoes[side].forget(topic)
+            self._loopback[side].forget(topic)
         if forward.retain and self._rules.both_ways(subject.kind):
-            self._agreement.tell(side, topic, payload)
+            self._reconciliation.note_published(side, topic, payload)
 
     def _is_echo(self, side: Side, subject: Subject, message: Message) -> bool:
         if self._transports[side].exact_echo or message.retain or not _echo_matters(subject):
             return False
-        return self._echoes[side].is_echo(message.topic, message.payload)
+        return self._loopback[side].is_echo(message.topic, message.payload)
 
     def _echo_is_exact(self, over: Callable[[list[bool]], bool]) -> bool:
         return over([transport.exact_echo for transport in self._transports.values()])
 
     def _may_mirror(self) -> bool:
-        """A broker that sends our own commands back would repeat each one, a moment later: after the stop, too."""
+        """A broker that sends our own commands back would repeat each one later: also after the stop."""
         if not self.mirroring:
             self._mirror_refused = False
             return False
@@ -248,16 +298,20 @@ class Forwarder:
 
 
 def barrier(transport: Transport, filter_: str) -> None:
-    """Wait, bounded, until ``transport``'s other end has dealt with all we sent, and its kept copies have come.
+    """Wait, bounded, until the other end of ``transport`` has handled all we sent, and its retained messages are here.
 
-    A subscription is confirmed after everything before it. ``filter_`` should be one we listen to anyway: a broker may
-    forbid others.
+    A subscription is acknowledged after everything before it. ``filter_`` should be one that is subscribed to anyway: a
+    broker may forbid others.
     """
     transport.subscribe(filter_, _ignore, echo=False, direct=True, limit=1).close()
 
 
 def _ignore(_message: Message) -> None:
-    """Received only because a barrier has to subscribe to something."""
+    """A barrier has to subscribe to something."""
+
+
+def _is_stop(subject: Subject | None) -> bool:
+    return subject is not None and subject.channel is ESTOP
 
 
 def _is_event(subject: Subject, message: Message) -> bool:
@@ -265,5 +319,5 @@ def _is_event(subject: Subject, message: Message) -> bool:
 
 
 def _echo_matters(subject: Subject) -> bool:
-    """What is forwarded both ways whether remote-mirror is on or not."""
+    """Whether it is forwarded both ways even while remote-mirror is off."""
     return subject.kind in (Kind.FLAG, Kind.ACTION)

@@ -1,4 +1,4 @@
-"""Which messages pass between a robot's own fabric and another side, and how: a pure function of a table."""
+"""Which messages pass between a robot's own transport and another one, and how: a pure function of a table."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class Drop(Enum):
     FOREIGN = "no topic of this robot"
     MEDIA = "media has connections of its own"
     STAYS = "stays on the robot"
-    STALE = "a kept copy of something that happens once"
+    STALE = "a retained message of something that happens once"
     ONE_WAY = "goes the other way only"
     NOT_MIRRORED = "passes only while remote-mirror is on"
-    # what the forwarder finds out
-    ECHO = "our own, come back"
-    KNOWN = "the other side knows it already"
-    OVERRULED = "the other side's copy counts"
-    HELD = "waits for the other side's copy"
+    # found by the forwarder
+    ECHO = "our own, sent back by the broker"
+    KNOWN = "the other side has this value"
+    OVERRULED = "the other side's value counts"
+    HELD = "waits for the other side's values"
     CLOSED = "nothing is forwarded now"
 
 
@@ -59,12 +59,25 @@ class Rules:
     leaves_robot: bool  # the other side is not on the robot
 
     def both_ways(self, kind: Kind) -> bool:
-        """May both sides be the origin of such messages?"""
+        """Whether both sides may be the origin of such messages."""
         return all(kind in self.passes[side] for side in Side)
 
 
+#: Between the robot and its operators: the paper's Table A.1. What no table may allow, :func:`route` drops itself.
+TABLE_A1: Final = Rules(
+    passes={
+        Side.LOCAL: frozenset({Kind.STATE, Kind.EVENT, Kind.STREAM, Kind.FLAG, Kind.ACTION}),
+        Side.REMOTE: frozenset({Kind.COMMAND, Kind.FLAG, Kind.ACTION, Kind.FEED}),
+    },
+    mirrored={Side.LOCAL: frozenset({Kind.COMMAND, Kind.FEED})},
+    leaves_robot=True,
+)
+#: Between a robot's own transport and a broker on the robot: everything, both ways, except media.
+MIRROR: Final = Rules(passes={side: frozenset(Kind) for side in Side}, leaves_robot=False)
+
+
 def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *, mirroring: bool) -> Forward | Drop:
-    """What becomes of ``message``, received on ``side``. Pure."""
+    """How to forward ``message``, received on ``side``, or why not. Pure."""
     if subject is None:
         return Drop.FOREIGN
     if not subject.bridged:
@@ -82,23 +95,23 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
 
 
 def is_stale(kind: Kind, message: Message) -> bool:
-    """Something that happens once, marked as kept: a kept copy, or (they look alike in places) meant to become one."""
-    return kind in ONE_SHOT and (message.retain or bool(message.keep))
+    """Whether something that happens once is retained, or was published to be retained (some brokers hide which)."""
+    return kind in ONE_SHOT and (message.retain or bool(message.retain_requested))
 
 
 def _qos(subject: Subject, message: Message) -> QoS:
-    """As received; what is sent *to* a robot gets its channel's quality at least: one QoS per topic keeps the order."""
+    """As received; messages *to* a robot get their channel's QoS at least: one QoS per topic keeps the order."""
     if subject.kind.direction == INCOMING:
         return QoS(max(message.qos, subject.qos))
     return message.qos
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """As published, where one can know; a flag is kept on both sides whoever set it."""
+    """As published, if that is known; a flag is always retained on both sides."""
     if subject.kind in ONE_SHOT:
         return False
     if subject.kind is Kind.FLAG and subject.retain:
         return True
-    if message.retain or message.keep is not None:
-        return message.retain or bool(message.keep)
+    if message.retain or message.retain_requested is not None:
+        return message.retain or bool(message.retain_requested)
     return subject.retain

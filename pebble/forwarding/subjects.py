@@ -1,17 +1,17 @@
-"""What a topic means to one robot: its channel, renamed or not, or the family a stranger's metric belongs to."""
+"""What a topic means to one robot: its channel, renamed or not, or the family of an unknown metric."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pebble.addresses import Addresses
 from pebble.config import Config
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind
 from pebble.errors import TransportError
-from pebble.process import view_of
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.process import view_of
 from pebble.transports.topics import check_topic, matches
 
-_REMEMBERED = 4096  # topics; a stranger may invent as many as he likes
+_REMEMBERED = 4096  # topics; other programs may invent any number
 
 #: Metrics the contract does not know, by the families of the paper's Table A.2.
 _FAMILIES = (
@@ -28,16 +28,16 @@ class Subject:
     kind: Kind
     channel: Channel | None = None
     qos: int = 0
-    retain: bool = False  # what is to be assumed where the broker hides it
+    retain: bool = False  # assumed if the broker hides it
 
     @property
     def stays(self) -> bool:
-        """Never leaves the robot."""
+        """Whether it never leaves the robot."""
         return self.channel is not None and not self.channel.remote
 
     @property
     def bridged(self) -> bool:
-        """Travels with the other messages; media has connections of its own."""
+        """Whether it is forwarded with other messages; media has connections of its own."""
         return self.channel is None or self.channel.bridged
 
 
@@ -58,7 +58,7 @@ class Subjects:
         self._known: dict[str, Subject | _Unknown | None] = {}
 
     def __getitem__(self, topic: str) -> Subject | None:
-        """The subject of ``topic``; None when it is none of this robot's, or no transport may carry it on."""
+        """The subject of ``topic``; None if it is not this robot's, or not a valid topic."""
         found = self._known.get(topic, _UNKNOWN)  # one step: another thread may clear them
         if not isinstance(found, _Unknown):
             return found

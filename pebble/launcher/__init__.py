@@ -1,1 +1,1 @@
-"""Starts, watches, restarts and stops the processes of a robot, and says how they fare."""
+"""Starts, supervises, restarts and stops the processes of a robot, and publishes their status."""

@@ -1,4 +1,4 @@
-"""The process that says to the world what the launcher has to say: ``python -m pebble.launcher.announcer CONFIG``.
+"""The process that publishes the launcher's messages: ``python -m pebble.launcher.announcer CONFIG``.
 
 The launcher itself never opens a transport: it could not fork any more, and a broker might keep it waiting.
 """
@@ -14,11 +14,11 @@ from pathlib import Path
 
 from pebble.config import load
 from pebble.errors import PebbleError
-from pebble.launched import ALIVE_PERIOD_S, Notifier, set_up_logging
-from pebble.launcher.news import Word, next_word
+from pebble.launcher.announcer_pipe import Envelope, next_envelope
 from pebble.launcher.reactor import Reactor
-from pebble.links import local_transport
-from pebble.process import exit_at_the_latest
+from pebble.runtime.connections import local_transport
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
+from pebble.runtime.process import exit_at_the_latest
 from pebble.transports import Message, State, Transport
 
 _STDIN = 0
@@ -27,27 +27,27 @@ log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """Publishes the words that come in on ``news``. States are said again on every new connection, records are not."""
+    """Publishes the envelopes that arrive on ``pipe``; states again on every new connection, records only once."""
 
-    def __init__(self, news: int, transport: Transport) -> None:
-        self._news, self._transport = news, transport
+    def __init__(self, pipe: int, transport: Transport) -> None:
+        self._pipe, self._transport = pipe, transport
         self._states: dict[str, Message] = {}
         self._reactor = Reactor()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._stopping = False
-        os.set_blocking(news, False)
+        os.set_blocking(pipe, False)
 
     def run(self, notify: Notifier) -> None:
-        """Live until :meth:`stop`, or until no more will come; then say the rest, and the will."""
-        self._reactor.watch(self._news, self._hear)
-        self._reactor.watch(self._wake, self._repeat)
+        """Run until :meth:`stop` or the end of the pipe; then publish what is still in it, and the will."""
+        self._reactor.watch(self._pipe, self._receive)
+        self._reactor.watch(self._wake, self._publish_states)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)
         self._transport.on_state(self._on_state)
         notify.ready()
         try:
             self._transport.open(timeout=0.0)
             self._reactor.run_until(lambda: self._stopping)
-            self._hear_rest()
+            self._receive_rest()
         finally:
             self._transport.close()
 
@@ -56,26 +56,26 @@ class Announcer:
         self._stopping = True
         os.eventfd_write(self._wake, 1)
 
-    def _hear(self) -> None:
-        word = next_word(self._news)
-        if word is None:
+    def _receive(self) -> None:
+        envelope = next_envelope(self._pipe)
+        if envelope is None:
             self._stopping = True
         else:
-            self._say(word)
+            self._handle(envelope)
 
-    def _hear_rest(self) -> None:
+    def _receive_rest(self) -> None:
         try:
-            while (word := next_word(self._news)) is not None:
-                self._say(word)
+            while (envelope := next_envelope(self._pipe)) is not None:
+                self._handle(envelope)
         except BlockingIOError:
             pass
 
-    def _say(self, word: Word) -> None:
-        if word.what == "state":
-            self._states[word.message.topic] = word.message
-        self._publish(word.message)
+    def _handle(self, envelope: Envelope) -> None:
+        if envelope.kind == "state":
+            self._states[envelope.message.topic] = envelope.message
+        self._publish(envelope.message)
 
-    def _repeat(self) -> None:
+    def _publish_states(self) -> None:
         os.eventfd_read(self._wake)
         for message in self._states.values():
             self._publish(message)
@@ -89,9 +89,9 @@ class Announcer:
 
 
 def run(make_transport: Callable[[Message], Transport]) -> int:
-    """Announce what comes in on stdin through ``make_transport(will)``; returns the exit code."""
+    """Publish what arrives on stdin through ``make_transport(will)``; returns the exit code."""
     try:
-        will = next_word(_STDIN)
+        will = next_envelope(_STDIN)
         if will is None:  # the launcher has ended already
             return 0
         announcer = Announcer(_STDIN, make_transport(will.message))
@@ -112,7 +112,7 @@ def run(make_transport: Callable[[Message], Transport]) -> int:
 def main(arguments: list[str]) -> int:
     set_up_logging("INFO")
     if len(arguments) != 1:
-        log.error("usage: python -m pebble.launcher.announcer CONFIG, with words from the launcher on stdin")
+        log.error("usage: python -m pebble.launcher.announcer CONFIG, with envelopes from the launcher on stdin")
         return 2
     try:
         config = load(Path(arguments[0]))

@@ -9,13 +9,13 @@ from contextlib import suppress
 from typing import NoReturn
 
 from pebble.launcher.forked import become
-from pebble.launcher.program import Program
+from pebble.launcher.programs import Program
 
 _READ_BYTES = 65_536
 
 
 class Child:
-    """A process of its own group, so that a terminal's Ctrl-C reaches only the launcher and nobody outlives it.
+    """A process of its own group, so that a terminal's Ctrl-C reaches only the launcher and no grandchild outlives it.
 
     ``output`` (stdout and stderr, in order), ``notes`` (READY and ALIVE lines) and ``exited`` are descriptors to wait
     on. ``stdin`` stays the caller's. Forks: only for a process with one thread and without sessions. Raises OSError.
@@ -43,16 +43,16 @@ class Child:
             os.kill(self.pid, signal.SIGTERM)
 
     def kill(self) -> None:
-        """End it, and whatever it started that stayed in its group. Safe at any time, from a signal handler too."""
-        if self._reaped:  # the number may be somebody else's by now
+        """Kill it and what it started that stayed in its group. Safe at any time, also from a signal handler."""
+        if self._reaped:  # the number may belong to another process by now
             return
         try:
             os.killpg(self.pid, signal.SIGKILL)
-        except (ProcessLookupError, PermissionError):  # nobody left, or only what runs as another user by sudo
+        except (ProcessLookupError, PermissionError):  # all have ended, or run as another user by sudo
             os.kill(self.pid, signal.SIGKILL)
 
     def end(self) -> str:
-        """Clean up after it has exited; says how it ended: ``exit code 1`` or ``signal 9``."""
+        """Clean up after it has exited; returns how it ended: ``exit code 1`` or ``signal 9``."""
         self._reaped = True  # first: a signal handler may come in between
         code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         for descriptor in (self.output, self.notes, self.exited):
@@ -62,14 +62,14 @@ class Child:
     def _watch_exit(self) -> int:
         try:
             return os.pidfd_open(self.pid)
-        except OSError:  # no descriptors left: a child whose end nobody would notice must not live
+        except OSError:  # no descriptors left: a child whose end would go unnoticed must not live
             self.kill()
             os.waitpid(self.pid, 0)
             raise
 
 
 def read_available(descriptor: int) -> bytes | None:
-    """What a non-blocking pipe holds just now, up to 64 KiB; empty at its end, None when there is nothing."""
+    """Read what a non-blocking pipe holds, up to 64 KiB; empty at its end, None when there is nothing."""
     try:
         return os.read(descriptor, _READ_BYTES)
     except BlockingIOError:
@@ -83,13 +83,13 @@ def _pipe(opened: list[int]) -> tuple[int, int]:
 
 
 def _fork(run: Callable[[], NoReturn]) -> int:
-    """With signals blocked: until ``run`` has handlers of its own, a child would answer in the launcher's way."""
+    """Fork with signals blocked: until ``run`` sets its own handlers, a child would run the launcher's."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     try:
         pid = os.fork()
         if pid == 0:
             run()
-        with suppress(OSError):  # the child does the same: whoever comes first
+        with suppress(OSError):  # the child does the same: one of the two comes first
             os.setpgid(pid, pid)
         return pid
     finally:

@@ -15,8 +15,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import NoReturn
 
-from pebble.launched import NOTIFY_FD, die_with_launcher
-from pebble.launcher.program import Program
+from pebble.launcher.programs import Program
+from pebble.runtime.parent import NOTIFY_FD, die_with_launcher
 
 _NOTES = 3  # the descriptor of READY and ALIVE, next after stdin, stdout and stderr
 _PR_SET_NAME, _NAME_BYTES = 15, 15
@@ -26,7 +26,7 @@ def become(program: Program, environment: Mapping[str, str], *, stdin: int, outp
     """Run ``program`` with these descriptors and no others, and exit with its code. Call right after the fork.
 
     Expects all signals blocked. Never returns or raises: the frames below belong to the launcher. They must stay,
-    too, because closing an object of theirs would close a descriptor that by then is somebody else's.
+    too, because closing an object of theirs would close a descriptor that by then belongs to another.
     """
     code = 1
 
@@ -45,11 +45,11 @@ def become(program: Program, environment: Mapping[str, str], *, stdin: int, outp
 
 
 def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
-    """Nothing else stays open: the launcher's lock, for one, would be held for as long as this child lives."""
+    """Close everything else: the launcher's lock, for one, would be held for as long as this child lives."""
     wanted = (stdin, output, output, notes)
     clear = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
     for number, descriptor in enumerate(clear):
-        os.dup2(descriptor, number, inheritable=number != _NOTES)  # what a child starts in turn tells us nothing
+        os.dup2(descriptor, number, inheritable=number != _NOTES)  # what a child starts in turn must not write to it
     for name in os.listdir("/proc/self/fd"):  # noqa: PTH208  (a Path for each is slower than the fork itself)
         if int(name) > _NOTES:
             with suppress(OSError):  # that of the listing itself
@@ -60,7 +60,7 @@ def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
 
 
 def _reset_signals() -> None:
-    """As in a fresh interpreter. What was ignored (nohup) stays ignored."""
+    """Set signals as in a fresh interpreter. What was ignored (nohup) stays ignored."""
     signal.set_wakeup_fd(-1)
     for number in signal.valid_signals():
         if callable(signal.getsignal(number)):
@@ -84,12 +84,12 @@ def _run(program: Program) -> None:
         os.chdir(program.folder)
     sys.argv = [program.module, *program.arguments]
     if not hasattr(sys.modules.get(program.module), "__path__"):
-        sys.modules.pop(program.module, None)  # it is __main__ now; whoever imports it as well gets another, as always
+        sys.modules.pop(program.module, None)  # it is __main__ now; importing it as well gives a second copy, as always
     runpy.run_module(program.module, run_name="__main__", alter_sys=True)
 
 
 def _finish() -> None:
-    """What the interpreter does at its end, up to where it would take down what belongs to the launcher."""
+    """Do what the interpreter does at its end, up to where it would destroy what belongs to the launcher."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     sys.stdout.flush()

@@ -1,9 +1,10 @@
-"""Where log lines go: the launcher's own stderr, and as records to whoever watches the robot (paper A.8.7)."""
+"""Where log lines go: the launcher's own stderr, and as records to the robot's log topic (paper A.8.7)."""
 
 from __future__ import annotations
 
 import logging
 import os
+import re
 import select
 import sys
 import time
@@ -11,38 +12,42 @@ from collections.abc import Callable
 from typing import Self
 
 from pebble.config.tree import LogsSection
-from pebble.launcher.log_lines import LEVELS, LevelReader, cut
-from pebble.payloads import LogRecord
+from pebble.contract.payloads import LogRecord
+
+LINE_LIMIT = 16_384  # bytes of a child's line; the rest of a longer one is dropped
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 _OWN_NAME = "launcher"
+_FORM = re.compile(r"\d\d:\d\d:\d\d(?:[.,]\d+)? \[([A-Z]+)\] (.*)", re.DOTALL).fullmatch
+_TRACEBACK = re.compile(r"[\s|+]*(Exception Group )?Traceback \(most recent call last\):").match
 
 
 class LogForwarder:
-    """Echoes every line, and hands those that are important enough to ``publish`` as records."""
+    """Writes every line to stderr, and hands those of at least the configured level to ``publish`` as records."""
 
-    def __init__(self, publish: Callable[[LogRecord], None], logs: LogsSection, *, echo: int | None = None) -> None:
+    def __init__(self, publish: Callable[[LogRecord], None], logs: LogsSection, *, stderr: int | None = None) -> None:
         self._publish, self._limit = publish, logs.max_message_chars
         self._least = LEVELS.index(logs.min_level)
-        self._echo = Echo(sys.stderr.fileno() if echo is None else echo)
+        self._stderr = NonBlockingWriter(sys.stderr.fileno() if stderr is None else stderr)
         self._readers: dict[str, LevelReader] = {}
 
     def child_line(self, service: str, pid: int, line: str, *, published: bool = True) -> None:
-        """One line that the child ``service`` wrote. Those of whoever publishes them would make new ones for ever."""
+        """Forward one line of a child. Those of the process that publishes would cause new ones for ever."""
         level, text = self._readers.setdefault(service, LevelReader()).read(line)
-        self._say(level, service, pid, text, logger="root", published=published)
+        self._forward(level, service, pid, text, logger="root", published=published)
 
     def child_started(self, service: str) -> None:
-        """What the one before wrote has nothing to do with what comes."""
+        """Forget the level of the last line: it belongs to the previous process."""
         self._readers.pop(service, None)
 
     def own_record(self, record: logging.LogRecord, text: str) -> None:
-        level = LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]  # others' levels lie in between
-        self._say(level, _OWN_NAME, os.getpid(), text, logger=record.name)
+        level = LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]  # others may lie in between
+        self._forward(level, _OWN_NAME, os.getpid(), text, logger=record.name)
 
-    def _say(self, level: str, service: str, pid: int, text: str, *, logger: str, published: bool = True) -> None:
+    def _forward(self, level: str, service: str, pid: int, text: str, *, logger: str, published: bool = True) -> None:
         clock = time.strftime("%H:%M:%S")
         for line in text.splitlines():
-            self._echo.write(f"{clock} [{level}] [{service}] {line}")
+            self._stderr.write(f"{clock} [{level}] [{service}] {line}")
         if published and LEVELS.index(level) >= self._least:
             message = cut(f"[{service}] {text}", self._limit)
             now_ms = time.time_ns() // 1_000_000
@@ -50,15 +55,16 @@ class LogForwarder:
 
 
 class OwnRecords(logging.Handler):
-    """The launcher's own log, the same two ways, from ``with`` on."""
+    """Forwards the launcher's own log records the same two ways, inside its ``with`` block."""
 
     def __init__(self, forwarder: LogForwarder, level: str) -> None:
         super().__init__()
         self._forwarder, self._level = forwarder, level
+        self._previous_level = logging.WARNING
 
     def __enter__(self) -> Self:
         root = logging.getLogger()
-        self._level_before = root.level
+        self._previous_level = root.level
         root.addHandler(self)
         root.setLevel(self._level)
         return self
@@ -66,14 +72,14 @@ class OwnRecords(logging.Handler):
     def __exit__(self, *_: object) -> None:
         root = logging.getLogger()
         root.removeHandler(self)
-        root.setLevel(self._level_before)
+        root.setLevel(self._previous_level)
 
     def emit(self, record: logging.LogRecord) -> None:
         self._forwarder.own_record(record, self.format(record))
 
 
-class Echo:
-    """Writes lines to a descriptor, but never waits for whoever reads there: a stopped terminal stops no robot."""
+class NonBlockingWriter:
+    """Writes lines to a descriptor and drops those it has no room for: a stopped terminal must not stop a robot."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -87,6 +93,48 @@ class Echo:
             if self._poll.poll(0):
                 os.write(self._descriptor, data)
                 return
-        except OSError:  # nobody reads there any more
+        except OSError:  # the reader has gone
             pass
         self.dropped += 1
+
+
+class LevelReader:
+    """The level of each line of one process: ``HH:MM:SS [LEVEL] text`` names it, other lines are INFO (paper A.8.7).
+
+    A traceback, up to the next line that names its level, has that of the line it belongs to; ERROR without one.
+    Indented lines continue the line before them.
+    """
+
+    def __init__(self) -> None:
+        self._last_level: str | None = None
+        self._in_traceback = False
+
+    def read(self, line: str) -> tuple[str, str]:
+        """Return the level and the text of ``line``."""
+        form = _FORM(line)
+        level = _known(form[1]) if form else None
+        if form and level:
+            self._last_level, self._in_traceback = level, False
+            return level, form[2]
+        if _TRACEBACK(line):
+            self._in_traceback = True
+            self._last_level = self._last_level or "ERROR"
+        if self._last_level and (self._in_traceback or line[0].isspace()):
+            return self._last_level, line
+        self._last_level = None
+        return "INFO", line
+
+
+def text_of(line: bytes) -> str:
+    """A line as text, whatever bytes are in it."""
+    return line.decode(errors="replace").rstrip()
+
+
+def _known(level: str) -> str | None:
+    level = {"WARN": "WARNING", "FATAL": "CRITICAL"}.get(level, level)
+    return level if level in LEVELS else None
+
+
+def cut(text: str, limit: int) -> str:
+    """At most ``limit`` characters; what was longer ends in three dots."""
+    return text if len(text) <= limit else text[: limit - 3] + "..."

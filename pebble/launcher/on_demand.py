@@ -1,77 +1,78 @@
-"""The programs that run only while they are wanted: who may want them, and what becomes of the wants of the dead."""
+"""Programs that run only while they are requested: which program may request them, and what follows from its exit."""
 
 from __future__ import annotations
 
 import logging
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable
 
-from pebble.launched import ENCODING, WANTED
-from pebble.launcher.keeper import Keeper
-from pebble.launcher.program import Program
+from pebble.launcher.process_supervisor import ProcessSupervisor
+from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
+from pebble.runtime.parent import ENCODING, WANTED
 
-#: What a program wanted counts for this long after its end; then whoever replaced it has to have said it again.
+#: Requests of a program that has ended count for this long; then its successor must have repeated them.
 OUTLIVE_S = 5.0
 
-_want = re.compile(r"WANT (\S{1,64}) ([01])(?: ([a-z0-9]{1,16}))?", re.ASCII).fullmatch
+_request = re.compile(r"WANT (\S{1,64}) ([01])(?: ([a-z0-9]{1,16}))?", re.ASCII).fullmatch
 
 log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """Hears ``WANT <program> 1|0 [encoding]`` from the program that may say it, and tells the keepers. One thread's."""
+    """Handles ``WANT <program> 1|0 [encoding]`` from a program that may request others. For one thread only."""
 
-    def __init__(self, reactor: Reactor, keepers: Mapping[str, Keeper]) -> None:
-        self._reactor, self._keepers = reactor, keepers
+    def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
+        self._reactor = reactor
+        self._supervisors = {s.program.name: s for s in supervisors if s.program.on_demand}
         self._encodings: dict[str, str] = {}  # that a program is to begin with, whenever it is started
-        self._until: dict[str, float] = {}  # wanted by somebody who has ended since
-        self._complained: set[str] = set()
+        self._until: dict[str, float] = {}  # when requests of a program that has ended expire
+        self._refused: set[str] = set()  # programs whose first refused line has been logged
 
     @property
-    def wanted(self) -> tuple[str, ...]:
-        return tuple(name for name, keeper in self._keepers.items() if keeper.wanted)
+    def requested(self) -> tuple[str, ...]:
+        return tuple(name for name, supervisor in self._supervisors.items() if supervisor.requested)
 
     def environment(self, program: Program) -> dict[str, str]:
-        """What a new process of ``program`` is to know of all this."""
-        if program.asks:
-            return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.wanted)}
+        """The variables that pass requests on to a new process of ``program``."""
+        if program.may_request:
+            return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}
 
-    def hear(self, speaker: Program, line: str) -> None:
-        """A note of ``speaker`` that is no sign of life."""
-        said = _want(line)
-        keeper = self._keepers.get(said[1]) if said else None
-        if said is None or keeper is None or not speaker.asks:
-            self._complain(speaker, line)
+    def receive(self, sender: Program, line: str) -> None:
+        """Handle a note of ``sender`` that is no sign of life."""
+        found = _request(line)
+        supervisor = self._supervisors.get(found[1]) if found else None
+        if found is None or supervisor is None or not sender.may_request:
+            self._refuse(sender, line)
             return
-        encoding = said[3] or ""
-        changed = encoding != self._encodings.get(said[1], "")
-        self._encodings[said[1]] = encoding
-        self._until.pop(said[1], None)
-        if said[2] == "0" or (changed and keeper.wanted and keeper.life.state != "ready"):
-            keeper.unwant()  # one that still starts would not hear that it is to begin with something else
-        if said[2] == "1":
-            keeper.want()
+        name, encoding = found[1], found[3] or ""
+        changed = encoding != self._encodings.get(name, "")
+        self._encodings[name] = encoding
+        self._until.pop(name, None)
+        if found[2] == "0" or (changed and supervisor.requested and supervisor.policy.state != "ready"):
+            supervisor.release()  # one that still starts would not receive the new encoding
+        if found[2] == "1":
+            supervisor.request()
 
-    def ended(self, speaker: Program) -> None:
-        """Nobody watches over what ``speaker`` wanted: it may go on for a while, but not for ever."""
-        if not speaker.asks or not self.wanted:
+    def ended(self, program: Program) -> None:
+        """A program has ended: what it requested may run on for a while, but not for ever."""
+        if not program.may_request or not self.requested:
             return
         due = time.monotonic() + OUTLIVE_S
-        for name in self.wanted:
+        for name in self.requested:
             self._until.setdefault(name, due)
-        self._reactor.at(due, self._withdraw)
+        self._reactor.at(due, self._expire)
 
-    def _withdraw(self) -> None:
+    def _expire(self) -> None:
         now = time.monotonic()
         for name in [name for name, due in self._until.items() if due <= now]:
             del self._until[name]
-            log.warning("%s: who wanted it has ended, and nobody has wanted it again", name)
-            self._keepers[name].unwant()
+            log.warning("%s: the program that requested it has ended, and the request was not repeated", name)
+            self._supervisors[name].release()
 
-    def _complain(self, speaker: Program, line: str) -> None:
-        if speaker.name not in self._complained:
-            self._complained.add(speaker.name)
-            log.warning("%s says what it has no say in, ignored: %.80s", speaker.name, line)
+    def _refuse(self, sender: Program, line: str) -> None:
+        if sender.name not in self._refused:
+            self._refused.add(sender.name)
+            log.warning("%s may not request this, ignored: %.80s", sender.name, line)

@@ -2,45 +2,111 @@
 
 from __future__ import annotations
 
+import gc
+import logging
+import os
+from collections.abc import Iterable, Iterator
+from enum import IntEnum
+from importlib import import_module
+from pathlib import Path
+from pkgutil import walk_packages
 from typing import Any
 
+from msgspec import Struct
 from msgspec.json import encode
 
 from pebble.config import Config
-from pebble.launcher.program import Program, Stage
-from pebble.links import hub_settings
-from pebble.transports.registry import BUILT_IN
+from pebble.runtime.connections import hub_settings
+from pebble.transports import module_of
+
+log = logging.getLogger(__name__)
+
+
+class Stage(IntEnum):
+    """Programs of one stage stop together; the highest stage stops first."""
+
+    LOCAL_TRANSPORT = 0  # what the others publish through
+    ANNOUNCER = 1  # publishes how the others ended
+    DEVICE = 2  # owns hardware
+    CONNECTION = 3  # is connected to other machines
+
+
+class Program(Struct, frozen=True):
+    """One process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` would.
+
+    The launcher imports the module, or all modules of the package, before it forks: importing must do nothing.
+    """
+
+    name: str
+    module: str
+    arguments: tuple[str, ...]
+    stage: Stage
+    reads_announcer_pipe: bool = False  # on its stdin; the others' stdin is empty
+    may_request: bool = False  # may request on-demand programs
+    on_demand: bool = False  # runs only while it is requested
+    preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
+    environment: dict[str, str] = {}
+    folder: Path | None = None  # to run in; None: the launcher's
+    stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed
 
 
 def programs(config: Config) -> tuple[Program, ...]:
-    """The processes of this robot. Hardware comes before links: a motor is told to stop before anyone can steer it."""
-    services = config.services
+    """The processes of this robot.
+
+    Devices start before connections, so that a motor has received its stop before any command can arrive.
+    """
+    services, mirror = config.services, config.transport.mqtt_mirror
     table = [
         (config.transport.kind == "zenoh", _hub(config)),
-        (True, Program("announcer", "pebble.launcher.announcer", (str(config.path),), Stage.NEWS, told=True)),
+        (True, _announcer(config)),
         *((True, _service(config, "serial_mcu_bridge", Stage.DEVICE, line)) for line in config.serial_instances()),
         (services.av_daemon.enabled, _av_daemon(config)),
-        (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.LINK, asks=True)),
-        (config.transport.mqtt_mirror is not None, _service(config, "mqtt_mirror", Stage.LINK)),
+        (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
+        (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
         *((True, _on_demand(config, name)) for name in config.on_demand_programs()),
     ]
-    return tuple(program for wanted, program in table if wanted)
+    return tuple(program for enabled, program in table if enabled)
 
 
-def transport_modules(config: Config) -> tuple[str, ...]:
-    """The modules of our own transports that some process of this robot opens."""
+def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
+    """The modules and packages to import before the first fork: what the programs run, and what several of them use."""
+    media = ["pebble.transports.frames", "pebble.media.sound"] if config.media_programs() else []
+    return [*_transport_modules(config), *media, *(program.module for program in table if program.preloaded)]
+
+
+def preload(modules: Iterable[str]) -> None:
+    """Import ``modules``, and those inside packages: what is in memory before a fork, parent and children share.
+
+    A module that cannot be imported is left to the process that runs it, which reports what is wrong.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else numpy starts threads, and no fork may follow
+    for name in modules:
+        try:
+            for part in _parts(name):
+                import_module(part)
+        except Exception:
+            log.debug("%s cannot be imported", name, exc_info=True)
+    gc.collect()
+    gc.freeze()  # a collection writes into every object it visits, and a page that is written to is no longer shared
+
+
+def _parts(name: str) -> Iterator[str]:
+    """The module, and those inside it if it is a package."""
+    yield name
+    for found in walk_packages(getattr(import_module(name), "__path__", ()), f"{name}."):
+        if not found.name.endswith(".__main__"):
+            yield found.name
+
+
+def _transport_modules(config: Config) -> tuple[str, ...]:
+    """The modules of Pebble's own transports that some process of this robot opens."""
     bridge = config.services.mqtt_bridge
     kinds = {config.transport.kind}
     if config.transport.mqtt_mirror is not None:
         kinds.add("mqtt")
     if bridge.enabled:
         kinds.add("mqtt" if bridge.remote is None else bridge.remote.kind)
-    return tuple(BUILT_IN[kind].partition(":")[0] for kind in sorted(kinds) if kind in BUILT_IN)
-
-
-def shared_modules(config: Config) -> tuple[str, ...]:
-    """What several programs of this robot import and its launcher does not: once in memory instead of in each."""
-    return ("pebble.transports.frames", "pebble.media.sound") if config.media_programs() else ()
+    return tuple(module for kind in sorted(kinds) if (module := module_of(kind)) is not None)
 
 
 def _service(config: Config, name: str, stage: Stage, instance: str = "", **more: Any) -> Program:
@@ -54,16 +120,16 @@ def _av_daemon(config: Config) -> Program:
 
 
 def _on_demand(config: Config, name: str) -> Program:
-    """Started when the bridge wants it: pictures and sound for operators."""
+    """A program that the bridge requests while operators want its video or audio."""
     if name == "video_stream":
-        return _service(config, name, Stage.LINK, on_demand=True)
+        return _service(config, name, Stage.CONNECTION, on_demand=True)
     bridge = config.services.mqtt_bridge
     control = bridge.video_control if name == "camera_publisher" else bridge.audio_control
     own = control.receiver_env if name == "audio_receiver" else control.publisher_env
     return _service(
         config,
         name,
-        Stage.LINK,
+        Stage.CONNECTION,
         on_demand=True,
         preloaded=False,
         environment={**control.env, **own},
@@ -71,6 +137,11 @@ def _on_demand(config: Config, name: str) -> Program:
     )
 
 
+def _announcer(config: Config) -> Program:
+    arguments = (str(config.path),)
+    return Program("announcer", "pebble.launcher.announcer", arguments, Stage.ANNOUNCER, reads_announcer_pipe=True)
+
+
 def _hub(config: Config) -> Program:
     settings = encode(hub_settings(config), enc_hook=str).decode()  # paths and numbers: nothing secret is in them
-    return Program("zenoh_hub", "pebble.hub", (settings,), Stage.FABRIC)
+    return Program("zenoh_hub", "pebble.runtime.hub", (settings,), Stage.LOCAL_TRANSPORT)

@@ -1,12 +1,18 @@
-"""One thread that waits for file descriptors and timers at once."""
+"""One thread that waits for file descriptors, timers and stop signals at once."""
 
 from __future__ import annotations
 
 import selectors
+import signal
+import socket
 import time
 from collections.abc import Callable
+from types import FrameType
+from typing import Any, Self
 
-from pebble.timers import Timer, Timers
+from pebble.runtime.timers import Timer, Timers
+
+_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 Job = Callable[[], None]
 
@@ -36,7 +42,7 @@ class Reactor:
         return self._timers.add(time.monotonic() + seconds, job, period=seconds)
 
     def run_until(self, condition: Callable[[], bool], timeout: float | None = None) -> bool:
-        """Work until ``condition()`` holds; False when ``timeout`` seconds went by without it."""
+        """Work until ``condition()`` holds; False when ``timeout`` seconds have passed without it."""
         end = None if timeout is None else time.monotonic() + timeout
         while not condition():
             now = time.monotonic()
@@ -49,9 +55,53 @@ class Reactor:
         self._selector.close()
 
     def _turn(self, *waits: float | None) -> None:
-        """What was said is heard before a timer judges the silence."""
+        """Read descriptors before timers run: a timer that checks for signs of life must know those that have come."""
         limited = [wait for wait in waits if wait is not None]
         for key, _ in self._selector.select(min(limited) if limited else None):
-            if key.fd in self._selector.get_map():  # an earlier job of this turn may have let go of it
+            if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()
         self._timers.run_due(time.monotonic())
+
+
+class StopSignals:
+    """Counts SIGTERM, SIGINT and SIGHUP inside its ``with`` block; ``descriptor`` is readable after each one.
+
+    ``on_repeat`` is called in the signal handler from the second one on: the user does not want to wait any longer.
+    Main thread only. A signal that was ignored before (nohup) stays ignored.
+    """
+
+    def __init__(self, on_repeat: Callable[[], None]) -> None:
+        self.received = 0
+        self._on_repeat = on_repeat
+        self._previous: dict[signal.Signals, Any] = {}
+        self._previous_wakeup = -1
+        self._written, self._read = socket.socketpair()
+        self._written.setblocking(False)
+        self._read.setblocking(False)
+
+    @property
+    def descriptor(self) -> int:
+        return self._read.fileno()
+
+    def drain(self) -> None:
+        """Read what made :attr:`descriptor` readable."""
+        self._read.recv(64)
+
+    def __enter__(self) -> Self:
+        self._previous_wakeup = signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
+        for number in _SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._previous[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._previous_wakeup)
+        self._written.close()
+        self._read.close()
+
+    def _receive(self, _number: int, _frame: FrameType | None) -> None:
+        self.received += 1
+        if self.received > 1:
+            self._on_repeat()

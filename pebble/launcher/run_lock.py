@@ -2,47 +2,42 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import stat
 from pathlib import Path
 from typing import Self
 
 from pebble.errors import PebbleError
+from pebble.transports.peers import FileLock
 
 LOCK_NAME = "launcher.lock"
 
 
 class RunLock:
-    """Makes the run directory for this user alone and holds its lock; the kernel lets go however the process ends.
+    """Makes the run directory for this user alone and holds its lock; the kernel releases it however the process ends.
 
-    Raises PebbleError when another process holds the lock, or when the directory is not ours to trust.
+    Raises PebbleError when another process holds the lock, or when the directory cannot be trusted.
     """
 
     def __init__(self, run_dir: Path, robot: str) -> None:
         self._run_dir, self._robot = run_dir, robot
         self.path = run_dir / LOCK_NAME
-        self._descriptor: int | None = None
+        self._lock: FileLock | None = None
 
     def take(self) -> Self:
         _make_private(self._run_dir)
-        descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(descriptor, 32).decode(errors="replace").strip()
-            os.close(descriptor)
-            raise PebbleError(f"{self._robot} already runs: process {holder} holds {self.path}") from None
-        os.truncate(descriptor, 0)
-        os.write(descriptor, f"{os.getpid()}\n".encode())
-        self._descriptor = descriptor
+        self._lock = FileLock.take(self.path)
+        if self._lock is None:
+            holder = self.path.read_text(errors="replace").strip()
+            raise PebbleError(f"{self._robot} already runs: process {holder} holds {self.path}")
+        self._lock.write(f"{os.getpid()}\n".encode())
         return self
 
     def release(self) -> None:
-        """Let go. The file stays: removing it would let two launchers lock two files of the same name."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
+        """Release the lock. The file stays, with the process id of the last launcher."""
+        if self._lock is not None:
+            self._lock.release(remove=False)
+            self._lock = None
 
     def __enter__(self) -> Self:
         return self.take()
@@ -52,7 +47,7 @@ class RunLock:
 
 
 def _make_private(run_dir: Path) -> None:
-    """Whoever can write here can drive the robot, and in /tmp somebody else may have prepared the names we use."""
+    """Write access here is control over the robot, and in /tmp another user may have created these names first."""
     try:
         run_dir.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if run_dir.parent.stat().st_uid not in (os.getuid(), 0):

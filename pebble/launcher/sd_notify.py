@@ -1,4 +1,4 @@
-"""Telling systemd how we are: sd_notify(3) in pure Python, silent where systemd does not listen."""
+"""Reports to systemd: sd_notify(3) in pure Python; does nothing where systemd does not listen."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 class SystemdNotifier:
     """Sends state datagrams to ``$NOTIFY_SOCKET``; systemd's unit must say ``Type=notify``."""
 
-    #: What concerns the process systemd started and nobody it starts in turn.
+    #: For the process that systemd started alone, and not for its children.
     VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:

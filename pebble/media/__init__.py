@@ -1,1 +1,1 @@
-"""Pictures and sound on the wire: encoders, decoders, and what makes up for lost packets."""
+"""Pictures and sound on the wire: encoders, decoders, a jitter buffer, and computed test material."""

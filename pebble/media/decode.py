@@ -1,22 +1,21 @@
-"""Any video payload to pictures; what cannot be right is not shown, and a full picture is asked for instead."""
+"""Decodes video payloads of every encoding; a damaged picture is refused, and a key frame is wanted instead."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from pebble.contract.packets import KEY_FRAME, PBVD, Picture, PictureKind
 from pebble.errors import PayloadError, PebbleError
-from pebble.media import h264
+from pebble.media import pyav
 from pebble.media.h264 import H264Decoder
-from pebble.media.inflate import inflate
 from pebble.media.jpeg import MAX_BYTES, SOI, Pixels, decode_jpeg
 from pebble.media.jpeg_delta import add
-from pebble.media.json_video import JsonPicture, plausible
-from pebble.packets import KEY_FRAME, PBVD, Picture, PictureKind
+from pebble.media.json_video import JsonPicture, inflate, plausible
 
 MAX_PAYLOAD: Final = MAX_BYTES * 3 // 2  # base64 takes a third more
 _FRAME_LIMIT: Final = 1 << 32
-#: Longer between two pictures, or backwards: the number may be the next by chance, after a restart nobody saw.
+#: With more time between two pictures, or less than none, the sender may have restarted and the number fits by chance.
 _LONGEST_STEP_MS: Final = 5000
 
 _KINDS: Final = {
@@ -32,7 +31,7 @@ class Decoded:
     """A picture that may be shown."""
 
     picture: Pixels  # BGR, (height, width, 3), the caller's own
-    captured_ms: int | None  # epoch time at the sender; None: it did not say
+    captured_ms: int | None  # epoch time at the sender; None: not in the payload
     frame: int | None  # its number; None: raw JPEG has none
     keyframe: bool
     encoding: str  # json | pbvd | pbvz | h264 | jpeg
@@ -48,7 +47,7 @@ class DecodeCounters:
     gaps: int = 0  # times that the numbering was broken
 
 
-class _Arrival(NamedTuple):
+class _Payload(NamedTuple):
     encoding: str
     keyframe: bool
     frame: int | None
@@ -57,73 +56,73 @@ class _Arrival(NamedTuple):
 
 
 class VideoDecoder:
-    """Reads one topic: json, pbvd, pbvz, h264 and raw JPEG, whatever comes.
+    """Decodes the payloads of one topic: json, pbvd, pbvz, h264 and raw JPEG, in any order.
 
-    After a lost frame, a restart of the sender or anything refused it is silent until the next key frame.
+    After a lost frame, a restart of the sender or a refused payload it returns nothing until the next key frame.
     Damage is found by the checksums of json, pbvz and h264; of pbvd and raw JPEG, which have none, by their structure.
     """
 
     def __init__(self) -> None:
         self.counters = DecodeCounters()
-        self.wants_keyframe = False  # ask the sender for one, at most once a second
-        self.problem = ""  # why the last payload was refused, for people
-        self._last: _Arrival | None = None  # without its body; None: the next difference builds on nothing
+        self.wants_keyframe = False  # request one, at most once a second
+        self.problem = ""  # why the last payload was refused, for display
+        self._last: _Payload | None = None  # without its body; None: the next difference builds on nothing
         self._reference: Pixels | None = None
         self._h264: H264Decoder | None = None
 
     def feed(self, payload: bytes) -> Decoded | None:
-        """The picture of this payload, or None: refused, or waiting for a key frame. Never raises for what came in."""
+        """The picture of this payload; None if it is refused or waits for a key frame. Never raises for a payload."""
         try:
-            arrival = _read(payload)
-            if not arrival.keyframe and not self._follows(arrival):
+            parsed = _read(payload)
+            if not parsed.keyframe and not self._follows(parsed):
                 self._wait()
                 return None
-            self._notice_gap(arrival)
-            picture = self._decode(arrival)
+            self._count_gap(parsed)
+            picture = self._decode(parsed)
         except PebbleError as error:
             self._refuse(str(error))
             self.wants_keyframe = isinstance(error, PayloadError)  # against a missing library a key frame does not help
             return None
-        self._last = arrival._replace(body=b"")
+        self._last = parsed._replace(body=b"")
         self.wants_keyframe = False
         self.counters.pictures += 1
-        return Decoded(picture, arrival.captured_ms, arrival.frame, arrival.keyframe, arrival.encoding)
+        return Decoded(picture, parsed.captured_ms, parsed.frame, parsed.keyframe, parsed.encoding)
 
-    def _follows(self, arrival: _Arrival) -> bool:
+    def _follows(self, parsed: _Payload) -> bool:
         last = self._last
-        if last is None or last.encoding != arrival.encoding or arrival.frame != _after(last):
+        if last is None or last.encoding != parsed.encoding or parsed.frame != _after(last):
             return False
-        if last.captured_ms is None or arrival.captured_ms is None:
-            return last.captured_ms == arrival.captured_ms
-        return 0 <= arrival.captured_ms - last.captured_ms <= _LONGEST_STEP_MS
+        if last.captured_ms is None or parsed.captured_ms is None:
+            return last.captured_ms == parsed.captured_ms
+        return 0 <= parsed.captured_ms - last.captured_ms <= _LONGEST_STEP_MS
 
-    def _notice_gap(self, arrival: _Arrival) -> None:
+    def _count_gap(self, parsed: _Payload) -> None:
         """A key frame needs nothing before it, yet frames before it may be lost. (Numbers that fall: a new sender.)"""
         last = self._last
-        if last is not None and last.encoding == arrival.encoding and last.frame is not None and arrival.frame:
-            self.counters.gaps += arrival.frame > last.frame + 1
+        if last is not None and last.encoding == parsed.encoding and last.frame is not None and parsed.frame:
+            self.counters.gaps += parsed.frame > last.frame + 1
 
     def _wait(self) -> None:
         self.counters.waiting += 1
         self.counters.gaps += self._last is not None
-        self._break()
+        self._reset()
 
     def _refuse(self, problem: str) -> None:
         self.counters.refused += 1
         self.problem = problem
-        self._break()
+        self._reset()
 
-    def _break(self) -> None:
+    def _reset(self) -> None:
         self._last = self._reference = None
         self.wants_keyframe = True
 
-    def _decode(self, arrival: _Arrival) -> Pixels:
-        if arrival.encoding == "h264":
-            return self._decode_h264(arrival)
-        pixels = decode_jpeg(arrival.body)
-        if arrival.encoding == "jpeg":
+    def _decode(self, parsed: _Payload) -> Pixels:
+        if parsed.encoding == "h264":
+            return self._decode_h264(parsed)
+        pixels = decode_jpeg(parsed.body)
+        if parsed.encoding == "jpeg":
             return pixels
-        if arrival.keyframe or self._reference is None:
+        if parsed.keyframe or self._reference is None:
             self._reference = pixels
         elif pixels.shape == self._reference.shape:
             add(self._reference, pixels, self._reference)
@@ -131,14 +130,14 @@ class VideoDecoder:
             raise PayloadError("a difference of another size than the picture it builds on")
         return self._reference.copy()
 
-    def _decode_h264(self, arrival: _Arrival) -> Pixels:
+    def _decode_h264(self, parsed: _Payload) -> Pixels:
         if self._h264 is None or self._last is None:
             self._h264 = H264Decoder()
-        return self._h264.decode(arrival.body, keyframe=arrival.keyframe)
+        return self._h264.decode(parsed.body, keyframe=parsed.keyframe)
 
 
 def encoding_of(payload: bytes) -> str | None:
-    """What a payload seems to be, whether it may be shown or not; None: nothing we know."""
+    """The encoding of a payload by its first bytes, valid or not; None if unknown."""
     if payload.startswith(b"{"):
         return "json"
     try:
@@ -148,34 +147,34 @@ def encoding_of(payload: bytes) -> str | None:
     return "h264" if kind == PictureKind.H264 else _KINDS[PictureKind(kind)][0] if kind in _KINDS else None
 
 
-def _after(last: _Arrival) -> int | None:
+def _after(last: _Payload) -> int | None:
     if last.frame is None:
         return None
     return last.frame + 1 if last.encoding == "json" else (last.frame + 1) % _FRAME_LIMIT
 
 
-def _read(payload: bytes) -> _Arrival:
-    """Told apart by the first bytes. PayloadError for everything else."""
+def _read(payload: bytes) -> _Payload:
+    """The encodings differ in their first bytes. Raises PayloadError for everything else."""
     if len(payload) > MAX_PAYLOAD:
         raise PayloadError(f"{len(payload)} bytes, more than {MAX_PAYLOAD}")
     if payload.startswith(PBVD):
         return _read_pbvd(Picture.unpack(payload))
     if payload.startswith(SOI):
-        return _Arrival("jpeg", True, None, None, payload)
+        return _Payload("jpeg", True, None, None, payload)
     if payload[:1] in (b"{", b" ", b"\t", b"\r", b"\n"):
         message = JsonPicture.unpack(payload)
-        return _Arrival("json", message.keyframe, message.frame, message.captured_ms, message.jpeg)
+        return _Payload("json", message.keyframe, message.frame, message.captured_ms, message.jpeg)
     raise PayloadError("none of the forms of a picture")
 
 
-def _read_pbvd(packet: Picture) -> _Arrival:
+def _read_pbvd(packet: Picture) -> _Payload:
     captured_ms = plausible(packet.captured_ms)
     if packet.kind == PictureKind.H264:
-        if not h264.installed():
-            raise PebbleError(f"h264 {h264.INSTALL}")
-        return _Arrival("h264", bool(packet.flags & KEY_FRAME), packet.frame, captured_ms, packet.body)
+        if not pyav.installed():
+            raise PebbleError(f"h264 {pyav.INSTALL}")
+        return _Payload("h264", bool(packet.flags & KEY_FRAME), packet.frame, captured_ms, packet.body)
     if packet.kind not in _KINDS:
         raise PayloadError(f"PBVD: kind {packet.kind} is unknown")
     encoding, keyframe = _KINDS[PictureKind(packet.kind)]
     body = inflate(packet.body, MAX_BYTES) if encoding == "pbvz" else packet.body
-    return _Arrival(encoding, keyframe, packet.frame, captured_ms, body)
+    return _Payload(encoding, keyframe, packet.frame, captured_ms, body)

@@ -1,4 +1,4 @@
-"""H.264 through PyAV: one access unit per picture, and no picture ever waits for a later one.
+"""H.264 through PyAV: one access unit per picture, without delay: no picture waits for a later one.
 
 Annex B with parameter sets in every key frame, so a receiver can begin at any of them (ITU-T H.264, annex B, 7.4.1.2).
 The last NAL unit is a seal: type 31, which the standard leaves to applications and decoders skip, with the CRC-32 of
@@ -11,45 +11,26 @@ import math
 import re
 import zlib
 from fractions import Fraction
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import cv2
 
 from pebble.errors import PayloadError, PebbleError
+from pebble.media import pyav
 from pebble.media.jpeg import MAX_BYTES, MAX_EDGE, Pixels
 
 if TYPE_CHECKING:
     import av
 
-INSTALL: Final = "needs PyAV: pip install 'pebble-robot[media]'"
 SMALLEST_EDGE: Final = 16  # one macroblock
 
 _IDR, _SPS, _PPS = 5, 7, 8
 _nal_types = re.compile(rb"\x00\x00\x01(.)", re.DOTALL).findall
 _SEAL: Final = b"\x00\x00\x00\x01\x1f"
 _SEAL_BYTES: Final = len(_SEAL) + 5
-_VBV_SECONDS: Final = 0.5  # how much of the bitrate a single picture may take at once
+_VBV_SECONDS: Final = 0.5  # of the bitrate that a single picture may take
 _LOWEST_BITRATE: Final = 10_000
 _WORST_CRF: Final = 51.0
-
-
-def installed() -> bool:
-    """Is PyAV there? Does not import it: that costs some 20 MB and 100 ms."""
-    try:
-        return find_spec("av") is not None
-    except ValueError:  # somebody said "not this one": sys.modules["av"] is None
-        return False
-
-
-def _av() -> Any:
-    try:
-        import av
-        import av.error
-        import av.video.frame
-    except ImportError as error:
-        raise PebbleError(f"h264 {INSTALL} ({error})") from None
-    return av
 
 
 def quality_to_crf(quality: float) -> float:
@@ -71,9 +52,9 @@ class H264Encoder:
         self.quality = quality
         self.bitrate = bitrate
         self.interval = interval
-        self.keyframe = False  # was the last one?
+        self.keyframe = False  # was the last one a key frame?
         self._rate = Fraction(fps).limit_denominator(1000)
-        self._av = _av()
+        self._av = pyav.load("h264")
         try:
             self._av.codec.Codec("libx264", "w")
         except ValueError:  # UnknownCodecError
@@ -107,11 +88,11 @@ class H264Encoder:
 
     def _ready(self, width: int, height: int) -> av.VideoCodecContext:
         control = self.quality if self.bitrate is None else None
-        wanted = (width, height, control, self.interval)
+        settings = (width, height, control, self.interval)
         bitrate = max(_LOWEST_BITRATE, self.bitrate or 0)
-        if self._context is None or self._opened_for != wanted or bitrate > self._most_bitrate:
+        if self._context is None or self._opened_for != settings or bitrate > self._most_bitrate:
             self._context = self._open(width, height, bitrate)
-            self._opened_for = wanted
+            self._opened_for = settings
             self._most_bitrate = bitrate
         elif self.bitrate is not None:
             self._context.bit_rate = bitrate  # x264 takes it over with the next picture
@@ -142,18 +123,18 @@ class H264Encoder:
 
 
 class H264Decoder:
-    """Access units to BGR pictures, as strict as FFmpeg can be: a picture it had to mend is refused."""
+    """Access units to BGR pictures, as strict as FFmpeg can be: a picture it had to repair is refused."""
 
     def __init__(self) -> None:
-        self._av = _av()
+        self._av = pyav.load("h264")
         self._context: av.VideoCodecContext | None = None
 
     def decode(self, unit: bytes, *, keyframe: bool) -> Pixels:
-        """Raises PayloadError for what is cut, damaged or too large; then begin again with a key frame."""
+        """Raises PayloadError for what is cut, damaged or too large; the next unit has to be a key frame then."""
         try:
             return self._picture(self._frame(unit, keyframe))
         except PayloadError:
-            self._context = None  # what it remembers is no longer what the sender has
+            self._context = None  # its reference pictures are no longer the sender's
             raise
         except (self._av.error.FFmpegError, ValueError, MemoryError) as error:
             self._context = None
@@ -209,7 +190,7 @@ def unseal(sealed: bytes) -> bytes:
 
 
 def check_unit(unit: bytes, keyframe: bool) -> None:
-    """PayloadError unless this is Annex B, and a key frame exactly if it is said to be one."""
+    """Raise PayloadError unless this is Annex B, and a key frame exactly if ``keyframe``."""
     if len(unit) > MAX_BYTES:
         raise PayloadError(f"h264: {len(unit)} bytes, more than {MAX_BYTES}")
     if not unit.startswith((b"\x00\x00\x00\x01", b"\x00\x00\x01")):
@@ -218,4 +199,4 @@ def check_unit(unit: bytes, keyframe: bool) -> None:
     if keyframe and not types >= {_IDR, _SPS, _PPS}:
         raise PayloadError("h264: a key frame without its parameter sets or its picture")
     if not keyframe and types & {_IDR, _SPS}:
-        raise PayloadError("h264: a key frame that does not say so")
+        raise PayloadError("h264: a key frame that is not marked as one")

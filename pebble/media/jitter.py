@@ -1,4 +1,4 @@
-"""Packets as the network brings them, sound as an ear wants it: in order, evenly, without holes. Pure: clocks come in.
+"""A jitter buffer: packets as the network delivers them to sound in order, evenly, without gaps. Pure: times come in.
 
 Times are seconds on the caller's monotonic clock. One thread at a time may call a buffer.
 """
@@ -10,19 +10,19 @@ from typing import Final
 
 import numpy as np
 
+from pebble.contract.packets import SEQUENCE_LIMIT, Sound
 from pebble.errors import PayloadError
 from pebble.media.pcm import Samples, to_bytes, to_int16
-from pebble.media.sound import Heard, SoundDecoder, unpack
-from pebble.packets import SEQUENCE_LIMIT, Sound
+from pebble.media.sound import ReceivedSound, SoundDecoder, unpack
 from pebble.transports.counters import Counters
 
-_NUMBERS: Final = SEQUENCE_LIMIT - 1  # 1 to 0xFFFFFFFF: 0 is nobody's number
-_BEHIND_LIMIT: Final = 5  # packets in a row that seem old: the sender began anew, and its clock went back
-_GAP_LIMIT: Final = 1000  # missing packets that are believed to have been sent
+_NUMBERS: Final = SEQUENCE_LIMIT - 1  # 1 to 0xFFFFFFFF: 0 is not used
+_BEHIND_LIMIT: Final = 5  # packets in a row that seem old: the sender restarted, and its clock went back
+_GAP_LIMIT: Final = 1000  # of missing packets that count as lost
 _BYTES_LIMIT: Final = 4_000_000  # that wait, whatever the number of packets
-_PIECE_S: Final = 0.02  # what is made up at a time, so that a late packet is soon heard
-_FADE_S: Final = 0.005  # back from what was made up, and over what was left out
-_BEHINDHAND_S: Final = 0.2  # whoever takes so late is not hurried to make up for it
+_PIECE_S: Final = 0.02  # what is concealed at a time, so that a late packet is soon played
+_FADE_S: Final = 0.005  # back from concealed sound, and over what was left out
+_DELAY_LIMIT_S: Final = 0.2  # a caller that takes this late does not have to catch up
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +51,10 @@ def ahead(sequence: int, of: int) -> int:
 
 
 class Depth:
-    """How much sound should wait: enough for the network's jitter, and no more.
+    """The target of how much sound waits: enough for the network's jitter, and no more.
 
-    A packet that comes late raises the target by what it was late; quiet times lower it again. What has been too much
-    through a whole window was never needed: the sender's clock runs ahead of the player's, or a stall has ended.
+    A late packet raises the target by its lateness; calm times lower it again. What has been too much through a whole
+    window was not needed: the sender's clock is faster than the player's, or a stall has ended.
     """
 
     WINDOW_S = 1.0
@@ -75,7 +75,7 @@ class Depth:
         self._calm_since = now
 
     def excess(self, waiting_s: float, now: float) -> float:
-        """Seconds of sound to leave out now, while ``waiting_s`` wait. Mostly 0."""
+        """Seconds of sound to leave out now, while ``waiting_s`` wait. Usually 0."""
         self._lowest = min(self._lowest, waiting_s)
         if now - self._calm_since >= self._CALM_S:
             self.target_s, self._calm_since = max(self._least_s, self.target_s - self._STEP_S), now
@@ -89,8 +89,9 @@ class Depth:
 class JitterBuffer:
     """:meth:`put` what arrives, :meth:`take` what is to be played and write it to the player at once.
 
-    At most ``limit`` packets wait; the oldest gives way. A gap is filled with at most ``concealment_ms`` of what might
-    have been, fading away; then the next packet that did come is played, or nothing if the sender simply stopped.
+    At most ``limit`` packets wait; the oldest is dropped for the newest. A gap is filled with at most
+    ``concealment_ms`` of estimated sound, which fades; then the next received packet is played, or nothing if the
+    sender has stopped.
 
     ``counters``: packets (played), refused, duplicates, late, lost, overflow, skipped (left out to keep up), underruns,
     jumps, restarts (of the sender), concealed_ms.
@@ -108,9 +109,9 @@ class JitterBuffer:
         self._behind = 0  # packets in a row that seemed old
         self._playing = False
         self._due = 0.0  # of the next chunk
-        self._last: Heard | None = None
-        self._concealed = 0  # samples made up since
-        self._spare: Samples | None = None  # made up by the codec and not played yet
+        self._last: ReceivedSound | None = None
+        self._concealed = 0  # samples concealed since
+        self._spare: Samples | None = None  # concealed by the codec and not played yet
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -123,7 +124,7 @@ class JitterBuffer:
     # -- in
 
     def put(self, payload: bytes, now: float) -> None:
-        """One MQTT payload, whatever it is."""
+        """Add one MQTT payload."""
         try:
             sound = unpack(payload)
         except PayloadError:
@@ -143,7 +144,7 @@ class JitterBuffer:
         self._make_room()
 
     def _is_old(self, number: int, captured_ms: int) -> bool:
-        """Of a number that has been played or given up; unless it was captured later: then its sender began anew."""
+        """Has this number been played or given up? If it was captured later, the sender has restarted instead."""
         if self._expected is None or ahead(number, self._expected) >= 0:
             self._behind = 0
             return False
@@ -163,10 +164,10 @@ class JitterBuffer:
             del self._waiting[self._first()]
             self.counters.add("overflow")
             if self._expected is not None:
-                self._expected = self._first()  # left out on purpose: no gap
+                self._expected = self._first()  # left out on purpose: not a gap
 
     def _first(self) -> int:
-        """The number that comes first of those that wait."""
+        """The first of the waiting numbers."""
         base = next(iter(self._waiting)) if self._expected is None else self._expected
         return min(self._waiting, key=lambda number: ahead(number, base))
 
@@ -184,7 +185,7 @@ class JitterBuffer:
             return None
         if now < self._due:
             return None
-        if now - self._due > _BEHINDHAND_S:
+        if now - self._due > _DELAY_LIMIT_S:
             self._due = now
         chunk = self._next(now)
         if chunk is None:
@@ -199,7 +200,7 @@ class JitterBuffer:
         if not self._waiting or now < self._due:
             return False
         self._playing, self._due = True, now
-        self._last, self._concealed, self._spare = None, 0, None  # the silence before was no gap
+        self._last, self._concealed, self._spare = None, 0, None  # the silence before was not a gap
         self._depth.begin(now)
         return True
 
@@ -211,9 +212,9 @@ class JitterBuffer:
         number = self._first()
         missing = 0 if self._expected is None else max(0, ahead(number, self._expected))
         if missing and self._last is not None:
-            made_up = self._conceal(missing * len(self._last.samples) / self._last.rate)
-            if made_up is not None:
-                return made_up
+            concealed = self._conceal(missing * len(self._last.samples) / self._last.rate)
+            if concealed is not None:
+                return concealed
         if missing > _GAP_LIMIT:
             self.counters.add("jumps")
         elif missing:
@@ -223,42 +224,42 @@ class JitterBuffer:
         return self._play(number, now)
 
     def _play(self, number: int, now: float) -> Chunk | None:
-        heard = self._decode(number)
+        received = self._decode(number)
         excess = self._depth.excess(self.waiting_s, now)
-        if heard is not None and excess > len(heard.samples) / heard.rate:
-            heard = self._leave_out(heard, excess)
-        if heard is None:
+        if received is not None and excess > len(received.samples) / received.rate:
+            received = self._leave_out(received, excess)
+        if received is None:
             return self._conceal(self._budget_s)
-        samples = heard.samples
-        if self._concealed and self._last is not None and heard.encoding == "pcm":
-            samples = _faded_in(samples, heard.rate)
-        self._last, self._concealed, self._spare = heard, 0, None
-        self.encoding = heard.encoding
-        return Chunk(samples, heard.rate, heard.channels)
+        samples = received.samples
+        if self._concealed and self._last is not None and received.encoding == "pcm":
+            samples = _faded_in(samples, received.rate)
+        self._last, self._concealed, self._spare = received, 0, None
+        self.encoding = received.encoding
+        return Chunk(samples, received.rate, received.channels)
 
-    def _decode(self, number: int) -> Heard | None:
-        """None for what turns out to be damaged."""
+    def _decode(self, number: int) -> ReceivedSound | None:
+        """None if it is damaged."""
         sound = self._waiting.pop(number)
         self._expected = number % _NUMBERS + 1
         try:
-            heard = self._decoder.decode(sound)
+            received = self._decoder.decode(sound)
         except PayloadError:
             self.counters.add("refused")
             return None
         self.counters.add("packets")
-        return heard if len(heard.samples) else None
+        return received if len(received.samples) else None
 
-    def _leave_out(self, heard: Heard, excess: float) -> Heard:
-        """The packet that is played after ``excess`` seconds were left out, its beginning faded over from ``heard``."""
-        newest, left = heard, excess
+    def _leave_out(self, received: ReceivedSound, excess: float) -> ReceivedSound:
+        """The packet to play after leaving out ``excess`` seconds, its beginning faded over from ``received``."""
+        newest, left = received, excess
         while self._waiting and left > len(newest.samples) / newest.rate:
             left -= len(newest.samples) / newest.rate
             newest = self._decode(self._first()) or newest
             self.counters.add("skipped")
-        return _faded_over(heard, newest)
+        return _faded_over(received, newest)
 
     def _conceal(self, gap_s: float) -> Chunk | None:
-        """A piece of what might have been, as long as the gap and what is allowed for one are not used up."""
+        """A piece of estimated sound, until the gap is filled or ``concealment_ms`` are used up."""
         last = self._last
         if last is None:
             return None
@@ -266,19 +267,19 @@ class JitterBuffer:
         size = min(round(min(gap_s, self._budget_s) * last.rate) - self._concealed, round(_PIECE_S * last.rate))
         if size <= 0:
             return None
-        made = self._made_up(last, size)
-        gain = 1.0 - (self._concealed + np.arange(len(made))) / allowed
-        self._concealed += len(made)
-        self.counters.add("concealed_ms", round(1000 * len(made) / last.rate))
-        return Chunk(to_int16(made * gain[:, None]), last.rate, last.channels, concealed=True)
+        estimate = self._estimated(last, size)
+        gain = 1.0 - (self._concealed + np.arange(len(estimate))) / allowed
+        self._concealed += len(estimate)
+        self.counters.add("concealed_ms", round(1000 * len(estimate) / last.rate))
+        return Chunk(to_int16(estimate * gain[:, None]), last.rate, last.channels, concealed=True)
 
-    def _made_up(self, last: Heard, size: int) -> Samples:
-        """By the codec if it can, else the last packet backwards, forwards, backwards: no step at its ends."""
+    def _estimated(self, last: ReceivedSound, size: int) -> Samples:
+        """By the codec, or the last packet backwards and forwards in turn, which makes no step at its ends."""
         if self._spare is None or not len(self._spare):
             self._spare = self._decoder.conceal()
         if self._spare is not None:
-            made, self._spare = self._spare[:size], self._spare[size:]
-            return made
+            estimate, self._spare = self._spare[:size], self._spare[size:]
+            return estimate
         length = len(last.samples)
         way = (self._concealed + np.arange(size)) % (2 * length)
         return last.samples[np.where(way < length, length - 1 - way, way - length)]
@@ -291,7 +292,7 @@ def _faded_in(samples: Samples, rate: int) -> Samples:
     return faded
 
 
-def _faded_over(old: Heard, new: Heard) -> Heard:
+def _faded_over(old: ReceivedSound, new: ReceivedSound) -> ReceivedSound:
     """``new``, beginning as ``old`` does."""
     size = min(len(old.samples), len(new.samples), round(_FADE_S * new.rate))
     if (old.rate, old.channels) != (new.rate, new.channels) or old is new:
@@ -299,4 +300,4 @@ def _faded_over(old: Heard, new: Heard) -> Heard:
     weight = np.linspace(0.0, 1.0, size)[:, None]
     samples = new.samples.copy()
     samples[:size] = to_int16(old.samples[:size] * (1 - weight) + new.samples[:size] * weight)
-    return Heard(samples, new.rate, new.channels, new.captured_ms, new.sequence, new.encoding)
+    return ReceivedSound(samples, new.rate, new.channels, new.captured_ms, new.sequence, new.encoding)

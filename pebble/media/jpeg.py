@@ -1,4 +1,4 @@
-"""JPEG from outside: looked through before it is decoded, so that half a picture is never shown as a whole one."""
+"""Checks a JPEG before it is decoded, so that half a picture is never shown as a whole one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pebble.errors import PayloadError
 
-#: What no camera of a robot needs more of: bytes of one picture, and pixels along an edge.
+#: More than any camera of a robot needs: bytes of one picture, and pixels along an edge.
 MAX_BYTES: Final = 8 << 20
 MAX_EDGE: Final = 4096
 
@@ -29,12 +29,12 @@ Pixels: TypeAlias = NDArray[np.uint8]
 
 
 def decode_jpeg(jpeg: bytes) -> Pixels:
-    """BGR, shape (height, width, 3), the caller's own. PayloadError for everything that is not a whole picture.
+    """BGR, shape (height, width, 3), the caller's own. Raises PayloadError unless it is a whole picture.
 
-    What cannot be seen: bits flipped within the coefficients. JPEG has no checksum; TCP and zlib have.
+    Bits flipped within the coefficients go undetected: JPEG has no checksum; TCP and zlib have.
     """
     width, height = jpeg_size(jpeg)
-    # The picture as it was sent: a turn asked for by EXIF would not fit the differences that follow.
+    # The picture as it was sent: turned as EXIF says, it would not fit the differences that follow.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), flags)
@@ -49,17 +49,17 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
     """Width and height of a complete JPEG; PayloadError if it is too large, no JPEG, or has no proper end.
 
     libjpeg fills what is missing with grey and calls it a picture. An end marker cannot occur within a scan (FF is
-    stuffed there), so walking over the segments to the end marker tells a whole picture from a part of one.
+    stuffed there), so walking over the segments to the end marker distinguishes a whole picture from a part of one.
     """
     if len(jpeg) > MAX_BYTES:
         raise PayloadError(f"JPEG: {len(jpeg)} bytes, more than {MAX_BYTES}")
     if not jpeg.startswith(SOI):
-        raise PayloadError("JPEG: does not begin like one")
-    return _Walk(jpeg).size()
+        raise PayloadError("JPEG: no start marker")
+    return _Segments(jpeg).size()
 
 
-class _Walk:
-    """From one marker to the next."""
+class _Segments:
+    """Walks from one marker to the next."""
 
     def __init__(self, jpeg: bytes) -> None:
         self._jpeg = jpeg
@@ -79,7 +79,7 @@ class _Walk:
             if marker in _SIZES:
                 self._start_of_frame(marker, body)
             elif 0xC0 <= marker <= 0xCF and marker not in (_DHT, _JPG, _DAC):
-                raise PayloadError("JPEG: of a kind that nobody sends")
+                raise PayloadError("JPEG: of an unsupported kind")
             elif marker == _SOS:
                 self._scan()
         raise PayloadError("JPEG: too many segments")

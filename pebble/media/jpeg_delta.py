@@ -1,4 +1,4 @@
-"""A film as JPEGs: full pictures, and between them differences from what the receiver really has (paper 8.8)."""
+"""Video as JPEGs: full pictures, and between them differences from what the receiver has decoded (paper 8.8)."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def add(reference: Pixels, difference: Pixels, out: Pixels | None = None) -> Pix
 
 
 class JpegDelta:
-    """Codes pictures one after the other.
+    """Encodes pictures one after the other.
 
-    It decodes its own JPEGs, so a difference also mends the errors of the one before. (Differences from the camera's
-    previous picture, as the paper's first encoder made them, pile the errors up until the next full picture.)
+    It decodes its own JPEGs, so a difference also corrects the errors of the one before. (Differences from the camera's
+    previous picture, as the paper's first encoder made them, add the errors up until the next full picture.)
     ``quality`` (1..100) and ``interval`` (pictures from one full picture to the next) may change at any time.
     ``optimize``: Huffman tables made for each picture; at low quality a quarter smaller, for 0.4 ms more at 640x480.
     """
@@ -50,17 +50,17 @@ class JpegDelta:
         if keyframe or reference is None or reference.shape != picture.shape:
             self._since_keyframe = 0
             jpeg = self._jpeg(picture)
-            if self._needed():
+            if self._is_reference():
                 self._reference = decode_jpeg(jpeg)
             return CodedPicture(jpeg, True)
         self._since_keyframe += 1
         self._difference = subtract(picture, reference, self._fitting(self._difference, picture))
         jpeg = self._jpeg(self._difference)
-        if self._needed():
+        if self._is_reference():
             add(reference, decode_jpeg(jpeg), reference)
         return CodedPicture(jpeg, False)
 
-    def _needed(self) -> bool:
+    def _is_reference(self) -> bool:
         """Will anything build on this picture? Not if the next one is full."""
         self._chained = self._since_keyframe + 1 < self.interval
         return self._chained

@@ -9,10 +9,9 @@ from typing import Annotated, Final
 import msgspec
 
 from pebble.errors import PayloadError
-from pebble.media.inflate import inflate
 from pebble.media.jpeg import MAX_BYTES
 
-_MILLISECONDS_FROM: Final = 1e11  # a stamp as large as this is in milliseconds already
+_MILLISECONDS_FROM: Final = 1e11  # a timestamp as large as this is in milliseconds
 _LATEST_MS: Final = 253_402_300_800_000  # the year 10000
 _MAX_TEXT: Final = MAX_BYTES * 4 // 3 + 1024
 
@@ -30,7 +29,7 @@ _decoder = msgspec.json.Decoder(_Message)
 
 @dataclass(frozen=True, slots=True)
 class JsonPicture:
-    """One message. ``jpeg``: a full picture, or a difference plus 128. ``captured_ms``: epoch, None if unusable."""
+    """One message. ``jpeg``: a full picture, or a difference plus 128. ``captured_ms``: epoch, None if implausible."""
 
     frame: int
     keyframe: bool
@@ -53,6 +52,27 @@ class JsonPicture:
             raise PayloadError(f"JSON picture: {error}") from None
         jpeg = inflate(message.data, MAX_BYTES)
         return cls(message.id, message.keyframe, _milliseconds(message.timestamp), jpeg)
+
+
+def inflate(packed: bytes, limit: int) -> bytes:
+    """Unpack the one complete zlib stream in ``packed``. Raises PayloadError for anything else.
+
+    The limit matters because a few kilobytes may unpack to gigabytes. zlib ends with a checksum of the content.
+    """
+    unpacker = zlib.decompressobj()
+    try:
+        plain = unpacker.decompress(packed, limit)
+        if not unpacker.eof:  # zlib may have the last byte out, and its checksum still to come
+            plain += unpacker.decompress(unpacker.unconsumed_tail, 1)
+    except zlib.error as error:
+        raise PayloadError(f"zlib: {error}") from None
+    if len(plain) > limit:
+        raise PayloadError(f"zlib: unpacks to more than {limit} bytes")
+    if not unpacker.eof:
+        raise PayloadError("zlib: cut short")
+    if unpacker.unused_data:
+        raise PayloadError("zlib: something follows the stream")
+    return plain
 
 
 def _milliseconds(stamp: float | None) -> int | None:

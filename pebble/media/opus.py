@@ -2,7 +2,7 @@
 
 The body is one or more Opus packets, each behind its length in bytes as u16, big-endian as the header is. All of them
 belong together in time; ``samples`` of the header counts what all of them decode to, at the header's rate, which is one
-of RATES. Three short packets instead of one long one: each stands for itself when a decoder conceals.
+of RATES. Three short packets instead of one long one, because a decoder conceals each by itself.
 
 Facts: RFC 6716 (3.1: the first byte tells a packet's length in time; a frame of no more than its first byte asks the
 decoder to conceal one). FFmpeg's decoder always yields 48 kHz and offers no other way to conceal; what in-band FEC adds
@@ -11,8 +11,6 @@ to the next packet only decoders with an own libopus make use of.
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import struct
 from collections.abc import Iterator
 from typing import Any, Final
@@ -20,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from pebble.errors import PayloadError, PebbleError
+from pebble.media import pyav
 from pebble.media.pcm import Resampler, Samples
 
 RATES: Final = (8000, 12000, 16000, 24000, 48000)
@@ -28,18 +27,6 @@ BUNDLE_LIMIT: Final = 3  # Opus packets in one of ours
 _DECODED_RATE = 48_000
 _EXPECTED_LOSS = 10  # per cent; how much of the bitrate FEC may have
 _LENGTH = struct.Struct(">H")
-
-
-def available() -> bool:
-    """Is PyAV installed? It is imported only where it is used: it is large."""
-    return importlib.util.find_spec("av") is not None
-
-
-def _av() -> Any:
-    try:
-        return importlib.import_module("av")
-    except ImportError:
-        raise PebbleError("Opus needs PyAV, which is not installed: pip install 'pebble-robot[media]'") from None
 
 
 def _layout(channels: int) -> str:
@@ -71,7 +58,7 @@ def _pieces(body: bytes) -> Iterator[bytes]:
 
 
 def milliseconds(packet: bytes) -> float:
-    """How long an Opus packet sounds, by its first byte or two (RFC 6716, 3.1 and 3.2)."""
+    """The duration of an Opus packet, by its first byte or two (RFC 6716, 3.1 and 3.2)."""
     mode, code = packet[0] >> 3, packet[0] & 3
     if mode < 12:  # SILK
         frame_ms: float = (10, 20, 40, 60)[mode % 4]
@@ -94,7 +81,7 @@ class OpusEncoder:
     """Frames of ``frame_ms`` (one of FRAMES_MS) at one of RATES, mono or stereo, to one Opus packet each."""
 
     def __init__(self, rate: int, channels: int, *, frame_ms: int, bitrate: int) -> None:
-        self._av = _av()
+        self._av = pyav.load("opus")
         self.samples = rate * frame_ms // 1000
         self._rate, self._layout = rate, _layout(channels)
         codec = _codec(self._av, "w")
@@ -120,7 +107,7 @@ class OpusDecoder:
     """Opus packets to samples at ``rate`` (one of RATES), mono or stereo whatever they were made of."""
 
     def __init__(self, rate: int, channels: int) -> None:
-        self._av = _av()
+        self._av = pyav.load("opus")
         self._codec = _codec(self._av, "r")
         self._codec.sample_rate, self._codec.layout = _DECODED_RATE, _layout(channels)
         self._channels = channels
@@ -134,7 +121,7 @@ class OpusDecoder:
         return samples
 
     def conceal(self) -> Samples:
-        """What one more frame might have been; fades by itself when called again and again. Empty at the beginning."""
+        """An estimate of one more frame, which fades when called again and again. Empty before the first packet."""
         if self._mode is None:
             return np.zeros((0, self._channels), np.int16)
         return self._decode(self._mode)

@@ -27,7 +27,7 @@ def to_bytes(samples: Samples) -> bytes:
 
 
 def remix(samples: Samples, channels: int) -> Samples:
-    """Another number of channels: the mean of all of them on each, because ears expect no more of a robot."""
+    """Another number of channels: the mean of all of them on each, which is enough for a robot."""
     if samples.shape[1] == channels:
         return samples
     mean = samples.mean(axis=1, dtype=np.float32)
@@ -46,9 +46,9 @@ class Resampler:
     Chunks that hold a whole number of output samples yield exactly that many.
     """
 
-    def __init__(self, rate: int, wanted: int, channels: int) -> None:
-        common = gcd(rate, wanted)
-        self._up, self._down = wanted // common, rate // common
+    def __init__(self, rate: int, rate_out: int, channels: int) -> None:
+        common = gcd(rate, rate_out)
+        self._up, self._down = rate_out // common, rate // common
         widened = max(1.0, self._down / self._up)
         self._taps = 2 * ceil(_CROSSINGS * widened)
         self._filter = _filter(min(self._up, _PHASES), self._taps, _PASS / widened)

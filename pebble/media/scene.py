@@ -1,4 +1,4 @@
-"""A moving scene drawn from nothing but the number of the frame: for robots without a camera, tests and measurements.
+"""A moving scene computed from the frame's number alone: for robots without a camera, tests and measurements.
 
 The counter in it can be read back from what is left of a picture after lossy encoding and resizing.
 """
@@ -11,9 +11,9 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.media.noise import noise
-
 Picture: TypeAlias = NDArray[np.uint8]
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)  # of noise()
 
 COUNTER_LIMIT: Final = 1 << 24  # the counter starts again at 0: after 13 days at 15 frames per second
 TAG_ID: Final = 7
@@ -28,14 +28,25 @@ _BAND = 10  # the counter takes the lowest tenth of the picture
 _DARK, _LIGHT = 72, 184
 _MIDDLE = (_DARK + _LIGHT) / 2
 _MARGIN = 20  # a cell nearer than this to the middle is neither dark nor light: the picture is damaged
-_WITHIN = (0.3, 0.4, 0.5, 0.6, 0.7)  # where a reader looks, as shares of a cell
-_SMALLEST_BAND = 2 * _ROWS  # pixels; below, and below 2 pixels per column, nobody can read it
+_WITHIN = (0.3, 0.4, 0.5, 0.6, 0.7)  # where a reader samples, as shares of a cell
+_SMALLEST_BAND = 2 * _ROWS  # pixels; with less, or below 2 pixels per column, it cannot be read
 
 _TURN = 320  # frames until the background has passed once
 _LAP = 450  # frames of one round of the tag
-_BOUNCE_X, _BOUNCE_Y = 211, 89  # frames of one swing of the ball: it takes long until it comes by the same way again
+_BOUNCE_X, _BOUNCE_Y = 211, 89  # frames of one swing of the ball: its path repeats only after 18,779 frames
 _STRIPE = 16  # rows of the background that are made at a time
 _BALL_BGR = np.array((60, 90, 220), np.uint8)
+
+
+def noise(seed: int, count: int) -> NDArray[np.float32]:
+    """``count`` pseudo-random numbers, 0 to 1, the same on every machine; ``seed``: 32 bits.
+
+    Splitmix64 (Steele, Lea, Flood 2014), which needs no import of numpy.random.
+    """
+    state = (np.arange(1, count + 1, dtype=np.uint64) + np.uint64(seed << 32)) * _STEP
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return ((state ^ (state >> np.uint64(31))) >> np.uint64(40)).astype(np.float32) / np.float32(1 << 24)
 
 
 class Scene:
@@ -96,7 +107,7 @@ class Scene:
 def read_counter(picture: Picture) -> int | None:
     """The number of the frame, out of a picture of any size, in colour (h, w, 3) or grey (h, w).
 
-    None where there is no counter, or a damaged one: of those, one in 65,536 is told as a wrong number.
+    None where there is no counter, or a damaged one: one in 65,536 of those is read as a wrong number.
     """
     height, width = picture.shape[:2]
     band = height // _BAND
@@ -121,7 +132,7 @@ def _value(bits: NDArray[np.bool_]) -> int | None:
 
 
 def _samples(length: int, cells: int) -> NDArray[np.intp]:
-    """Where to look for ``cells`` cells on ``length`` pixels: some places within each, away from its edges."""
+    """Where to sample ``cells`` cells on ``length`` pixels: some places within each, away from its edges."""
     return (np.add.outer(np.arange(cells), _WITHIN) * length / cells).astype(np.intp).ravel()
 
 

@@ -1,4 +1,4 @@
-"""Sound to PBAT packets and back. What travels in which order, and when it is played, is not known here."""
+"""Sound to PBAT packets and back. Order and timing of playback are the jitter buffer's."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from pebble.contract.encodings import ALL_SOUND
+from pebble.contract.packets import SEQUENCE_LIMIT, Codec, Sound
 from pebble.errors import PayloadError, PebbleError
-from pebble.media import opus
+from pebble.media import opus, pyav
 from pebble.media.opus import OpusDecoder, OpusEncoder
 from pebble.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
-from pebble.packets import SEQUENCE_LIMIT, Codec, Sound
 from pebble.transports.counters import Counters
 
 #: Those this installation can make.
-SOUND_ENCODINGS: Final[tuple[str, ...]] = ("pcm", "opus") if opus.available() else ("pcm",)
+SOUND_ENCODINGS: Final = pyav.available(ALL_SOUND)
 
 CHANNELS_LIMIT: Final = 8
-LOWEST_RATE: Final = 4000  # Hz; nobody means less, and a player would fail
+LOWEST_RATE: Final = 4000  # Hz; a player would fail with less
 _HIGHEST_PCM_RATE = 65_535  # what the header can express
 _LONGEST_S = 1.0  # of one packet: the most the original can be configured to send
-_SEAM_MS = 60  # a capture time further than this from where the last chunk ended: something is missing between them
+_GAP_MS = 60  # a capture time further than this from where the last chunk ended: sound is missing between them
 
 
 class SoundEncoder(Protocol):
-    """Any amount of s16le in, whole packets out; what is left over waits for more."""
+    """Takes any amount of s16le and returns whole packets; the rest waits for more samples."""
 
     @property
     def name(self) -> str: ...
@@ -40,7 +41,7 @@ class SoundEncoder(Protocol):
 
     @property
     def part_way(self) -> bool:
-        """Is sound already encoded that a packet still to come will hold?"""
+        """Does an unfinished packet already hold encoded sound?"""
 
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
         """No, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
@@ -64,9 +65,9 @@ def make_sound_encoder(
     sent_channels: int | None = None,
     numbers: Iterator[int] | None = None,
 ) -> SoundEncoder:
-    """``rate`` and ``channels`` are those of what is fed; ``sent_…`` those wanted on the wire, where it can have them.
+    """``rate`` and ``channels`` are those of the input; ``sent_…`` those on the wire, as far as the encoding has them.
 
-    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share one of ours.
+    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet.
     Raises PebbleError for an unknown name and for one this installation cannot make.
     """
     numbers = sequence_numbers() if numbers is None else numbers
@@ -83,7 +84,7 @@ def make_sound_encoder(
 
 
 class _Intake:
-    """Sound on its way into packets: at the rate and with the channels of the wire, cut into equal frames."""
+    """Converts sound to the rate and channels on the wire and cuts it into equal frames."""
 
     def __init__(self, rate: int, channels: int, rate_out: int, channels_out: int) -> None:
         self.rate, self.channels = rate_out, channels_out
@@ -92,9 +93,9 @@ class _Intake:
         self._left = np.zeros((0, channels_out), np.int16)
         self._next_ms: float | None = None  # when the first sample of the next chunk should have been captured
 
-    def has_seam(self, captured_ms: int) -> bool:
-        """Is something missing before what begins at ``captured_ms``? Then what was left over is of no more use."""
-        if self._next_ms is None or abs(captured_ms - self._next_ms) <= _SEAM_MS:
+    def has_gap(self, captured_ms: int) -> bool:
+        """Is sound missing before ``captured_ms``? Then the samples left over are dropped."""
+        if self._next_ms is None or abs(captured_ms - self._next_ms) <= _GAP_MS:
             return False
         self._left = self._left[:0]
         return True
@@ -123,7 +124,7 @@ class _PcmEncoder:
         self._size = min(max(1, self.rate * chunk_ms // 1000), _HIGHEST_PCM_RATE)
 
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
-        self._intake.has_seam(captured_ms)
+        self._intake.has_gap(captured_ms)
         return [self._packet(frame, first_ms) for frame, first_ms in self._intake.frames(pcm, captured_ms, self._size)]
 
     def _packet(self, frame: Samples, first_ms: int) -> bytes:
@@ -149,7 +150,7 @@ class _OpusPackets:
 
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
         packets = []
-        if self._intake.has_seam(captured_ms):
+        if self._intake.has_gap(captured_ms):
             self._ready = []
         for frame, first_ms in self._intake.frames(pcm, captured_ms, self._encoder.samples):
             if not self._ready:
@@ -167,7 +168,7 @@ class _OpusPackets:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class ReceivedSound:
     """A packet that was decoded: samples are (samples, channels)."""
 
     samples: Samples
@@ -187,16 +188,16 @@ def unpack(payload: bytes) -> Sound:
     """The packet in ``payload``, if it may be played. Raises PayloadError for anything else."""
     sound = Sound.unpack(payload)
     if sound.channels > CHANNELS_LIMIT or sound.rate < LOWEST_RATE:
-        raise PayloadError(f"PBAT: {sound.channels} channels at {sound.rate} Hz are not to be played")
+        raise PayloadError(f"PBAT: {sound.channels} channels at {sound.rate} Hz cannot be played")
     if sound.samples > _LONGEST_S * sound.rate:
         raise PayloadError(f"PBAT: one packet of {sound.samples / sound.rate:.1f} s")
     if sound.codec == Codec.PCM16LE:
         if len(sound.body) < 2 * sound.samples * sound.channels:
-            raise PayloadError("PBAT: fewer samples than its header says")
+            raise PayloadError("PBAT: fewer samples than in its header")
     elif sound.codec == Codec.OPUS and "opus" in SOUND_ENCODINGS:
         _check_opus(sound)
     else:
-        raise PayloadError(f"PBAT: codec {sound.codec} is not known here")
+        raise PayloadError(f"PBAT: codec {sound.codec} is unknown")
     return sound
 
 
@@ -218,16 +219,16 @@ class SoundDecoder:
         self._format = (0, 0, 0)
         self._opus: OpusDecoder | None = None
 
-    def feed(self, payload: bytes) -> Heard | None:
-        """The sound of one MQTT payload; None for what cannot be played."""
+    def feed(self, payload: bytes) -> ReceivedSound | None:
+        """The sound of one MQTT payload; None if it cannot be played."""
         try:
             return self.decode(unpack(payload))
         except PayloadError:
             self.counters.add("refused")
             return None
 
-    def decode(self, sound: Sound) -> Heard:
-        """The sound of a packet that :func:`unpack` let through. Raises PayloadError if it cannot be decoded after all.
+    def decode(self, sound: Sound) -> ReceivedSound:
+        """The sound of a packet from :func:`unpack`. Raises PayloadError if it cannot be decoded.
 
         Raises PebbleError for Opus where PyAV is missing.
         """
@@ -238,10 +239,10 @@ class SoundDecoder:
         samples = self._samples(sound)
         self.counters.add("packets")
         encoding = "pcm" if self._opus is None else "opus"
-        return Heard(samples, sound.rate, sound.channels, sound.captured_ms, sound.sequence, encoding)
+        return ReceivedSound(samples, sound.rate, sound.channels, sound.captured_ms, sound.sequence, encoding)
 
     def conceal(self) -> Samples | None:
-        """One more frame as it might have been, by the codec's own means; None if it has none."""
+        """An estimate of one more frame by the codec itself; None if it cannot conceal."""
         if self._opus is None:
             return None
         made = self._opus.conceal()

@@ -1,4 +1,4 @@
-"""Something like speech, made from nothing but the number of the sample: for robots without a microphone, and tests.
+"""Speech-like sound computed from the sample's number alone: for robots without a microphone, and for tests.
 
 Syllables of voiced harmonics under three formants, some with a hiss before them, with pauses between words.
 """
@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.media.noise import noise
+from pebble.media.scene import noise
 
-PERIOD_S: Final = 10  # then the same is said again: the longest delay that a comparison can tell
+PERIOD_S: Final = 10  # then it repeats: the longest delay that a comparison can measure
 
 _SYLLABLES = 50  # in one period: 200 ms each, as people speak
 _PAUSE_EVERY = 6  # syllables

@@ -6,21 +6,21 @@ import zlib
 from abc import ABC, abstractmethod
 from typing import Final, Protocol
 
+from pebble.contract.encodings import ALL_VIDEO
+from pebble.contract.packets import KEY_FRAME, Picture, PictureKind
 from pebble.errors import ConfigError
-from pebble.media import h264
+from pebble.media import pyav
 from pebble.media.h264 import H264Encoder
 from pebble.media.jpeg import Pixels
 from pebble.media.jpeg_delta import JpegDelta
 from pebble.media.json_video import JsonPicture
-from pebble.packets import KEY_FRAME, Picture, PictureKind
 
-_ALL: Final = ("json", "pbvd", "pbvz", "h264")
 #: Those this installation can make.
-VIDEO_ENCODINGS: Final[tuple[str, ...]] = _ALL if h264.installed() else _ALL[:-1]
+VIDEO_ENCODINGS: Final = pyav.available(ALL_VIDEO)
 
 DEFAULT_QUALITY: Final = 10
 _FRAME_LIMIT: Final = 1 << 32
-_H264_INTERVAL_S: Final = 4.0  # a receiver that misses a frame asks for a key frame; this is for those who cannot ask
+_H264_INTERVAL_S: Final = 4.0  # a receiver that misses a frame requests a key frame; this is for receivers that cannot
 
 
 class VideoEncoder(Protocol):
@@ -61,30 +61,35 @@ def make_encoder(
             return PbvzEncoder(interval, quality)
         case "h264":
             return H264VideoEncoder(fps, interval, quality, bitrate)
-    raise ConfigError(f"video encoding {name!r}: unknown; there are {', '.join(_ALL)}")
+    raise ConfigError(f"video encoding {name!r}: unknown; there are {', '.join(ALL_VIDEO)}")
+
+
+def _packet(kind: PictureKind, frame: int, captured_ms: int, body: bytes, flags: int = 0) -> bytes:
+    """The header has no times before 1970: a clock that is not set yet counts as unknown, which is 0."""
+    return Picture(kind, frame, max(0, captured_ms), body, flags).pack()
 
 
 class _JpegEncoder(ABC):
-    """What the three forms made of JPEGs share."""
+    """The common part of the three encodings made of JPEGs."""
 
     optimize = True
 
     def __init__(self, interval: int, quality: float) -> None:
         self.last_was_keyframe = False
         self.bitrate: int | None = None
-        self._film = JpegDelta(interval=interval, quality=quality, optimize=self.optimize)
+        self._delta = JpegDelta(interval=interval, quality=quality, optimize=self.optimize)
         self._frame = 0
 
     @property
     def quality(self) -> float:
-        return self._film.quality
+        return self._delta.quality
 
     @quality.setter
     def quality(self, quality: float) -> None:
-        self._film.quality = quality
+        self._delta.quality = quality
 
     def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
-        coded = self._film.code(picture, keyframe=keyframe)
+        coded = self._delta.code(picture, keyframe=keyframe)
         self.last_was_keyframe = coded.keyframe
         frame = self._frame
         self._frame = (frame + 1) % _FRAME_LIMIT
@@ -95,7 +100,7 @@ class _JpegEncoder(ABC):
 
 
 class JsonEncoder(_JpegEncoder):
-    """Paper 8.8: what every operator page understands."""
+    """Paper 8.8: the encoding that every operator page decodes."""
 
     name = "json"
 
@@ -110,17 +115,17 @@ class PbvdEncoder(_JpegEncoder):
 
     def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
         kind = PictureKind.JPEG if keyframe else PictureKind.DELTA_JPEG
-        return Picture(kind, frame, captured_ms, jpeg).pack()
+        return _packet(kind, frame, captured_ms, jpeg)
 
 
 class PbvzEncoder(_JpegEncoder):
-    """A binary header and the zlib of the JPEG: its tables and its empty blocks shrink to little."""
+    """A binary header and the JPEG compressed by zlib, which shortens its tables and empty blocks."""
 
     name = "pbvz"
 
     def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
         kind = PictureKind.ZLIB_JPEG if keyframe else PictureKind.ZLIB_DELTA_JPEG
-        return Picture(kind, frame, captured_ms, zlib.compress(jpeg, 9)).pack()
+        return _packet(kind, frame, captured_ms, zlib.compress(jpeg, 9))
 
 
 class H264VideoEncoder:
@@ -155,4 +160,4 @@ class H264VideoEncoder:
         frame = self._frame
         self._frame = (frame + 1) % _FRAME_LIMIT
         flags = KEY_FRAME if self.last_was_keyframe else 0
-        return Picture(PictureKind.H264, frame, captured_ms, unit, flags).pack()
+        return _packet(PictureKind.H264, frame, captured_ms, unit, flags)

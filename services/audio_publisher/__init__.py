@@ -1,1 +1,1 @@
-"""Sound towards operators: packed as they asked for, never old, over a connection of its own."""
+"""Sends sound to operators, in the encoding they request and never old, over a connection of its own."""

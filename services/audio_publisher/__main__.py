@@ -2,7 +2,7 @@
 
 import sys
 
-from pebble.process import run
+from pebble.runtime.process import run
 from pebble.services.audio_publisher.service import AudioPublisher
 
 sys.exit(run(AudioPublisher))

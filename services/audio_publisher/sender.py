@@ -3,46 +3,38 @@
 from __future__ import annotations
 
 import logging
-from typing import Final
 
-from pebble.config.later import AudioPublisher as Options
+from pebble.config.media import AudioPublisher as Options
 from pebble.errors import PebbleError
+from pebble.media.rate_meter import RateMeter
 from pebble.media.sound import SOUND_ENCODINGS, SoundEncoder, make_sound_encoder, sequence_numbers
-from pebble.services.audio_publisher.thrift import Thrift, steps
-from pebble.services.audio_publisher.under_way import UnderWay
+from pebble.services.audio_publisher.rate_control import RateController, Step
 from pebble.transports import QoS, State, Transport
 from pebble.transports.counters import Counters
 from pebble.transports.frames import FrameInfo
 
 log = logging.getLogger(__name__)
 
-#: Of the oldest packet on the link, beyond a round trip: then the newest are dropped. On a slow link Opus gets smaller
-#: (see .thrift); what it waits for are packets that were lost and are sent again. Measured behind `pebble impair` at
-#: 64 kbit/s and 5 % loss, windows of 12 s: with 0.2 s it lost 3 to 8 % of the sound, with 0.5 s 0 to 1.5 %.
-WAITING_LIMIT_S: Final = 0.2
-OPUS_WAITING_LIMIT_S: Final = 0.5
-
 
 class Sender:
-    """One thread feeds it; ``wanted`` may be set, and all attributes read, by any other.
+    """One thread feeds it; any other may set ``requested`` and read the other attributes.
 
-    ``counters``: packets, bytes (sent), dropped (the link was away or too slow), refused (not sound).
+    ``counters``: packets, bytes (sent), dropped (no connection, or one that is too slow), refused (not sound).
     """
 
     def __init__(
         self, options: Options, transport: Transport, topic: str, qos: QoS, counters: Counters, now: float
     ) -> None:
         self.counters = counters
-        self.wanted: str = options.encoding
-        self.problem = ""  # why it is not as wanted
-        self.reduced = ""  # what is done about a slow link
-        self.told = ""  # what is sent, for people
+        self.meter = RateMeter()  # of what is sent
+        self.requested: str = options.encoding
         self.encoding: str = options.encoding  # of what is sent
+        self.problem = ""  # why it is not the requested one
+        self.reduced = ""  # because of a slow connection
+        self.format = ""  # of what is sent, for display
         self._options, self._transport, self._topic, self._qos = options, transport, topic, qos
         self._numbers = sequence_numbers()
-        self._steps = steps(options.bundle, options.bitrate)
-        self._thrift = Thrift(len(self._steps) - 1, now)
-        self._under_way = UnderWay()
+        self._rate = RateController(options.bundle, options.bitrate, now, lambda: transport.outgoing)
         self._encoder: SoundEncoder | None = None
         self._made_for: tuple[object, ...] = ()  # encoding, rate, channels and step
 
@@ -53,43 +45,38 @@ class Sender:
             return
         if self._transport.state is not State.CONNECTED:
             self.counters.add("dropped")
-            self._under_way.clear()
+            self._rate.connection_lost()
             return
-        age_s = self._age_s(now)
-        if self.encoding == "opus":
-            self._thrift.look(age_s, now)
+        self._rate.poll(now, self.encoding)
         encoder = self._encoder_for(info.rate, info.channels)
         first_ms = info.captured_ms - round(1000 * len(pcm) / (2 * info.channels * info.rate))
         for packet in encoder.encode(pcm, first_ms):
-            self._send(packet, age_s, now)
+            self._send(packet, now)
 
-    def _age_s(self, now: float) -> float:
-        outgoing = self._transport.outgoing
-        return max(0.0, self._under_way.age_s(outgoing.waiting, now) - outgoing.round_trip_s)
-
-    def _send(self, packet: bytes, age_s: float, now: float) -> None:
-        limit_s = OPUS_WAITING_LIMIT_S if self.encoding == "opus" else WAITING_LIMIT_S
-        if age_s > limit_s or not self._transport.publish(self._topic, packet, qos=self._qos):
+    def _send(self, packet: bytes, now: float) -> None:
+        may_send = self._rate.may_send(self.encoding)
+        if not may_send or not self._transport.publish(self._topic, packet, qos=self._qos):
             self.counters.add("dropped")
             return
-        self._under_way.sent(len(packet), now)
+        self._rate.sent(len(packet), now)
+        self.meter.add(now, len(packet))
         self.counters.add("packets")
         self.counters.add("bytes", len(packet))
 
     def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
         """The present one, or a new one if anything about it has to change; another step waits for a packet's end."""
-        level = self._thrift.level if self.wanted == "opus" else 0
-        needed = (self.wanted, rate, channels, level)
+        step = self._rate.step if self.requested == "opus" else self._rate.configured
+        needed = (self.requested, rate, channels, step)
         same_sound = needed[:-1] == self._made_for[:-1]
         if self._encoder is None or (needed != self._made_for and not (same_sound and self._encoder.part_way)):
             self._made_for = needed
             self._encoder = self._make(*needed)
-            self._tell(self._encoder, level)
+            self._describe(self._encoder, step)
         return self._encoder
 
-    def _make(self, name: str, rate: int, channels: int, level: int) -> SoundEncoder:
-        """One that cannot be made here is replaced by the form that everybody can make and read."""
-        options, step = self._options, self._steps[level]
+    def _make(self, name: str, rate: int, channels: int, step: Step) -> SoundEncoder:
+        """The encoder called ``name``; where it cannot be made, the one that every robot has and every client reads."""
+        options = self._options
         self.problem = ""
         for attempt in (name, "pcm"):
             try:
@@ -109,14 +96,14 @@ class Sender:
                 log.warning("sound cannot be sent as %s: %s", attempt, error)
         raise PebbleError(self.problem)
 
-    def _tell(self, encoder: SoundEncoder, level: int) -> None:
+    def _describe(self, encoder: SoundEncoder, step: Step) -> None:
         self.encoding = encoder.name
-        self.reduced = self._steps[level].told if encoder.name == "opus" else ""
+        self.reduced = step.reduced if encoder.name == "opus" else ""
         shape = {1: "mono", 2: "stereo"}.get(encoder.channels, f"{encoder.channels} channels")
-        self.told = f"{encoder.name} {encoder.rate / 1000:g} kHz {shape}"
-        log.info("sound is sent as %s%s", self.told, f", with {self.reduced}" if self.reduced else "")
+        self.format = f"{encoder.name} {encoder.rate / 1000:g} kHz {shape}"
+        log.info("sound is sent as %s%s", self.format, f", with {self.reduced}" if self.reduced else "")
 
 
-def encoding_of(asked: str | None, configured: str) -> str:
-    """What a request means: unknown or absent is as configured."""
-    return asked if asked is not None and asked in SOUND_ENCODINGS else configured
+def known_encoding(requested: str | None, configured: str) -> str:
+    """The requested encoding if this installation has it, else the configured one."""
+    return requested if requested is not None and requested in SOUND_ENCODINGS else configured

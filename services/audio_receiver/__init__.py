@@ -1,1 +1,1 @@
-"""An operator's voice: evened out, and handed to a program that plays it."""
+"""Plays an operator's voice: a jitter buffer, and a program that writes to the loudspeaker."""

@@ -2,7 +2,7 @@
 
 import sys
 
-from pebble.process import run
+from pebble.runtime.process import run
 from pebble.services.audio_receiver.service import AudioReceiver
 
 sys.exit(run(AudioReceiver))

@@ -1,4 +1,4 @@
-"""The program that plays: started when there is something to play, started again when it dies."""
+"""The program that plays sound: started when there is something to play, restarted when it ends."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from pebble.media.jitter import Chunk
 
 log = logging.getLogger(__name__)
 
-SILENCE_S = 5.0  # without sound before the device is left to others
+SILENCE_S = 5.0  # without sound before the device is released
 _PIPE_BYTES = 4096  # a page, the least there is: what waits here is late, and cannot be taken back
 _CHANGE_S = 0.3  # a program is not replaced by one for another format more often than that
-_STUCK_S = 2.0  # a program that takes nothing for so long is replaced
+_STUCK_S = 2.0  # a program that reads nothing for so long is replaced
 _BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.5, 30.0
-_STEADY_S = 10.0  # a program that lived this long has not failed to start
-_LOOK_MS = 100  # how soon a wish to stop is noticed
-_OBEY_S = 0.2  # for a program to end when told
-_DRAIN_S = 1.0  # for a program to play what it still has
+_STEADY_S = 10.0  # a program that ran this long has not failed to start
+_POLL_MS = 100  # how soon ``stopping`` takes effect
+_TERMINATE_S = 0.2  # for a program to end after SIGTERM
+_DRAIN_S = 1.0  # for a program to play what is left in its buffer
 
 
 class Player:
-    """One thread's, apart from ``problem`` and ``stopping``. Its writes wait for the program, but never for long."""
+    """For one thread, apart from ``problem`` and ``stopping``. Writes wait for the program, but for 2 s at most."""
 
     def __init__(self, command: Sequence[str], device: str, stopping: threading.Event) -> None:
-        self.problem = ""  # why nothing is heard; empty while all is well
+        self.problem = ""  # why nothing is played; empty while sound is played
         self.restarts = 0  # of a program that ended by itself
-        self.dropped = 0  # chunks nobody was there to play
-        self.told = ""  # what is being played, for people
+        self.dropped = 0  # chunks without a program to play them
+        self.doing = ""  # what is being played, for display
         self._command, self._device, self._stopping = command, device, stopping
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe = -1  # its standard input, while there is one
@@ -46,7 +46,7 @@ class Player:
             self._failed(f"{command[0]} is not installed", time.monotonic())
 
     def play(self, chunk: Chunk) -> None:
-        """Hand it over; drop it if there is nobody to take it."""
+        """Write it to the program; drop it if there is none."""
         now = self._played_at = time.monotonic()
         if self._process is not None and (chunk.rate, chunk.channels) != self._format:
             if now - self._started_at < _CHANGE_S:
@@ -60,8 +60,8 @@ class Player:
         else:
             self._write(self._process, chunk.pcm)
 
-    def rest(self) -> None:
-        """Nothing is to be played just now."""
+    def idle(self) -> None:
+        """Call this while nothing is to be played: ends the program after SILENCE_S."""
         if self._process is not None and time.monotonic() - self._played_at > SILENCE_S:
             self._end(_DRAIN_S)
 
@@ -72,21 +72,21 @@ class Player:
         values = {"{rate}": str(chunk.rate), "{channels}": str(chunk.channels), "{device}": self._device}
         words = [_filled(word, values) for word in self._command]
         self._format, self._started_at = (chunk.rate, chunk.channels), now
-        theirs, ours = os.pipe()
-        with suppress(OSError):  # only a matter of latency
-            fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        os.set_blocking(ours, False)
+        source, sink = os.pipe()
+        with suppress(OSError):  # costs latency only
+            fcntl.fcntl(sink, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        os.set_blocking(sink, False)
         try:
-            process = subprocess.Popen(words, stdin=theirs, stdout=subprocess.DEVNULL)
+            process = subprocess.Popen(words, stdin=source, stdout=subprocess.DEVNULL)
         except OSError as error:
-            os.close(ours)
+            os.close(sink)
             missing = isinstance(error, FileNotFoundError)
             self._failed(f"{words[0]} is not installed" if missing else f"cannot run {words[0]}: {error}", now)
             return None
         finally:
-            os.close(theirs)
-        self._pipe = ours
-        self.told = f"plays {chunk.rate / 1000:g} kHz, {chunk.channels} channel{'s' if chunk.channels > 1 else ''}"
+            os.close(source)
+        self._pipe = sink
+        self.doing = f"plays {chunk.rate / 1000:g} kHz, {chunk.channels} channel{'s' if chunk.channels > 1 else ''}"
         return process
 
     def _write(self, process: subprocess.Popen[bytes], data: bytes) -> None:
@@ -98,7 +98,7 @@ class Player:
             try:
                 left = left[os.write(self._pipe, left) :]
             except BlockingIOError:
-                poll.poll(_LOOK_MS)
+                poll.poll(_POLL_MS)
             except OSError:
                 self._died(f"{self._command[0]} has ended: {_exit(process)}")
                 return
@@ -124,12 +124,12 @@ class Player:
         self._back_off_s = min(2 * self._back_off_s, _LONGEST_BACK_OFF_S)
 
     def _end(self, drain_s: float) -> None:
-        """Close its input, which ends it once it has played everything; it is not waited for any longer than that."""
-        process, self._process, self.told = self._process, None, ""
+        """Close its input, which ends it once it has played everything; terminate it after ``drain_s``."""
+        process, self._process, self.doing = self._process, None, ""
         if process is None:
             return
         os.close(self._pipe)
-        for wait_s, then in ((drain_s, process.terminate), (_OBEY_S, process.kill)):
+        for wait_s, then in ((drain_s, process.terminate), (_TERMINATE_S, process.kill)):
             try:
                 process.wait(wait_s)
                 return
@@ -140,7 +140,7 @@ class Player:
 
 def _exit(process: subprocess.Popen[bytes]) -> str:
     try:
-        code = process.wait(_OBEY_S)
+        code = process.wait(_TERMINATE_S)
     except subprocess.TimeoutExpired:
         return "it has closed its input"
     return f"exit code {code}" if code >= 0 else f"signal {-code}"

@@ -1,1 +1,1 @@
-"""The one owner of camera and microphone: captures while somebody looks or listens, for any number of readers."""
+"""Captures camera and microphone while there are readers, for any number of them."""

@@ -2,7 +2,7 @@
 
 import sys
 
-from pebble.process import run
+from pebble.runtime.process import run
 from pebble.services.av_daemon.service import AvDaemon
 
 sys.exit(run(AvDaemon))

@@ -1,28 +1,28 @@
-"""Microphones, through ALSA's own recorder."""
+"""Microphones, through ALSA's own recorder, ``arecord``."""
 
 from __future__ import annotations
 
 import shutil
 import time
 
-from pebble.config.later import AvDaemon
-from pebble.errors import LinkError
-from pebble.services.av_daemon.child import Child
+from pebble.config.media import AvDaemon
+from pebble.errors import DeviceError
+from pebble.services.av_daemon.capture_program import CaptureProgram
 from pebble.services.av_daemon.source import Capture
 from pebble.transports.frames import FrameInfo
 
 CHUNK_S = 0.02  # of sound in one frame
-_BUFFER_S = 0.5  # what ALSA holds for us while we are busy elsewhere
-_BEHIND = 10  # chunks; whoever is further behind skips to the newest
+_BUFFER_S = 0.5  # what ALSA holds while this process is busy
+_BEHIND = 10  # chunks; further behind, it skips to the newest
 
 
 class AlsaMicrophone:
-    """``arecord``: s16le, 20 ms at a time, none lost unless we stood still for 200 ms."""
+    """``arecord``: s16le, 20 ms at a time, none lost unless this process was delayed by 200 ms."""
 
     def __init__(self, options: AvDaemon) -> None:
         audio = options.audio
         if shutil.which("arecord") is None:
-            raise LinkError("arecord is not installed: sudo apt install alsa-utils")
+            raise DeviceError("arecord is not installed: sudo apt install alsa-utils")
         self._size = round(audio.rate * CHUNK_S) * 2 * audio.channels
         self._info = FrameInfo(format="s16le", rate=audio.rate, channels=audio.channels)
         self._buffer = bytearray()
@@ -32,11 +32,11 @@ class AlsaMicrophone:
             f"--period-time={CHUNK_S * 1e6:.0f}", f"--buffer-time={_BUFFER_S * 1e6:.0f}",
             *([f"--device={audio.device}"] if audio.device is not None else []),
         ]  # fmt: skip
-        self._child = Child(command, stop_s=options.stop_timeout_seconds)
+        self._program = CaptureProgram(command, stop_s=options.stop_timeout_seconds)
 
     def grab(self) -> Capture:
         while len(self._buffer) < self._size:
-            self._buffer += self._child.read()
+            self._buffer += self._program.read()
         behind = len(self._buffer) // self._size - 1
         skipped = behind if behind > _BEHIND else 0
         del self._buffer[: skipped * self._size]
@@ -47,7 +47,7 @@ class AlsaMicrophone:
         return Capture(self._info, self._size, chunk, at_ns=at_ns, skipped=skipped)
 
     def close(self) -> None:
-        self._child.close()
+        self._program.close()
 
     def interrupt(self) -> None:
-        self._child.interrupt()
+        self._program.interrupt()

@@ -1,4 +1,4 @@
-"""The thread of one device: opens it while somebody reads, hands its frames on, lets it rest, tries again."""
+"""The thread of one device: opens it while its stream has readers, delivers its frames, and retries after failures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pebble.transports.frames import FrameInfo
 
 log = logging.getLogger(__name__)
 
-_LOOK_S = 0.1  # how soon the first reader is noticed
+_POLL_S = 0.1  # how soon the first reader is noticed
 
 
 class Slot(Protocol):
@@ -30,7 +30,7 @@ class Slot(Protocol):
 
 
 class Writer(Protocol):
-    """What is needed of a FrameWriter."""
+    """The part of a FrameWriter that a capturer uses."""
 
     counters: Counters
     problem: str
@@ -44,9 +44,9 @@ class Writer(Protocol):
 
 
 class Capturer:
-    """One try after the other, until it is ended. A device can hang: so it can be ended without waiting for it.
+    """Captures until :meth:`end`, which does not wait, because a device can hang.
 
-    An ended one neither writes nor reports any more, whenever its device answers at last.
+    After that it neither writes nor reports, even if its device answers at last.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Capturer:
             source.interrupt()
 
     def join(self, timeout: float) -> bool:
-        """Did the device let go?"""
+        """Wait for the thread to end; False if it has not, because its device hangs."""
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
@@ -89,14 +89,14 @@ class Capturer:
         self._ended.wait(self._wait_s)
         while not self._ended.is_set():
             if not self._writer.wanted:
-                self._health.rests()
-                self._ended.wait(_LOOK_S)
+                self._health.idle()
+                self._ended.wait(_POLL_S)
                 continue
             try:
                 self._capture()
             except PebbleError as error:
                 self._failed(str(error))
-            except Exception as error:  # of a device's library: whatever it is, this thread must go on
+            except Exception as error:  # of a device's library: this thread must go on
                 log.exception("%s failed unexpectedly", self._name)
                 self._failed(f"{type(error).__name__}: {error}")
 
@@ -117,9 +117,9 @@ class Capturer:
                 read_at = now
             elif now - read_at >= self._rest_s:
                 return
-            self._hand_on(source.grab())
+            self._deliver(source.grab())
 
-    def _hand_on(self, capture: Capture) -> None:
+    def _deliver(self, capture: Capture) -> None:
         if self._writer.wanted:
             self._write(capture)
         if not self._ended.is_set():
@@ -128,7 +128,7 @@ class Capturer:
     def _write(self, capture: Capture) -> None:
         slot = self._writer.slot(capture.size) if capture.draw is not None else None
         pixels = capture.pixels(self._room(capture) if slot is None else slot.array)
-        if self._ended.is_set():  # the device came to itself after another thread had taken over
+        if self._ended.is_set():  # the device answered after another thread had taken over
             return
         if slot is None:
             self._writer.write(pixels, _stamped(capture))

@@ -1,4 +1,4 @@
-"""How one device fares: told by its thread, asked by the service. Clock values are passed in."""
+"""The health of one device: written by its thread, reported by the service. Times are passed in."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import threading
 
 from msgspec.structs import replace
 
-from pebble.payloads import MediaReport
-from pebble.services.av_daemon.rate import Rate
+from pebble.contract.payloads import MediaReport
+from pebble.media.rate_meter import RateMeter
 from pebble.transports.frames import FrameInfo
 
-_OPENING_S = 15.0  # a device that has not opened by then hangs
-_SILENCE_S = 4.0  # and one that gives no frame for so long; a second more than what sources wait for by themselves
+_OPENING_S = 15.0  # a device that takes longer to open hangs
+_SILENCE_S = 4.0  # as does one without a frame for so long; a second more than the sources' own timeout
 _LONGEST_DELAY_S = 30.0
 _GOOD_RUN_S = 10.0  # after which a failure is the first again
 
 
 class Health:
-    """Safe from any thread. After a first failure a device gets ``restart_delay_s``, with each that follows double."""
+    """Safe from any thread. A failed device is opened again after ``restart_delay_s``, doubled with each failure."""
 
     def __init__(self, restart_delay_s: float) -> None:
         self._first_delay_s = restart_delay_s
         self._lock = threading.Lock()
         self._doing = "starts"
-        self._deadline: float | None = None  # for the next sign of life; None: none is expected
+        self._deadline: float | None = None  # for the next frame; None: none is expected
         self._opened_at = 0.0
         self._info: FrameInfo | None = None  # of the latest frame; None while there are none
-        self._rate = Rate()
+        self._meter = RateMeter()
         self._failures = 0  # in a row
         self._restarts = 0
         self._dropped = 0
@@ -34,7 +34,7 @@ class Health:
 
     # -- the device's thread
 
-    def rests(self) -> None:
+    def idle(self) -> None:
         with self._lock:
             self._no_frames("rests: nobody reads")
 
@@ -49,7 +49,7 @@ class Health:
         with self._lock:
             self._dropped += skipped
             self._info, self._doing = info, "runs"
-            self._rate.count(now)
+            self._meter.add(now)
             self._deadline = now + _SILENCE_S
             if now - self._opened_at >= _GOOD_RUN_S:
                 self._failures = 0
@@ -65,8 +65,8 @@ class Health:
 
     # -- the service's thread
 
-    def silent(self, now: float) -> bool:
-        """Should there have been a sign of life by now?"""
+    def overdue(self, now: float) -> bool:
+        """Should the device have opened, or given a frame, by now?"""
         with self._lock:
             return self._deadline is not None and now > self._deadline
 
@@ -82,9 +82,9 @@ class Health:
             info = self._info
             if info is None:
                 return report
-            rate = round(self._rate.per_second(now), 1)
+            rate = round(self._meter.rate(now), 1)
         return replace(report, encoding=info.format, rate=rate, width=info.width or None, height=info.height or None)
 
     def _no_frames(self, doing: str) -> None:
         self._doing, self._info, self._deadline = doing, None, None
-        self._rate.clear()
+        self._meter.clear()

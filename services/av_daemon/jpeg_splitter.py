@@ -1,4 +1,4 @@
-"""Cuts a stream of JPEG pictures, one right behind the other, into pictures. Bytes in, bytes out."""
+"""Cuts a stream of JPEG pictures into pictures. Bytes in, bytes out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _BARE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a length: TEM a
 
 
 class JpegSplitter:
-    """Feed it what was read. A picture longer than ``limit`` bytes, or bytes that are none, are skipped and counted.
+    """Takes bytes as they are read. A picture longer than ``limit`` bytes, or bytes that are none, are skipped.
 
     Segments before the scan are stepped over by their lengths: a preview inside them has an end marker, too.
     """

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pebble.config.later import AvDaemon
-from pebble.errors import LinkError
-from pebble.services.av_daemon.child import Child
+from pebble.config.media import AvDaemon
+from pebble.errors import DeviceError
+from pebble.services.av_daemon.capture_program import CaptureProgram
 from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
-from pebble.services.av_daemon.opencv import opencv
-from pebble.services.av_daemon.source import Bytes, Capture
+from pebble.services.av_daemon.source import Bytes, Capture, opencv
 from pebble.transports.frames import FrameInfo
 
 _PROGRAMS = ("rpicam-vid", "libcamera-vid")
@@ -22,54 +21,54 @@ _ROW_UNIT = 64  # pixels; rows of other lengths are padded in raw output, by how
 
 
 def open_libcamera(options: AvDaemon) -> JpegCamera | RawCamera:
-    """The camera as configured: JPEG pictures as they are, unless ``capture_format`` asks for raw ones."""
+    """The camera as configured: JPEG pictures as they are, unless ``capture_format`` is raw."""
     if options.video.capture_format in ("auto", "mjpeg"):
         return JpegCamera(options)
     if options.video.capture_format in ("raw", "yuv420"):
         return RawCamera(options)
-    raise LinkError(f'libcamera has no capture_format "{options.video.capture_format}": use auto, mjpeg or raw')
+    raise DeviceError(f'libcamera has no capture_format "{options.video.capture_format}": use auto, mjpeg or raw')
 
 
 class JpegCamera:
-    """Shares every picture as the camera compressed it."""
+    """Pictures as the camera compressed them."""
 
     def __init__(self, options: AvDaemon) -> None:
         video = options.video
-        self._child = _start(options, "mjpeg")
+        self._program = _start(options, "mjpeg")
         self._splitter = JpegSplitter()
         self._info = FrameInfo(format="mjpeg", width=video.width, height=video.height)
 
     def grab(self) -> Capture:
         pictures: list[bytes] = []
         while not pictures:
-            pictures = self._splitter.feed(self._child.read())
+            pictures = self._splitter.feed(self._program.read())
         newest = pictures[-1]
         return Capture(self._info, len(newest), newest, at_ns=time.monotonic_ns(), skipped=len(pictures) - 1)
 
     def close(self) -> None:
-        self._child.close()
+        self._program.close()
 
     def interrupt(self) -> None:
-        self._child.interrupt()
+        self._program.interrupt()
 
 
 class RawCamera:
-    """Makes BGR pictures of the camera's planes: more bytes and more work, no loss."""
+    """BGR pictures made of the camera's planes: more bytes and more work, no loss."""
 
     def __init__(self, options: AvDaemon) -> None:
         video = options.video
         if video.width % _ROW_UNIT or video.height % 2:
-            raise LinkError(f"raw libcamera pictures must be a multiple of {_ROW_UNIT} wide and of 2 high")
+            raise DeviceError(f"raw libcamera pictures must be a multiple of {_ROW_UNIT} wide and of 2 high")
         self._cv2: Any = opencv()
         self._width, self._height = video.width, video.height
         self._size = video.width * video.height * 3 // 2
-        self._child = _start(options, "yuv420")
+        self._program = _start(options, "yuv420")
         self._buffer = bytearray()
         self._info = FrameInfo(format="bgr24", width=video.width, height=video.height, stride=3 * video.width)
 
     def grab(self) -> Capture:
         while len(self._buffer) < self._size:
-            self._buffer += self._child.read()
+            self._buffer += self._program.read()
         complete = len(self._buffer) // self._size
         end = complete * self._size
         newest = np.frombuffer(bytes(self._buffer[end - self._size : end]), np.uint8)
@@ -84,17 +83,17 @@ class RawCamera:
         return Capture(self._info, size, draw=draw, at_ns=time.monotonic_ns(), skipped=complete - 1)
 
     def close(self) -> None:
-        self._child.close()
+        self._program.close()
 
     def interrupt(self) -> None:
-        self._child.interrupt()
+        self._program.interrupt()
 
 
-def _start(options: AvDaemon, codec: str) -> Child:
+def _start(options: AvDaemon, codec: str) -> CaptureProgram:
     video = options.video
     program = next((name for name in _PROGRAMS if shutil.which(name)), None)
     if program is None:
-        raise LinkError("neither rpicam-vid nor libcamera-vid is installed: sudo apt install rpicam-apps")
+        raise DeviceError("neither rpicam-vid nor libcamera-vid is installed: sudo apt install rpicam-apps")
     command = [
         program, "--nopreview", "--verbose", "0", "--timeout", "0", "--flush", "--codec", codec,
         "--width", str(video.width), "--height", str(video.height), "--framerate", f"{video.fps:g}", "--output", "-",
@@ -103,4 +102,4 @@ def _start(options: AvDaemon, codec: str) -> Child:
         command += ["--camera", video.camera_name]
     for name, value in video.camera_controls.items():
         command += [f"--{name}"] if value is True else [f"--{name}", str(value)]
-    return Child(command, stop_s=options.stop_timeout_seconds, pipe_bytes=_PIPE_BYTES)
+    return CaptureProgram(command, stop_s=options.stop_timeout_seconds, pipe_bytes=_PIPE_BYTES)

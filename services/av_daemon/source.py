@@ -1,4 +1,4 @@
-"""What a camera or microphone must offer, and what it hands over."""
+"""The interface of an open camera or microphone, and the frames it returns."""
 
 from __future__ import annotations
 
@@ -44,10 +44,21 @@ class Source(Protocol):
     """An open device. One thread uses it, except for ``interrupt``."""
 
     def grab(self) -> Capture:
-        """Wait for the next frame; what it returns is good until the next call. LinkError: the device failed."""
+        """Wait for the next frame, which is valid until the next call. Raises DeviceError if the device failed."""
 
     def close(self) -> None:
-        """Let the device go."""
+        """Release the device."""
 
     def interrupt(self) -> None:
         """From any thread: make a waiting ``grab`` fail soon, where that is possible."""
+
+
+def opencv() -> Any:
+    """OpenCV on one thread, because one picture is too small a job for several.
+
+    Imported only where a camera needs it: it is 16 MB, which a robot without one does not pay.
+    """
+    import cv2
+
+    cv2.setNumThreads(1)
+    return cv2

@@ -1,25 +1,30 @@
-"""Which camera and which microphone a config means."""
+"""Which camera and microphone a config means, and a camera that is mounted at an angle."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
-from pebble.config.later import AvDaemon
+import numpy as np
+from msgspec.structs import replace
+
+from pebble.config.media import AvDaemon
+from pebble.errors import DeviceError, PayloadError
 from pebble.services.av_daemon.alsa import CHUNK_S, AlsaMicrophone
 from pebble.services.av_daemon.libcamera import open_libcamera
-from pebble.services.av_daemon.rotation import Rotated
-from pebble.services.av_daemon.source import Source
+from pebble.services.av_daemon.source import Bytes, Capture, Source, opencv
 from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone
 from pebble.services.av_daemon.v4l2 import V4l2Camera
+from pebble.transports.frames.frame import picture
 
 Opener: TypeAlias = Callable[[], Source]
 
-_LIBCAMERA: Final = ("libcamera", "arducam", "picamera2")  # three names of one way
+_LIBCAMERA: Final = ("libcamera", "arducam", "picamera2")  # three names of one backend
+_BROKEN_LIMIT = 30  # pictures one after the other that cannot be decoded; a few is what bad cables do
 
 
 def camera(options: AvDaemon, start: float) -> Opener:
-    """What opens the camera, upright. ``start``: when a synthetic one began to count, on ``time.monotonic()``."""
+    """A function that opens the camera, upright. ``start``: when a synthetic one begins to count, in monotonic time."""
 
     def open_() -> Source:
         degrees = options.video.rotate_degrees
@@ -30,14 +35,14 @@ def camera(options: AvDaemon, start: float) -> Opener:
 
 
 def microphone(options: AvDaemon, start: float) -> Opener:
-    """What opens the microphone."""
+    """A function that opens the microphone."""
     if options.audio.source == "synthetic":
         return lambda: SyntheticMicrophone(options.audio, start)
     return lambda: AlsaMicrophone(options)
 
 
 def picture_bytes(options: AvDaemon) -> int:
-    """Room for the largest picture."""
+    """The size of the largest picture."""
     video = options.video
     pixels = video.width * video.height
     compressed = video.backend in _LIBCAMERA and video.capture_format in ("auto", "mjpeg") and not video.rotate_degrees
@@ -55,3 +60,45 @@ def _camera(options: AvDaemon, start: float) -> Source:
     if options.video.backend in _LIBCAMERA:
         return open_libcamera(options)
     return V4l2Camera(options.video)
+
+
+class Rotated:
+    """A camera whose pictures are turned clockwise by 90, 180 or 270 degrees, once for all readers; they are BGR."""
+
+    def __init__(self, camera: Source, degrees: int) -> None:
+        cv2 = opencv()
+        self._turns = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+        self._cv2: Any = cv2
+        self._camera, self._degrees = camera, degrees
+        self._scratch: Bytes = np.empty(0, np.uint8)
+
+    def grab(self) -> Capture:
+        capture, upright, skipped = self._next()
+        height, width = upright.shape[:2] if self._degrees == 180 else upright.shape[1::-1]
+
+        def draw(target: Bytes) -> None:
+            self._cv2.rotate(upright, self._turns[self._degrees], dst=target.reshape(height, width, 3))
+
+        info = replace(capture.info, format="bgr24", width=width, height=height, stride=3 * width)
+        return Capture(info, 3 * width * height, draw=draw, at_ns=capture.at_ns, skipped=skipped)
+
+    def close(self) -> None:
+        self._camera.close()
+
+    def interrupt(self) -> None:
+        self._camera.interrupt()
+
+    def _next(self) -> tuple[Capture, Bytes, int]:
+        """The next picture that is whole, and how many were skipped."""
+        skipped = 0
+        for broken in range(_BROKEN_LIMIT):
+            capture = self._camera.grab()
+            skipped += capture.skipped
+            if len(self._scratch) < capture.size and capture.draw is not None:
+                self._scratch = np.empty(capture.size, np.uint8)
+            try:
+                upright = picture(capture.pixels(self._scratch[: capture.size]), capture.info)
+                return capture, upright, skipped + broken
+            except PayloadError:
+                continue
+        raise DeviceError(f"{_BROKEN_LIMIT} pictures one after the other cannot be decoded")

@@ -1,4 +1,4 @@
-"""One stream: a device and its writer, with somebody who notices when the device does not answer."""
+"""One stream: a device and its writer; a device that hangs is abandoned and opened again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from pebble.payloads import MediaReport
+from pebble.contract.payloads import MediaReport
 from pebble.services.av_daemon.capturer import Capturer, Writer
 from pebble.services.av_daemon.health import Health
 from pebble.services.av_daemon.source import Source
@@ -16,11 +16,11 @@ from pebble.services.av_daemon.source import Source
 log = logging.getLogger(__name__)
 
 REST_S = 5.0  # without a reader, until the device is closed
-_HUNG_LIMIT = 3  # attempts whose device never answers, before no more are made
+_HUNG_LIMIT = 3  # threads whose device never answers, before no more are started
 
 
 class Stream:
-    """All methods are for the service's thread. ``look`` has to be called now and then."""
+    """All methods are for the service's thread. ``poll`` has to be called now and then."""
 
     def __init__(
         self,
@@ -36,10 +36,10 @@ class Stream:
         self._capturer = self._start(0.0)
         self._hung: list[Capturer] = []
 
-    def look(self, now: float) -> None:
-        """Give a device up that has been silent for too long, and try again beside it."""
+    def poll(self, now: float) -> None:
+        """Abandon a device that is overdue, and open it again in another thread."""
         self._hung = [capturer for capturer in self._hung if capturer.alive]
-        if len(self._hung) >= _HUNG_LIMIT or not self._health.silent(now):
+        if len(self._hung) >= _HUNG_LIMIT or not self._health.overdue(now):
             return
         self._capturer.end()
         self._hung.append(self._capturer)
@@ -57,11 +57,11 @@ class Stream:
         )
 
     def end(self) -> None:
-        """Begin to let the device go. Returns at once."""
+        """Begin to release the device. Returns at once."""
         self._capturer.end()
 
     def join(self, timeout: float = 0.5) -> None:
-        """Wait for the device to let go; one that does not is left to the end of the process."""
+        """Wait until the device is released; one that hangs is left to the end of the process."""
         deadline = time.monotonic() + timeout
         for capturer in (self._capturer, *self._hung):
             if not capturer.join(max(0.0, deadline - time.monotonic())):

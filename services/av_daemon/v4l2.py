@@ -1,4 +1,4 @@
-"""Cameras of the Linux kernel (V4L2), and files and streams that play a camera's part, through OpenCV."""
+"""Cameras of the Linux kernel (V4L2), and files and network streams in place of a camera, through OpenCV."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.config.later import CameraCapture
-from pebble.errors import LinkError
-from pebble.services.av_daemon.child import SILENCE_S
-from pebble.services.av_daemon.opencv import opencv
-from pebble.services.av_daemon.source import Bytes, Capture
+from pebble.config.media import CameraCapture
+from pebble.errors import DeviceError
+from pebble.services.av_daemon.capture_program import SILENCE_S
+from pebble.services.av_daemon.source import Bytes, Capture, opencv
 from pebble.transports.frames import FrameInfo
 
 log = logging.getLogger(__name__)
 
-_ASKED = {"mjpeg": "MJPG", "yuyv": "YUYV", "raw": "YUYV"}  # V4L2's name; others are its names already
+_FOURCC = {"mjpeg": "MJPG", "yuyv": "YUYV", "raw": "YUYV"}  # V4L2's name; others are its names already
 _PASSED_ON = {"MJPG": "mjpeg", "YUYV": "yuyv"}  # frames that may travel as the camera made them
 
 
 class V4l2Camera:
-    """A camera by its device. What one compresses itself is shared as it is, unless ``raw`` says otherwise.
+    """A camera by its device. MJPEG of the camera is shared as it is, unless ``capture_format`` is ``raw``.
 
-    A read that hangs cannot be interrupted; the time-out in OpenCV ends it after 3 s.
+    A read that hangs cannot be interrupted; OpenCV's timeout ends it after 3 s.
     """
 
     def __init__(self, video: CameraCapture) -> None:
@@ -36,9 +35,9 @@ class V4l2Camera:
         self._name = _without_secrets(self._device)
         self._capture = self._open(video)
         try:
-            self._format = self._agree(video)
-            self._info = self._first_picture()  # it also says what the camera really sends
-        except LinkError:
+            self._format = self._choose_format(video)
+            self._info = self._first_picture()  # shows what the camera really sends
+        except DeviceError:
             self.close()
             raise
 
@@ -54,7 +53,7 @@ class V4l2Camera:
         self._capture.release()
 
     def interrupt(self) -> None:
-        """Nothing would be safe while another thread reads."""
+        """OpenCV has no safe way while another thread reads."""
 
     def _open(self, video: CameraCapture) -> Any:
         cv2, device = self._cv2, self._device
@@ -62,10 +61,10 @@ class V4l2Camera:
         name = int(device) if device.isdecimal() else device
         capture = cv2.VideoCapture(name, cv2.CAP_V4L2 if is_device else cv2.CAP_ANY)
         if not capture.isOpened():
-            raise LinkError(f"cannot open {self._name}: not there, in use, or no camera")
+            raise DeviceError(f"cannot open {self._name}: not there, in use, or no camera")
         if video.capture_format != "auto":
-            asked = _ASKED.get(video.capture_format, video.capture_format.upper())
-            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*f"{asked:4.4}"))
+            fourcc = _FOURCC.get(video.capture_format, video.capture_format.upper())
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*f"{fourcc:4.4}"))
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, video.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, video.height)
         capture.set(cv2.CAP_PROP_FPS, video.fps)
@@ -75,8 +74,8 @@ class V4l2Camera:
                 log.warning("%s does not take camera_controls.%s = %s", self._name, control, value)
         return capture
 
-    def _agree(self, video: CameraCapture) -> str:
-        """The format of the frames: the camera's own if it may be passed on and OpenCV leaves it alone."""
+    def _choose_format(self, video: CameraCapture) -> str:
+        """The format of the frames: the camera's own if readers can decode it and OpenCV leaves it alone."""
         code = int(self._capture.get(self._cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
         has = code.to_bytes(4, "little").decode("latin-1")
         wanted = video.capture_format
@@ -90,7 +89,7 @@ class V4l2Camera:
         first = self._retrieve()
         if self._format == "bgr24":
             if first.ndim != 3 or first.shape[2] != 3:
-                raise LinkError(f"{self._name} sends pictures of shape {first.shape}, not BGR")
+                raise DeviceError(f"{self._name} sends pictures of shape {first.shape}, not BGR")
             height, width = first.shape[:2]
             return FrameInfo(format="bgr24", width=width, height=height, stride=3 * width)
         width, height = (
@@ -100,25 +99,25 @@ class V4l2Camera:
 
     def _wait(self) -> None:
         if not self._capture.grab():
-            raise LinkError(f"{self._name} gives no picture: unplugged, hung, or at its end")
+            raise DeviceError(f"{self._name} gives no picture: unplugged, hung, or at its end")
 
     def _retrieve(self, into: Bytes | None = None) -> NDArray[np.uint8]:
         good, picture = self._capture.retrieve(into)
         if not good or picture is None:
-            raise LinkError(f"{self._name} gave a picture that cannot be read")
+            raise DeviceError(f"{self._name} gave a picture that cannot be read")
         return np.asarray(picture)
 
     def _draw(self, target: Bytes) -> None:
         wanted = target.reshape(self._info.height, self._info.width, 3)
         got = self._retrieve(wanted)
         if got.shape != wanted.shape:
-            raise LinkError(f"{self._name} changed the size of its pictures")
-        if not np.shares_memory(got, wanted):  # not every part of OpenCV writes where it is told to
+            raise DeviceError(f"{self._name} changed the size of its pictures")
+        if not np.shares_memory(got, wanted):  # not every backend of OpenCV writes into the array given to it
             np.copyto(wanted, got)
 
 
 def _without_secrets(device: str) -> str:
-    """A network camera's URL may hold a password; what is said of a camera is logged and published."""
+    """A network camera's URL without its password: the name of a camera is logged and published."""
     scheme, separator, rest = device.partition("://")
     if not separator:
         return device

@@ -1,1 +1,1 @@
-"""Pictures towards operators: as many per second as configured, never old ones, over a connection of their own."""
+"""Sends pictures to operators: at the configured rate, never old ones, over a connection of its own."""

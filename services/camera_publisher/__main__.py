@@ -2,7 +2,7 @@
 
 import sys
 
-from pebble.process import run
+from pebble.runtime.process import run
 from pebble.services.camera_publisher.service import CameraPublisher
 
 sys.exit(run(CameraPublisher))

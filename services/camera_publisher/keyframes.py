@@ -1,30 +1,30 @@
-"""When a full picture is sent because somebody asked for one. Pure: times are passed in."""
+"""When a full picture is sent because one was requested or is required. Pure: times are passed in."""
 
 from __future__ import annotations
 
-PERIOD_S = 1.0  # full pictures are large: whatever the number of those who ask, one per second
+PERIOD_S = 1.0  # full pictures are large: one per second, however many receivers request one
 
 
-class Keyframes:
-    """Requests that wait for their full picture. The one that is sent serves everybody who asked before it."""
+class KeyframeRequests:
+    """The requests since the last full picture; the next one answers all of them."""
 
     def __init__(self) -> None:
-        self._asked = self._needed = False
-        self._answered_at = float("-inf")
+        self._requested = self._required = False
+        self._sent_at = float("-inf")
 
-    def ask(self) -> None:
-        """Somebody else has lost the thread."""
-        self._asked = True
+    def request(self) -> None:
+        """A receiver cannot decode the differences."""
+        self._requested = True
 
-    def need(self) -> None:
-        """We know that the next picture cannot build upon the last one."""
-        self._needed = True
+    def require(self) -> None:
+        """The next picture cannot build upon the last one: send a full one at once."""
+        self._required = True
 
-    def wanted(self, now: float) -> bool:
-        """Is the next picture to be a full one?"""
-        return self._needed or (self._asked and now - self._answered_at >= PERIOD_S)
+    def due(self, now: float) -> bool:
+        """Has the next picture to be a full one?"""
+        return self._required or (self._requested and now - self._sent_at >= PERIOD_S)
 
     def sent(self, now: float) -> None:
-        """A full picture is on its way, for whatever reason."""
-        self._asked = self._needed = False
-        self._answered_at = now
+        """A full picture was sent, for whatever reason."""
+        self._requested = self._required = False
+        self._sent_at = now

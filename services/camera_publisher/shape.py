@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from pebble.errors import PayloadError
-from pebble.transports.frame import Frame
+from pebble.transports.frames.frame import Frame
 
 Pixels = np.ndarray[Any, np.dtype[np.uint8]]
 

@@ -1,1 +1,1 @@
-"""The link to operators: heartbeat, mirroring between the robot and a remote broker, flags and system commands."""
+"""The connection to operators: heartbeat, forwarding to and from the remote side, media requests, system actions."""

@@ -2,7 +2,7 @@
 
 import sys
 
-from pebble.process import run
+from pebble.runtime.process import run
 from pebble.services.mqtt_bridge.service import MqttBridge
 
 sys.exit(run(MqttBridge))

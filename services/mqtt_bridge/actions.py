@@ -1,4 +1,4 @@
-"""reboot, service-restart, git-pull: flags that run one command of the operating system each."""
+"""System actions: reboot, service-restart and git-pull each run one command of the operating system."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LINE_CHARS = 2048  # of a command's output, per log record
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One action: its channel, and the config section of services.mqtt_bridge that says what it runs."""
+    """One action: its channel, and the section of services.mqtt_bridge with its command."""
 
     channel: Channel
     section: str
@@ -35,17 +35,17 @@ ACTIONS: Final = (
 
 
 class Action:
-    """Runs one command at a time, no more often than its cooldown allows. Belongs to one thread."""
+    """Runs one command at a time, no more often than its cooldown allows. Not thread-safe."""
 
     def __init__(self, name: str, control: SystemControl, *, clock: Callable[[], float] = time.monotonic) -> None:
         self.name, self.control = name, control
         self._clock = clock
         self._ran_at: float | None = None
         self._process: subprocess.Popen[str] | None = None
-        self._said_missing = False
+        self._warned = False
 
     def request(self) -> bool:
-        """Run the command; False, with a log line, where that is refused."""
+        """Run the command; False, with a log line, if that is refused."""
         if not self.control.command:
             self._warn_of_missing_command()
             return False
@@ -71,7 +71,7 @@ class Action:
                 stderr=subprocess.STDOUT,
                 text=True,
                 errors="replace",
-                start_new_session=True,  # what restarts us must survive our end
+                start_new_session=True,  # a command that restarts this process must survive its end
             )
         except OSError as error:
             log.error("%s failed: %s", self.name, error)
@@ -82,31 +82,32 @@ class Action:
         return True
 
     def _warn_of_missing_command(self) -> None:
-        if not self._said_missing:
-            self._said_missing = True
+        if not self._warned:
+            self._warned = True
             log.warning("%s refused: services.mqtt_bridge has no command for it", self.name)
 
 
-class Actions:
-    """The whole table."""
+class SystemActions:
+    """The whole table, for one robot's config."""
 
     def __init__(self, section: MqttBridge, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._actions = {
             row.channel: Action(row.channel.metric, getattr(section, row.section), clock=clock) for row in ACTIONS
         }
 
-    def accepts_kept(self, channel: Channel) -> bool:
-        """Does the config want kept requests executed, too (``ignore_retained: false``)?"""
-        return not self._actions[channel].control.ignore_retained
+    def accepts_retained(self, channel: Channel) -> bool:
+        """Whether ``channel`` is an action whose retained requests run, too (``ignore_retained: false``)."""
+        action = self._actions.get(channel)
+        return action is not None and not action.control.ignore_retained
 
     def request(self, channel: Channel) -> bool:
-        """Run the command of ``channel``; False where it is refused."""
+        """Run the command of ``channel``; False if it is refused."""
         return self._actions[channel].request()
 
 
 def _follow(name: str, process: subprocess.Popen[str]) -> None:
-    """Log what the command says, and how it ends."""
-    assert process.stdout is not None  # noqa: S101  (asked for above)
+    """Log the command's output and its exit code."""
+    assert process.stdout is not None  # noqa: S101  (PIPE above)
     with process.stdout as output:
         while line := output.readline(_LINE_CHARS):
             log.info("%s: %s", name, line.rstrip())

@@ -1,19 +1,20 @@
-"""Which media programs are wanted: a flag of the operators allows, a request of theirs starts and stops. Pure."""
+"""Which media programs are to run: a flag of the operators allows them, a request starts and stops them. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
-from pebble.launched import Want
-from pebble.payloads import MediaRequest
+from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
+from pebble.contract.payloads import MediaRequest
+from pebble.runtime.parent import ProgramRequest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """One medium: the channel that allows it, the one that asks for it and for which form, and what it takes."""
+    """One medium: the flag that allows it, the channel that requests it, its encodings and its programs."""
 
     flag: Channel
     request: Channel
@@ -22,22 +23,22 @@ class Row:
 
 
 MEDIA: Final = (
-    Row(MQTT_VIDEO, VIDEO_CONTROL, ("json", "pbvd", "pbvz", "h264"), ("camera_publisher", "video_stream")),
-    Row(MQTT_AUDIO, AUDIO_CONTROL, ("pcm", "opus"), ("audio_publisher", "audio_receiver")),
+    Row(MQTT_VIDEO, VIDEO_CONTROL, ALL_VIDEO, ("camera_publisher", "video_stream")),
+    Row(MQTT_AUDIO, AUDIO_CONTROL, ALL_SOUND, ("audio_publisher", "audio_receiver")),
 )
 _ROWS: Final = {channel.suffix: row for row in MEDIA for channel in (row.flag, row.request)}
-_NO: Final = Want(on=False)
+_NO: Final = ProgramRequest(on=False)
 
 
 class Media:
-    """What was said last about each medium of a robot that has ``programs``.
+    """The newest flag and request of each medium of a robot that has ``programs``.
 
-    ``running`` are those that a bridge before this one wanted: they count as requested, because the request is never
-    kept and the operator does not know that the bridge was replaced. Whether a medium is allowed is not known until
-    somebody has said it; until then nothing is said about what that alone decides.
+    ``running`` are the programs that an earlier bridge process had requested. They count as requested, because a
+    request is never retained and the operator does not know that the bridge was restarted. Until the flag of a medium
+    is known, its programs are left as they are, except that a request may stop them.
     """
 
-    def __init__(self, programs: Collection[str], running: Mapping[str, Want] | None = None) -> None:
+    def __init__(self, programs: Collection[str], running: Mapping[str, ProgramRequest] | None = None) -> None:
         self._programs = programs
         self._allowed: dict[Row, bool] = {}
         self._requested = {row: _first(row, running or {}) for row in MEDIA}
@@ -46,20 +47,45 @@ class Media:
         self._allowed[_ROWS[flag.suffix]] = allowed
 
     def request(self, channel: Channel, request: MediaRequest) -> None:
-        """The last one counts, in all it says: an encoding it does not name, or one nobody knows, is as configured."""
+        """The newest request counts as a whole: a missing or unknown encoding means the configured one."""
         row = _ROWS[channel.suffix]
         encoding = request.encoding if request.encoding in row.encodings else None
-        self._requested[row] = Want(request.enabled, encoding or "")
+        self._requested[row] = ProgramRequest(request.enabled, encoding or "")
 
-    def wants(self) -> dict[str, Want]:
-        """By program; left out are those of which we cannot know yet."""
-        found: dict[str, Want] = {}
-        for row, want in self._requested.items():
-            if not want.on or row in self._allowed:
-                allowed = want.on and self._allowed[row]
-                found |= dict.fromkeys(row.programs, want if allowed else _NO)
-        return {name: want for name, want in found.items() if name in self._programs}
+    def requests(self) -> dict[str, ProgramRequest]:
+        """By program; without those whose flag has to be known first."""
+        found: dict[str, ProgramRequest] = {}
+        for row, request in self._requested.items():
+            if not request.on or row in self._allowed:
+                allowed = request.on and self._allowed[row]
+                found |= dict.fromkeys(row.programs, request if allowed else _NO)
+        return {name: request for name, request in found.items() if name in self._programs}
 
 
-def _first(row: Row, running: Mapping[str, Want]) -> Want:
+class MediaRequests:
+    """Sends the launcher each change of what :class:`Media` requests; ``send_one`` returns False if it is busy.
+
+    The launcher starts and stops the programs; this never waits for it.
+    """
+
+    def __init__(self, media: Media, send_one: Callable[[str, ProgramRequest], bool]) -> None:
+        self._media, self._send_one = media, send_one
+        self._sent: dict[str, ProgramRequest] = {}  # by program
+
+    def allow(self, flag: Channel, allowed: bool) -> None:
+        self._media.allow(flag, allowed)
+        self.send()
+
+    def request(self, channel: Channel, request: MediaRequest) -> None:
+        self._media.request(channel, request)
+        self.send()
+
+    def send(self) -> None:
+        """Send what has changed, and again what the launcher did not accept."""
+        for program, request in self._media.requests().items():
+            if self._sent.get(program) != request and self._send_one(program, request):
+                self._sent[program] = request
+
+
+def _first(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:
     return next((running[name] for name in row.programs if name in running), _NO)

@@ -1,25 +1,58 @@
-"""What a self-describing MCU wants kept on the robot: learnt from its manifest, and not let out before.
+"""Keeps ``local_only`` interfaces of self-describing MCUs on the robot, as their manifests say.
 
-No order between two topics is promised: on Zenoh, and behind a full queue of a broker, a sample may come before the
-manifest that calls it private, and to a bridge that starts late it nearly always does. So a value passes only once its
-manifest has said that it may.
+The order of two topics is undefined: on Zenoh, and behind a full queue of a broker, a sample may arrive before the
+manifest that makes it private, and at a bridge that starts late it nearly always does. So a value passes only after a
+manifest that allows it. Each interface is read by itself, whatever the rest of its manifest looks like; of an MCU whose
+interfaces cannot be read nothing passes.
 """
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
 
-from pebble import codec
-from pebble.contract import INCOMING, MCU_COMMAND, MCU_DESCRIBE, MCU_VALUE, OUTGOING
+from pebble.contract import INCOMING, MCU_COMMAND, MCU_DESCRIBE, MCU_VALUE, OUTGOING, codec, is_reserved
+from pebble.contract.identity import LEVEL
 from pebble.errors import PayloadError
-from pebble.payloads import McuManifest
 from pebble.transports import Message
 
 _DEVICES = 256  # remembered; a robot has a handful
-_WAITING = 256  # kept values that wait for a manifest
+_TOPICS = 1024  # remembered of one MCU
+_WAITING = 256  # retained values that wait for a manifest
 _QUESTION = "/" + MCU_DESCRIBE.metric.rpartition("/")[2]
-_MARK = b'"device_uid"'  # what a value under an alias carries: it says whose it is
+_MARK = b'"device_uid"'  # in every value under an alias: the MCU it belongs to
+_DIRECTIONS = {"in": (INCOMING,), "out": (OUTGOING,)}
+_BOTH = (INCOMING, OUTGOING)
+
+_level = re.compile(LEVEL).search
+
+
+@dataclass(frozen=True, slots=True)
+class _Interface:
+    """What can be read of one. Only a missing or false ``local_only`` makes it public."""
+
+    name: str | None
+    channel: str | None
+    directions: tuple[str, ...]  # both, if that cannot be read
+    public: bool
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of its topics are known."""
+        return self.name is not None and self.channel is not None
+
+
+@dataclass(frozen=True, slots=True)
+class _Device:
+    """One MCU by its newest manifest; ``topics`` also by earlier ones."""
+
+    public: frozenset[str] = frozenset()  # outgoing interfaces that may pass; one that is gone has none
+    private: frozenset[str] = frozenset()  # topics that may not; remembered
+    topics: frozenset[str] = frozenset()  # that are or were this MCU's
+    allowed: frozenset[str] | None = None  # if not all could be read: the only topics of it that may pass
 
 
 class PrivateTopics:
@@ -28,73 +61,94 @@ class PrivateTopics:
     def __init__(self, base: str) -> None:
         self._base = base
         self._lock = threading.Lock()
-        self._public: dict[str, frozenset[str]] = {}  # interfaces that may pass, by uid; one that is gone has none
-        self._private: dict[str, frozenset[str]] = {}  # topics that may not, by uid; remembered
+        self._devices: dict[str, _Device] = {}  # by uid
         self._waiting: dict[str, Message] = {}  # by topic
         self._values = f"{base}/{OUTGOING}/{MCU_VALUE.metric.partition('{')[0]}"
         self._commands = f"{base}/{INCOMING}/{MCU_COMMAND.metric.partition('{')[0]}"
 
     def is_known(self, topic: str) -> bool:
-        """Does a manifest call this topic private? So is the question whose a uid is: only lines settle that."""
+        """Whether a manifest makes this topic private. Requests for one always are: they concern serial lines only."""
         if topic.startswith(self._commands) and topic.endswith(_QUESTION):
             return True
-        return any(topic in topics for topics in list(self._private.values()))
+        if any(topic in device.private for device in list(self._devices.values())):
+            return True
+        device = self._device_of(topic)
+        return device is not None and device.allowed is not None and topic not in device.allowed
 
     def admit(self, message: Message) -> list[Message]:
-        """What may pass now: ``message`` or nothing; with a manifest, after it the kept values that waited for it."""
+        """What may pass now: ``message`` or nothing; with a manifest, then the retained values that waited for it."""
         if not message.payload:
             with self._lock:
-                self._waiting.pop(message.topic, None)  # taken back: not to be told any more
+                self._waiting.pop(message.topic, None)  # removed: nothing to forward any more
         if not message.topic.startswith(self._values) and _MARK not in message.payload:
             return [] if self.is_known(message.topic) else [message]
         with self._lock:
             uid = MCU_DESCRIBE.names(message.topic).get("uid")
             if uid is not None and message.topic == MCU_DESCRIBE.topic(self._base, uid=uid):
-                self._learn(uid, message)
-                return [message, *self._released()]
+                return [message, *self._released()] if self._learn(uid, message) else []
             return [message] if self._may_pass(message) else self._hold(message)
 
-    def _learn(self, uid: str, message: Message) -> None:
-        """A malformed manifest changes nothing. One that is taken back leaves what is private private."""
+    def _learn(self, uid: str, message: Message) -> bool:
+        """False if no interface can be read. After the removal of a manifest, what is private stays private."""
+        known = self._devices.get(uid)
         if not message.payload:
-            self._public.pop(uid, None)
-            return
-        try:
-            manifest: McuManifest = codec.decode(MCU_DESCRIBE, message.payload)
-        except PayloadError:
-            return
-        if uid not in self._private and len(self._private) >= _DEVICES:
-            return
-        interfaces = [one for one in manifest.interfaces if isinstance(one.get("name"), str)]
-        private = [one for one in interfaces if one.get("local_only") is True]
-        outgoing = {one["name"] for one in interfaces if one.get("dir") != "in"}
-        self._public[uid] = frozenset(outgoing - {one["name"] for one in private if one.get("dir") != "in"})
-        self._private[uid] = frozenset(topic for one in private for topic in self._topics(uid, one))
+            if known is not None:
+                self._devices[uid] = replace(known, public=frozenset())
+            return True
+        entries = _entries(message.payload)
+        interfaces = [_interface(entry) for entry in entries or ()]
+        by_public = {
+            public: frozenset(topic for one in interfaces if one.public is public for topic in self._topics(uid, one))
+            for public in (True, False)
+        }
+        topics = by_public[True] | by_public[False]
+        if known is not None and len(known.topics) < _TOPICS:
+            topics |= known.topics
+        private, allowed = by_public[False], None
+        if entries is None or not all(one.whole for one in interfaces):  # an unread one may be any of the others
+            allowed = by_public[True] - private
+            private |= topics - allowed
+        self._remember(uid, _Device(_public_names(interfaces), private, topics, allowed))
+        return entries == [] or any(one.name is not None for one in interfaces)
 
-    def _topics(self, uid: str, interface: dict[str, object]) -> Iterator[str]:
-        incoming = interface.get("dir") == "in"
-        generic = MCU_COMMAND if incoming else MCU_VALUE
-        yield generic.topic(self._base, uid=uid, name=str(interface["name"]))
-        if interface.get("channel"):
-            yield f"{self._base}/{INCOMING if incoming else OUTGOING}/{interface['channel']}"
+    def _remember(self, uid: str, device: _Device) -> None:
+        if uid in self._devices or len(self._devices) < _DEVICES:
+            self._devices[uid] = device
+
+    def _topics(self, uid: str, interface: _Interface) -> Iterator[str]:
+        for direction in interface.directions:
+            if interface.name is not None:
+                generic = MCU_COMMAND if direction == INCOMING else MCU_VALUE
+                yield generic.topic(self._base, uid=uid, name=interface.name)
+            if interface.channel and not is_reserved(interface.channel):  # never an alias: a stop must pass
+                yield f"{self._base}/{direction}/{interface.channel}"
+
+    def _device_of(self, topic: str) -> _Device | None:
+        """The MCU below whose generic topics this one is."""
+        prefix = next((prefix for prefix in (self._values, self._commands) if topic.startswith(prefix)), topic)
+        return self._devices.get(topic.removeprefix(prefix).partition("/")[0])
 
     def _may_pass(self, message: Message) -> bool:
         if self.is_known(message.topic):
             return False
         if not message.payload:
-            return True  # a kept value is taken back
+            return True  # a retained value is removed
         if message.topic.startswith(self._values):
             names = MCU_VALUE.names(message.topic)
-            return not names or names["name"] in self._public.get(names["uid"], ())
-        try:
-            sample = codec.decode(MCU_VALUE, message.payload)
-        except PayloadError:
-            return True  # something else that happens to use the word
-        return sample.interface in self._public.get(sample.device_uid, ())
+            return not names or self._is_public(names["uid"], names["name"])
+        sample = _object(message.payload)
+        uid, name = sample.get("device_uid"), sample.get("interface")
+        if not isinstance(uid, str) or not (isinstance(name, str) or uid in self._devices):
+            return True  # another message that contains the word by chance
+        return self._is_public(uid, name)
+
+    def _is_public(self, uid: str, name: object) -> bool:
+        device = self._devices.get(uid)
+        return device is not None and isinstance(name, str) and name in device.public
 
     def _hold(self, message: Message) -> list[Message]:
-        kept = (message.retain or message.keep) and not self.is_known(message.topic)
-        if kept and (message.topic in self._waiting or len(self._waiting) < _WAITING):
+        retained = (message.retain or message.retain_requested) and not self.is_known(message.topic)
+        if retained and (message.topic in self._waiting or len(self._waiting) < _WAITING):
             self._waiting[message.topic] = message
         return []
 
@@ -104,3 +158,37 @@ class PrivateTopics:
         for message in waiting.values():
             released += [message] if self._may_pass(message) else self._hold(message)
         return released
+
+
+def _object(payload: bytes) -> dict[str, Any]:
+    """The JSON object that ``payload`` is; empty for anything else."""
+    try:
+        plain = codec.plain(MCU_DESCRIBE, payload)
+    except PayloadError:
+        return {}
+    return plain if isinstance(plain, dict) else {}
+
+
+def _entries(payload: bytes) -> list[Any] | None:
+    """The interfaces of a manifest, whatever each is; None if there are none to be read."""
+    entries = _object(payload).get("interfaces")
+    return entries if isinstance(entries, list) else None
+
+
+def _interface(entry: object) -> _Interface:
+    plain = entry if isinstance(entry, dict) else {}
+    name, channel, direction = plain.get("name"), plain.get("channel"), plain.get("dir")
+    return _Interface(
+        name=name if isinstance(name, str) and _level(name) else None,
+        channel=channel
+        if isinstance(channel, str) and all(map(_level, channel.split("/") if channel else ()))
+        else None,
+        directions=_DIRECTIONS.get(direction, _BOTH) if isinstance(direction, str) else _BOTH,
+        public=plain.get("local_only", False) is False,
+    )
+
+
+def _public_names(interfaces: list[_Interface]) -> frozenset[str]:
+    outgoing = [one for one in interfaces if one.name is not None and OUTGOING in one.directions]
+    private = {one.name for one in outgoing if not one.public}
+    return frozenset(one.name for one in outgoing if one.name is not None and one.name not in private)

@@ -1,41 +1,37 @@
-"""The bridge as a process: two transports, a routing table, a heartbeat, and the actions operators may ask for."""
+"""The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
-from pebble import codec
-from pebble.contract import BRIDGE_PROBE, INCOMING, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, Kind
+from pebble.contract import BRIDGE_PROBE, INCOMING, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, codec
+from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError
-from pebble.forwarding.forwarder import SETTLE_S, Forwarder, Gate, barrier
-from pebble.forwarding.routing import Drop, Forward, Side
+from pebble.forwarding.forwarder import INITIAL_SYNC_S, Forwarder, Gate, Routed, barrier
+from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.subjects import Subject, Subjects
-from pebble.launched import Notifier, Want, wanted_before
-from pebble.links import remote_transport
-from pebble.payloads import MediaRequest
-from pebble.service import Service, every
-from pebble.services.mqtt_bridge.actions import ACTIONS, Actions
+from pebble.runtime.connections import remote_transport
+from pebble.runtime.parent import Notifier, earlier_requests
+from pebble.runtime.service import Service, every
+from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
-from pebble.services.mqtt_bridge.media import MEDIA, Media
-from pebble.services.mqtt_bridge.one_broker import OneBroker
+from pebble.services.mqtt_bridge.media import MEDIA, Media, MediaRequests
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
-from pebble.services.mqtt_bridge.routing import TABLE_A1
+from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.transports import Message, State, Subscription
 
-#: After the barrier, for brokers that hand messages from connection to connection at their leisure.
-_VERDICT_S = 0.1
-_PROBE_PERIOD_S = 1.0
+#: After the barrier, for brokers that pass messages between connections with a delay.
+_PROBE_WAIT_S = 0.1
 _RETRY_S = 1.0
-_REQUESTS = tuple(row.request for row in MEDIA)
-_MEDIA_FLAGS = tuple(row.flag for row in MEDIA)
 
 
 class MqttBridge(Service):
-    """Forwards by Table A.1, once it is sure that its two sides are not one broker.
+    """Forwards by Table A.1, once its two sides are known not to be one broker.
 
-    Messages are forwarded on the transports' receiving threads (pebble.forwarding.forwarder says why); everything else
-    happens on the service's own thread, so a burst of messages delays neither the heartbeat nor a verdict.
+    Messages are forwarded on the transports' receiving threads (see pebble.forwarding.forwarder); everything else
+    happens on the service's own thread, so a burst of messages delays neither the heartbeat nor a probe.
     """
 
     name = "mqtt_bridge"
@@ -48,238 +44,233 @@ class MqttBridge(Service):
         media = (channel for row in MEDIA for channel in (row.flag, row.request))
         return (REMOTE_MIRROR, *media, *(row.channel for row in ACTIONS))
 
-    def start(self) -> None:
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         section = self.config.services.mqtt_bridge
-        self._subjects = Subjects(self.config)
-        self._private = PrivateTopics(self.config.base)
-        self._actions = Actions(section)
-        self._media = Media(self.config.on_demand_programs(), wanted_before())
-        self._notifier = Notifier()
-        self._told: dict[str, Want] = {}  # as the launcher knows it
         self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None
-        self._one_broker = OneBroker(self.config.base)
-        remote_kind = "mqtt" if section.remote is None else section.remote.kind
-        self._may_be_one = self.config.transport.kind == remote_kind
-        self._probed_at = float("-inf")
-        self._round = 0  # of finding out whether both sides are one broker
-        self._given_away = -1  # the round in which they turned out to be
-        self._remote_epoch = 0
+        will = self._heartbeat.will(now_ms()) if self._heartbeat is not None else None
+        self._remote = remote_transport(self.config, "remote-bridge", will=will)
+        self._remote_epoch = 0  # counts lost connections
         self._local_subscriptions: list[Subscription] = []
         self._remote_subscriptions: list[Subscription] = []
-        will = self._heartbeat.will(_now_ms()) if self._heartbeat is not None else None
-        self._remote = remote_transport(self.config, "remote-bridge", will=will)
+        self._same_broker = SameBrokerProbe(self.config, self.transport, self._remote, self.clock)
+        self._actions = SystemActions(section, clock=self.clock)
+        self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), Notifier().request)
+        self._private = PrivateTopics(self.config.base)
+        self._subjects = Subjects(self.config)
         self._forwarder = Forwarder(
             self._subjects,
             TABLE_A1,
             {Side.LOCAL: self.transport, Side.REMOTE: self._remote},
             winner=Side.REMOTE,
-            agreed=self._on_agreed,
+            on_value=self._on_flag,
+            clock=self.clock,
         )
-        self.transport.on_state(partial(self._on_link, Side.LOCAL))
-        self._remote.on_state(partial(self._on_link, Side.REMOTE))
+        #: What the bridge itself does about a message, and about a flag's value, by channel.
+        self._message_reactions: dict[str, Callable[[bytes], None]] = {
+            **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
+            **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
+        }
+        self._flag_reactions: dict[str, Callable[[bytes], None]] = {
+            **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
+            REMOTE_MIRROR.suffix: self._on_remote_mirror,
+        }
+
+    def start(self) -> None:
+        self.transport.on_state(partial(self._on_side_state, Side.LOCAL))
+        self._remote.on_state(partial(self._on_side_state, Side.REMOTE))
         self._remote.open(timeout=0.0)
+        self.on_stop(self._remote.close)
         if self._heartbeat is not None:
-            self.timers.add(time.monotonic(), self._beat, period=section.heartbeat.interval_seconds)
-        self.post(self._listen_locally)
+            interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
+            self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
+        self.post(self._subscribe_local)
 
     def stop(self) -> None:
-        if hasattr(self, "_remote"):
-            self.log.info("forwarded and dropped: %s", self._forwarder.counters.snapshot())
-            self._remote.close()
+        self.log.info("forwarded and dropped: %s", self._forwarder.counters.snapshot())
 
     # -- the service's thread
 
-    def _beat(self) -> None:
+    def _publish_heartbeat(self) -> None:
         if self._heartbeat is not None:
-            self._heartbeat.beat(self._remote, _now_ms())
+            self._heartbeat.publish(self._remote, now_ms())
 
-    def _listen_locally(self) -> None:
+    def _subscribe_local(self) -> None:
         self._local_subscriptions = [
             self.transport.subscribe(filter_, self._on_local, echo=False, direct=True)
             for filter_ in self._subjects.filters(INCOMING, OUTGOING)
         ]
 
-    def _joined(self, side: Side, epoch: int) -> None:
+    def _connected(self, side: Side, epoch: int) -> None:
         """A side is connected (again)."""
         if side is Side.REMOTE:
-            self._beat()
+            self._publish_heartbeat()
         else:
-            barrier(self.transport, self._one_broker.topic)
+            barrier(self.transport, self._same_broker.topic)
             self._forwarder.subscribed(Side.LOCAL)
-            self._settle_later(Side.LOCAL)
+            self._synchronize_later(Side.LOCAL)
         if self._forwarder.gate is not Gate.OPEN:
-            self._find_out()
+            self._check_brokers()
         elif side is Side.REMOTE and epoch == self._remote_epoch:
-            self._probe()
-            self._listen_remotely()
+            self._same_broker.send()
+            self._subscribe_remote()
         else:
-            self._probe()
+            self._same_broker.send()
 
-    def _left(self, side: Side) -> None:
+    def _disconnected(self, side: Side) -> None:
         if side is Side.REMOTE:
-            self._stop_listening_remotely()
+            self._unsubscribe_remote()
 
-    def _settle_later(self, side: Side) -> None:
+    def _synchronize_later(self, side: Side) -> None:
         epoch = self._remote_epoch
 
-        def settle() -> None:
+        def synchronize() -> None:
             if side is Side.LOCAL or epoch == self._remote_epoch:
-                self._forwarder.settle(side)
+                self._forwarder.synchronize(side)
 
-        self.call_at(time.monotonic() + SETTLE_S, settle)
+        self.call_at(self.clock() + INITIAL_SYNC_S, synchronize)
 
-    def _listen_remotely(self) -> None:
-        """Anew for each connection, once the transport has sent what changed while it was away: then what the remote
-        side has kept is older than nothing of ours."""
-        self._stop_listening_remotely()
+    def _subscribe_remote(self) -> None:
+        """Subscribe anew for each connection, after the transport has sent what changed during the outage.
+
+        So a retained message of the remote side is never older than what the robot has changed.
+        """
+        self._unsubscribe_remote()
+        self._forwarder.subscribing(Side.REMOTE)
         receive = partial(self._on_remote, self._remote_epoch)
         self._remote_subscriptions = [
             self._remote.subscribe(filter_, receive, echo=False, direct=True)
             for filter_ in self._subjects.filters(INCOMING)
         ]
         self._forwarder.subscribed(Side.REMOTE)
-        self._settle_later(Side.REMOTE)
+        self._synchronize_later(Side.REMOTE)
 
-    def _stop_listening_remotely(self) -> None:
+    def _unsubscribe_remote(self) -> None:
         subscriptions, self._remote_subscriptions = self._remote_subscriptions, []
         _close_all(subscriptions)
 
-    # -- one broker or two
-
-    def _probe(self) -> bool:
-        self._probed_at = time.monotonic()
-        return self._one_broker.probe(self._remote, _now_ms())
-
-    def _find_out(self) -> None:
-        if not self._may_be_one:
+    def _check_brokers(self) -> None:
+        """Open the gate if the two sides cannot be one broker, or begin a round of probing."""
+        if not self._same_broker.possible:
+            if self._same_broker.announces:
+                self._same_broker.send()  # before anything is forwarded: the mirror may have to shut
             self._open()
-        if self._forwarder.gate is Gate.OPEN or not self._both_connected():
+        if self._forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        self._round += 1
-        if self._probe() and self._one_broker.wait(self._remote, self._subjects.filters(INCOMING)[0], self.transport):
-            self.call_at(time.monotonic() + _VERDICT_S, partial(self._decide, self._round))
+        round_ = self._same_broker.begin_round(self._subjects.filters(INCOMING)[0])
+        if round_ is not None:
+            self.call_at(self.clock() + _PROBE_WAIT_S, partial(self._end_round, round_))
 
-    def _decide(self, round_: int) -> None:
-        """Nothing came back: two brokers. A connection that was lost meanwhile brings a new round."""
-        if round_ == self._round != self._given_away and self._both_connected():
+    def _end_round(self, round_: int) -> None:
+        """Open the gate if no probe came back. A connection that was lost meanwhile brings a new round."""
+        if self._same_broker.proves_two_brokers(round_):
             self._open()
-
-    def _both_connected(self) -> bool:
-        return self.transport.state is State.CONNECTED and self._remote.state is State.CONNECTED
 
     def _open(self) -> None:
         if self._remote.state is not State.CONNECTED or self._forwarder.gate is Gate.OPEN:
             return
         was_shut = self._forwarder.gate is Gate.SHUT
         self._forwarder.open()
-        if was_shut:  # what was said meanwhile went nowhere: ask for the kept copies again
+        if was_shut:  # what was received meanwhile was dropped: a new subscription brings the retained messages again
             _close_all(self._local_subscriptions)
-            self._listen_locally()
-        self._listen_remotely()
+            self._forwarder.subscribing(Side.LOCAL)
+            self._subscribe_local()
+            self._forwarder.subscribed(Side.LOCAL)
+        self._subscribe_remote()
         self.log.info("forwarding between the robot and its remote side")
 
-    def _suspect(self) -> None:
-        """A heartbeat like ours came from the local side: ours, or one of the same millisecond?"""
-        if time.monotonic() - self._probed_at >= _PROBE_PERIOD_S:
-            self._probe()
-
-    def _stand_down(self) -> None:
+    def _disable(self) -> None:
         self._forwarder.shut()  # again: it may just have been opened
-        self._stop_listening_remotely()
+        self._unsubscribe_remote()
         self.log.info("the local and the remote side are one broker: nothing is mirrored")
-        self._forwarder.settle(Side.REMOTE)  # kept flags have waited for copies that it will not send
+        self._forwarder.synchronize(Side.REMOTE)  # retained local flags wait for remote ones, which will not come
 
     def _run_action(self, channel: Channel) -> None:
         self.counters.add("actions" if self._actions.request(channel) else "actions_refused")
 
-    def _allow_media(self, flag: Channel, allowed: bool) -> None:
-        self._media.allow(flag, allowed)
-        self._say_wants()
-
-    def _request_media(self, channel: Channel, request: MediaRequest) -> None:
-        self._media.request(channel, request)
-        self._say_wants()
-
     @every(_RETRY_S)
-    def _say_wants(self) -> None:
-        """Tell the launcher what has changed; it starts and stops the programs, and we wait for nobody."""
-        for program, want in self._media.wants().items():
-            if self._told.get(program) != want and self._notifier.want(program, want):
-                self._told[program] = want
+    def _send_media_requests(self) -> None:
+        self._media.send()
 
     # -- the transports' threads
 
-    def _on_link(self, side: Side, state: State) -> None:
+    def _on_side_state(self, side: Side, state: State) -> None:
         self._forwarder.watch(side, state)
         if state is State.CONNECTED:
-            self.post(partial(self._joined, side, self._remote_epoch))
+            self.post(partial(self._connected, side, self._remote_epoch))
             return
         if side is Side.REMOTE:
             self._remote_epoch += 1
-        self.post(partial(self._left, side))
+        self.post(partial(self._disconnected, side))
 
     def _on_local(self, message: Message) -> None:
-        if self._one_broker.is_probe(message):
-            self._on_probe(message)
+        if message.topic == self._same_broker.topic:
+            self._on_probe(message)  # probes are never forwarded
             return
         if self._heartbeat is not None and message.topic == self._heartbeat.topic:
             if self._heartbeat.is_ours(message) and self._forwarder.gate is Gate.OPEN:
-                self.post(self._suspect, newest_of="suspect")
+                # one broker after all, or another program's heartbeat of the same millisecond
+                self.post(self._same_broker.send_again, newest_of="suspect")
             return
         for admitted in self._private.admit(message):
-            self._follow_up(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))
+            self._react(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))
 
     def _on_probe(self, message: Message) -> None:
-        if self._one_broker.gives_away(message):
-            self._given_away = self._round
+        if self._same_broker.proves_same_broker(message):
             if self._forwarder.gate is not Gate.SHUT:
                 self._forwarder.shut()
-                self.post(self._stand_down)
+                self.post(self._disable)
+        elif self._same_broker.is_request(message):
+            self.post(self._same_broker.answer_request, newest_of="request")
 
     def _on_remote(self, epoch: int, message: Message) -> None:
         if epoch != self._remote_epoch or self._private.is_known(message.topic):
             return
-        self._follow_up(Side.REMOTE, message, self._forwarder.receive(Side.REMOTE, message))
+        self._react(Side.REMOTE, message, self._forwarder.receive(Side.REMOTE, message))
 
-    def _follow_up(self, side: Side, message: Message, result: Forward | Drop) -> None:
-        """Do what is asked of ourselves, on the service's thread, whether or not there was anybody to forward it to.
+    def _react(self, side: Side, message: Message, routed: Routed) -> None:
+        """Do what the message requests of the bridge itself, whether or not a remote side is connected.
 
-        What we forward to the local side never comes back to us, so it is done right now.
+        What is forwarded to the local side is never received there by the bridge, so this is the only occasion.
         """
-        subject = self._subjects[message.topic]
-        channel = subject.channel if subject is not None else None
-        local, action = side is Side.LOCAL, channel is not None and channel.kind is Kind.ACTION
-        if result is Drop.STALE and not (local and channel and action and self._actions.accepts_kept(channel)):
-            self._refuse_stale(subject)
-        elif channel is None or result is Drop.ECHO or not (local or isinstance(result, Forward)):
+        channel = routed.subject.channel if routed.subject is not None else None
+        local = side is Side.LOCAL
+        if routed.outcome is Drop.STALE:
+            if channel is None or not (local and self._actions.accepts_retained(channel)):
+                self._refuse_stale(channel)
+                return
+        elif routed.outcome is Drop.ECHO or not (local or isinstance(routed.outcome, Forward)):
             return
-        elif _is_one_of(_REQUESTS, channel):
-            self._hear_request(channel, message.payload)
-        elif action and self._switch(channel, message.payload):
-            self.post(partial(self._run_action, channel), newest_of=channel.metric)
+        reaction = self._message_reactions.get(channel.suffix) if channel is not None else None
+        if reaction is not None:
+            reaction(message.payload)
 
-    def _hear_request(self, channel: Channel, payload: bytes) -> None:
+    def _on_flag(self, subject: Subject, payload: bytes) -> None:
+        """Called by the forwarder with the value on which both sides agree."""
+        reaction = self._flag_reactions.get(subject.channel.suffix) if subject.channel is not None else None
+        if reaction is not None:
+            reaction(payload)
+
+    def _on_remote_mirror(self, payload: bytes) -> None:
+        self._forwarder.mirroring = self._boolean(REMOTE_MIRROR, payload)
+
+    def _on_media_flag(self, flag: Channel, payload: bytes) -> None:
+        self.post(partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
+
+    def _on_media_request(self, channel: Channel, payload: bytes) -> None:
         try:
             request: MediaRequest = codec.decode(channel, payload)
         except PayloadError as error:
             self._refuse(channel, error)
         else:
-            self.post(partial(self._request_media, channel, request), newest_of=channel.metric)
+            self.post(partial(self._media.request, channel, request), newest_of=channel.metric)
 
-    def _refuse_stale(self, subject: Subject | None) -> None:
-        what = "a command" if subject is None or subject.channel is None else subject.channel.metric
-        self.counters.add("stale")
-        self._quiet_log.warning(f"{what} kept", "refused a kept copy of %s", what)
+    def _on_action(self, channel: Channel, payload: bytes) -> None:
+        if self._boolean(channel, payload):
+            self.post(partial(self._run_action, channel), newest_of=channel.metric)
 
-    def _on_agreed(self, subject: Subject, payload: bytes) -> None:
-        channel = subject.channel
-        if channel is REMOTE_MIRROR:
-            self._forwarder.mirroring = self._switch(REMOTE_MIRROR, payload)
-        elif channel is not None and _is_one_of(_MEDIA_FLAGS, channel):
-            self.post(partial(self._allow_media, channel, self._switch(channel, payload)), newest_of=channel.metric)
-
-    def _switch(self, channel: Channel, payload: bytes) -> bool:
-        """What a boolean control says; nothing (a removed flag) and nonsense are false."""
+    def _boolean(self, channel: Channel, payload: bytes) -> bool:
+        """The value of a boolean control; an empty payload (a removed flag) and a malformed one are false."""
         try:
             return bool(payload) and bool(codec.decode(channel, payload))
         except PayloadError as error:
@@ -290,15 +281,12 @@ class MqttBridge(Service):
         self.counters.add("refused")
         self._quiet_log.warning(channel.metric, "refused a message: %s", error)
 
-
-def _is_one_of(channels: tuple[Channel, ...], channel: Channel) -> bool:
-    return any(channel is one for one in channels)  # comparing all they say takes longer
+    def _refuse_stale(self, channel: Channel | None) -> None:
+        what = "a command" if channel is None else channel.metric
+        self.counters.add("stale")
+        self._quiet_log.warning(f"{what} retained", "refused a retained message on %s", what)
 
 
 def _close_all(subscriptions: list[Subscription]) -> None:
     for subscription in subscriptions:
         subscription.close()
-
-
-def _now_ms() -> int:
-    return time.time_ns() // 1_000_000

@@ -1,91 +1,100 @@
-"""What all services at a serial line share: the line, and the way of its bytes to the service's thread."""
+"""The base of all bridges: it owns the serial line and passes received bytes to the service's thread."""
 
 from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from importlib import import_module
+from typing import Any, ClassVar
 
-from pebble.config import SerialBridge
-from pebble.errors import ConfigError, LinkError
-from pebble.rate_limit import RateLimitedLog
-from pebble.service import Service
-from pebble.services.serial_mcu_bridge.line import LineState, SerialLine
+from pebble.config import Config, SerialBridge
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+from pebble.errors import ConfigError, DeviceError
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.runtime.service import Service
+from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
 
 
 class SerialService(Service, ABC):
-    """A subclass opens the line in ``start`` and understands what comes up it. Without a ``stop`` nothing moves."""
+    """A subclass sets how its protocol uses the serial line, and parses the received bytes."""
 
     name = "serial_mcu_bridge"
-    end: ClassVar[bytes] = b"\n"  # of a line, or a frame
+    end: ClassVar[bytes] = b"\n"  # of a text line, or a frame
+    stop_line: ClassVar[bytes] = b""  # stops all motors; empty: the device has none
+    receive_only: ClassVar[bool] = False  # nothing is ever sent
+    boot_s: ClassVar[float] = 0.5  # input during so many seconds after opening is discarded
+    retry_s: ClassVar[float] = 1.0  # the longest wait between two attempts to open the device
 
-    def open_line(self, *, stop: bytes = b"", settle_s: float = 0.5, retry_s: float = 1.0) -> None:
-        options = self.options
-        if options.serial.port is None:
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        section = self.options
+        if section.serial.port is None:
             raise ConfigError("services.serial_mcu_bridge.serial.port: required, for example /dev/ttyACM0")
-        self.chatter_log = RateLimitedLog(self.log, burst=20)
+        self.device_log = RateLimitedLog(self.log, burst=20)
         self._input = bytearray()
         self._input_lock = threading.Lock()
         self.line = SerialLine(
-            options.serial.port,
-            options.serial.baud,
-            stop=stop,
-            on_bytes=self._take_in,
-            on_state=lambda state, _problem: self.post(lambda: self._line_is(state)),
-            drive_timeout_s=options.safety.drive_timeout_seconds,
-            settle_s=settle_s,
-            read_timeout_s=options.serial.timeout_seconds,
-            retry_s=retry_s,
-            end=self.end,
+            section.serial.port,
+            section.serial.baud,
+            stop=self.stop_line,
+            on_bytes=self._queue_input,
+            on_state=lambda state, _problem: self.post(lambda: self._on_line_state(state)),
+            drive_timeout_s=section.safety.drive_timeout_seconds,
+            boot_s=self.boot_s,
+            read_timeout_s=section.serial.timeout_seconds,
+            retry_s=self.retry_s,
+            end=b"" if self.receive_only else self.end,
         )
-        self.line.open()
 
-    def stop(self) -> None:
-        if hasattr(self, "line"):
-            self.line.close()
-            chatter, dropped = self.chatter_log.totals(), self.counters["input_dropped"]
-            if chatter or dropped:
-                self.log.info("lines of the MCU that were no report: %s; bytes dropped unread: %d", chatter, dropped)
+    def start(self) -> None:
+        self.on_stop(self._close_line)
+        self.line.open()
 
     @property
     def options(self) -> SerialBridge:
-        """Our section of the config; an instance's own where we are one."""
+        """The config section of this serial line; with instances, the merged one of this instance."""
         return self.config.services.serial_mcu_bridge
 
     @property
     def republish_interval_s(self) -> float:
         return self.options.retained_publish_interval_seconds
 
-    def exit_if_asked(self) -> None:
-        """The device has gone. It is looked for again, unless the config would rather have the process start anew."""
+    def exit_if_configured(self) -> None:
+        """Raise DeviceError for a device that has gone, if the config asks for a restart instead of another attempt."""
         if self.options.health.exit_on_serial_error and self.line.opened:
-            raise LinkError(self.line.problem or "the device has gone")
+            raise DeviceError(self.line.problem or "the device has gone")
 
     # -- to override
 
     @abstractmethod
     def on_input(self, chunk: bytes) -> None:
-        """Bytes came up the line."""
+        """Parse received bytes."""
 
-    def on_line(self, state: LineState) -> None:
-        """The line was opened, is ready, or has gone."""
+    def on_line_state(self, state: LineState) -> None:
+        """React to a serial line that was opened, is ready, or has gone."""
 
-    # -- up the line
+    # -- the line
 
-    def _line_is(self, state: LineState) -> None:
+    def _close_line(self) -> None:
+        self.line.close()
+        logged, dropped = self.device_log.totals(), self.counters["input_dropped"]
+        if logged or dropped:
+            self.log.info("log lines of the MCU: %s; bytes dropped unread: %d", logged, dropped)
+
+    def _on_line_state(self, state: LineState) -> None:
         if state is LineState.CLOSED:
-            raise LinkError("the serial line's thread has ended")  # and so do we: the launcher starts us again
-        self.on_line(state)
+            raise DeviceError("the serial line's thread has ended")  # so the process ends and the launcher restarts it
+        self.on_line_state(state)
 
-    def _take_in(self, chunk: bytes) -> None:
-        """On the line's thread: one waiting job, however fast the MCU talks, so that commands are never crowded out."""
+    def _queue_input(self, chunk: bytes) -> None:
+        """On the reading thread: at most one job waits, however much the MCU sends: commands are not delayed."""
         with self._input_lock:
             if len(self._input) + len(chunk) > _INPUT_LIMIT:
                 self.counters.add("input_dropped", len(self._input))
                 self._input.clear()
-                self._input += self.end  # what follows is no continuation of what was kept
+                self._input += self.end  # what follows does not continue the text line before the gap
             self._input += chunk
         self.post(self._read_input, newest_of="serial input")
 
@@ -95,9 +104,16 @@ class SerialService(Service, ABC):
             self._input.clear()
         self.on_input(chunk)
 
-    def count_too_long(self, discarded: int) -> None:
-        """Tell of lines that a splitter has thrown away, ``discarded`` of them so far."""
+    def count_discarded(self, discarded: int) -> None:
+        """Count and log text lines that a splitter has discarded, ``discarded`` of them so far."""
         too_long = discarded - self.counters["lines_discarded"]
         if too_long:
             self.counters.add("lines_discarded", too_long)
-            self.chatter_log.warning("too long", "a line of the MCU was too long", times=too_long)
+            self.device_log.warning("too long", "a line of the MCU was too long", times=too_long)
+
+
+def bridge_of(config: Config) -> type[SerialService]:
+    """Return the service class for the protocol in ``config``, which is the view of one instance."""
+    module, _, name = SERIAL_PROTOCOLS[config.services.serial_mcu_bridge.protocol].service.partition(":")
+    bridge: type[SerialService] = getattr(import_module(module), name)
+    return bridge

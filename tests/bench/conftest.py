@@ -1,4 +1,4 @@
-"""What tests of several comparisons share."""
+"""Fixtures for tests of several comparisons."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture
 def temporary(tmp_path: Path) -> Path:
-    """Where the bench makes its folders; short, because of unix sockets."""
+    """The folder for temporary files of the bench; short, because of Unix sockets."""
     folder = tmp_path / "t"
     folder.mkdir()
     return folder

@@ -1,4 +1,4 @@
-"""Results as comparisons leave them behind, made up: what plots and reports are tested with."""
+"""Synthetic results of all comparisons, to test plots and reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _random = np.random.default_rng(7)
 
 
 def latencies(middle: float, count: int = 300, rounds: int = 10, spread: float = 0.25) -> list[list[float]]:
-    """Rounds of skewed samples, as latencies are, each round in a mood of its own."""
+    """Rounds of skewed samples, as latencies are, with an offset of their own in each round."""
     return [
         (middle * _random.lognormal(0, 0.04) * (_random.lognormal(0, spread, count) + _random.exponential(0.1, count)))
         .round(3)
@@ -30,7 +30,7 @@ def latencies(middle: float, count: int = 300, rounds: int = 10, spread: float =
     ]
 
 
-def _results(bench: str, cells: list[Cell], verdict: list[str], **more: object) -> Results:
+def _results(bench: str, cells: list[Cell], assessment: list[str], **more: object) -> Results:
     machine = {"cpu": "Some CPU @ 2.40GHz", "cores": 2, "kernel": "6.1.0", "python": "3.11.2", "mosquitto": "2.0.11"}
     return Results(
         bench=bench,
@@ -39,7 +39,7 @@ def _results(bench: str, cells: list[Cell], verdict: list[str], **more: object) 
         began="2026-11-20T14:00:00Z",
         took_s=61.0,
         cells=cells,
-        verdict=verdict,
+        assessment=assessment,
         **more,  # type: ignore[arg-type]
     )
 
@@ -68,7 +68,7 @@ def control(small: bool = False) -> Results:
         "control",
         cells,
         [
-            "zenoh-p2p is faster than mqtt-nodelay: 0.43 (0.41 to 0.45) of its figure",
+            "zenoh-p2p takes 0.43× the time of mqtt-nodelay (99 % interval 0.41–0.45)",
             "aim: Zenoh peer to peer, p50 at most 0.70 of the better MQTT variant's: met (0.43, at most 0.45)",
             "aim: with media, p99 at 200 Hz at most 0.35 of it: missed (0.41, at most 0.52)",
         ],
@@ -132,7 +132,7 @@ def frames(small: bool = False) -> Results:
         for readers in ((3,) if small else (1, 3))
         for variant, middle in variants.items()
     ]  # fmt: skip
-    return _results("frames", cells, ["zenoh-shm is faster than mqtt: 0.08 (0.07 to 0.09) of its figure"])
+    return _results("frames", cells, ["zenoh-shm takes 0.08× the time of mqtt (99 % interval 0.07–0.09)"])
 
 
 def fleet() -> Results:
@@ -192,7 +192,7 @@ def impair(trials: tuple[str, ...] = TRIALS) -> Results:
 
 
 def broken() -> Results:
-    """NaN, empty rounds, one round, a variant that is missing in places, names that do not end."""
+    """NaN, empty rounds, a single round, a missing variant, very long names."""
     long = "a-variant-with-a-name-that-is-much-longer-than-anybody-would-think"
     nowhere = Cell(variant="mqtt5", params={"size": "40 B"}, measure="one-way", unit="us", rounds=[[], [math.nan] * 30])
     cells = [

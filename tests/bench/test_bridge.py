@@ -1,4 +1,4 @@
-"""What is made of the driving of whole robots: matching, adding up, and telling. No robot is started here."""
+"""The bridge comparison without robots: matching, cells, plans, assessment and profile."""
 
 import io
 import json
@@ -11,16 +11,16 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import bridge, bridge_null, bridge_profile, bridge_report
-from pebble.bench.bridge_drive import Found, Stretch, arrivals, found_of, matched, settled
-from pebble.bench.bridge_hop import HOP
+from pebble.bench.bridge_capture import _stamp, commands
+from pebble.bench.bridge_drive import Arrived, DriveSegment, all_arrived, arrivals, arrived_of, matched
+from pebble.bench.bridge_one_hop import HOP
 from pebble.bench.bridge_operator import wheels, wheels_of
-from pebble.bench.bridge_plan import Mode, Plan, plan
-from pebble.bench.bridge_robot import Robot
+from pebble.bench.bridge_plan import BridgePlan, Mode, plan
+from pebble.bench.bridge_robot import RobotProcesses
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP, Tally
-from pebble.bench.bridge_wire import _stamp, commands
 from pebble.bench.results import Cell, Value
 from pebble.errors import PebbleError
-from pebble.services.serial_mcu_bridge.goob_base import Touch
+from pebble.services.serial_mcu_bridge.text.goob_base import Touch
 from pebble.simulation.trace import Entry
 
 MS = 1_000_000
@@ -34,13 +34,13 @@ def test_every_command_makes_both_wheels_turn_and_none_too_fast() -> None:
     assert all(0.1 <= side < 0.9 for number in range(0, 640_000, 997) for side in wheels(number))
 
 
-def test_a_command_is_known_by_what_it_says() -> None:
+def test_a_command_is_identified_by_its_speeds() -> None:
     for number in range(0, 640_000, 997):
         left, right = wheels(number)
         assert wheels_of(json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}).encode()) == (left, right)
 
 
-# -- a stretch of driving
+# -- a segment of driving
 
 
 def test_a_command_counts_once_and_when_it_came_first() -> None:
@@ -52,12 +52,12 @@ def test_a_command_counts_once_and_when_it_came_first() -> None:
         Entry(63 * MS, "motors", "0.200 0.100"),
         Entry(900 * MS, "line", "M 0.000 0.000"),
     ]
-    found = found_of(Stretch(0, 200 * MS, sent), arrivals(trace), [])
+    found = arrived_of(DriveSegment(0, 200 * MS, sent), arrivals(trace), [])
     assert (found.down, found.sent) == ([1.0, 2.0], 3)
 
 
-def test_a_report_is_known_by_its_values_if_they_are_said_once() -> None:
-    stretch = Stretch(100 * MS, 200 * MS, {})
+def test_a_report_is_identified_by_values_that_occur_once() -> None:
+    segment = DriveSegment(100 * MS, 200 * MS, {})
     trace = [
         Entry(90 * MS, "said", "T a0=1 a1=1 a2=1"),
         Entry(110 * MS, "said", "T a0=2 a1=2 a2=2"),
@@ -69,34 +69,36 @@ def test_a_report_is_known_by_its_values_if_they_are_said_once() -> None:
         Entry(190 * MS, "said", "T a0=5 a1=5 a2=5"),
         Entry(210 * MS, "said", "T a0=6 a1=6 a2=6"),
     ]
-    heard = [(ns * MS, Touch(value, value, value)) for ns, value in ((91, 1), (112, 2), (131, 3), (193, 5), (211, 6))]
-    found = found_of(stretch, {}, matched(trace, heard))
+    received = [
+        (ns * MS, Touch(value, value, value)) for ns, value in ((91, 1), (112, 2), (131, 3), (193, 5), (211, 6))
+    ]
+    found = arrived_of(segment, {}, matched(trace, received))
     assert (found.up, found.reports) == ([2.0, 3.0], 3)
 
 
-def test_what_was_heard_before_it_was_said_is_another_report() -> None:
+def test_a_report_received_before_it_was_sent_is_another_one() -> None:
     trace = [Entry(10 * MS, "said", "T a0=1 a1=2 a2=3")]
-    heard = [(9 * MS, Touch(1, 2, 3)), (12 * MS, Touch(1, 2, 3)), (14 * MS, Touch(1, 2, 3))]
-    assert matched(trace, heard) == [(10 * MS, 12 * MS)]
+    received = [(9 * MS, Touch(1, 2, 3)), (12 * MS, Touch(1, 2, 3)), (14 * MS, Touch(1, 2, 3))]
+    assert matched(trace, received) == [(10 * MS, 12 * MS)]
 
 
-def test_waiting_is_over_when_the_last_have_arrived() -> None:
-    stretch = Stretch(0, 100 * MS, {(0.1, 0.1): 10 * MS, (0.2, 0.1): 60 * MS})
+def test_waiting_ends_when_the_last_ones_have_arrived() -> None:
+    segment = DriveSegment(0, 100 * MS, {(0.1, 0.1): 10 * MS, (0.2, 0.1): 60 * MS})
     first, last = {(0.1, 0.1): 11 * MS}, {(0.2, 0.1): 61 * MS}
-    assert not settled(stretch, first, [])
-    assert settled(stretch, last, [])
-    assert settled(stretch, last, [(20 * MS, None), (90 * MS, 91 * MS), (110 * MS, None)])
-    assert not settled(stretch, last, [(20 * MS, 21 * MS), (90 * MS, None)])
+    assert not all_arrived(segment, first, [])
+    assert all_arrived(segment, last, [])
+    assert all_arrived(segment, last, [(20 * MS, None), (90 * MS, 91 * MS), (110 * MS, None)])
+    assert not all_arrived(segment, last, [(20 * MS, 21 * MS), (90 * MS, None)])
 
 
-# -- adding up
+# -- cells
 
 
 def test_cells_have_a_list_of_samples_for_each_round() -> None:
     tally = Tally("zenoh", LOADED)
-    stretches = [Stretch(0, 500 * MS, {}, cpu_s=0.1), Stretch(600 * MS, 1100 * MS, {}, cpu_s=0.1)]
-    tally.add_round(stretches, [Found([1.0], [2.0], 1, 1), Found([1.5], [], 1, 1)], {"frames": 30, "video": 15})
-    tally.add_round(stretches, [Found([3.0], [2.5], 2, 1)], {"frames": 28, "video": 15})
+    segments = [DriveSegment(0, 500 * MS, {}, cpu_s=0.1), DriveSegment(600 * MS, 1100 * MS, {}, cpu_s=0.1)]
+    tally.add_round(segments, [Arrived([1.0], [2.0], 1, 1), Arrived([1.5], [], 1, 1)], {"frames": 30, "video": 15})
+    tally.add_round(segments, [Arrived([3.0], [2.5], 2, 1)], {"frames": 28, "video": 15})
     down, up = tally.cells()
     assert (down.variant, down.measure, down.params, down.unit) == ("zenoh", DOWN, {"load": "media"}, "ms")
     assert (down.rounds, down.lost) == ([[1.0, 1.5], [3.0]], 1)
@@ -104,9 +106,9 @@ def test_cells_have_a_list_of_samples_for_each_round() -> None:
     assert down.figures == {"sent": 4, "cpu_percent": 20.0, "frames_per_s": 29.0, "video_per_s": 15.0}
 
 
-def test_where_nobody_reports_there_is_one_cell() -> None:
+def test_without_reports_there_is_one_cell() -> None:
     tally = Tally(HOP, reports=False)
-    tally.add_round([Stretch(0, MS, {})], [Found([0.2], sent=1)])
+    tally.add_round([DriveSegment(0, MS, {})], [Arrived([0.2], sent=1)])
     (cell,) = tally.cells()
     assert (cell.rounds, cell.figures) == ([[0.2]], {"sent": 1})
 
@@ -117,19 +119,21 @@ def test_where_nobody_reports_there_is_one_cell() -> None:
 @pytest.mark.parametrize(
     "nonsense",
     [
-        Plan(kinds=["carrier-pigeon"]),
-        Plan(kinds=[]),
-        Plan(kinds=["mqtt", "mqtt"]),
-        Plan(seconds=0.0),
-        Plan(rounds=0),
-        Plan(seconds=math.inf),
-        Plan(mode=Mode.NULL),
-        Plan(output=Path("/dev/null/there")),
+        BridgePlan(kinds=["carrier-pigeon"]),
+        BridgePlan(kinds=[]),
+        BridgePlan(kinds=["mqtt", "mqtt"]),
+        BridgePlan(seconds=0.0),
+        BridgePlan(rounds=0),
+        BridgePlan(seconds=math.inf),
+        BridgePlan(mode=Mode.NULL),
+        BridgePlan(output=Path("/dev/null/there")),
     ],
 )
-def test_nonsense_is_refused_before_anything_starts(nonsense: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_options_are_refused_before_anything_starts(
+    nonsense: BridgePlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in (bridge, bridge_null, bridge_profile):
-        monkeypatch.setattr(module, "Driven", None)
+        monkeypatch.setattr(module, "DrivenRobot", None)
         with pytest.raises(PebbleError):
             module.run(nonsense, Console(file=io.StringIO()))
 
@@ -144,22 +148,23 @@ def test_shared_memory_is_swept_however_it_ends(
         raise PebbleError("no robot today")
 
     swept: list[bool] = []
-    monkeypatch.setattr(module, "Driven", fail)
+    monkeypatch.setattr(module, "DrivenRobot", fail)
     monkeypatch.setattr(module, "sweep", lambda: swept.append(True))
     with pytest.raises(PebbleError, match="no robot today"):
         module.run(plan(mode, rounds=1, output=tmp_path), Console(file=io.StringIO()))
     assert swept == [True]
 
 
-def test_the_broker_on_the_robot_is_the_robots_as_a_hub_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot("mqtt", media=False)
-    brokers = [SimpleNamespace(program=SimpleNamespace(pid=pid)) for pid in (-1, -2)]
+def test_the_local_broker_counts_as_part_of_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = RobotProcesses("mqtt", media=False)
+    pids = {"remote": -1, "local": -2}
+    brokers = {name: SimpleNamespace(program=SimpleNamespace(pid=pid)) for name, pid in pids.items()}
     monkeypatch.setattr(robot, "_brokers", brokers)
     monkeypatch.setattr(robot, "_launcher", SimpleNamespace(pid=-3))
     assert robot.pids() == [-3, -2]
 
 
-def test_the_impatient_have_fewer_and_what_is_given_counts() -> None:
+def test_a_quick_plan_is_shorter_and_given_options_replace_it() -> None:
     assert plan(Mode.MEDIA, quick=True).seconds < plan(Mode.MEDIA).seconds
     assert plan(Mode.NULL).kinds == ("zenoh",)
     assert plan(Mode.NULL, kinds=["mqtt"], rounds=3).command() == [
@@ -168,7 +173,7 @@ def test_the_impatient_have_fewer_and_what_is_given_counts() -> None:
     assert plan(Mode.COMPARE, quick=True).command()[-1] == "--quick"
 
 
-# -- telling
+# -- the assessment
 
 
 def cell(
@@ -180,64 +185,64 @@ def cell(
     return Cell(variant=variant, params=params, measure=measure, unit="ms", rounds=samples, figures=figures)
 
 
-def test_the_verdict_names_winners_media_floor_and_aims() -> None:
+def test_the_assessment_names_ratios_media_floor_and_aims() -> None:
     cells = [
         *(cell("mqtt", 0.6), cell("zenoh", 0.4), cell("mqtt", 0.5, UP), cell("zenoh", 0.5, UP)),
         *(cell("mqtt", 0.7, load=LOADED), cell("zenoh", 2.4, load=LOADED), cell(HOP, 0.1)),
     ]
-    text = "\n".join(bridge_report.verdict(cells))
-    assert "Median, command to the wheels: zenoh is faster than mqtt: 0.67" in text
-    assert "Median, command to the wheels, media flowing: zenoh is slower than mqtt: 3.43" in text
+    text = "\n".join(bridge_report.assessment(cells))
+    assert "Median, command to the wheels: zenoh takes 0.67× the time of mqtt" in text
+    assert "Median, command to the wheels, media flowing: zenoh takes 3.43× the time of mqtt" in text
     assert "zenoh and mqtt are equal within noise" in text
-    assert "zenoh, command to the wheels, p99: 0.44 ms, with media 2.64 ms; the robot with media is slower" in text
+    assert "zenoh, command to the wheels, p99: 0.44 ms, with media 2.64 ms; the robot with media takes" in text
     assert "takes 0.10 ms; mqtt 0.50 ms more, zenoh 0.30 ms more." in text
     assert "aim: mqtt, command to the wheels, p50 at most 0.7 ms: met (0.60 ms)" in text
 
 
-def test_a_missed_aim_is_told_with_how_much() -> None:
-    last = bridge_report.verdict([cell("zenoh", 2.0)])[-1]
+def test_a_missed_aim_is_shown_with_the_difference() -> None:
+    last = bridge_report.assessment([cell("zenoh", 2.0)])[-1]
     assert last == "aim: zenoh, command to the wheels, p99 at most 2 ms: missed by 0.20 ms (2.20 ms)"
 
 
-def test_what_never_arrived_took_longer_than_anything() -> None:
-    *_, median, slowest = bridge_report.verdict([cell("zenoh", 0.4, lost=9)])
+def test_lost_commands_count_as_infinitely_late() -> None:
+    *_, median, slowest = bridge_report.assessment([cell("zenoh", 0.4, lost=9)])
     assert median.endswith("p50 at most 0.7 ms: met (0.44 ms)")
     assert slowest.endswith("p99 at most 2 ms: missed (not within 1 s)")
 
 
-def test_a_robot_that_heard_nothing_missed_its_aims() -> None:
-    lines = bridge_report.verdict([cell("mqtt", 0.4), cell("zenoh", 0.4, each=0, lost=800), cell(HOP, 0.1)])
+def test_a_robot_that_received_nothing_missed_its_aims() -> None:
+    lines = bridge_report.assessment([cell("mqtt", 0.4), cell("zenoh", 0.4, each=0, lost=800), cell(HOP, 0.1)])
     assert "zenoh, command to the wheels: 100.0 % of 800 were overtaken, or did not arrive within 1 s." in lines
     assert "aim: zenoh, command to the wheels, p50 at most 0.7 ms: missed (not within 1 s)" in lines
 
 
-@pytest.mark.parametrize(("lost", "told"), [(4, False), (5, True)])
-def test_loss_is_said_where_it_is_more_than_a_stray_one(lost: int, told: bool) -> None:
-    lines = bridge_report.verdict([cell("zenoh", 0.4, load=LOADED, lost=lost)])
+@pytest.mark.parametrize(("lost", "shown"), [(4, False), (5, True)])
+def test_loss_is_reported_above_a_threshold(lost: int, shown: bool) -> None:
+    lines = bridge_report.assessment([cell("zenoh", 0.4, load=LOADED, lost=lost)])
     line = f"zenoh, command to the wheels, media flowing: 0.6 % of {800 + lost} were overtaken"
-    assert any(found.startswith(line) for found in lines) is told
+    assert any(found.startswith(line) for found in lines) is shown
 
 
-def test_few_rounds_and_nothing_at_all_can_be_told_too() -> None:
+def test_few_rounds_and_no_samples_are_assessed() -> None:
     few = [cell("mqtt", 0.6, rounds=7), cell("zenoh", 0.4, rounds=7), cell("zenoh", 0.4, load=LOADED, rounds=7)]
-    lines = bridge_report.verdict(few)
+    lines = bridge_report.assessment(few)
     assert any("7 rounds" in line for line in lines)
     assert lines[-1] == "aim: zenoh, command to the wheels, p99 at most 2 ms: not judged (0.44 ms)"
-    assert bridge_report.verdict([]) == []
+    assert bridge_report.assessment([]) == []
 
 
 def test_a_percentile_is_judged_only_where_something_lies_beyond_it() -> None:
     cells = [cell("zenoh", 0.4, each=36), cell("zenoh", 2.4, load=LOADED, each=98)]
-    lines = bridge_report.verdict(cells)
+    lines = bridge_report.assessment(cells)
     assert "zenoh, command to the wheels, p99: 0.44 ms, with media 2.64 ms" in lines
     assert [line.partition(" ms: ")[2] for line in lines[-2:]] == ["met (0.40 ms)", "not judged (0.44 ms)"]
 
 
 def test_the_tables_have_the_robots_cost() -> None:
-    said = io.StringIO()
-    bridge_report.show([cell("mqtt", 0.6), cell(HOP, 0.1)], Console(file=said, width=120))
-    assert "one hop" in said.getvalue()
-    assert "12.5" in said.getvalue()
+    printed = io.StringIO()
+    bridge_report.show([cell("mqtt", 0.6), cell(HOP, 0.1)], Console(file=printed, width=120))
+    assert "one hop" in printed.getvalue()
+    assert "12.5" in printed.getvalue()
 
 
 # -- the profile
@@ -249,17 +254,17 @@ def test_hops_are_the_times_between_stations() -> None:
     assert bridge_profile.hops(sent, [into, out]) == [(1.0, 3.0)]
 
 
-def test_the_profile_tells_which_hop_makes_the_slowest_slow() -> None:
+def test_the_profile_names_the_hop_that_makes_the_slowest_slow() -> None:
     times: bridge_profile.Times = [*(395 * [(0.1, 0.1, 0.3)]), *(5 * [(0.1, 3.1, 1.3)])]
     assert bridge_profile.slowest(times) == 5 * [(0.1, 3.1, 1.3)]
-    (line,) = bridge_profile.verdict("zenoh", times)
+    (line,) = bridge_profile.assessment("zenoh", times)
     assert line.startswith(
         "zenoh: of what the slowest 5 of 400 commands take longer than a typical one (4.00 ms), 75 %"
     )
     assert line.endswith("is spent in: remote broker.")
-    (line,) = bridge_profile.verdict("zenoh", times[1:300] + times[-4:])
-    assert line == "zenoh: 303 commands are too few to say what makes the slowest slow."
-    assert bridge_profile.verdict("zenoh", []) == ["zenoh: no command was followed all the way"]
+    (line,) = bridge_profile.assessment("zenoh", times[1:300] + times[-4:])
+    assert line == "zenoh: 303 commands are too few to tell where the slowest lose their time."
+    assert bridge_profile.assessment("zenoh", []) == ["zenoh: no command was traced all the way"]
 
 
 def test_stamps_of_another_form_are_refused() -> None:

@@ -15,17 +15,17 @@ SEEDS = range(300)
 def exchanges(
     random_: random.Random, *, count: int = 200, offset: int = 0, drift: float = 0.0, there_us: float, back_us: float
 ) -> list[Exchange]:
-    """Half of a millisecond each way at least, and queues that are longer one way than the other."""
+    """At least half a millisecond each way, and queues that are longer in one direction."""
 
     def far(now: int) -> int:
         return now + offset + round(drift * now)
 
     found, now = [], 0
     for _ in range(count):
-        heard = now + 500_000 + round(1000 * random_.expovariate(1 / there_us))
-        sent = heard + random_.randrange(5_000, 200_000)
+        received = now + 500_000 + round(1000 * random_.expovariate(1 / there_us))
+        sent = received + random_.randrange(5_000, 200_000)
         back = sent + 500_000 + round(1000 * random_.expovariate(1 / back_us))
-        found.append(Exchange(now, far(heard), far(sent), back))
+        found.append(Exchange(now, far(received), far(sent), back))
         now += SECOND // 100
     return found
 
@@ -59,7 +59,7 @@ def test_the_two_ways_add_up_to_the_round_trip() -> None:
 
 def test_too_few_exchanges_are_refused() -> None:
     measured = exchanges(random.Random(3), count=LEAST - 1, there_us=1, back_us=1)
-    with pytest.raises(PebbleError, match=f"fewer than {LEAST}"):
+    with pytest.raises(PebbleError, match=f"at least {LEAST}"):
         estimate(measured)
 
 

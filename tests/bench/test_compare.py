@@ -1,4 +1,4 @@
-"""Two files of results: what got worse is named, noise is not."""
+"""Two result files: worse metrics are named, noise is not."""
 
 import io
 import random
@@ -46,43 +46,43 @@ def kinds(a: Results, b: Results) -> list[Kind]:
 def report(tmp_path: Path, a: Results, b: Results, **options: object) -> tuple[int, str]:
     a.save(tmp_path / "a.json")
     b.save(tmp_path / "b.json")
-    said = io.StringIO()
-    code = run(tmp_path / "a.json", tmp_path / "b.json", console=Console(file=said, width=80), **options)  # type: ignore[arg-type]
-    return code, said.getvalue()
+    printed = io.StringIO()
+    code = run(tmp_path / "a.json", tmp_path / "b.json", console=Console(file=printed, width=80), **options)  # type: ignore[arg-type]
+    return code, printed.getvalue()
 
 
 def test_a_planted_slowdown_is_found_and_named(tmp_path: Path) -> None:
-    code, said = report(tmp_path, results(1), results(2, "zenoh-copy", 1.2))
+    code, printed = report(tmp_path, results(1), results(2, "zenoh-copy", 1.2))
     assert code == 1
-    shown = [line for line in said.splitlines() if "us" in line]
+    shown = [line for line in printed.splitlines() if "us" in line]
     assert [line.split(",")[0].strip() for line in shown][:2] == ["zenoh-copy"] * 2
     assert all(line.rstrip().endswith("worse") for line in shown)
-    assert "mqtt" not in said
+    assert "mqtt" not in printed
 
 
 def test_the_same_twice_is_no_change(tmp_path: Path) -> None:
-    code, said = report(tmp_path, results(1), results(2))
+    code, printed = report(tmp_path, results(1), results(2))
     assert code == 0
-    assert said.startswith("12 figures judged: 0 worse, 0 better, 12 without a difference beyond noise")
-    assert "99.92 %" in said
+    assert printed.startswith("12 metrics compared: 0 worse, 0 better, 12 without a difference beyond noise")
+    assert "99.92 %" in printed
 
 
 def test_all_shows_what_did_not_change(tmp_path: Path) -> None:
-    _, said = report(tmp_path, results(1), results(2), everything=True)
-    assert said.count("no difference") == 12
+    _, printed = report(tmp_path, results(1), results(2), everything=True)
+    assert printed.count("no difference") == 12
 
 
-def test_what_got_faster_is_better_and_nothing_to_fail_for(tmp_path: Path) -> None:
-    code, said = report(tmp_path, results(1, "mqtt", 1.5), results(2))
+def test_a_faster_run_is_better_and_exits_with_0(tmp_path: Path) -> None:
+    code, printed = report(tmp_path, results(1, "mqtt", 1.5), results(2))
     assert code == 0
-    assert "better" in said
+    assert "better" in printed
 
 
-def test_hardly_ever_fooled_by_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noise_rarely_shows_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ratios, "_RESAMPLES", 500)
     runs = [(results(2 * n, each=3), results(2 * n + 1, each=3)) for n in range(300)]
-    fooled = sum(any(finding.changed for finding in compare(a, b, threshold=1.0)) for a, b in runs)
-    assert fooled <= 6  # 3 are claimed; were it 5 % instead of 1 %, it would be so few in one of a hundred times
+    false_alarms = sum(any(finding.changed for finding in compare(a, b, threshold=1.0)) for a, b in runs)
+    assert false_alarms <= 6  # 3 are expected; with 5 % instead of 1 %, so few would occur in one of a hundred tests
 
 
 def test_the_worst_comes_first() -> None:
@@ -97,7 +97,7 @@ def test_the_worst_comes_first() -> None:
     assert sum(finding.kind is Kind.BETTER for finding in found) == 2
 
 
-def test_more_figures_are_asked_for_more_certainty() -> None:
+def test_more_metrics_need_a_higher_confidence_level() -> None:
     assert certainty(1) == pytest.approx(1 - CHANCE)
     assert certainty(100) == pytest.approx(1 - CHANCE / 100)
     assert {finding.ratio.level for finding in compare(results(1), results(2))} == {certainty(12)}
@@ -116,34 +116,34 @@ def test_what_is_in_one_file_only() -> None:
     assert found == {Kind.ONLY_A: "mqtt", Kind.ONLY_B: "zenoh-shm"}
 
 
-def test_what_does_not_arrive_any_more_is_worse_than_slow(tmp_path: Path) -> None:
+def test_missing_samples_count_as_worse(tmp_path: Path) -> None:
     silent = one([], [])
-    assert kinds(one([1.0], [1.0]), silent) == [Kind.SILENT]
+    assert kinds(one([1.0], [1.0]), silent) == [Kind.NO_SAMPLES]
     assert report(tmp_path, one([1.0], [1.0]), silent)[0] == 1
     assert kinds(silent, silent) == []
     assert kinds(silent, one([1.0], [1.0])) == [Kind.ONLY_B]
 
 
-def test_few_rounds_tell_nothing_of_chance() -> None:
+def test_few_rounds_are_not_judged() -> None:
     assert kinds(one(*[[1.0]] * 7), one(*[[5.0]] * 10)) == [Kind.UNKNOWN]
     assert kinds(one(*[[1.0]] * 8), one(*[[5.0]] * 8)) == [Kind.WORSE]
     assert kinds(one(*[[1.0]] * 7, []), one(*[[5.0]] * 8)) == [Kind.UNKNOWN]
     assert kinds(one(*[[0.0]] * 8), one(*[[5.0]] * 8)) == [Kind.UNKNOWN]
-    assert "1 cannot be told: fewer than 8 rounds" in summary(compare(one([1.0]), one([5.0])))[-1]
+    assert "1 unknown: fewer than 8 rounds" in summary(compare(one([1.0]), one([5.0])))[-1]
 
 
-def test_the_slowest_hundredth_is_told_where_rounds_have_hundreds_of_samples() -> None:
+def test_p99_is_compared_where_rounds_have_hundreds_of_samples() -> None:
     enough, few = one(*[[1.0] * 100] * 8), one(*[[1.0] * 99] * 8)
     assert [finding.percent for finding in compare(enough, enough)] == [50, 99]
     assert [finding.percent for finding in compare(enough, few)] == [50]
 
 
-def test_of_pictures_a_second_more_is_better_and_none_is_worst() -> None:
+def test_more_pictures_per_second_are_better_and_none_is_worst() -> None:
     fifteen, twenty, none = (one(*[[rate]] * 8, unit="1/s", measure="pictures") for rate in (15.0, 20.0, 0.0))
     assert kinds(fifteen, twenty) == [Kind.BETTER]
     assert kinds(twenty, fifteen) == [Kind.WORSE]
-    assert kinds(fifteen, none) == [Kind.SILENT]
-    assert kinds(one([15.0], unit="1/s"), one([0.0], unit="1/s")) == [Kind.SILENT]
+    assert kinds(fifteen, none) == [Kind.NO_SAMPLES]
+    assert kinds(one([15.0], unit="1/s"), one([0.0], unit="1/s")) == [Kind.NO_SAMPLES]
 
 
 def losing(*lost: int) -> Results:
@@ -160,9 +160,9 @@ def test_more_that_is_lost_is_worse_and_a_burst_is_noise(tmp_path: Path) -> None
     assert kinds(lossy, clean) == [Kind.BETTER, Kind.EQUAL]
     assert kinds(clean, burst) == [Kind.EQUAL, Kind.EQUAL]
     assert kinds(losing(0), losing(9)) == [Kind.UNKNOWN, Kind.UNKNOWN]
-    code, said = report(tmp_path, clean, lossy)
+    code, printed = report(tmp_path, clean, lossy)
     assert code == 1
-    assert "lost %" in said
+    assert "lost %" in printed
 
 
 def test_bytes_of_encoders_are_the_same_every_time() -> None:
@@ -170,11 +170,11 @@ def test_bytes_of_encoders_are_the_same_every_time() -> None:
     assert kinds(one([100.0], unit="kB/s"), one([101.0], unit="kB/s")) == [Kind.EQUAL]
 
 
-def test_a_curve_is_no_distribution() -> None:
+def test_curves_over_time_are_not_compared() -> None:
     assert kinds(*[one([1.0, 2.0], [3.0, 4.0], measure="audio over time")] * 2) == []
 
 
-def test_what_else_differs_is_told(tmp_path: Path) -> None:
+def test_other_differences_are_listed(tmp_path: Path) -> None:
     a, b = results(1, each=1), results(2, rounds=9, each=1)
     b.machine, b.quick, b.pebble = {"cpu": "another", "cores": 2, "kernel": "6"}, True, "9.9"
     assert differences(a, b) == [
@@ -187,7 +187,7 @@ def test_what_else_differs_is_told(tmp_path: Path) -> None:
     assert "not the same: machine cpu" in report(tmp_path, a, b)[1]
 
 
-def test_only_like_can_be_compared(tmp_path: Path) -> None:
+def test_only_files_of_the_same_bench_are_compared(tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match=r"a\.json is of bench frames, .*b\.json of bench control"):
         report(tmp_path, results(1), results(2, bench="control"))
 

@@ -13,10 +13,10 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import control, control_far, output
-from pebble.bench.control_cast import Cast
-from pebble.bench.control_ends import Order
+from pebble.bench.control_ends import SliceSpec
 from pebble.bench.control_far import BACK, THERE, FarPlan
-from pebble.bench.control_plan import Plan
+from pebble.bench.control_participants import Participants
+from pebble.bench.control_plan import ControlPlan
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP
 from pebble.bench.control_variants import VARIANTS
 from pebble.bench.results import load
@@ -41,7 +41,7 @@ def command(*options: str) -> list[str]:
 
 @pytest.fixture
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They have tests of their own."""
+    """Plots have tests of their own."""
     monkeypatch.setattr(output, "find_spec", lambda _name: None)
 
 
@@ -64,7 +64,7 @@ def test_all_variants_alone_and_beside_a_busy_process(temporary: Path, tmp_path:
 
 @pytest.mark.usefixtures("no_plots")
 def test_pictures_flow_beside_the_messages_and_replies_take_longer_than_the_way_there(tmp_path: Path) -> None:
-    plan = Plan.of(
+    plan = ControlPlan.of(
         variants=["mqtt", "zenoh-p2p"], sizes=[1024], rates=[100.0], loads=["media"], seconds=0.1, rounds=1,
         output=tmp_path,
     )  # fmt: skip
@@ -77,7 +77,7 @@ def test_pictures_flow_beside_the_messages_and_replies_take_longer_than_the_way_
         hops = [float(there.figures[name] or 0) for name in ("call_us", "fabric_us", "inbox_us")]
         assert min(hops) > 0
         assert hops[1] + hops[2] < max(back.samples)
-        assert float(there.figures["wake_ups"] or 0) >= 4  # a service has two threads at least that take part
+        assert float(there.figures["wake_ups"] or 0) >= 4  # a service has at least two threads that take part
 
 
 def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
@@ -99,11 +99,11 @@ def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
 
 
 def test_a_process_that_dies_is_named() -> None:
-    with Cast(["mqtt"], ["none"]) as cast:
+    with Participants(["mqtt"], ["none"]) as participants:
         lines = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in children(os.getpid())}
         os.kill(next(pid for pid, line in lines.items() if "\0sender\0" in line), signal.SIGKILL)
         with pytest.raises(PebbleError, match="mqtt: sender ended with code -9"):
-            cast.run("mqtt", Order(size=40, rate=100.0, seconds=0.1), "none")
+            participants.run("mqtt", SliceSpec(size=40, rate=100.0, seconds=0.1), "none")
 
 
 # -- another machine
@@ -133,9 +133,9 @@ def echo(broker: Broker) -> Iterator[Child]:
 
 @pytest.mark.usefixtures("echo", "no_plots")
 def test_a_far_clock_is_found_within_its_error(settings: MqttSettings, tmp_path: Path) -> None:
-    said = io.StringIO()
+    printed = io.StringIO()
     plan = FarPlan.of(sizes=[40], rates=[200.0], seconds=0.3, rounds=2, output=tmp_path)
-    assert control_far.measure(plan, settings, Console(file=said, width=80)) == 0
+    assert control_far.measure(plan, settings, Console(file=printed, width=80)) == 0
     round_trip, there, back = load(tmp_path / "control-far.json").cells
     assert [cell.measure for cell in (round_trip, there, back)] == [ROUND_TRIP, THERE, BACK]
     offset, error = there.figures["clock_offset_ms"], there.figures["clock_error_ms"]
@@ -143,7 +143,7 @@ def test_a_far_clock_is_found_within_its_error(settings: MqttSettings, tmp_path:
     assert isinstance(error, float)
     assert abs(offset - SHIFT_NS / 1e6) <= error + 0.001
     assert str(there.params["clocks"]).startswith("± ")
-    assert "the far clock is +1" in said.getvalue()
+    assert "the far clock is +1" in printed.getvalue()
 
 
 def test_the_echo_ends_with_ctrl_c(broker: Broker) -> None:
@@ -162,7 +162,7 @@ def test_a_clock_that_is_slewed_is_not_used(monkeypatch: pytest.MonkeyPatch) -> 
     assert wall() >= before
 
 
-def test_a_far_echo_that_is_not_there_is_said(
+def test_a_missing_far_echo_is_reported(
     settings: MqttSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(control_far, "_ANSWER_S", 0.3)
@@ -171,20 +171,20 @@ def test_a_far_echo_that_is_not_there_is_said(
 
 
 def test_one_way_times_that_the_clocks_error_hides_are_unknown() -> None:
-    way = control_far.Way(40, 20.0)
-    way.sent, way.rounds, way.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [control_far.Offset(0, 10)]
-    round_trip, there, back = control_far.cells_of(way)
+    case = control_far.FarCase(40, 20.0)
+    case.sent, case.rounds, case.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [control_far.Offset(0, 10)]
+    round_trip, there, back = control_far.cells_of(case)
     assert round_trip.samples == [2e-5]
     assert there.samples == back.samples == []
-    assert any("one-way there: unknown" in line for line in control_far.verdict([way]))
+    assert any("one-way there: unknown" in line for line in control_far.assessment([case]))
 
 
 def test_clocks_that_could_not_be_compared_leave_the_round_trips() -> None:
-    way = control_far.Way(40, 20.0)
-    way.sent, way.rounds, way.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [None]
-    assert math.isnan(way.error_ms)
-    assert [len(cell.samples) for cell in control_far.cells_of(way)] == [1, 0, 0]
-    assert "one-way times are unknown" in control_far.verdict([way])[-1]
+    case = control_far.FarCase(40, 20.0)
+    case.sent, case.rounds, case.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [None]
+    assert math.isnan(case.error_ms)
+    assert [len(cell.samples) for cell in control_far.cells_of(case)] == [1, 0, 0]
+    assert "one-way times are unknown" in control_far.assessment([case])[-1]
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_clocks_that_could_not_be_compared_leave_the_round_trips() -> None:
         ("--variants", "nats"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(options: tuple[str, ...]) -> None:
+def test_invalid_options_are_refused(options: tuple[str, ...]) -> None:
     ended = subprocess.run(command(*options), cwd=ROOT, capture_output=True, text=True, timeout=30, check=False)
     assert ended.returncode == 1
     assert "secret" not in ended.stderr

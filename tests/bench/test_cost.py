@@ -1,4 +1,4 @@
-"""What is made of the readings of robots."""
+"""Cells, table and assessment from readings of robots."""
 
 import io
 import subprocess
@@ -8,11 +8,11 @@ import pytest
 from rich.console import Console
 
 from pebble.bench.cost_cells import cells_of
-from pebble.bench.cost_report import legend, table, verdict
+from pebble.bench.cost_report import assessment, legend, table
 from pebble.bench.cost_robot import IDLE, Reading
-from pebble.bench.onlooker import form_of
 from pebble.bench.results import Cell
-from pebble.packets import Codec, Picture, PictureKind, Sound
+from pebble.bench.robot_subscriber import encoding_of
+from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 
 
 def reading(phase: str, scale: float, broker: str, pictures_per_s: float | None = None) -> Reading:
@@ -59,7 +59,7 @@ def test_a_picture_costs_the_cpu_time_of_the_whole_robot(cells: list[Cell]) -> N
     assert find(cells, "mqtt", "CPU per picture", "all", "json+pcm").rounds[0] == [pytest.approx(60 / 15)]
 
 
-def test_without_a_picture_none_has_a_price() -> None:
+def test_without_pictures_there_is_no_cpu_per_picture() -> None:
     cells = cells_of({"mqtt": [[reading("json+pcm", 1.0, "mosquitto", 0.0)]]})
     assert find(cells, "mqtt", "CPU per picture", "all", "json+pcm").rounds == [[]]
 
@@ -72,25 +72,25 @@ def test_the_table_has_the_processes_of_both_within_100_columns(cells: list[Cell
     assert "…" not in shown
 
 
-def test_the_verdict_is_about_sums(cells: list[Cell]) -> None:
-    said = "\n".join(verdict(cells))
-    assert "idle, memory: mqtt 31.5 (30.0 to 33.0) MB, zenoh 60.0 (60.0 to 60.0) MB\n" in said
-    assert "json+pcm, CPU for each picture delivered: mqtt 4.20" in said
-    assert "takes 8" in said
+def test_the_assessment_is_about_sums(cells: list[Cell]) -> None:
+    printed = "\n".join(assessment(cells))
+    assert "idle, memory: mqtt 31.5 (30.0 to 33.0) MB, zenoh 60.0 (60.0 to 60.0) MB\n" in printed
+    assert "json+pcm, CPU per delivered picture: mqtt 4.20" in printed
+    assert "needs 8" in printed
 
 
-def test_the_legend_says_what_is_in_the_sum(cells: list[Cell]) -> None:
-    assert any("Not: the remote broker" in line for line in legend(cells))
+def test_the_legend_lists_what_is_in_the_sum(cells: list[Cell]) -> None:
+    assert any("Without the remote broker" in line for line in legend(cells))
 
 
-def test_forms_are_told_apart() -> None:
+def test_encodings_are_distinguished() -> None:
     pcm = Sound(Codec.PCM16LE, 1, 16_000, 320, 1, 0, b"\0" * 640).pack()
     opus = Sound(Codec.OPUS, 1, 16_000, 320, 1, 0, b"\0").pack()
     h264, jpeg = (Picture(kind, 0, 0, b"").pack() for kind in (PictureKind.H264, PictureKind.JPEG))
-    assert [form_of(raw) for raw in (pcm, opus, h264, jpeg, b'{"a": 1}')] == ["pcm", "opus", "h264", "pbvd", "json"]
+    assert [encoding_of(raw) for raw in (pcm, opus, h264, jpeg, b'{"a": 1}')] == ["pcm", "opus", "h264", "pbvd", "json"]
 
 
-def test_who_measures_memory_does_not_share_the_large_libraries() -> None:
-    """Or part of what a robot takes would be counted as the measurer's."""
-    look = "import sys, pebble.bench.cost; print({'numpy', 'cv2', 'av', 'zenoh'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout == "set()\n"
+def test_the_measuring_process_does_not_import_large_libraries() -> None:
+    """Otherwise part of a robot's memory would be counted as the measuring process's."""
+    code = "import sys, pebble.bench.cost; print({'numpy', 'cv2', 'av', 'zenoh'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

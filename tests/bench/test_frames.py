@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import frames, frames_variants
-from pebble.bench.frames import Plan
+from pebble.bench.frames import FramesPlan
 from pebble.bench.frames_variants import Case, Size, parse_size
 from pebble.bench.results import load
 from pebble.bench.usage import children
@@ -25,7 +25,7 @@ def command(*options: str) -> list[str]:
 
 
 def alive(pid: int) -> bool:
-    """Does it still run? (A zombie does not.)"""
+    """Whether it still runs. (A zombie does not.)"""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
@@ -52,8 +52,8 @@ def test_a_short_run_leaves_results_and_nothing_else(temporary: Path, tmp_path: 
     assert all(cell.params == {"size": "64x48", "readers": 1} for cell in results.cells)
     assert all([len(samples) > 3 for samples in cell.rounds] == [True, True] for cell in results.cells)
     assert all(min(cell.samples) > 0 and cell.lost is not None and cell.lost >= 0 for cell in results.cells)
-    assert len(results.verdict) == 3  # against two others, and that two rounds are few
-    assert all(line in ended.stdout for line in results.verdict)
+    assert len(results.assessment) == 3  # two comparisons, and a note about too few rounds
+    assert all(line in ended.stdout for line in results.assessment)
     assert results.command[:3] == ["pebble", "bench", "frames"]
     assert list(temporary.iterdir()) == []
 
@@ -63,12 +63,12 @@ def test_frames_in_shared_memory_arrive_whole_at_every_reader(variant: str) -> N
     round_ = frames.run_case(Case(variant, Size(320, 240), 2), 0.5)
     assert len(round_.latencies_us) > 10
     assert round_.torn == 0
-    assert round_.fallbacks < len(round_.latencies_us) / 4  # a reader that gets no processor keeps buffers
+    assert round_.fallbacks < len(round_.latencies_us) / 4  # a reader without CPU time holds buffers
     assert round_.memory_reader_mb > 0
     assert children(os.getpid()) == []
 
 
-def test_the_bare_copy_is_nobody_s_cpu_but_the_copier_s() -> None:
+def test_the_bare_copy_counts_only_the_cpu_of_the_copier() -> None:
     round_ = frames.run_case(Case("memcpy", Size(320, 240), 1), 0.5)
     assert len(round_.latencies_us) > 3
     assert round_.cpu_writer == 0.0
@@ -84,7 +84,7 @@ def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
         started = children(bench.pid)
         assert until(lambda: all(map(segments, started)), 20)
         shared = set().union(*map(segments, started))
-        time.sleep(1)  # what is younger than a second is nobody's to sweep
+        time.sleep(1)  # files younger than a second are not swept
         bench.send_signal(signal.SIGINT)
         assert bench.wait(20) == 130
     finally:
@@ -114,32 +114,32 @@ def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(
 ) -> None:
     monkeypatch.setattr(frames_variants, "_SYSTEM_PYTHON", "/nowhere/python3")
     frames_variants._gstreamer.cache_clear()
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
-        assert frames._installed(["zenoh-shm", "gstreamer-shm"], Console(file=said, width=80)) == ["zenoh-shm"]
+        assert frames._installed(["zenoh-shm", "gstreamer-shm"], Console(file=printed, width=80)) == ["zenoh-shm"]
     finally:
         frames_variants._gstreamer.cache_clear()
-    assert "gstreamer-shm is left out" in said.getvalue()
-    assert frames_variants.INSTALL_GSTREAMER in said.getvalue()
+    assert "gstreamer-shm is left out" in printed.getvalue()
+    assert frames_variants.INSTALL_GSTREAMER in printed.getvalue()
 
 
 @pytest.mark.parametrize(
     "plan",
     [
-        Plan(variants=["zenoh"]),
-        Plan(seconds=0.0),
-        Plan(seconds=float("nan")),
-        Plan(rounds=1),
-        Plan(readers=[0]),
-        Plan(sizes=["big"]),
-        Plan(sizes=["1x1"]),
-        Plan(sizes=["30x30"]),
-        Plan(variants=[]),
-        Plan(variants=["mqtt", "mqtt"]),
-        Plan(output=Path("/dev/null/x")),
+        FramesPlan(variants=["zenoh"]),
+        FramesPlan(seconds=0.0),
+        FramesPlan(seconds=float("nan")),
+        FramesPlan(rounds=1),
+        FramesPlan(readers=[0]),
+        FramesPlan(sizes=["big"]),
+        FramesPlan(sizes=["1x1"]),
+        FramesPlan(sizes=["30x30"]),
+        FramesPlan(variants=[]),
+        FramesPlan(variants=["mqtt", "mqtt"]),
+        FramesPlan(output=Path("/dev/null/x")),
     ],
 )
-def test_nonsense_is_refused_before_anything_starts(plan: Plan) -> None:
+def test_invalid_options_are_refused_before_anything_starts(plan: FramesPlan) -> None:
     with pytest.raises(PebbleError):
         frames.run(plan, Console(file=io.StringIO()))
 

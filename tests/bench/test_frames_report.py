@@ -1,10 +1,10 @@
-"""Rounds become cells, cells become tables and plain words."""
+"""Rounds become cells, cells become tables and an assessment."""
 
 from typing import Any
 
 import pytest
 
-from pebble.bench.frames_report import Round, cell_of, complete, legend, tables, verdict
+from pebble.bench.frames_report import Round, assessment, cell_of, complete, legend, tables
 from pebble.bench.frames_variants import VARIANTS, Case, Size
 from pebble.bench.results import Cell
 
@@ -56,10 +56,10 @@ def test_a_case_that_never_ran_is_there_and_empty() -> None:
     assert (cell.samples, cell.figures["cpu_reader"], cell.lost) == ([], None, 0)
     [table] = tables([cell])
     assert table.row_count == 1
-    assert verdict([eight_rounds("zenoh-shm", 5.0), cell])[0].endswith("nothing was measured")
+    assert assessment([eight_rounds("zenoh-shm", 5.0), cell])[0].endswith("nothing was measured")
 
 
-def test_a_role_goes_by_its_own_name() -> None:
+def test_a_cell_has_the_name_of_its_role() -> None:
     cell = cell_of(Case("mqtt", HD, 1, role="mqtt again"), [a_round(1)])
     assert cell.variant == "mqtt again"
     assert len(list(tables([cell]))) == 1
@@ -72,32 +72,32 @@ def test_words_compare_like_with_like() -> None:
         eight_rounds("memcpy", 500),
         cell_of(Case("gstreamer-shm", HD, 3), [a_round(1)] * 8),
     ]
-    against, memcpy = verdict(cells)
-    assert against.startswith("1920x1080, one reader: zenoh-shm is faster than gstreamer-shm: 0.50 (")
-    assert against.endswith("; a reader's CPU 0.50 % against 1.00 %")
-    assert memcpy.startswith("1920x1080, one reader: zenoh-shm and memcpy are equal within noise: 1.00 (")
+    against, memcpy = assessment(cells)
+    assert against.startswith("1920x1080, one reader: zenoh-shm takes 0.50× the time of gstreamer-shm (")
+    assert against.endswith("; CPU of a reader 0.50 % against 1.00 %")
+    assert memcpy.startswith("1920x1080, one reader: zenoh-shm and memcpy are equal within noise: 1.00× the time (")
 
 
 @pytest.mark.parametrize(("rounds", "lines"), [(7, 2), (8, 1)])
 def test_few_rounds_are_shown_and_not_judged(rounds: int, lines: int) -> None:
     cells = [cell_of(Case(name, HD, 1), [a_round(5.0)] * rounds) for name in ("zenoh-shm", "mqtt")]
-    assert len(verdict(cells)) == lines
-    assert ("equal within noise" in verdict(cells)[0]) == (lines == 1)
+    assert len(assessment(cells)) == lines
+    assert ("equal within noise" in assessment(cells)[0]) == (lines == 1)
 
 
 @pytest.mark.parametrize(
     ("gone", "asked", "enough"), [(0, 8, True), (2, 10, True), (3, 10, False), (1, 2, True), (2, 2, False)]
 )
-def test_rounds_that_failed_are_told_and_too_few_are_not_enough(gone: int, asked: int, enough: bool) -> None:
+def test_failed_rounds_are_reported_and_too_few_are_not_enough(gone: int, asked: int, enough: bool) -> None:
     cell = cell_of(Case("mqtt", HD, 1), [None] * gone + [a_round(1.0)] * (asked - gone))
     assert complete([cell], asked) == enough
-    told = [f"1920x1080, one reader, mqtt: {gone} rounds failed and are left out"]
-    assert verdict([cell]) == (told if gone else [])
+    lines = [f"1920x1080, one reader, mqtt: {gone} rounds failed and are left out"]
+    assert assessment([cell]) == (lines if gone else [])
 
 
-def test_frames_that_arrived_otherwise_than_they_should_are_told() -> None:
+def test_torn_frames_and_fallbacks_are_reported() -> None:
     cell = cell_of(Case("zenoh-copy", HD, 3), [a_round(1, torn=2), a_round(1, fallbacks=5)])
-    assert verdict([cell]) == [
+    assert assessment([cell]) == [
         "1920x1080, 3 readers, zenoh-copy: 2 frames arrived torn",
         "1920x1080, 3 readers, zenoh-copy: 5 frames could not go through shared memory",
     ]

@@ -1,4 +1,4 @@
-"""The null test: fooled neither way, and it says so when it was."""
+"""The null test passes or misses as it should, and reports it."""
 
 import io
 import random
@@ -37,27 +37,27 @@ def test_roles_know_their_variant() -> None:
     assert [null.is_slowed(role) for role in (plain, again, slowed)] == [False, False, True]
 
 
-def test_as_it_should_be() -> None:
+def test_a_passed_null_test() -> None:
     assert null.passed(cells())
-    again, slowed, aim = null.verdict(cells())
-    assert again.endswith("equal, as they are")
-    assert slowed.endswith("the planted 20 % were seen")
+    again, slowed, aim = null.assessment(cells())
+    assert again.endswith("equal, as expected")
+    assert slowed.endswith("the planted 20 % were found")
     assert aim.startswith("aim: ")
     assert ": met (" in aim
 
 
 @pytest.mark.parametrize(("again", "slowed", "missed"), [(1.3, 1.2, [True, False]), (1.0, 1.0, [False, True])])
-def test_fooled(again: float, slowed: float, missed: list[bool]) -> None:
+def test_a_missed_null_test(again: float, slowed: float, missed: list[bool]) -> None:
     assert not null.passed(cells(again, slowed))
-    *lines, aim = null.verdict(cells(again, slowed))
+    *lines, aim = null.assessment(cells(again, slowed))
     assert [line.endswith("MISSED") for line in lines] == missed
     assert ": missed (" in aim
 
 
 def test_few_rounds_are_shown_and_not_judged() -> None:
     few = cells(1.3, 1.0, rounds=4)
-    assert ": not judged (mqtt again 1." in null.verdict(few)[-1]
-    assert "MISSED" not in "".join(null.verdict(few))
+    assert ": not judged (mqtt again 1." in null.assessment(few)[-1]
+    assert "MISSED" not in "".join(null.assessment(few))
 
 
 def test_nothing_measured_is_not_passed() -> None:
@@ -81,7 +81,7 @@ def a_round(*latencies_us: float) -> Round:
 
 
 class Processes:
-    """In place of real ones: 400 µs, a little noise, and what the writer is told to add, or nothing of it."""
+    """Replaces real processes: 400 µs, a little noise, and the delay that the writer is to add, if ``obedient``."""
 
     def __init__(self, *, obedient: bool = True) -> None:
         self._noise, self._obedient = random.Random(1), obedient
@@ -103,15 +103,15 @@ def test_frames_against_themselves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, obedient: bool, quick: bool, code: int, outcome: str
 ) -> None:
     monkeypatch.setattr(frames, "run_case", Processes(obedient=obedient))
-    said = io.StringIO()
+    printed = io.StringIO()
     plan = frames_null.plan(quick=quick, output=tmp_path)
-    assert frames_null.run(plan, Console(file=said, width=80)) == code
+    assert frames_null.run(plan, Console(file=printed, width=80)) == code
     results = load(tmp_path / "frames-null.json")
     assert [cell.variant for cell in results.cells] == list(null.roles("zenoh-shm"))
     assert (results.bench, results.quick) == ("frames-null", quick)
     assert "--null zenoh-shm" in " ".join(results.command)
-    assert outcome in results.verdict[-1]
-    assert results.verdict[-1] in said.getvalue()
+    assert outcome in results.assessment[-1]
+    assert results.assessment[-1] in printed.getvalue()
 
 
 def test_one_thing_is_tested_at_a_time(tmp_path: Path) -> None:

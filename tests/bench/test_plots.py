@@ -1,4 +1,4 @@
-"""Every shape of results becomes pictures that can be read."""
+"""Results of every shape become readable pictures."""
 
 import io
 import itertools
@@ -20,15 +20,15 @@ from pebble.bench.results import Cell, Results
 from pebble.errors import PebbleError
 from tests.bench import synthetic
 
-pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib warns where a layout has no room
+pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib warns if a layout does not fit
 SHAPES = [*synthetic.one_of_each(small=True).values(), synthetic.broken()]
 LARGEST = 200_000  # bytes of a file
 TOUCH = 1.0  # pixels
 
 
 def texts(figure: Figure) -> Iterator[tuple[str, Bbox]]:
-    """What is written in a drawn figure, with its place; a tick beyond the ends of its axis is not to be seen."""
-    figure.set_layout_engine("none")  # it has its layout
+    """The visible texts of a drawn figure, with their boxes; ticks beyond the ends of an axis are invisible."""
+    figure.set_layout_engine("none")  # the layout is already computed
     renderer = FigureCanvasAgg(figure).get_renderer()
     unseen = set()
     for axes in figure.axes:
@@ -45,11 +45,11 @@ def texts(figure: Figure) -> Iterator[tuple[str, Bbox]]:
 
 
 def unreadable(figure: Figure) -> list[tuple[str, ...]]:
-    """Pairs of texts that lie over each other, and texts that reach over the edge."""
+    """Pairs of overlapping texts, and texts that exceed the edge."""
     box, places = figure.bbox, list(texts(figure))
     assert places
     return [
-        *((one, other) for (one, a), (other, b) in itertools.combinations(places, 2) if _meet(a, b)),
+        *((one, other) for (one, a), (other, b) in itertools.combinations(places, 2) if _overlap(a, b)),
         *(
             (text,)
             for text, a in places
@@ -58,7 +58,7 @@ def unreadable(figure: Figure) -> list[tuple[str, ...]]:
     ]
 
 
-def _meet(a: Bbox, b: Bbox) -> bool:
+def _overlap(a: Bbox, b: Bbox) -> bool:
     return min(a.x1, b.x1) - max(a.x0, b.x0) > TOUCH and min(a.y1, b.y1) - max(a.y0, b.y0) > TOUCH
 
 
@@ -105,7 +105,7 @@ def test_the_trials_that_were_run_are_enough(tmp_path: Path) -> None:
     assert len(draw(one, tmp_path)) == 6
 
 
-def test_a_quick_run_says_so_in_the_picture(tmp_path: Path) -> None:
+def test_a_quick_run_is_marked_in_the_picture(tmp_path: Path) -> None:
     (picture,) = pictures(synthetic.startup())
     for quick in (False, True):
         save(picture, tmp_path / f"{quick}.png", Results(bench="startup", quick=quick))
@@ -120,7 +120,7 @@ def test_a_distribution_ends_below_100_percent_by_what_was_lost() -> None:
     lossy = Cell(variant="mqtt", measure="way", unit="ms", rounds=[[1.0] * 90], figures={"sent": 100})
     (all_of_it,), (most_of_it,) = (pictures(Results(bench="fleet", cells=[cell])) for cell in (whole, lossy))
     assert "never arrived" not in all_of_it.caption
-    assert most_of_it.caption.endswith("what never arrived is missing from 100 %")
+    assert most_of_it.caption.endswith("lost messages are missing from 100 %")
     for picture, top in ((all_of_it, 100), (most_of_it, 90)):
         (curve, *_) = picture.make().axes[0].get_lines()
         assert max(curve.get_ydata()) == pytest.approx(top)  # type: ignore[arg-type]
@@ -171,7 +171,7 @@ def test_a_variant_looks_the_same_everywhere_and_like_no_other() -> None:
     assert len({style.colour for style in unknown.values()}) == len(unknown)
 
 
-def test_conditions_read_as_people_say_them() -> None:
+def test_conditions_are_readable() -> None:
     def of(**params: str | int | None) -> str:
         return place(Cell(variant="mqtt", params=params, measure="", unit=""))
 

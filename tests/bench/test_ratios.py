@@ -1,4 +1,4 @@
-"""Intervals of ratios: right as often as they say, and sharp enough to see a fifth."""
+"""Intervals of ratios: correct as often as their level, and narrow enough to detect a fifth."""
 
 import math
 
@@ -19,7 +19,7 @@ def fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def make(random: np.random.Generator, rounds: int, *, factor: float = 1.0, mood: float = 0.05) -> Rounds:
-    """As measured: each round has a mood of its own, and samples with a long tail."""
+    """As measured: each round has an offset of its own, and samples with a long tail."""
     moods = factor * np.exp(random.normal(0, mood, rounds))
     return [(100 * one * np.exp(random.normal(0, 0.1, 25))).tolist() for one in moods]
 
@@ -29,17 +29,17 @@ def make(random: np.random.Generator, rounds: int, *, factor: float = 1.0, mood:
 def test_the_same_twice_is_called_equal(judge: type[paired], rounds: int) -> None:
     random = np.random.default_rng(rounds)
     equal = sum(judge(make(random, rounds), make(random, rounds)).equal for _ in range(RUNS))
-    assert equal >= 0.975 * RUNS  # 99 % is claimed; 300 runs do not tell it from 98 %
+    assert equal >= 0.975 * RUNS  # the level is 99 %; 300 runs cannot distinguish it from 98 %
 
 
 @pytest.mark.parametrize("judge", [paired, unpaired])
-def test_a_fifth_more_is_seen(judge: type[paired]) -> None:
+def test_a_fifth_more_is_detected(judge: type[paired]) -> None:
     random = np.random.default_rng(7)
     seen = sum(judge(make(random, 12, factor=1.2, mood=0.04), make(random, 12, mood=0.04)).low > 1 for _ in range(100))
     assert seen >= 95
 
 
-def test_rounds_in_turn_forgive_a_mood_that_both_share() -> None:
+def test_variation_that_both_share_cancels_out_in_turns() -> None:
     random = np.random.default_rng(3)
     theirs = make(random, 10, mood=0.5)
     ours = [[1.2 * sample for sample in one] for one in theirs]
@@ -67,7 +67,7 @@ def test_the_percentile_is_that_of_each_round() -> None:
     assert paired(rounds, [[1.0]] * 3, 50).ratio == pytest.approx(1)
 
 
-def test_rounds_that_failed_do_not_count() -> None:
+def test_failed_rounds_do_not_count() -> None:
     ours, theirs = [[2.0], [], [2.0], [9.0]], [[1.0], [1.0], [], [0.0]]
     assert paired(ours, theirs).ratio == pytest.approx(2)
     assert unpaired([[2.0], []], [[], [1.0]]).ratio == pytest.approx(2)
@@ -99,9 +99,9 @@ def test_the_same_samples_give_the_same_interval() -> None:
 @pytest.mark.parametrize(
     ("interval", "words"),
     [
-        (Interval(0.5, 0.4, 0.6), "a is faster than b: 0.50 (0.40 to 0.60) of its figure"),
-        (Interval(2.0, 1.5, 2.5), "a is slower than b: 2.00 (1.50 to 2.50) of its figure"),
-        (Interval(1.1, 0.9, 1.3), "a and b are equal within noise: 1.10 (0.90 to 1.30)"),
+        (Interval(0.5, 0.4, 0.6), "a takes 0.50× the time of b (99 % interval 0.40–0.60)"),
+        (Interval(2.0, 1.5, 2.5), "a takes 2.00× the time of b (99 % interval 1.50–2.50)"),
+        (Interval(1.1, 0.9, 1.3), "a and b are equal within noise: 1.10× the time (99 % interval 0.90–1.30)"),
     ],
 )
 def test_words(interval: Interval, words: str) -> None:

@@ -1,4 +1,4 @@
-"""What a report says, and that it is written whatever happens to the comparisons."""
+"""The text of a report, and that it is written even if comparisons fail."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rich.console import Console
 from pebble.bench import report
 from pebble.bench.report_limits import limits
 from pebble.bench.report_plan import COMPARISONS, Comparison, chosen
-from pebble.bench.report_run import Ended, Run
+from pebble.bench.report_run import Outcome, Run
 from pebble.bench.report_text import Section, text
 from pebble.bench.results import Results
 from pebble.bench.usage import children
@@ -28,21 +28,21 @@ from tests.bench import synthetic
 from tests.support import ROOT, Child, gone, until
 
 
-def section(name: str, results: Results | None = None, said: str = "") -> Section:
-    return Section(comparison=chosen([name])[0], results=results, said=said)
+def section(name: str, results: Results | None = None, output: str = "") -> Section:
+    return Section(comparison=chosen([name])[0], results=results, output=output)
 
 
 def comparison(name: str, *arguments: str) -> Comparison:
     return Comparison(name=name, title=name, what="", full=arguments, quick=arguments, full_s=1, quick_s=1)
 
 
-def put(folder: Path, results: Results, said: str) -> None:
+def put(folder: Path, results: Results, output: str) -> None:
     results.save(folder / f"{results.bench}.json")
-    (folder / f"{results.bench}.txt").write_text(said)
+    (folder / f"{results.bench}.txt").write_text(output)
 
 
 def test_aims_of_all_comparisons_stand_in_one_table() -> None:
-    bridge = Results(bench="bridge", verdict=["aim: p50 | p99: missed by 0.2 ms (0.9 ms)", "aim: bytes: 0.15, met"])
+    bridge = Results(bench="bridge", assessment=["aim: p50 | p99: missed by 0.2 ms (0.9 ms)", "aim: bytes: 0.15, met"])
     lines = text([section("control", synthetic.control(small=True)), section("bridge", bridge)]).splitlines()
     assert [line for line in lines if line.startswith("| ") and "](#" in line] == [
         "| Zenoh peer to peer, p50 at most 0.70 of the better MQTT variant's | [control](#service-to-service) | met "
@@ -54,11 +54,11 @@ def test_aims_of_all_comparisons_stand_in_one_table() -> None:
     ]
 
 
-def test_what_helps_to_choose_and_what_can_be_believed_comes_first() -> None:
+def test_the_summary_with_null_tests_comes_first() -> None:
     null_test = synthetic.null_test("control", "zenoh-p2p")
-    said = text([section("control", synthetic.control(small=True)), section("control-null", null_test)])
-    summary = said[said.index("## In short") : said.index("## Aims")]
-    assert "* [Service to service](#service-to-service)\n  * zenoh-p2p is faster than mqtt-nodelay" in summary
+    document = text([section("control", synthetic.control(small=True)), section("control-null", null_test)])
+    summary = document[document.index("## In short") : document.index("## Aims")]
+    assert "* [Service to service](#service-to-service)\n  * zenoh-p2p takes 0.43× the time of mqtt-nodelay" in summary
     assert "control passed" in summary
 
 
@@ -70,18 +70,18 @@ def test_a_null_test_of_few_rounds_is_not_judged() -> None:
 
 
 def test_an_aim_that_was_not_judged_is_neither_met_nor_missed() -> None:
-    few = Results(bench="bridge", verdict=["aim: p50 at most 0.7 ms: not judged (0.6 ms)", "zenoh is faster"])
+    few = Results(bench="bridge", assessment=["aim: p50 at most 0.7 ms: not judged (0.6 ms)", "zenoh is faster"])
     written = text([section("bridge", few)])
     assert "| p50 at most 0.7 ms | [bridge](#operator-to-wheels-and-back) | not judged | 0.6 ms |" in written
     assert "  * zenoh is faster" in written
 
 
-def test_a_table_stands_in_it_once_and_the_verdict_is_not_repeated() -> None:
-    said = "conditions  p50\n40 B  12.0\nzenoh is faster\nWritten: a, b\n"
+def test_a_table_appears_once_and_the_assessment_is_not_repeated() -> None:
+    document = "conditions  p50\n40 B  12.0\nzenoh is faster\nWritten: a, b\n"
     results = Results(
-        bench="control", verdict=["zenoh is faster"], command=["pebble", "bench", "control", "--rounds", "3"]
+        bench="control", assessment=["zenoh is faster"], command=["pebble", "bench", "control", "--rounds", "3"]
     )
-    written = text([section("control", results, said)])
+    written = text([section("control", results, document)])
     assert "```text\nconditions  p50\n40 B  12.0\n```" in written
     assert written.count("zenoh is faster") == 2  # in short, and in its section
     assert "    pebble bench control --rounds 3\n" in written
@@ -94,7 +94,7 @@ def test_long_tables_are_folded() -> None:
     )
 
 
-def test_what_failed_is_named_with_what_it_said() -> None:
+def test_a_failed_comparison_is_named_with_its_output() -> None:
     written = text(
         [section("control", Results(bench="control")), section("bridge", None, "pebble: mosquitto is missing")]
     )
@@ -102,35 +102,35 @@ def test_what_failed_is_named_with_what_it_said() -> None:
     assert "pebble: mosquitto is missing" in written
 
 
-def test_a_quick_run_says_so_and_how_little_it_means() -> None:
+def test_a_quick_run_is_marked_with_its_limits() -> None:
     quick, full = (section("startup", Results(bench="startup", quick=quick)) for quick in (True, False))
     sound = section("sound", Results(bench="sound"))  # is as long in either
     assert "# Results of a quick run" in text([quick, sound])
     assert "several runs" not in text([quick, sound])
     assert "quick" not in text([full]).lower()
-    assert "Not all of it is quick: it comes from several runs" in text([quick, section("cost", Results(bench="cost"))])
+    assert "Not all of it is quick: it combines several runs" in text([quick, section("cost", Results(bench="cost"))])
 
 
 def test_what_ended_badly_is_no_whole_result() -> None:
-    """It left results, and its exit code says that something is missing."""
+    """It wrote results, but its exit code shows that something is missing."""
     one = section("startup", synthetic.startup())
-    known = replace(one, ended=Ended(code=1, took_s=90.0))
+    known = replace(one, ended=Outcome(code=1, took_s=90.0))
     assert "incomplete" not in text([one])
     assert "[Start-up](#start-up): **incomplete**, it ended with code 1" in text([known])
     assert "**It ended with code 1: something could not be measured.**" in text([known])
 
 
-def test_what_was_left_out_or_cut_short_is_said_and_times_are_those_of_the_clock() -> None:
+def test_left_out_and_interrupted_comparisons_are_listed_with_wall_times() -> None:
     run = Run(left_out=["bridge-profile"], interrupted="in cost, after 3 of 12")
-    one = replace(section("startup", synthetic.startup()), ended=Ended(code=0, took_s=119.7))
+    one = replace(section("startup", synthetic.startup()), ended=Outcome(code=0, took_s=119.7))
     written = text([one], run)
-    assert "* Operator to wheels: where the time goes: left out, it needs root" in written
+    assert "* Operator to wheels: where the time goes: left out, needs root" in written
     assert "**The run was interrupted in cost, after 3 of 12 comparisons.**" in written
     assert "Measured on 2026-11-20, in 2 min 0 s." in written
-    assert "Begun 2026-11-20 14:00 UTC, 2 min 0 s." in written
+    assert "Started 2026-11-20 14:00 UTC, 2 min 0 s." in written
 
 
-def test_a_proxy_is_no_link() -> None:
+def test_a_proxy_is_listed_among_the_limits() -> None:
     why = "ip is not installed"
     proxy, asked, spaces = (
         limits([Results(bench="impair", options=options)])
@@ -168,32 +168,32 @@ def test_results_of_another_version_do_not_keep_the_others_out(tmp_path: Path) -
 def test_pictures_that_were_just_drawn_are_not_drawn_again(tmp_path: Path) -> None:
     put(tmp_path, synthetic.startup(), "a table")
     picture = tmp_path / "startup.png"
-    report.write(tmp_path, anew=False)
+    report.write(tmp_path, redraw=False)
     assert picture.exists()
     picture.write_text("drawn")
-    report.write(tmp_path, anew=False)
+    report.write(tmp_path, redraw=False)
     assert picture.read_text() == "drawn"
     report.write(tmp_path)
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_no_document_of_somebody_else_is_written_over(tmp_path: Path) -> None:
+def test_a_foreign_document_is_not_overwritten(tmp_path: Path) -> None:
     put(tmp_path, synthetic.startup(), "a table")
     (tmp_path / "README.md").write_text("# My robot")
-    with pytest.raises(PebbleError, match=r"README\.md is no report of pebble bench"):
+    with pytest.raises(PebbleError, match=r"README\.md is not a report of pebble bench"):
         report.write(tmp_path)
-    with pytest.raises(PebbleError, match=r"README\.md is no report of pebble bench"):
+    with pytest.raises(PebbleError, match=r"README\.md is not a report of pebble bench"):
         report.run([comparison("sound", "bench", "sound")], tmp_path, quick=True, console=Console(quiet=True))
     assert (tmp_path / "README.md").read_text() == "# My robot"
 
 
 def test_nothing_there_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(PebbleError, match="holds no results"):
+    with pytest.raises(PebbleError, match="has no results"):
         report.write(tmp_path)
 
 
 def test_a_comparison_that_fails_does_not_stop_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both command lines are wrong; what an earlier run of one of them left must not hide that."""
+    """Both command lines are invalid; results of an earlier run must not hide that."""
     plan = [comparison("control", "bench", "nonsense"), comparison("sound", "topics")]
     monkeypatch.setattr(report, "COMPARISONS", plan)
     put(tmp_path, synthetic.control(small=True), "old")
@@ -204,9 +204,9 @@ def test_a_comparison_that_fails_does_not_stop_the_others(tmp_path: Path, monkey
     assert not (tmp_path / "control-ratios.png").exists()
     assert "No such command 'nonsense'" in (tmp_path / "README.md").read_text()
     assert "No such option" in (tmp_path / "README.md").read_text()
-    said = console.export_text()
-    assert "control ended with code 2: see" in said
-    assert "sound ended with code 2: see" in said
+    document = console.export_text()
+    assert "control ended with code 2: see" in document
+    assert "sound ended with code 2: see" in document
 
 
 def test_what_this_user_may_not_run_is_not_taken_from_an_earlier_run(
@@ -220,11 +220,11 @@ def test_what_this_user_may_not_run_is_not_taken_from_an_earlier_run(
     assert not (tmp_path / "bridge.json").exists()
     written = (tmp_path / "README.md").read_text()
     assert "bridge-down.png" not in written
-    assert "left out, it needs root" in written
-    assert "left out, it needs root" in report.write(tmp_path).read_text()
+    assert "left out, needs root" in written
+    assert "left out, needs root" in report.write(tmp_path).read_text()
 
 
-def test_a_run_that_was_interrupted_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_is_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = [comparison("sound", "bench", "sound"), comparison("startup", "bench", "startup")]
     monkeypatch.setattr(report, "COMPARISONS", plan)
     ran: list[str] = []
@@ -247,9 +247,9 @@ def test_a_run_that_was_interrupted_says_so(tmp_path: Path, monkeypatch: pytest.
     assert "**It was interrupted, and left no results.**" in written
 
 
-def test_one_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "_PATIENCE", 0)
-    monkeypatch.setattr(report, "_PATIENCE_S", 0.0)
+def test_a_hanging_comparison_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "_TIMEOUT_FACTOR", 0)
+    monkeypatch.setattr(report, "_TIMEOUT_EXTRA_S", 0.0)
     plan = [comparison("fleet", "bench", "fleet")]
     monkeypatch.setattr(report, "COMPARISONS", plan)
     console = Console(record=True, width=100)
@@ -257,7 +257,7 @@ def test_one_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "fleet hung and was ended" in console.export_text()
 
 
-def test_one_that_ends_well_runs_as_its_command_line_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_successful_comparison_runs_its_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = [comparison("sound", "bench", "sound")]
     monkeypatch.setattr(report, "COMPARISONS", plan)
     assert report.run(plan, tmp_path, quick=False, console=Console(quiet=True)) == 0
@@ -289,7 +289,7 @@ def test_every_command_line_is_one_that_exists(one: Comparison, quick: bool) -> 
 
 
 def parse(command: object, words: Sequence[str]) -> None:
-    """Reads a command line to its end without running it."""
+    """Parses a whole command line without running it."""
     while True:
         context = command.make_context("pebble", list(words))  # type: ignore[attr-defined]
         if not hasattr(command, "resolve_command"):
@@ -308,7 +308,7 @@ def test_unknown_names_are_an_error_and_no_names_are_all(monkeypatch: pytest.Mon
         chosen(["nonsense"])
 
 
-def test_the_times_that_were_promised() -> None:
+def test_the_expected_times_are_as_documented() -> None:
     assert sum(one.full_s for one in COMPARISONS) <= 3600
     assert sum(one.quick_s for one in COMPARISONS) <= 280
 
@@ -316,7 +316,7 @@ def test_the_times_that_were_promised() -> None:
 def test_no_robot_and_no_command_loads_matplotlib() -> None:
     program = (
         "import sys; sys.argv = ['pebble', 'bench', '--help']; from pebble.cli import main; main(); "
-        "import pebble.bench.output, pebble.bench.report, pebble.launcher.programs, pebble.service; "
+        "import pebble.bench.output, pebble.bench.report, pebble.launcher.programs, pebble.runtime.service; "
         "sys.exit('matplotlib' in sys.modules)"
     )
     done = subprocess.run(

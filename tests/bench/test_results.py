@@ -1,4 +1,4 @@
-"""What a comparison leaves behind comes back as it was, and anything else is refused in one line."""
+"""Results are loaded as they were saved; other files are refused with one line."""
 
 import math
 import subprocess
@@ -35,7 +35,7 @@ def test_all_that_repeats_it_is_there(tmp_path: Path) -> None:
     assert results.machine == machine()
 
 
-def test_a_broker_that_does_not_say_its_version_costs_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broker_without_a_version_costs_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
     def stuck(*_: object, **__: object) -> None:
         raise subprocess.TimeoutExpired("mosquitto", 5)
 
@@ -53,7 +53,7 @@ def test_a_folder_in_which_nothing_can_be_written_is_refused(tmp_path: Path) -> 
     check_folder(tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
     with pytest.raises(PebbleError, match="/proc: "):
-        check_folder(Path("/proc"))  # it is there, and not even root writes into it
+        check_folder(Path("/proc"))  # it exists, and not even root can write into it
 
 
 def test_samples_keep_three_digits(tmp_path: Path) -> None:

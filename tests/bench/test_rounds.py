@@ -1,4 +1,4 @@
-"""Rounds that fail: what is kept, what is said, and when it is no use to go on."""
+"""Failed rounds: what still counts, what is reported, and when the run is given up."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import bridge, cost, output, startup
-from pebble.bench.bridge_drive import Found, Stretch
-from pebble.bench.bridge_plan import Plan
+from pebble.bench.bridge_drive import Arrived, DriveSegment
+from pebble.bench.bridge_plan import BridgePlan
 from pebble.bench.cost_robot import IDLE, Reading
 from pebble.bench.results import Cell, load
 from pebble.bench.rounds import Rounds
@@ -19,9 +19,9 @@ from pebble.errors import PebbleError
 FULL = [Cell(variant="mqtt", measure="m", unit="ms", rounds=[[1.0]])]
 
 
-def attempted(outcomes: str, said: io.StringIO | None = None) -> Rounds:
+def attempted(outcomes: str, printed: io.StringIO | None = None) -> Rounds:
     """One round for each letter: ``x`` fails."""
-    rounds = Rounds(len(outcomes), Console(file=said or io.StringIO(), width=80))
+    rounds = Rounds(len(outcomes), Console(file=printed or io.StringIO(), width=80))
     for number, outcome in enumerate(outcomes):
         with rounds.attempt(number):
             if outcome == "x":
@@ -37,24 +37,24 @@ def test_too_few_rounds_are_left_where_enough_were_asked_for(outcomes: str, code
     assert attempted(outcomes).code(FULL) == code
 
 
-def test_what_has_no_figures_was_not_measured() -> None:
+def test_a_cell_without_samples_exits_with_1() -> None:
     assert attempted("..").code([*FULL, Cell(variant="zenoh", measure="m", unit="ms", rounds=[[], []])]) == 1
 
 
-def test_what_was_left_out_is_told_and_shown_at_once() -> None:
-    said = io.StringIO()
-    assert attempted(".xx", said).told() == ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
-    assert "round 3: the robot is not up\nits last [words]" in said.getvalue()
-    assert attempted("..").told() == []
+def test_a_failed_round_is_noted_and_shown_at_once() -> None:
+    printed = io.StringIO()
+    assert attempted(".xx", printed).notes() == ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
+    assert "round 3: the robot is not up\nits last [words]" in printed.getvalue()
+    assert attempted("..").notes() == []
 
 
 @pytest.mark.parametrize("outcomes", ["x", "xx."])
-def test_where_the_first_ones_fail_nothing_can_be_measured(outcomes: str) -> None:
+def test_two_failures_at_the_start_end_the_run(outcomes: str) -> None:
     with pytest.raises(PebbleError, match="the robot is not up"):
         attempted(outcomes)
 
 
-# -- one robot that does not come up costs its round, not the run
+# -- a robot that does not become ready costs its round, not the run
 
 
 @pytest.fixture(autouse=True)
@@ -69,17 +69,17 @@ def test_startup_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         if (s := next(launches)) is None:
             raise PebbleError(f"{kind}: no heartbeat")
         return startup.Launch(
-            beat_s=s, ready_s=s, obeyed_s=s, operator_ms=[s], stock_operator_ms=[s], service_ms=joins * [s]
+            heartbeat_s=s, ready_s=s, obeyed_s=s, operator_ms=[s], stock_operator_ms=[s], service_ms=joins * [s]
         )
 
     monkeypatch.setattr(startup, "launch", launch)
-    assert startup.run(startup.Plan(rounds=3, output=tmp_path), Console(file=io.StringIO())) == 0
+    assert startup.run(startup.StartupPlan(rounds=3, output=tmp_path), Console(file=io.StringIO())) == 0
     results = load(tmp_path / "startup.json")
     assert {cell.variant: cell.rounds for cell in results.cells if cell.measure == "first heartbeat"} == {
         "mqtt": [[1.0], [3.0]],
         "zenoh": [[2.0], [4.0]],
     }
-    assert results.verdict[0] == "1 of 3 rounds failed and were left out; round 2: zenoh: no heartbeat"
+    assert results.assessment[0] == "1 of 3 rounds failed and were left out; round 2: zenoh: no heartbeat"
 
 
 def test_cost_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,21 +91,21 @@ def test_cost_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return [Reading(phase=IDLE, memory={"launcher": mb}, cpu={"launcher": mb}, threads={"launcher": 1})]
 
     monkeypatch.setattr(cost, "measure", measure)
-    plan = cost.Plan(rounds=3, kinds=["mqtt"], output=tmp_path)
+    plan = cost.CostPlan(rounds=3, kinds=["mqtt"], output=tmp_path)
     assert cost.run(plan, Console(file=io.StringIO())) == 0
     results = load(tmp_path / "cost.json")
     assert results.cells[0].rounds == [[1.0], [3.0]]
-    assert results.verdict[0] == "1 of 3 rounds failed and were left out; round 2: mqtt: a process ended"
+    assert results.assessment[0] == "1 of 3 rounds failed and were left out; round 2: mqtt: a process ended"
 
 
 def test_the_bridge_goes_on_and_counts_no_half_of_a_round(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def round_(_plan: object, tallies: list[bridge.Tally], number: int, _say: object) -> list[bridge.Played]:
+    def round_(_plan: object, tallies: list[bridge.Tally], number: int, _write_line: object) -> list[bridge.Played]:
         if number == 1:
             raise PebbleError("zenoh: the robot is not up after 30 s")
-        return [(tally, [Stretch(0, 1, {})], [Found([1.0], [1.0], 1, 1)], {}) for tally in tallies]
+        return [(tally, [DriveSegment(0, 1, {})], [Arrived([1.0], [1.0], 1, 1)], {}) for tally in tallies]
 
     monkeypatch.setattr(bridge, "_round", round_)
-    assert bridge.run(Plan(rounds=3, output=tmp_path), Console(file=io.StringIO())) == 0
+    assert bridge.run(BridgePlan(rounds=3, output=tmp_path), Console(file=io.StringIO())) == 0
     results = load(tmp_path / "bridge.json")
     assert {len(cell.rounds) for cell in results.cells} == {2}
-    assert results.verdict[0].startswith("1 of 3 rounds failed and were left out; round 2: zenoh: ")
+    assert results.assessment[0].startswith("1 of 3 rounds failed and were left out; round 2: zenoh: ")

@@ -1,4 +1,4 @@
-"""What sound costs on the wire."""
+"""Bytes of sound on the wire."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def test_opus_stays_within_the_aim(tmp_path: Path) -> None:
     assert opus[1].percentile(50) <= AIM * pcm.percentile(50)
     assert min(cell.figures["likeness"] for cell in opus) > 0.9
     assert "opus 24 kbit/s" in shown.getvalue()
-    assert results.verdict[0] in shown.getvalue().replace("\n", " ")
+    assert results.assessment[0] in shown.getvalue().replace("\n", " ")
 
 
 def test_a_moment_is_too_short(tmp_path: Path) -> None:
-    with pytest.raises(PebbleError, match="1 at least"):
+    with pytest.raises(PebbleError, match="at least 1"):
         run(tmp_path, seconds=0.5)

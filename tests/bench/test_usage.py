@@ -1,4 +1,4 @@
-"""What /proc tells of processes, and of those that have gone."""
+"""Resource usage of running and ended processes, from the kernel."""
 
 import os
 import sys
@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from pebble.bench import usage
-from pebble.bench.frames_process import Worker
 from pebble.bench.usage import children, cpu_s, pss_mb, wake_ups
-from pebble.bench.wake import wake_up_us
+from pebble.bench.wake_up import wake_up_us
+from pebble.bench.worker import Worker
 from pebble.errors import PebbleError
 from tests.support import Child, until
 
@@ -24,12 +24,12 @@ def test_cpu_time_is_finer_than_ticks() -> None:
     assert 0.003 <= cpu_s([os.getpid(), GONE]) - before < 5
 
 
-def test_who_waits_is_woken_up() -> None:
-    """A process of its own: of a thread that ends meanwhile its count goes, too, and ours has many."""
+def test_wake_ups_of_a_waiting_process_are_counted() -> None:
+    """Uses a child process: the count of a thread disappears with it, and the test process has many."""
     child = Child([sys.executable, "-c", "while not input(): print(flush=True)"], stdin=-1, stdout=-1)
     child.stdin.write(b"\n")
     child.stdin.flush()
-    child.stdout.readline()  # it has started, and will wait
+    child.stdout.readline()  # it has started, and waits
     before = wake_ups([child.pid, GONE])
     for _ in range(5):
         child.stdin.write(b"\n")
@@ -55,7 +55,7 @@ def test_a_child_is_found_by_its_parent() -> None:
     assert child.pid not in children(os.getpid())
 
 
-def test_memory_of_what_has_gone_is_nothing_and_of_what_is_not_told_an_error(
+def test_memory_of_an_ended_process_is_zero_and_unknown_memory_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert pss_mb(os.getpid()) > 1
@@ -67,9 +67,9 @@ def test_memory_of_what_has_gone_is_nothing_and_of_what_is_not_told_an_error(
     assert pss_mb(8) == 0
 
 
-def test_a_worker_that_has_ended_says_so_when_it_is_asked(tmp_path: Path) -> None:
+def test_a_worker_that_has_ended_is_reported_when_asked(tmp_path: Path) -> None:
     worker = Worker("sender", [sys.executable, "-c", "exit('no broker')"], tmp_path / "log")
     with pytest.raises(PebbleError, match="no broker"):
         worker.answer(20)
-    worker.tell("1")
-    worker.ask_to_end()
+    worker.send("1")
+    worker.close_input()

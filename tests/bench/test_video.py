@@ -1,4 +1,4 @@
-"""The comparison of video forms: its ruler, its film, and the aims themselves on a short film."""
+"""The video comparison: similarity measures, clips, and the aims on a short clip."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pebble.bench.similarity import psnr, squared_error, ssim
 from pebble.bench.video import AIMS, TOLERANCE, run
 
 
-def test_the_ruler() -> None:
+def test_similarity_of_known_pictures() -> None:
     random = np.random.default_rng(1)
     picture = random.integers(0, 256, (64, 64, 3), np.uint8)
     assert ssim(picture, picture) == pytest.approx(1)
@@ -45,5 +45,5 @@ def test_the_aims_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         for name, aim in AIMS.items():
             assert ours[name].percentile(50) <= aim * ours["reference"].percentile(50)
             assert abs(ours[name].figures["ssim"] - ours["reference"].figures["ssim"]) <= TOLERANCE
-    assert [": met (" in line for line in results.verdict] == [True] * len(AIMS)
-    assert results.verdict[0] in capsys.readouterr().out
+    assert [": met (" in line for line in results.assessment] == [True] * len(AIMS)
+    assert results.assessment[0] in capsys.readouterr().out

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from pebble.config import Config, load, parse, resolved
+from pebble.contract import channel_of
 from pebble.errors import ConfigError
 from pebble.transports.topics import check_topic
 
@@ -43,9 +44,9 @@ def problems(raw: dict[str, Any], env: Mapping[str, str] | None = None, folder: 
 
 
 def only_problem(raw: dict[str, Any], env: Mapping[str, str] | None = None, folder: Path = FOLDER) -> str:
-    told = problems(raw, env, folder)
-    assert len(told) == 1, told
-    return told[0]
+    found = problems(raw, env, folder)
+    assert len(found) == 1, found
+    return found[0]
 
 
 def written(folder: Path, text: str) -> Path:
@@ -159,7 +160,7 @@ class TestOriginal:
         assert config.services.serial_mcu_bridge.topics.drive_values == "pebble/robots/rover-7/incoming/drive-values"
         assert list(config.serial_instances()) == [""]
 
-    def test_every_key_whose_meaning_is_gone_is_told_once_with_what_replaces_it(self) -> None:
+    def test_every_key_whose_meaning_is_gone_is_reported_once_with_what_replaces_it(self) -> None:
         gone = [line for line in load(ORIGINAL, env={}).warnings if "no longer used" in line]
         assert len(gone) == 3
         shared_memory, programs, odometry = gone
@@ -222,6 +223,19 @@ class TestOverridePoints:
         assert value(read({"robot": {"id": "goob"}})) is None
         assert value(read(at(f"services.{path}", "other/topic"))) == "other/topic"
         assert only_problem(at(f"services.{path}", "other/#")).startswith(f"services.{path}: must be a topic")
+        assert only_problem(at(f"services.{path}", "pebble/robots/goob/incoming/estop")).startswith(f"services.{path}")
+
+    @pytest.mark.parametrize("metric", ["incoming/estop", "incoming/estop-reset", "outgoing/estop/mcu"])
+    def test_no_channel_takes_a_topic_of_an_emergency_stop_and_those_keep_theirs(self, metric: str) -> None:
+        """Not even another robot's: whoever drives this one would stop that one."""
+        channel = channel_of(metric)
+        assert channel is not None
+        assert channel.override is None
+        for base in ("pebble/robots/goob", "pebble/robots/other"):
+            line = {"enabled": True, "serial": {"port": "/dev/null"}, "topics": {"drive_values": f"{base}/{metric}"}}
+            problem = only_problem(at("services.serial_mcu_bridge.instances", {"arm": line}))
+            assert "not one of an emergency stop" in problem
+        assert read(at("services.launcher.logs.topic", f"site/{metric}"))  # nobody's
 
     @given(st.text(st.characters(codec="utf-8"), min_size=1, max_size=260) | st.text("a/", min_size=190, max_size=260))
     def test_what_is_accepted_every_transport_carries(self, topic: str) -> None:
@@ -255,16 +269,16 @@ class TestInheritance:
         assert services.soundboard_handler.retained_publish_interval_seconds == 60
         assert services.launcher.capabilities.publish_interval_seconds == 60
 
-    def test_a_mistake_in_a_shared_value_is_told_where_it_stands(self) -> None:
+    def test_a_mistake_in_a_shared_value_is_reported_where_it_stands(self) -> None:
         assert only_problem(at("log_level", "LOUD")).startswith("log_level: must be ")
         serial = {"safety": {"drive_timeout_seconds": 0}, "typo": 1, "instances": {"a": {}, "b": {}}}
-        told = problems(at("services.serial_mcu_bridge", serial))
-        assert [line.partition(":")[0] for line in told] == [
+        found = problems(at("services.serial_mcu_bridge", serial))
+        assert [line.partition(":")[0] for line in found] == [
             "services.serial_mcu_bridge.safety.drive_timeout_seconds",
             "services.serial_mcu_bridge.typo",
         ]
 
-    def test_a_warning_about_a_shared_value_is_told_where_it_stands(self) -> None:
+    def test_a_warning_about_a_shared_value_is_reported_where_it_stands(self) -> None:
         serial: dict[str, Any] = {"odometry_shm": {}, "instances": {"a": {}}}
         (warning,) = read(at("services.serial_mcu_bridge", serial)).warnings
         assert warning.startswith("services.serial_mcu_bridge.odometry_shm: ")
@@ -329,10 +343,10 @@ class TestSerialInstances:
         assert only_problem(raw).startswith(f"services.serial_mcu_bridge.{expected}")
 
     def test_an_enabled_line_needs_a_port(self) -> None:
-        told = only_problem(at("services.serial_mcu_bridge.enabled", True))
-        assert told.startswith("services.serial_mcu_bridge.serial.port: is missing")
-        told = only_problem(at("services.serial_mcu_bridge", {"enabled": True, "instances": {"rear": {}}}))
-        assert told.startswith("services.serial_mcu_bridge.instances.rear.serial.port: is missing")
+        found = only_problem(at("services.serial_mcu_bridge.enabled", True))
+        assert found.startswith("services.serial_mcu_bridge.serial.port: is missing")
+        found = only_problem(at("services.serial_mcu_bridge", {"enabled": True, "instances": {"rear": {}}}))
+        assert found.startswith("services.serial_mcu_bridge.instances.rear.serial.port: is missing")
 
 
 class TestMistakes:
@@ -349,7 +363,12 @@ class TestMistakes:
             ("local_mqtt.port", True, "must be a whole number"),
             ("local_mqtt.keepalive", -1, "must be a whole number from 0 to 65535"),
             ("local_mqtt.protocol", "4", 'must be "3.1.1" or "5"'),
-            ("local_mqtt.silence_seconds", 0, "must be a number above 0"),
+            ("local_mqtt.silence_seconds", 0, "must be a number above 0 and at most 5"),
+            ("local_mqtt.silence_seconds", 5.1, "must be a number above 0 and at most 5, not 5.1"),
+            ("services.mqtt_bridge.remote_mqtt.silence_seconds", 60, "must be a number above 0 and at most 5, not 60"),
+            ("transport.lease_ms", 99, "must be a whole number from 100 to 5000, not 99"),
+            ("transport.lease_ms", 5001, "must be a whole number from 100 to 5000, not 5001"),
+            ("services.mqtt_bridge.remote.lease_ms", 600_000, "must be a whole number from 100 to 5000, not 600000"),
             ("local_mqtt.host", 5, "must be text, not 5"),
             ("local_mqtt.tls.ca_cert", 5, "must be a path, not 5"),
             ("local_mqtt.password_file", "~nobody-at-all/x", '"~nobody-at-all/x" names a home folder that'),
@@ -372,7 +391,7 @@ class TestMistakes:
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 0, "must be a number above 0 and at most 5"),
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 5.1, "must be a number above 0 and at most 5"),
             ("services.serial_mcu_bridge.odometry_shm.slots", 63, "must be a whole number from 64"),
-            ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1" or'),
+            ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1"'),
             ("services.av_daemon.video.rotate_degrees", 45, "must be 0, 90, 180 or 270, not 45"),
             ("services.av_daemon.video.io_mode", [], "must be text or a whole number, not a list"),
         ],
@@ -380,12 +399,12 @@ class TestMistakes:
     def test_one_wrong_value(self, path: str, value: Any, expected: str) -> None:
         raw = at(path, value)
         raw["robot"] = {"id": "goob"} | raw["robot"] if isinstance(raw["robot"], dict) else raw["robot"]
-        told = problems(raw)
-        assert told[0].startswith(f"{path}: {expected}"), told
+        found = problems(raw)
+        assert found[0].startswith(f"{path}: {expected}"), found
 
-    def test_items_of_lists_are_told_by_number(self) -> None:
-        told = problems(at("transport", {"kind": "zenoh", "listen": ["tcp/0.0.0.0:7447", "7447"]}))
-        assert told == ['transport.listen[1]: must be a Zenoh endpoint such as "tls/192.168.1.7:7447", not "7447"']
+    def test_items_of_lists_are_reported_by_number(self) -> None:
+        found = problems(at("transport", {"kind": "zenoh", "listen": ["tcp/0.0.0.0:7447", "7447"]}))
+        assert found == ['transport.listen[1]: must be a Zenoh endpoint such as "tls/192.168.1.7:7447", not "7447"']
         script = {"args": [{"key": "a", "type": "intt"}, {"label": "b"}]}
         assert [
             line.partition(":")[0] for line in problems(at("services.autonomy_manager.scripts", {"s": script}))
@@ -434,16 +453,16 @@ class TestMistakes:
     def test_a_remote_broker_beside_another_uplink_is_not_used(self) -> None:
         remote = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}
         config = read(at("services.mqtt_bridge", {"remote": remote, "remote_mqtt": {"host": "broker.example"}}))
-        assert config.warnings == ('services.mqtt_bridge.remote_mqtt: not used: remote says "zenoh"',)
+        assert config.warnings == ('services.mqtt_bridge.remote_mqtt: not used: remote.kind is "zenoh"',)
 
     def test_a_zenoh_uplink_only_connects(self) -> None:
-        told = problems(at("services.mqtt_bridge.remote", {"kind": "zenoh", "listen": ["tls/0.0.0.0:7447"]}))
-        assert [line.split(":")[0] for line in told] == [
+        found = problems(at("services.mqtt_bridge.remote", {"kind": "zenoh", "listen": ["tls/0.0.0.0:7447"]}))
+        assert [line.split(":")[0] for line in found] == [
             "services.mqtt_bridge.remote.connect",
             "services.mqtt_bridge.remote.listen",
         ]
 
-    def test_ten_mistakes_are_told_in_one_run(self, tmp_path: Path) -> None:
+    def test_ten_mistakes_are_reported_in_one_run(self, tmp_path: Path) -> None:
         raw = json.loads(ORIGINAL.read_text())
         services = raw["services"]
         del raw["robot"]["id"]
@@ -544,11 +563,11 @@ class TestPasswords:
             ({"password": 4711}, "password: must be text, not a value of another kind"),
         ],
     )
-    def test_mistakes_are_told_without_the_password(self, folder: Path, keys: dict[str, Any], expected: str) -> None:
-        told = only_problem(self.remote(**keys), {}, folder)
-        assert told.startswith(f"services.mqtt_bridge.remote_mqtt.{expected}")
-        assert self.SECRET not in told
-        assert "4711" not in told
+    def test_mistakes_do_not_show_the_password(self, folder: Path, keys: dict[str, Any], expected: str) -> None:
+        found = only_problem(self.remote(**keys), {}, folder)
+        assert found.startswith(f"services.mqtt_bridge.remote_mqtt.{expected}")
+        assert self.SECRET not in found
+        assert "4711" not in found
 
     def test_a_password_without_a_name_is_not_sent(self) -> None:
         (warning,) = read(at("local_mqtt.password", "x")).warnings
@@ -572,17 +591,17 @@ class TestTls:
         assert config.local_mqtt.tls.client_key == tmp_path / "me.key"
 
     def test_missing_files_and_half_a_pair_are_problems(self, tmp_path: Path) -> None:
-        told = problems(
+        found = problems(
             at("transport", {"kind": "zenoh", "tls": {"enabled": True, "client_key": "no.key"}}), {}, tmp_path
         )
-        assert told == [
+        assert found == [
             f"transport.tls.client_key: there is no file {tmp_path / 'no.key'}",
             "transport.tls.client_cert: is missing, it belongs to client_key",
         ]
 
     def test_certificates_of_a_link_that_is_not_encrypted_are_pointed_out(self) -> None:
         (warning,) = read(at("local_mqtt.tls.ca_cert", "ca.pem")).warnings
-        assert warning == "local_mqtt.tls.enabled: is false: the link is not encrypted, ca_cert unused"
+        assert warning == "local_mqtt.tls.enabled: is false: nothing is encrypted, ca_cert unused"
 
 
 class TestRunDirectory:
@@ -610,6 +629,32 @@ class TestRunDirectory:
         assert read(raw, {"RUNTIME_DIRECTORY": "/run/pebble"}, tmp_path).run_dir() == tmp_path / "run"
 
 
+class TestStateDirectory:
+    @pytest.mark.parametrize(
+        ("env", "parent"),
+        [
+            ({"STATE_DIRECTORY": "/var/lib/pebble:/more", "XDG_STATE_HOME": "/state"}, "/var/lib/pebble"),
+            ({"XDG_STATE_HOME": "/state"}, "/state/pebble"),
+            ({}, str(Path.home() / ".local/state/pebble")),
+        ],
+    )
+    def test_each_robot_has_its_own(self, env: dict[str, str], parent: str) -> None:
+        assert read({"robot": {"id": "goob"}}, env).state_dir() == Path(parent, "pebble+robots+goob")
+
+    def test_a_directory_that_robots_share_has_a_file_for_each(self, tmp_path: Path) -> None:
+        raw = at("transport", {"kind": "mqtt", "state_dir": "state"})
+        goob, fred = (read({**raw, "robot": {"id": name}}, {}, tmp_path) for name in ("goob", "fred"))
+        assert goob.state_dir() == fred.state_dir() == tmp_path / "state"
+        assert goob.state_file("estop-serial") == tmp_path / "state" / "estop-serial-pebble+robots+goob.json"
+        assert fred.state_file("estop-serial") != goob.state_file("estop-serial")
+
+    def test_the_longest_identity_is_no_problem_for_a_file_system(self, tmp_path: Path) -> None:
+        robot = {"system": "\N{PILE OF POO}" * 64, "type": "t" * 64, "id": "\N{PILE OF POO}" * 64}
+        config = read({"robot": robot}, {"XDG_STATE_HOME": str(tmp_path)})
+        config.state_dir().mkdir(parents=True)
+        config.state_file(f"estop-{'o' * 32}").touch()
+
+
 class TestResolved:
     def test_replacing_a_section_keeps_what_was_derived(self) -> None:
         config = load(ROOT / "configs" / "goob.json", env={})
@@ -617,7 +662,7 @@ class TestResolved:
         view = replace(config, services=replace(config.services, serial_mcu_bridge=line))
         assert (view.base, view.run_dir(), view.path) == (config.base, config.run_dir(), config.path)
 
-    def test_it_is_a_config_again_and_says_the_same(self) -> None:
+    def test_it_is_a_config_again_and_means_the_same(self) -> None:
         config = load(ROOT / "configs" / "goob.json", env={})
         shown = resolved(config)
         derived = shown.pop("derived")
@@ -637,7 +682,7 @@ def test_reading_a_config_imports_no_client_library_and_no_cli() -> None:
     assert loaded & heavy == set()
 
 
-def test_what_cannot_be_switched_off_says_so() -> None:
+def test_what_cannot_be_switched_off_gives_a_warning() -> None:
     safety = {"ignore_retained_drive": False, "stop_on_shutdown": False}
     serial = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}, "safety": safety}
     config = parse({"robot": {"id": "x"}, "services": {"serial_mcu_bridge": serial}}, folder=Path(), env={})

@@ -1,4 +1,4 @@
-"""The doctor finds what is wrong, and says what mends it."""
+"""Each check finds its problem, with the command that fixes it."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from pebble.config import load
+from pebble.doctor import Finding, Level
 from pebble.doctor import checks as doctor
-from pebble.doctor.broker_probe import Answer, connect_packet, knock
-from pebble.doctor.finding import Finding, Level
+from pebble.doctor.broker_probe import ProbeResult, connect_packet, probe
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.support import Broker, free_port
 
@@ -32,7 +32,7 @@ def open_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
 
 @pytest.fixture(scope="module")
 def closed_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    """Knows ann, whose password is geheim."""
+    """Requires the login of ann, whose password is geheim."""
     folder = tmp_path_factory.mktemp("closed")
     subprocess.run(
         ["mosquitto_passwd", "-b", "-c", str(folder / "passwords"), "ann", "geheim"], check=True, capture_output=True
@@ -81,7 +81,7 @@ def test_clock(now: float, synchronised: bool | None, level: Level) -> None:
 @pytest.mark.parametrize(
     ("script", "known"), [("echo yes", True), ("echo no", False), ("exit 1", None), ("echo Failed to connect", None)]
 )
-def test_what_systemd_knows_of_the_clock(
+def test_clock_synchronisation_by_systemd(
     script: str, known: bool | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tool = tmp_path / "timedatectl"
@@ -110,7 +110,7 @@ def test_segments_in_use_are_no_leftovers(tmp_path: Path) -> None:
 
 def test_run_directory(tmp_path: Path) -> None:
     own, uid = tmp_path / "run", os.geteuid()
-    assert doctor.run_directory(own, uid).text.endswith("will be made")
+    assert doctor.run_directory(own, uid).text.endswith("will be created")
     own.mkdir(mode=0o700)
     assert doctor.run_directory(own, uid).level is Level.OK
     own.chmod(0o755)
@@ -120,17 +120,17 @@ def test_run_directory(tmp_path: Path) -> None:
     assert doctor.run_directory(own, uid + 1).fix.startswith("sudo chown")
     assert doctor.run_directory(tmp_path / ("x" * 100), uid).level is Level.FAIL
     (tmp_path / "file").touch()
-    assert doctor.run_directory(tmp_path / "file", uid).text.endswith("is no directory")
+    assert doctor.run_directory(tmp_path / "file", uid).text.endswith("is not a directory")
 
 
-def test_sockets_of_the_dead_are_found(tmp_path: Path) -> None:
-    assert doctor.leftover_sockets(tmp_path / "missing", doctor._answers).level is Level.OK
+def test_leftover_sockets_are_found(tmp_path: Path) -> None:
+    assert doctor.leftover_sockets(tmp_path / "missing", doctor._is_listening).level is Level.OK
     with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:
         living.bind(str(tmp_path / "living.sock"))
         living.listen()
-        assert doctor.leftover_sockets(tmp_path, doctor._answers).text == "1 in use"
+        assert doctor.leftover_sockets(tmp_path, doctor._is_listening).text == "1 in use"
         dying.bind(str(tmp_path / "dead.sock"))
-        finding = doctor.leftover_sockets(tmp_path, doctor._answers)
+        finding = doctor.leftover_sockets(tmp_path, doctor._is_listening)
     assert finding.level is Level.WARN
     assert finding.fix == f"rm {tmp_path / 'dead.sock'}"
 
@@ -140,7 +140,7 @@ def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert missing.level is Level.FAIL
     assert "plugged in" in missing.text
     (tmp_path / "file").touch()
-    assert doctor.serial_port(tmp_path / "file").text == "is no device"
+    assert doctor.serial_port(tmp_path / "file").text == "is not a device"
     tty = os.ttyname(os.openpty()[1])
     assert doctor.serial_port(Path(tty)).level is Level.OK
     monkeypatch.setattr(os, "access", lambda *_: False)
@@ -154,24 +154,24 @@ def test_an_open_broker_on_this_machine_is_fine(open_broker: Broker) -> None:
     findings = list(doctor.broker("local broker", MqttSettings(host="127.0.0.1", port=open_broker.port)))
     assert levels(iter(findings)) == ["ok", "ok", "ok"]
     assert " ms" in findings[0].text
-    assert "anybody" in findings[1].text
+    assert "anonymous" in findings[1].text
 
 
-def test_a_broker_that_knows_us_and_nobody_else(closed_broker: Broker) -> None:
+def test_a_broker_that_requires_a_login(closed_broker: Broker) -> None:
     def found(username: str | None, password: str | None) -> list[Finding]:
         settings = MqttSettings(host="127.0.0.1", port=closed_broker.port, username=username, password=password)
         return list(doctor.broker("local broker", settings))
 
     right, wrong, none = found("ann", "geheim"), found("ann", "falsch"), found(None, None)
     assert [finding.level for finding in right] == [Level.OK] * 3
-    assert right[1].text == "lets nobody in without a login"
+    assert right[1].text == "refuses anonymous logins"
     assert wrong[0].level is Level.FAIL
     assert wrong[0].text.startswith("refuses user ann: ")
     assert none[0].fix == "set username and password_file of this broker"
     assert "falsch" not in str(wrong)
 
 
-def test_nobody_there() -> None:
+def test_an_unreachable_broker_fails() -> None:
     port = free_port()
     finding, *more = doctor.broker("local broker", MqttSettings(host="127.0.0.1", port=port))
     assert more == []
@@ -183,31 +183,31 @@ def test_nobody_there() -> None:
     )
 
 
-def answering(own: Answer, stranger: Answer) -> Callable[..., Answer]:
-    return lambda _settings, *, login: own if login else stranger
+def probe_returning(own: ProbeResult, without_login: ProbeResult) -> Callable[..., ProbeResult]:
+    return lambda _settings, *, login: own if login else without_login
 
 
 def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
-    let_in, shut_out = Answer(code=0, connect_ms=3.0), Answer(code=5)
+    let_in, shut_out = ProbeResult(code=0, connect_ms=3.0), ProbeResult(code=5)
     plain = MqttSettings(host="broker.example", username="ann", password="geheim")
     tls = MqttSettings(host="broker.example", port=8883, username="ann", password="geheim", tls=TlsSettings())
-    assert levels(doctor.broker("b", plain, answering(let_in, let_in))) == ["ok", "warn", "warn"]
-    assert levels(doctor.broker("b", plain, answering(let_in, shut_out))) == ["ok", "ok", "warn"]
-    assert levels(doctor.broker("b", tls, answering(let_in, shut_out))) == ["ok", "ok", "ok"]
-    ending = Answer(code=0, expires=1000.0 + 3 * 86400)
-    *_, last = doctor.broker("b", tls, answering(ending, shut_out), 1000.0)
-    assert (last.level, last.text) == (Level.WARN, "its certificate ends in 3 days")
+    assert levels(doctor.broker("b", plain, probe_returning(let_in, let_in))) == ["ok", "warn", "warn"]
+    assert levels(doctor.broker("b", plain, probe_returning(let_in, shut_out))) == ["ok", "ok", "warn"]
+    assert levels(doctor.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
+    ending = ProbeResult(code=0, expires=1000.0 + 3 * 86400)
+    *_, last = doctor.broker("b", tls, probe_returning(ending, shut_out), 1000.0)
+    assert (last.level, last.text) == (Level.WARN, "its certificate expires in 3 days")
 
 
-def test_what_is_no_broker_is_told_apart() -> None:
+def test_a_server_that_is_no_broker_is_a_problem() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1])
-        assert "timed out" in knock(settings, login=True, timeout_s=0.2).problem
+        assert "timed out" in probe(settings, login=True, timeout_s=0.2).problem
     wrong_file = MqttSettings(host="127.0.0.1", port=free_port(), tls=TlsSettings(ca_cert=Path("/nowhere/ca.pem")))
-    assert knock(wrong_file, login=True).problem != ""
+    assert probe(wrong_file, login=True).problem != ""
 
 
-def test_the_login_is_spelled_as_mqtt_says() -> None:
+def test_the_connect_packet_follows_the_mqtt_specification() -> None:
     settings = MqttSettings(host="b", username="ann", password="p" * 200)
     anonymous, named = connect_packet(settings, login=False), connect_packet(settings, login=True)
     assert anonymous[:1] + anonymous[2:12] == b"\x10\x00\x04MQTT\x04\x02\x00\x0a"
@@ -236,7 +236,7 @@ def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
         "services": {"mqtt_bridge": bridge, "serial_mcu_bridge": serial},
     }
     path.write_text(json.dumps(text))
-    findings = list(doctor.examine(load(path)))
+    findings = list(doctor.run_checks(load(path)))
     failed = [finding.what.split(" ")[0] for finding in findings if finding.level is Level.FAIL]
     assert failed == ["serial", "remote"]
     assert {"python", "eclipse-zenoh", "memory lock", "clock", "shared memory", "run directory", "sockets"} <= {

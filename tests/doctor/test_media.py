@@ -1,4 +1,4 @@
-"""What a machine lacks for pictures and sound, each with what helps."""
+"""Checks of camera, microphone, loudspeaker and codecs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, parse
-from pebble.doctor.finding import Level
+from pebble.doctor import Level
 from pebble.doctor.media import camera, codecs, media
 
 
@@ -25,7 +25,7 @@ def everything(name: str) -> str:
     return f"/usr/bin/{name}"
 
 
-def test_a_robot_that_neither_sees_nor_hears_needs_nothing(tmp_path: Path) -> None:
+def test_a_robot_without_camera_and_microphone_needs_nothing(tmp_path: Path) -> None:
     assert list(media(config_of({"enabled": False}), tmp_path, nothing)) == []
 
 
@@ -46,7 +46,7 @@ def test_nothing_there(tmp_path: Path) -> None:
         Level.WARN,
     ]
     assert "alsa-utils" in found["microphone"].fix
-    assert "video0 is not there" in found["camera"].text
+    assert "video0 does not exist" in found["camera"].text
 
 
 @pytest.mark.parametrize(

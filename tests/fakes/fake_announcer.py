@@ -1,4 +1,4 @@
-"""The real announcer around a transport that writes down: ``fake_announcer RECORD [option…]``.
+"""The real announcer with a transport that writes to a file: ``fake_announcer RECORD [option…]``.
 
 Options: ``hangs`` (the transport never opens), ``broken`` (it cannot be set up).
 """
@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 from pebble.errors import TransportError
-from pebble.launched import set_up_logging
 from pebble.launcher import announcer
+from pebble.runtime.parent import set_up_logging
 from pebble.transports import Message, Transport
 from tests.fakes.recording_transport import RecordingTransport
 

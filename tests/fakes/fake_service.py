@@ -1,4 +1,4 @@
-"""A child process for launcher tests: ``fake_service NAME BEHAVIOUR JOURNAL``. Says in JOURNAL what happens to it."""
+"""A child process for launcher tests: ``fake_service NAME BEHAVIOUR JOURNAL``. Writes to JOURNAL what happens to it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import threading
 import time
 from pathlib import Path
 
-from pebble.launched import NOTIFY_FD, Notifier, Want, encoding_asked_for, wanted_before
+from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests, requested_encoding
 
 WORDS = """12:00:00 [WARNING] mind the gap
 just a print
@@ -45,13 +45,14 @@ def live(notify: Notifier, *, alive: bool = True) -> None:
 
 
 def ask(notify: Notifier) -> None:
-    """Want what the lines say that somebody appends to the file ``JOURNAL.orders.NAME``: ``media 1 h264``.
+    """Send the requests that a test appends to the file ``JOURNAL.orders.NAME``: ``media 1 h264``.
 
-    ``half media 1`` says it in two pieces, ``noise media 1`` after 100 kB of anything.
+    ``half media 1`` sends it in two pieces, ``noise media 1`` after 100 kB of anything. ``lacks estop`` and
+    ``has estop`` are reports.
     """
     orders = Path(f"{sys.argv[3]}.orders.{sys.argv[1]}")
-    orders.write_text("")  # those of the one before are old
-    note("before:" + ",".join(f"{name}={want.encoding}" for name, want in wanted_before().items()))
+    orders.write_text("")  # those of the previous process are old
+    note("before:" + ",".join(f"{name}={request.encoding}" for name, request in earlier_requests().items()))
     note("ready")
     notify.ready()
     with orders.open() as lines:
@@ -60,8 +61,10 @@ def ask(notify: Notifier) -> None:
                 first, *rest = line.split()
                 if first in ("half", "noise"):
                     blurt(first, f"WANT {' '.join(rest)}\n".encode())
+                elif first in ("lacks", "has"):
+                    notify.lacks(rest[0], first == "lacks")
                 else:
-                    notify.want(first, Want(rest[0] == "1", *rest[1:]))
+                    notify.request(first, ProgramRequest(rest[0] == "1", *rest[1:]))
             notify.alive()
             time.sleep(0.01)
 
@@ -90,7 +93,7 @@ def end(how: str) -> None:
         threading.Thread(target=lambda: (time.sleep(0.2), note("thread"))).start()
 
 
-def look_around() -> None:
+def report_environment() -> None:
     """Descriptors and signals as a program finds them."""
     found = {number: Path(f"/proc/self/fd/{number}") for number in range(1024)}
     kinds = (f"{number}={path.readlink().name.partition(':')[0]}" for number, path in found.items() if path.exists())
@@ -103,7 +106,7 @@ def look_around() -> None:
 def main() -> None:
     behaviour = sys.argv[2]
     if behaviour == "curious":
-        look_around()
+        report_environment()
     signal.signal(signal.SIGTERM, signal.SIG_IGN if behaviour == "stubborn" else stop)
     note("start")
     if behaviour in ("crash", "word", "raise", "exit", "done"):
@@ -117,7 +120,7 @@ def main() -> None:
     if behaviour == "asker":
         ask(Notifier())
     if behaviour == "curious about itself":
-        note(f"env:{os.environ.get('MARK', '')}:{Path.cwd().name.replace(' ', '-')}:{encoding_asked_for()}")
+        note(f"env:{os.environ.get('MARK', '')}:{Path.cwd().name.replace(' ', '-')}:{requested_encoding()}")
     if behaviour == "environment":
         note("systemd:" + str("NOTIFY_SOCKET" in os.environ))
     if behaviour == "talker":

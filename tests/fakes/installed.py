@@ -28,11 +28,11 @@ class Installed:
 
     @property
     def pids(self) -> list[int]:
-        """Of all starts, in order."""
+        """The process ids of all starts, in order."""
         return [int(line) for line in self._starts.read_text().split()] if self._starts.exists() else []
 
     def gone(self, pid: int, timeout: float = 5.0) -> bool:
-        """Has this process ended, and been waited for?"""
+        """True if this process has ended and been reaped."""
         return until(lambda: not Path(f"/proc/{pid}").exists(), timeout)
 
 

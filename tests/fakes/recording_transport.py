@@ -1,4 +1,4 @@
-"""A transport that writes down what it is told to send, for tests that look at another process from outside."""
+"""A transport that writes what it publishes to a file, for tests of another process."""
 
 from __future__ import annotations
 

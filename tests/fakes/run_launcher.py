@@ -3,7 +3,7 @@
 TABLE is JSON: a list of [name, module, arguments, stage] and perhaps an object of what else a program is; what is
 published goes to RECORD. Options: those of fake_announcer, ``hasty`` (2 s without a sign of life is stuck),
 ``signal`` (a stop signal comes while the first child is being started), ``tireless`` (nothing is a crash loop),
-``forgetful`` (what the dead wanted counts for 1 s), ``missing`` (one more program, which does not exist).
+``forgetful`` (requests of an ended program expire after 1 s), ``missing`` (one more program, which does not exist).
 """
 
 import json
@@ -16,9 +16,13 @@ sys.path.insert(0, root)
 
 from pebble.config import load  # noqa: E402
 from pebble.errors import PebbleError  # noqa: E402
-from pebble.launcher import launcher, on_demand, supervisor  # noqa: E402
+from pebble.launcher import (  # noqa: E402
+    launcher,
+    on_demand,
+    restart_policy,
+)
 from pebble.launcher.child import Child  # noqa: E402
-from pebble.launcher.program import Program, Stage  # noqa: E402
+from pebble.launcher.programs import Program, Stage  # noqa: E402
 
 
 class SignalledChild(Child):
@@ -32,15 +36,15 @@ table = [
     Program(name, module, tuple(args), Stage(stage), **(more[0] if more else {}))
     for name, module, args, stage, *more in json.loads(table_json)
 ]
-table.append(Program("announcer", "fake_announcer", (record, *options), Stage.NEWS, told=True))
+table.append(Program("announcer", "fake_announcer", (record, *options), Stage.ANNOUNCER, reads_announcer_pipe=True))
 if "hasty" in options:
-    supervisor.ALIVE_LIMIT_S = 2.0
+    restart_policy.ALIVE_LIMIT_S = 2.0
 if "tireless" in options:
-    supervisor.LOOP_WINDOW_S = 0.0
+    restart_policy.LOOP_WINDOW_S = 0.0
 if "forgetful" in options:
     on_demand.OUTLIVE_S = 1.0
 if "missing" in options:
-    table.append(Program("missing", "no_such_module", (), Stage.LINK))
+    table.append(Program("missing", "no_such_module", (), Stage.CONNECTION))
 if "signal" in options:
     launcher.Child = SignalledChild  # type: ignore[misc]
 try:

@@ -1,8 +1,8 @@
-"""A robot with Wi-Fi in virtual time, an operator who drives it, faults at random times, and one rule that must hold.
+"""A robot with Wi-Fi in virtual time, an operator that drives it, faults at random times, and one rule that must hold.
 
-The rule: its motors only do what a command asked for that was fresh, not kept and reached the board in the last second.
-It is checked at every moment at which anything happens, blocked or not. The motors are read from the pins and from
-the bus, not by what the simulation of the robots believes.
+The rule: motors only run as requested by a command that is fresh, not retained, and reached the board in the last
+second. It is checked at every event, also while the firmware blocks. The motors are read from the pins and the bus, not
+from the simulated body.
 """
 
 from __future__ import annotations
@@ -17,11 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from pebble import contract as c
+from pebble.contract import codec
+from pebble.contract.payloads import Drive
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.micropython.ports import OF_ROBOT
-from pebble.simulation.micropython.virtual_broker import VirtualBroker
-from pebble.simulation.micropython.virtual_network import VirtualNetwork
+from tests.firmware.rules import FREE, Rules
+from tests.simulation.virtual_broker import Command, VirtualBroker
+from tests.simulation.virtual_network import VirtualNetwork
 
 START_S: Final = 1000.0  # of the clock, when a drill begins
 BUSY_S: Final = 0.01
@@ -31,8 +35,10 @@ RESENT_S: Final = 0.3  # a packet that was lost comes so much later
 STALE_S: Final = 2.45  # no command that is longer on its way moves: 2 s of silence, the longest latency, two slow turns
 BASE: Final = "pebble/robots/rover"
 DRIVE, ONLINE = f"{BASE}/incoming/drive-values", f"{BASE}/outgoing/online"
+ESTOP, RESET, STATE = f"{BASE}/incoming/estop", f"{BASE}/incoming/estop-reset", f"{BASE}/outgoing/estop/mcu"
 
 _WRAP_MS = 1 << 30
+_FILE = "/estop.json"
 
 Outputs = tuple[float, ...]
 
@@ -42,7 +48,7 @@ class ViolatedError(AssertionError):
 
 
 class WatchedClock(VirtualClock):
-    """Tells that time has passed, also to those who wait while the firmware blocks."""
+    """Calls ``watch`` whenever time passes, also while the firmware blocks."""
 
     def __init__(self, now: float) -> None:
         super().__init__(now)
@@ -54,7 +60,7 @@ class WatchedClock(VirtualClock):
 
 
 class Shield:
-    """BenJr's motor shield on the bus: obeys until its master says something else, as the real one does."""
+    """BenJr's motor shield on the bus: the last message holds until the next one, as on the real one."""
 
     def __init__(self) -> None:
         self.speeds = [0.0, 0.0]
@@ -71,17 +77,22 @@ class Shield:
 
 @dataclass
 class Arrived:
-    """A command that asks for ``wish``: when it left the broker, reached the board, and was followed by another."""
+    """A command that asks for ``wish``: when it left the broker, reached the board, and was followed by another.
+
+    It moves the motors for ``valid_s`` after it was read.
+    """
 
     sent: float
     arrived: float
     wish: Outputs
+    read: float
+    valid_s: float
     superseded: float = math.inf
 
 
 @dataclass
 class Seen:
-    """What a drill has seen, in seconds."""
+    """Measurements of a drill, in seconds."""
 
     longest_run: float = 0.0  # motors on, after the last command that arrived
     oldest: float = 0.0  # on its way, from the broker to the motors that it moved
@@ -90,7 +101,7 @@ class Seen:
 
 
 class Drill:
-    """One robot and its world; ``seed`` decides everything that is random. ``root``: firmware that is not Pebble's."""
+    """One robot and its environment; ``seed`` is that of all randomness. ``root``: firmware that is not Pebble's."""
 
     def __init__(self, kind: str, seed: int, *, root: Path | None = None) -> None:
         self.kind, self.random = kind, random.Random(f"{kind} {seed}")
@@ -99,8 +110,8 @@ class Drill:
         port = OF_ROBOT[kind]
         self.network = VirtualNetwork(self.clock, self.broker, platform=port.platform)
         self._latency = self.random.uniform(0.002, 0.03)
-        self.network.weather.latency_s = self._latency_s
-        self.network.weather.cut = self._cut
+        self.network.conditions.latency_s = self._latency_s
+        self.network.conditions.cut = self._cut
         self.network.radio.rejoins = self.random.random() < 0.7
         self.network.radio.join_s = self.random.choice((0.3, 1.0, 3.0))
         wraps = self.random.random() < 0.5
@@ -115,12 +126,14 @@ class Drill:
         )
         self.shield = Shield()
         self.seen = Seen()
-        self.quiet = False  # is the operator?
+        self.quiet = False  # whether the operator sends nothing
         self.lossy = False
         self._rests_until = 0.0
         self._before: Outputs = ()
         self._commands: list[Arrived] = []
-        self._meant: dict[bytes, Outputs] = {}
+        self._arrived: dict[int, float] = {}  # of each command on its way through the board's buffers, by its id
+        self._meant: dict[bytes, Drive] = {}
+        self.rules = Rules(START_S)
         self._events: list[tuple[float, int, Callable[[], object]]] = []
         self._count = itertools.count()
         self.robot = self._boot()
@@ -146,15 +159,29 @@ class Drill:
         settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home", "password": "secret"}, "mqtt": {"host": host}}
         return self.board.load(self.kind, settings)
 
+    def cut_power(self) -> None:
+        """Off, and on again at once: only the board's files survive."""
+        self._take_reads()
+        newest, rules = self.state(), self.rules
+        current = {"latched": True, "boot": self.robot.stops.latch.boot, "count": rules.count, "persisted": True}
+        promised = rules.latched and current.items() <= {key: newest.get(key) for key in current}.items()
+        saved = self.board.files.get(_FILE, FREE)
+        self._commands.clear()
+        self._arrived.clear()
+        rules.restart(self.clock.now(), saved, promised=promised)
+        self.network.power_off()
+        self.shield.speeds = [0.0, 0.0]
+        self.robot = self._boot()
+
     # -- time
 
     def at(self, seconds: float, event: Callable[[], object]) -> None:
-        """Have the world do something at that time of the drill."""
+        """Call ``event`` at that time of the drill."""
         heapq.heappush(self._events, (START_S + seconds, next(self._count), event))
 
     @property
     def seconds(self) -> float:
-        """Of the drill, so far."""
+        """Duration of the drill so far."""
         return self.clock.now() - START_S
 
     def run(self, until: float) -> None:
@@ -182,21 +209,36 @@ class Drill:
         if self.clock.now() > began:
             raise ViolatedError(f"{self.seconds:.3f} s: a turn of the loop waited for {self.clock.now() - began:.1f} s")
 
-    def heard(self, topic: str, since: float = 0.0) -> list[bytes]:
-        """What the robot has said on ``topic`` since that time of the drill."""
+    def received(self, topic: str, since: float = 0.0) -> list[bytes]:
+        """What the robot has published on ``topic`` since that time of the drill."""
         start = since + START_S
-        return [one.message.payload for one in self.broker.heard if one.at >= start and one.message.topic == topic]
+        return [one.message.payload for one in self.broker.received if one.at >= start and one.message.topic == topic]
 
     # -- the operator
 
-    def command(self, x: float, z: float, y: float = 0.0, *, qos: int = 1, retain: bool = False) -> None:
-        payload = json.dumps({"x": x, "z": z, "y": y}).encode()
-        self._meant[payload] = wanted(self.kind, x, z, y)
+    def command(self, x: float, z: float, y: float = 0.0, *, qos: int = 1, retain: bool = False, **more: Any) -> None:
+        payload = json.dumps({"x": x, "z": z, "y": y, **more}).encode()
+        self._meant[payload] = codec.decode(c.DRIVE, payload)
         self.broker.publish(DRIVE, payload, qos=qos, retain=retain)
 
     def nonsense(self, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
-        """What no robot may move for."""
+        """Publish a command that must not move a robot."""
         self.broker.publish(DRIVE, payload, qos=qos, retain=retain)
+
+    def stop(self, name: str) -> None:
+        self.broker.publish(ESTOP, json.dumps({"stop": name, "by": "drill"}).encode(), qos=1)
+
+    def reset(self, *, behind: int = 0) -> None:
+        """Reset by the newest state that arrived, or one that is so many stops older."""
+        if state := self.state():
+            order = {"boot": state["boot"], "count": state["count"] - behind, "by": "drill"}
+            self.broker.publish(RESET, json.dumps(order).encode(), qos=1)
+
+    def state(self) -> dict[str, Any]:
+        """The newest state of the emergency stop that arrived; empty: none."""
+        payloads = self.received(STATE)
+        state: dict[str, Any] = json.loads(payloads[-1]) if payloads else {}
+        return state
 
     # -- faults
 
@@ -207,20 +249,21 @@ class Drill:
     def clear_sky(self) -> None:
         """All faults are over."""
         self.quiet = False
-        self.network.weather.hole = self.network.weather.mute = False
-        self.network.weather.dns = self.network.weather.ntp = "answers"
+        self.network.conditions.hole = self.network.conditions.mute = False
+        self.network.conditions.dns = self.network.conditions.ntp = "answers"
         self.network.radio.restore()
         self.broker.thaw()
         self.broker.start()
         self._events.clear()
+        self.board.files.before = lambda *_: None
         if self.kind == "benjr":
-            self.board.bus.mend(self._shield_address)
+            self.board.bus.restore(self._shield_address)
 
     def failing_i2c(self, seconds: float) -> None:
         """The motor shield does not answer for a while; the rule rests until the next turn after that."""
         if self.kind == "benjr":
             self.board.bus.fail(self._shield_address)
-            self.at(self.seconds + seconds, lambda: self.board.bus.mend(self._shield_address))
+            self.at(self.seconds + seconds, lambda: self.board.bus.restore(self._shield_address))
             self._rests_until = self.clock.now() + seconds + TURN_S
 
     # -- the rule
@@ -232,35 +275,56 @@ class Drill:
 
     def check(self) -> None:
         outputs, now = self.outputs(), self.clock.now()
-        self._take_arrivals()
+        self._take_reads()
+        self.rules.tick(now)
         if any(outputs) and now > self._rests_until:
             self._check_motion(now, outputs)
         self._before = outputs
 
     def _check_motion(self, now: float, outputs: Outputs) -> None:
         asked = [one for one in self._commands if now - one.arrived <= LIMIT_S and one.wish == outputs]
-        asked = [one for one in asked if now - one.superseded <= TURN_S]
+        asked = [one for one in asked if now - one.superseded <= TURN_S and now - one.read <= one.valid_s + TURN_S]
         if not asked:
             raise ViolatedError(
-                f"{self.seconds:.3f} s: the motors do {outputs}, for which nobody asked in the last second"
+                f"{self.seconds:.3f} s: the motors are at {outputs}, without a command for it in the last second"
             )
         if outputs != self._before:
             self.seen.moves += 1
             self.seen.oldest = max(self.seen.oldest, min(now - one.sent for one in asked))
-        self.seen.longest_run = max(self.seen.longest_run, now - self._commands[-1].arrived)
+        self.seen.longest_run = max(self.seen.longest_run, now - asked[-1].arrived)
         if self.seen.oldest > STALE_S:
             raise ViolatedError(
                 f"{self.seconds:.3f} s: a command that was {self.seen.oldest:.2f} s on its way moves the motors"
             )
 
-    def _take_arrivals(self) -> None:
-        for arrived, command in self.network.arrivals:
-            wish = None if command.kept else self._meant.get(command.payload)
-            if wish is not None:
-                if self._commands:
-                    self._commands[-1].superseded = arrived
-                self._commands.append(Arrived(command.left_at, arrived, wish))
+    def _take_reads(self) -> None:
+        """Judge what the firmware has read since the last time; a command counts from its arrival at the board."""
+        self._arrived.update((id(command), arrived) for arrived, command in self.network.arrivals)
         self.network.arrivals.clear()
+        now = self.clock.now()
+        for command in self.network.reads:
+            arrived = self._arrived.pop(id(command), now)
+            if command.retained:
+                continue
+            if command.topic == DRIVE:
+                self._take_drive(command, arrived, now)
+            elif command.topic == ESTOP and self.rules.stop(command.payload):
+                self._supersede(arrived)
+            elif command.topic == RESET:
+                self.rules.reset(command.payload, self.robot.stops.latch.boot, now)
+        self.network.reads.clear()
+
+    def _take_drive(self, command: Command, arrived: float, now: float) -> None:
+        drive = self._meant.get(command.payload)
+        valid_s = self.rules.admits(drive, now) if drive is not None else None
+        if drive is not None and valid_s is not None:
+            self._supersede(arrived)
+            wish = wanted(self.kind, drive.x, drive.z, drive.y)
+            self._commands.append(Arrived(command.left_at, arrived, wish, now, valid_s))
+
+    def _supersede(self, arrived: float) -> None:
+        for one in self._commands[-1:]:
+            one.superseded = min(one.superseded, arrived)
 
 
 def wanted(kind: str, x: float, z: float, y: float) -> Outputs:

@@ -19,7 +19,7 @@ STOCK, FULL = "official image", "image with select"
 #: And on an ESP8266: the official image with a ROM file system, from which code runs in place, or the plain one.
 ROM, PLAIN = "image with ROMFS", "plain image"
 _UNUSED = {STOCK: ("usb",), FULL: ("console", "uart")}  # modules that are never loaded there
-_SCRIPTS = ("board", "net", "life_serial", "life_imu", "life_network", "heap")
+_SCRIPTS = ("board", "net", "workload_serial", "workload_imu", "workload_network", "heap")
 _HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage
 _SETTINGS = {
     "wifi": {"ssid": "Lab", "password": "geheim123"},
@@ -43,7 +43,7 @@ class Case:
 
 
 SMALL, MIDDLE = 12 * 1024, 20 * 1024
-#: Bytes of heap that a robot may need at its worst, with all that its code takes; None: only told.
+#: Most bytes of heap that a robot may need, with its code; None: only reported.
 LIMITS: dict[Case, int | None] = {
     Case("minilamp"): None,  # its board has hundreds of kilobytes
     Case("benjr", ROM): MIDDLE,
@@ -70,7 +70,7 @@ class Cost:
 
 
 def measure(case: Case, folder: Path, *, heap: int = _HEAP, capped: bool = False) -> Cost:
-    """A minute of its life. AssertionError if the robot fails."""
+    """Run the robot for a minute. AssertionError if it fails."""
     folder = folder / re.sub(r"\W+", "-", str(case))
     root, code = folder / "root", folder / ("rom" if case.image == ROM else "root")
     files = modules(case.firmware)
@@ -122,9 +122,21 @@ def _fill(root: Path, code: Path, case: Case, files: list[Path]) -> None:
         compile_file(SCRIPTS / f"{name}.py", root / f"{name}.mpy")
     # with a ROM file system, that is the working folder
     (root / "start.py").write_text("import sys\nsys.path.append('/')\nfrom heap import turn\n")
-    life = "life_imu" if case.robot == "goob_imu" else "life_serial" if case.firmware.is_report else "life_network"
+    workload = (
+        "workload_imu"
+        if case.robot == "goob_imu"
+        else "workload_serial"
+        if case.firmware.is_report
+        else "workload_network"
+    )
     settings = {} if case.firmware.is_report else {**_SETTINGS, "robot": {"id": case.robot}}
     names = [".".join(file.with_suffix("").parts) for file in _loaded(case, files)]
     names.sort(key=lambda name: name == f"{case.robot}.robot")  # last: it needs all others
-    told = {"modules": names, "robot": case.robot, "life": life, "stock": case.image == STOCK, "settings": settings}
-    (root / "case.json").write_text(json.dumps(told))
+    case_json = {
+        "modules": names,
+        "robot": case.robot,
+        "workload": workload,
+        "stock": case.image == STOCK,
+        "settings": settings,
+    }
+    (root / "case.json").write_text(json.dumps(case_json))

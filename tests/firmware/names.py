@@ -1,7 +1,7 @@
 """What a robot's names cost on its board: MicroPython keeps each name that its image does not know in memory, once.
 
 In the interpreter in Node.js the stand-ins' names and those of its own modules are known already, so what the robot's
-cost there says little. It is taken out of what was measured, and this is put in.
+cost there is not that of a board. It is subtracted from the measurement, and this is added.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _BLOCK = 16  # the heap gives nothing smaller
 def cost(compiled: list[Path], port: str, *, in_place: bool = False) -> int:
     """Bytes of heap for the names in these .mpy files on a board of this port.
 
-    ``in_place``: the files are in a ROM file system, and names stay there; only the addresses of them are kept.
+    ``in_place``: the files are in a ROM file system, and names stay there; only their addresses are in RAM.
     """
     own = {name for file in compiled for name in names_in(file.read_bytes())} - known(port)
     pools, size = 0, _FIRST_POOL

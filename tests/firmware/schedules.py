@@ -1,17 +1,22 @@
-"""Random schedules for a drill: an operator in his moods, and what goes wrong around the robot."""
+"""Random schedules for a drill: an operator's commands, and faults around the robot."""
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
-from pebble.simulation.micropython.virtual_network import Answers
+from pebble.simulation.micropython.faults import failure
 from tests.firmware.drill import DRIVE, LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
+from tests.simulation.virtual_network import Answers
 
-FAULTS: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "quiet", "flood", "i2c", "kept", "stale", "mute")
+_NETWORK: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "mute")
+_COMMANDS: Final = ("quiet", "flood", "retained", "stale", "limits", "script", "stops")
+FAULTS: Final = (*_NETWORK, *_COMMANDS, "i2c", "power", "disk")
 ACT_S: Final = 8.0  # so long an operator drives and things go wrong
 STABLE_S: Final = 1.0  # a connection that lasts so long is none that is just about to be given up
-BACK_S: Final = 30.0  # a back-off of 10 s, and Wi-Fi that nobody rejoins for 15 s, are the longest waits
+BACK_S: Final = 30.0  # the longest waits are a back-off of 10 s, and 15 s until the Wi-Fi is rejoined
 
 HOSTILE: Final = (
     b'{"x": 0, "z": NaN}',
@@ -45,7 +50,7 @@ def perform(drill: Drill, faults: tuple[str, ...] | None = None) -> None:
 
 
 def act(drill: Drill, faults: tuple[str, ...]) -> None:
-    """The operator drives for ACT_S, while these things go wrong."""
+    """The operator drives for ACT_S, while these faults occur."""
     random = drill.random
     drill.lossy = True
     _drive(drill, 1.0, ACT_S)
@@ -81,21 +86,27 @@ def _command(drill: Drill, axes: tuple[float, float, float], qos: int) -> Callab
 
 
 def _come_back(drill: Drill) -> None:
-    """Online within a bounded time, and telling so."""
+    """The robot is online again within a bounded time, and publishes heartbeats."""
     drill.clear_sky()
     since = drill.seconds
     online = since + 0.001
-    while drill.seconds < online + STABLE_S or len(drill.heard(ONLINE, online)) < 2 or drill.broker.queued:
+    while drill.seconds < online + STABLE_S or len(drill.received(ONLINE, online)) < 2 or drill.broker.queued:
         drill.turn(0.04)
-        if drill.robot.link.state != "online":
+        if drill.robot.connection.state != "online":
             online = drill.seconds + 0.001  # what is still under way from an old connection does not count
         if drill.seconds > since + BACK_S:
-            raise ViolatedError(f"not online {BACK_S:.0f} s after the last fault: {drill.robot.link.reason}")
+            raise ViolatedError(f"not online {BACK_S:.0f} s after the last fault: {drill.robot.connection.reason}")
     drill.seen.back = drill.seconds - since
 
 
 def _obey_again(drill: Drill) -> None:
-    """It still does what it is told, and stops by itself."""
+    """A robot that is stopped is reset; then it executes commands, and stops by itself."""
+    since = drill.seconds
+    while drill.rules.latched or drill.state()["latched"]:
+        drill.reset()
+        drill.run(drill.seconds + 1.0)
+        if drill.seconds > since + BACK_S:
+            raise ViolatedError(f"it cannot be reset: {drill.state()}")
     drill.run(drill.seconds + LIMIT_S)
     start, moves = drill.seconds, drill.seen.moves
     for number in range(5):
@@ -122,23 +133,23 @@ def _broker(drill: Drill, start: float, length: float) -> None:
 
 
 def _hole(drill: Drill, start: float, length: float) -> None:
-    drill.at(start, lambda: setattr(drill.network.weather, "hole", True))
-    drill.at(start + length, lambda: setattr(drill.network.weather, "hole", False))
+    drill.at(start, lambda: setattr(drill.network.conditions, "hole", True))
+    drill.at(start + length, lambda: setattr(drill.network.conditions, "hole", False))
 
 
 def _dns(drill: Drill, start: float, length: float) -> None:
     """A broken name server matters to who has to connect again."""
     how = drill.random.choice(("silent", "nonsense", "no such name"))
-    drill.at(start, lambda: setattr(drill.network.weather, "dns", how))
+    drill.at(start, lambda: setattr(drill.network.conditions, "dns", how))
     drill.at(start + 0.1, drill.broker.kill)
     drill.at(start + 0.3, drill.broker.start)
-    drill.at(start + length, lambda: setattr(drill.network.weather, "dns", "answers"))
+    drill.at(start + length, lambda: setattr(drill.network.conditions, "dns", "answers"))
 
 
 def _ntp(drill: Drill, start: float, _length: float) -> None:
     how: Answers = drill.random.choice(("silent", "nonsense"))
-    drill.at(0.0, lambda: setattr(drill.network.weather, "ntp", how))
-    drill.at(start + 5.0, lambda: setattr(drill.network.weather, "ntp", "answers"))
+    drill.at(0.0, lambda: setattr(drill.network.conditions, "ntp", how))
+    drill.at(start + 5.0, lambda: setattr(drill.network.conditions, "ntp", "answers"))
 
 
 def _frozen(drill: Drill, start: float, length: float) -> None:
@@ -167,8 +178,8 @@ def _i2c(drill: Drill, start: float, length: float) -> None:
     drill.at(start, lambda: drill.failing_i2c(min(length, 0.5)))
 
 
-def _kept(drill: Drill, start: float, length: float) -> None:
-    """Somebody has the broker keep a command, and the robot connects anew while it is there."""
+def _retained(drill: Drill, start: float, length: float) -> None:
+    """There is a retained command while the robot reconnects."""
     payload = b'{"x": 0, "z": 0.77, "y": 1}'
     drill.at(0.0, lambda: drill.nonsense(payload, retain=True))
     drill.at(start, drill.drop_robot)
@@ -182,12 +193,75 @@ def _stale(drill: Drill, start: float, length: float) -> None:
 
 
 def _mute(drill: Drill, start: float, length: float) -> None:
-    """The robot hears and is not heard."""
-    drill.at(start, lambda: setattr(drill.network.weather, "mute", True))
-    drill.at(start + length, lambda: setattr(drill.network.weather, "mute", False))
+    """Packets of the robot are lost, packets to it are not."""
+    drill.at(start, lambda: setattr(drill.network.conditions, "mute", True))
+    drill.at(start + length, lambda: setattr(drill.network.conditions, "mute", False))
+
+
+def _limits(drill: Drill, start: float, length: float) -> None:
+    """Commands that are valid for a short time, and after each of them a pause."""
+    _quiet(drill, start, length)
+    at = start
+    while at < start + length:
+        valid_ms, axes = drill.random.choice((50, 200, 400, 700, 5000)), (_wish(drill), _wish(drill), _wish(drill))
+        drill.at(at, partial(drill.command, *axes, valid_ms=valid_ms))
+        at += drill.random.uniform(0.1, 1.2)
+
+
+def _script(drill: Drill, start: float, _length: float) -> None:
+    """A script drives while the operator is silent; some stops, other runs, and commands of the operator beside it."""
+    random = drill.random
+    _quiet(drill, start, ACT_S)
+    run, at = random.randrange(1, 1000), start
+    while at < ACT_S:
+        axes = (_wish(drill), _wish(drill), _wish(drill))
+        event = random.random()
+        if event < 0.02:
+            drill.at(at, lambda: drill.command(0.0, 0.0))
+        elif event < 0.03:
+            drill.at(at, lambda: drill.command(0.0, 0.0, valid_ms=0))
+        elif event < 0.04:
+            drill.at(at, partial(drill.command, *axes))
+        elif event < 0.06:
+            run += random.choice((1, 1, 5))
+        sent = run - 1 if random.random() < 0.05 else run
+        drill.at(at, partial(drill.command, *axes, source="autonomy", run=sent, valid_ms=400))
+        at += random.uniform(0.03, 0.1)
+
+
+def _stops(drill: Drill, start: float, length: float) -> None:
+    """Presses, each repeated; then resets, of which some are made from an older state."""
+    random = drill.random
+    for _ in range(random.choice((1, 1, 2))):
+        name = f"{random.getrandbits(64):016x}"
+        pressed = start + random.uniform(0.0, 0.3)
+        for number in range(random.randint(1, 4)):
+            drill.at(pressed + 0.5 * number, partial(drill.stop, name))
+    for _ in range(random.randint(0, 3)):
+        drill.at(start + random.uniform(0.1, length + 0.5), partial(drill.reset, behind=random.choice((0, 0, 1))))
+
+
+def _power(drill: Drill, start: float, _length: float) -> None:
+    drill.at(start, drill.cut_power)
+
+
+def _disk(drill: Drill, start: float, length: float) -> None:
+    """The file system cannot be written to for a while, and there is a stop."""
+
+    def full(*_: object) -> None:
+        raise failure(errno.ENOSPC)
+
+    _stops(drill, start, length)
+    drill.at(start, lambda: setattr(drill.board.files, "before", full))
+    drill.at(start + length, lambda: setattr(drill.board.files, "before", lambda *_: None))
 
 
 _EVENTS: Final = {
+    "limits": _limits,
+    "script": _script,
+    "stops": _stops,
+    "power": _power,
+    "disk": _disk,
     "wifi": _wifi,
     "broker": _broker,
     "hole": _hole,
@@ -197,7 +271,7 @@ _EVENTS: Final = {
     "quiet": _quiet,
     "flood": _flood,
     "i2c": _i2c,
-    "kept": _kept,
+    "retained": _retained,
     "stale": _stale,
     "mute": _mute,
 }

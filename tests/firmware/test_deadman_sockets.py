@@ -18,9 +18,9 @@ import pytest
 from paho.mqtt.client import MQTTMessageInfo
 
 from pebble.simulation.wireless import KINDS
-from tests.firmware.wireless_rig import Pilot, Robots
-from tests.link import Link
+from tests.firmware.wireless_rig import Operator, Robots
 from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
 
 LIMIT_S = 1.0
 BACK_S = 20.0
@@ -43,11 +43,11 @@ class Case:
         self.fault = fault
         self.broker = Broker(folder)
         stack.callback(self.broker.kill)
-        self.link = stack.enter_context(Link(self.broker.port))
+        self.link = stack.enter_context(TcpProxy(self.broker.port))
         self.robots = Robots("localhost" if fault == "dns failing" else "127.0.0.1", self.link.port)
         self.robots.fleet.servers.clock = fault != "ntp silent"
         stack.enter_context(self.robots)
-        self.pilot = stack.enter_context(Pilot(self.broker.port))
+        self.operator = stack.enter_context(Operator(self.broker.port))
 
     def play(self) -> Result:
         self.robots.wait_online()
@@ -66,7 +66,7 @@ class Case:
         """Both robots move at the end; returns when the broker had the last command."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            last = [self.pilot.drive(kind, 0.1, 0.8) for kind in KINDS]
+            last = [self.operator.drive(kind, 0.1, 0.8) for kind in KINDS]
             time.sleep(_PERIOD_S)
         assert all(map(self.robots.moving, KINDS)), f"{self.fault}: {self._troubles()}"
         return self.acknowledged(last)
@@ -80,17 +80,17 @@ class Case:
     def _obeys(self) -> bool:
         """Are both robots driven again?"""
         for kind in KINDS:
-            self.pilot.drive(kind, 0.0, 0.7)
+            self.operator.drive(kind, 0.0, 0.7)
         return all(map(self.robots.moving, KINDS))
 
     def _troubles(self) -> Any:
-        return {kind: (robot.online, robot.trouble) for kind, robot in self.robots.robots.items()}
+        return {kind: (robot.online, robot.problem) for kind, robot in self.robots.robots.items()}
 
     def keep_driving(self, rate_hz: float, stop: threading.Event) -> None:
         """The operator notices nothing."""
         while not stop.wait(1 / rate_hz):
             for kind in KINDS:
-                self.pilot.drive(kind, 0.1, 0.8)
+                self.operator.drive(kind, 0.1, 0.8)
 
 
 @contextmanager
@@ -125,7 +125,7 @@ def _killed(case: Case) -> Iterator[None]:
 
 @contextmanager
 def _hole(case: Case) -> Iterator[None]:
-    case.link.hole()
+    case.link.blackhole()
     with _driven_through(case):
         yield
     case.link.resume()
@@ -157,7 +157,7 @@ def _keepalives(case: Case) -> Iterator[None]:
 def _flood(case: Case) -> Iterator[float]:
     began = time.monotonic()
     for number in range(1000):
-        last = [case.pilot.drive(kind, 0.1 * (number % 3), 0.8, qos=number % 2) for kind in KINDS]
+        last = [case.operator.drive(kind, 0.1 * (number % 3), 0.8, qos=number % 2) for kind in KINDS]
         time.sleep(max(0.0, began + number / 500 - time.monotonic()))
     assert all(map(case.robots.moving, KINDS))
     yield case.acknowledged(last)

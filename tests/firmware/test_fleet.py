@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from pebble import cli
-from pebble.bench.fleet import Figures, Plan, latencies_ms, longest_gap_s, measure, plan, run
+from pebble.bench.fleet import FleetMetrics, FleetPlan, latencies_ms, longest_gap_s, measure, plan, run
 from pebble.bench.fleet_operator import STEPS
 from pebble.bench.results import load
 from pebble.errors import ConfigError, PebbleError
@@ -60,7 +60,7 @@ class TestLatencies:
             if number != without
         ]
 
-    def test_every_command_is_told_apart(self) -> None:
+    def test_every_command_is_distinguished(self) -> None:
         assert latencies_ms({"r": SENT}, {"r": self.moves(3_000_000)}) == [3.0] * 20
 
     def test_also_when_it_is_slower_than_the_next_one_is_sent(self) -> None:
@@ -84,44 +84,51 @@ def test_a_robot_that_falls_silent_is_missed_until_the_end() -> None:
     assert longest_gap_s([alive, []], 0, 10 * second) == 10.0
 
 
-def test_a_quick_fleet_is_small_and_says_so() -> None:
+def test_a_quick_fleet_is_small_and_its_command_shows_it() -> None:
     quick = plan(quick=True, seconds=2.0)
     assert (quick.robots, quick.seconds) == (30, 2.0)
     assert " ".join(quick.command()) == "pebble bench fleet --robots 30 --seconds 2 --rate 10 --quick"
-    assert plan() == Plan()
+    assert plan() == FleetPlan()
 
 
 def test_a_small_fleet_is_measured() -> None:
     """Whole: a broker, ten robots, an operator; with bounds that hold on a busy machine too."""
-    figures = measure(Plan(robots=10, seconds=5.0))
-    assert figures.online == 10
-    assert figures.sent == 500
-    assert figures.lost <= 0.8 * figures.sent  # overtaken, where a busy machine let several wait
-    assert len(figures.beats_hz) == 10
-    assert all(rate == pytest.approx(4.0, rel=0.25) for rate in figures.beats_hz)
-    cell = figures.cell(10.0)
+    metrics = measure(FleetPlan(robots=10, seconds=5.0))
+    assert metrics.online == 10
+    assert metrics.sent == 500
+    assert metrics.lost <= 0.8 * metrics.sent  # overtaken, where a busy machine let several wait
+    assert len(metrics.heartbeats_hz) == 10
+    assert all(rate == pytest.approx(4.0, rel=0.25) for rate in metrics.heartbeats_hz)
+    cell = metrics.cell(10.0)
     assert cell.percentile(50) < 200
-    assert cell.lost == figures.lost
-    assert set(figures.cpu) == {"broker", "fleet", "operator"}
+    assert cell.lost == metrics.lost
+    assert set(metrics.cpu) == {"broker", "fleet", "operator"}
     assert 0 < cell.figures["mb_per_robot"] < 20
 
 
 def test_what_cannot_be_measured_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for bad in (Plan(robots=MOST + 1), Plan(seconds=0.0), Plan(rate_hz=100.0), Plan(output=tmp_path / "file" / "no")):
+    for bad in (
+        FleetPlan(robots=MOST + 1),
+        FleetPlan(seconds=0.0),
+        FleetPlan(rate_hz=100.0),
+        FleetPlan(output=tmp_path / "file" / "no"),
+    ):
         with pytest.raises(PebbleError):
             run(bad)
 
 
 def test_figures_are_shown_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = Figures(robots=2, seconds=1.0, online=2, sent=3, late=0, latencies_ms=[1.0, 9.0], beats_hz=[4.0, 4.1])
-    monkeypatch.setattr("pebble.bench.fleet.measure", lambda *_: figures)
+    metrics = FleetMetrics(
+        robots=2, seconds=1.0, online=2, sent=3, late=0, latencies_ms=[1.0, 9.0], heartbeats_hz=[4.0, 4.1]
+    )
+    monkeypatch.setattr("pebble.bench.fleet.measure", lambda *_: metrics)
     out = StringIO()
-    assert run(Plan(robots=2, output=tmp_path), Console(file=out, width=100)) == 0
+    assert run(FleetPlan(robots=2, output=tmp_path), Console(file=out, width=100)) == 0
     assert "3 / 2 / 1" in out.getvalue()  # sent, obeyed, lost
     results = load(tmp_path / "fleet.json")
     assert results.cells[0].rounds == [[1.0, 9.0]]
-    assert results.verdict[0] == "2 of 2 robots were online; of 3 commands 1 were overtaken or lost"
+    assert results.assessment[0] == "2 of 2 robots were online; of 3 commands 1 were overtaken or lost"
 
 
 class Command:
@@ -134,7 +141,7 @@ class Command:
             self.process = Child(command, cwd=ROOT, stdout=out, stderr=out)
 
     @property
-    def said(self) -> str:
+    def output(self) -> str:
         return self._file.read_text()
 
     def __enter__(self) -> Self:
@@ -145,15 +152,15 @@ class Command:
         self.process.wait()
 
 
-def test_the_program_shows_how_its_robots_fare_and_ends_in_order(broker: Broker, tmp_path: Path) -> None:
+def test_the_program_shows_the_status_of_its_robots_and_ends_in_order(broker: Broker, tmp_path: Path) -> None:
     with Command(tmp_path / "out", "fleet", "-n", "3", "--broker", f"mqtt://127.0.0.1:{broker.port}") as command:
-        assert until(lambda: "3 robots: connected" in command.said, 20), command.said
+        assert until(lambda: "3 robots: connected" in command.output, 20), command.output
         command.process.send_signal(signal.SIGTERM)
         began = time.monotonic()
         assert command.process.wait(10) == 0
         assert time.monotonic() - began < 2.0
-        assert "3 of 3 online" in command.said
-        assert "Traceback" not in command.said
+        assert "3 of 3 online" in command.output
+        assert "Traceback" not in command.output
 
 
 @pytest.mark.parametrize(
@@ -185,6 +192,6 @@ def test_a_config_names_broker_and_robot(tmp_path: Path) -> None:
         f'{{"robot": {{"id": "lamp", "type": "towers"}}, "local_mqtt": {{"host": "127.0.0.1", "port": {port}}}}}'
     )
     with Command(tmp_path / "out", "minilamp", "--broker", str(config)) as command:
-        assert until(lambda: "cannot reach" in command.said, 15), command.said
-        assert f"pebble/towers/lamp is on its way to the broker at 127.0.0.1:{port}" in command.said
-        assert "Connection refused" in command.said
+        assert until(lambda: "cannot reach" in command.output, 15), command.output
+        assert f"pebble/towers/lamp connects to the broker at 127.0.0.1:{port}" in command.output
+        assert "Connection refused" in command.output

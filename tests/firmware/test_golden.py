@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.goob_base import Charging, Level, Touch, parse
+from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch, parse
 from pebble.simulation.bodies import body_of
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
@@ -60,8 +60,8 @@ def play(robot: str, script: list[Entry]) -> list[Entry]:
                 transcript.append(entry)
                 act(board, entry)
         firmware.step()
-        body.settle()
-        transcript += [Entry(now, "<", line.decode()) for line in board.said().split(b"\r\n")[:-1]]
+        body.end_turn()
+        transcript += [Entry(now, "<", line.decode()) for line in board.take_output().split(b"\r\n")[:-1]]
     return transcript
 
 
@@ -85,7 +85,7 @@ def text(transcript: list[Entry]) -> str:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_the_board_says_exactly_this(robot: str) -> None:
+def test_the_boards_output_is_exactly_this(robot: str) -> None:
     script = [entry for entry in entries(robot) if entry.sign in "=>."]
     assert text(play(robot, script)) == (GOLDEN / f"{robot}.txt").read_text()
 
@@ -124,16 +124,16 @@ def test_the_host_reads_goobs_battery() -> None:
 
 def test_the_host_reads_freds_charger() -> None:
     world: dict[str, str] = {}
-    heard = []
+    received = []
     for entry in entries("fred"):
         if entry.sign == "=":
             world.update([entry.what.split()])
         if entry.sign == "<" and entry.what.startswith("T "):
             (charging,) = parse(entry.what.encode() + b"\r\n")[1:]
             assert charging == Charging(world["PA07"] == "high")
-            heard.append(charging)
-    assert Charging(True) in heard
-    assert Charging(False) in heard
+            received.append(charging)
+    assert Charging(True) in received
+    assert Charging(False) in received
 
 
 def main() -> None:

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.frame import Frame, FrameError, Type, decode, encode
-from pebble.services.serial_mcu_bridge.manifest import Manifest, parse_describe, parse_hello
-from pebble.services.serial_mcu_bridge.struct_v1 import unpack
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, FrameError, Type, decode, encode
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Manifest, parse_describe, parse_hello
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
 from pebble.simulation.bodies import body_of
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
@@ -20,7 +20,7 @@ ASK = encode(Frame(Type.DESCRIBE_REQ))
 
 
 class Bench:
-    """A board whose loop turns every 2 ms, and a host that collects what it says."""
+    """A board whose loop turns every 2 ms, and a host that collects its output."""
 
     def __init__(self, ticks_at_boot_ms: int = 0) -> None:
         self.clock = VirtualClock()
@@ -36,11 +36,11 @@ class Bench:
         while self.clock.now() < until and not done(frames):
             self.clock.advance(0.002)
             self.robot.step()
-            frames += self.hear()
+            frames += self.receive()
         return frames
 
-    def hear(self) -> list[Frame]:
-        *whole, self._rest = (self._rest + self.board.said()).split(b"\0")
+    def receive(self) -> list[Frame]:
+        *whole, self._rest = (self._rest + self.board.take_output()).split(b"\0")
         frames = []
         for one in filter(None, whole):
             try:
@@ -58,18 +58,18 @@ def of(frames: list[Frame], kind: Type) -> list[Frame]:
     return [frame for frame in frames if frame.type is kind]
 
 
-def test_it_says_hello_when_it_boots() -> None:
+def test_it_sends_hello_when_it_boots() -> None:
     (hello,) = of(Bench().run(0.1), Type.HELLO)
     assert parse_hello(hello.payload).device_uid == "goob-imu"
     assert hello.sequence == 1
 
 
 def test_half_a_frame_from_before_a_reset_does_not_swallow_its_hello() -> None:
-    """On a serial port without USB nobody else would tell the host that the firmware is another one now."""
+    """On a serial port without USB, the host has no other sign that the firmware has changed."""
     board = Board(VirtualClock())
     body_of("goob_imu", board)
     board.load("goob_imu", {}).step()
-    frames = (encode(Frame(Type.SAMPLE, b"\1" * 18, 1))[:20] + board.said()).split(b"\0")
+    frames = (encode(Frame(Type.SAMPLE, b"\1" * 18, 1))[:20] + board.take_output()).split(b"\0")
     assert Type.HELLO in [decode(one).type for one in frames[1:] if one]
 
 
@@ -127,19 +127,19 @@ def test_a_ping_comes_back_with_its_number() -> None:
     assert (pong.sequence, pong.interface) == (0xDEADBEEF, 0)
 
 
-def test_it_takes_no_commands_and_says_so() -> None:
+def test_it_refuses_commands() -> None:
     bench = Bench()
     bench.board.type(encode(Frame(Type.CMD, b"\x01", interface=3, sequence=9)))
     (nack,) = of(bench.run(0.1), Type.NACK)
     assert (nack.payload, nack.interface, nack.sequence) == (b"unknown_interface", 3, 9)
 
 
-def test_a_lost_mpu_is_told_and_found_again() -> None:
+def test_a_lost_mpu_is_reported_and_found_again() -> None:
     bench = Bench()
     bench.run(0.5)
     bench.board.bus.fail(0x68)
     lost = bench.run(2.5)
-    bench.board.bus.mend(0x68)
+    bench.board.bus.restore(0x68)
     found = bench.run(1.5)
     assert [frame.payload for frame in of(lost, Type.LOG)] == [
         b"imu_read_failed",
@@ -170,12 +170,12 @@ def test_it_describes_itself_though_its_loop_is_slow() -> None:
     for _ in range(20):
         bench.clock.advance(0.012)
         bench.robot.step()
-        frames += bench.hear()
+        frames += bench.receive()
     assert len(of(frames, Type.DESCRIBE)) == 1
     assert len(of(frames, Type.SAMPLE)) >= 18
 
 
-def test_a_board_without_an_mpu_says_so_every_second() -> None:
+def test_a_board_without_an_mpu_reports_it_every_second() -> None:
     bench = Bench()
     bench.board.bus.detach(0x68)
     frames = bench.run(3.5)
@@ -184,7 +184,7 @@ def test_a_board_without_an_mpu_says_so_every_second() -> None:
     assert of(bench.run(0.1), Type.DESCRIBE)
 
 
-def test_a_host_that_does_not_read_is_told_how_much_it_missed() -> None:
+def test_a_host_that_did_not_read_gets_the_number_of_lost_frames() -> None:
     bench = Bench()
     frames = bench.run(1.0)
     bench.board.console.reading = False
@@ -193,12 +193,14 @@ def test_a_host_that_does_not_read_is_told_how_much_it_missed() -> None:
         bench.robot.step()
     bench.board.console.reading = True
     frames += bench.run(1.0)
-    told = [int(frame.payload.split(b"=")[1]) for frame in of(frames, Type.LOG) if b"frames_lost=" in frame.payload]
-    heard = len(of(frames, Type.SAMPLE)) + len(of(frames, Type.STATE))
-    said = of(frames, Type.SAMPLE)[-1].sequence + of(frames, Type.STATE)[-1].sequence
-    assert len(told) == 1
-    assert told[0] > 200
-    assert said - heard - told[0] == bench.damaged
+    lost_counts = [
+        int(frame.payload.split(b"=")[1]) for frame in of(frames, Type.LOG) if b"frames_lost=" in frame.payload
+    ]
+    received = len(of(frames, Type.SAMPLE)) + len(of(frames, Type.STATE))
+    messages = of(frames, Type.SAMPLE)[-1].sequence + of(frames, Type.STATE)[-1].sequence
+    assert len(lost_counts) == 1
+    assert lost_counts[0] > 200
+    assert messages - received - lost_counts[0] == bench.damaged
     assert bench.damaged <= 1, "the one that was on its way"
 
 
@@ -221,7 +223,7 @@ def test_hostile_input() -> None:
     for _ in range(20_000):
         bench.board.type(noise.randbytes(noise.randrange(12)) + b"\0")
         bench.robot.step()
-        bench.hear()
+        bench.receive()
     assert bench.damaged == 0
     bench.board.type(b"\0")
     bench.run(1.0, done=lambda _frames: not bench.board.console.unread)

@@ -1,4 +1,4 @@
-"""A minute of every robot's life in the real MicroPython stays within the memory of its board."""
+"""Each robot runs for a minute in the real MicroPython within the memory of its board."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ def test_heap(case: Case, tmp_path: Path) -> None:
     cost = measure(case, tmp_path)
     limit = LIMITS[case]
     assert limit is None or cost.peak <= limit, f"{case}: {cost}"
-    told = int(documented()[str(case)][_PEAK])
-    assert abs(told - cost.peak) <= 0.02 * cost.peak, f"docs/firmware.md says {told}, it is {cost.peak}: make firmware"
+    documented_peak = int(documented()[str(case)][_PEAK])
+    assert abs(documented_peak - cost.peak) <= 0.02 * cost.peak, (
+        f"docs has {documented_peak}, measured {cost.peak}: make firmware"
+    )
     assert cost.imported < cost.built <= cost.live <= cost.peak, cost  # else something was not measured

@@ -1,7 +1,8 @@
-"""What a robot must not do for whatever arrives on its drive topic: move, crash, or let its heart stop."""
+"""What a robot must not do for whatever arrives on its topics: move, crash, or let its heartbeat stop."""
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -11,7 +12,7 @@ import pytest
 
 from pebble.simulation.wireless import KINDS
 from tests.firmware.schedules import HOSTILE
-from tests.firmware.wireless_rig import Pilot, Robots
+from tests.firmware.wireless_rig import Operator, Robots
 from tests.support import Broker, until
 
 HUGE = (
@@ -42,31 +43,79 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-def test_nothing_hostile_moves_a_robot_or_stops_its_heart(broker: Broker, stack: ExitStack) -> None:
+def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(broker: Broker, stack: ExitStack) -> None:
     robots = stack.enter_context(Robots("127.0.0.1", broker.port))
-    pilot = stack.enter_context(Pilot(broker.port))
+    operator = stack.enter_context(Operator(broker.port))
     robots.wait_online()
     began = time.monotonic()
     for number, payload in enumerate((*HOSTILE, *HUGE)):
         for kind in KINDS:
-            pilot.send(kind, payload, qos=number % 2)
+            operator.send(kind, payload, qos=number % 2)
         time.sleep(EVERY_S)
-    assert until(lambda: all(pilot.beating(kind, began) > 2.5 * RATE_HZ for kind in KINDS))
+    assert until(lambda: all(operator.beating(kind, began) > 2.5 * RATE_HZ for kind in KINDS))
     for kind in KINDS:
         assert robots.moves[kind] == []
-        stamps = [body["t"] for at, body in pilot.beats[kind] if at > began]
+        stamps = [body["t"] for at, body in operator.heartbeats[kind] if at > began]
         assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1000 == pytest.approx(RATE_HZ, rel=0.1)
         assert robots.robots[kind].online
-        pilot.drive(kind, 0.0, 0.8)
+        operator.drive(kind, 0.0, 0.8)
     assert until(lambda: all(map(robots.moving, KINDS)))
     assert until(lambda: not any(map(robots.moving, KINDS)))
     assert robots.alive
 
 
-def test_a_kept_command_moves_nobody_who_connects_or_comes_back(broker: Broker, stack: ExitStack) -> None:
-    pilot = stack.enter_context(Pilot(broker.port))
+def test_nothing_hostile_on_the_topics_of_stops_frees_a_robot_or_stops_its_heartbeat(
+    broker: Broker, stack: ExitStack
+) -> None:
+    """What cannot be read stops it, and it is reset and driven afterwards."""
+    robots = stack.enter_context(Robots("127.0.0.1", broker.port))
+    operator = stack.enter_context(Operator(broker.port))
+    robots.wait_online()
+    began = time.monotonic()
+    for number, payload in enumerate((*HOSTILE, *HUGE)):
+        for kind in KINDS:
+            for metric in ("estop", "estop-reset"):
+                operator.send(kind, payload, qos=number % 2, metric=metric)
+        time.sleep(EVERY_S)
+    assert until(lambda: all(operator.beating(kind, began) > 2.5 * RATE_HZ for kind in KINDS))
+    for kind, robot in robots.robots.items():
+        latch = robot.firmware.stops.latch
+        assert latch.latched
+        assert latch.count >= len((*HOSTILE, *HUGE)) - 1  # an empty one is none
+        operator.drive(kind, 0.0, 0.8)
+        operator.send(kind, json.dumps({"boot": latch.boot, "count": latch.count}), metric="estop-reset")
+    assert until(lambda: not any(robot.firmware.stops.latch.latched for robot in robots.robots.values()))
+    assert [robots.moves[kind] for kind in KINDS] == [[], []]
     for kind in KINDS:
-        info = pilot.send(kind, b'{"x": 0, "z": 1}', retain=True)
+        operator.drive(kind, 0.0, 0.0)
+        operator.drive(kind, 0.0, 0.8)
+    assert until(lambda: all(map(robots.moving, KINDS)))
+    assert robots.alive
+
+
+def test_a_stop_survives_a_power_cut_on_a_real_broker(broker: Broker, stack: ExitStack) -> None:
+    robots = stack.enter_context(Robots("127.0.0.1", broker.port))
+    operator = stack.enter_context(Operator(broker.port))
+    robots.wait_online()
+    for kind, robot in robots.robots.items():
+        before = robot.firmware
+        operator.send(kind, b'{"stop": "00000000000000aa"}', metric="estop")
+        assert until(lambda robot=robot: "/estop.json" in robot.board.files)  # type: ignore[misc]
+        robot.cut_power()
+        assert until(lambda robot=robot, before=before: robot.firmware is not before)  # type: ignore[misc]
+    robots.wait_online()
+    for kind, robot in robots.robots.items():
+        assert robot.firmware.stops.latch.latched
+        operator.drive(kind, 0.0, 0.8)
+    back = time.monotonic()
+    assert until(lambda: all(operator.beating(kind, back) > 2 for kind in KINDS))
+    assert [robots.moves[kind] for kind in KINDS] == [[], []]
+
+
+def test_a_retained_command_moves_no_robot_that_connects_or_reconnects(broker: Broker, stack: ExitStack) -> None:
+    operator = stack.enter_context(Operator(broker.port))
+    for kind in KINDS:
+        info = operator.send(kind, b'{"x": 0, "z": 1}', retain=True)
         assert info is not None
         info.wait_for_publish(5)
     robots = stack.enter_context(Robots("127.0.0.1", broker.port))
@@ -78,7 +127,7 @@ def test_a_kept_command_moves_nobody_who_connects_or_comes_back(broker: Broker, 
         robot.network.radio.restore()
     robots.wait_online()
     back = time.monotonic()
-    assert until(lambda: all(pilot.beating(kind, back) > 2 for kind in KINDS))
+    assert until(lambda: all(operator.beating(kind, back) > 2 for kind in KINDS))
     assert [robots.moves[kind] for kind in KINDS] == [[], []]
     assert all(robot.refused >= 2 for robot in robots.firmware())
 
@@ -86,15 +135,15 @@ def test_a_kept_command_moves_nobody_who_connects_or_comes_back(broker: Broker, 
 def test_messages_without_end_do_not_keep_the_motors_on(broker: Broker, stack: ExitStack) -> None:
     """Nonsense at a high rate feeds no dead-man, and a stop is obeyed in the middle of it."""
     robots = stack.enter_context(Robots("127.0.0.1", broker.port))
-    pilot = stack.enter_context(Pilot(broker.port))
+    operator = stack.enter_context(Operator(broker.port))
     robots.wait_online()
     for kind in KINDS:
-        pilot.drive(kind, 0.0, 0.8)
+        operator.drive(kind, 0.0, 0.8)
     assert until(lambda: all(map(robots.moving, KINDS)))
     end = time.monotonic() + 1.5
     while time.monotonic() < end:
         for kind in KINDS:
-            pilot.send(kind, b'{"x": 0, "z": NaN}')
+            operator.send(kind, b'{"x": 0, "z": NaN}')
         time.sleep(0.003)
     assert not any(map(robots.moving, KINDS))
     assert robots.alive

@@ -32,9 +32,9 @@ class Bench:
             self.turns += 1
             self.clock.advance(0.001)
             self.robot.step()
-            self.body.settle()
+            self.body.end_turn()
 
-    def say(self, line: bytes) -> None:
+    def send(self, line: bytes) -> None:
         self.board.type(line + b"\n")
 
 
@@ -74,14 +74,28 @@ def test_the_motors_come_first(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("half", [b"M 0.900", b"M 0.400 0."])
+def test_half_a_line_of_a_dead_host_moves_nothing(kind: str, half: bytes) -> None:
+    bench = Bench(kind)
+    bench.board.type(half)
+    bench.run(0.25)
+    bench.send(b"M 0.000 0.000")
+    bench.run(0.1)
+    assert all(motors == (0.0, 0.0) for _, motors in bench.motors)
+    bench.send(b"M 0.500 0.500")
+    bench.run(0.1)
+    assert any(bench.motors[-1][1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(20))
 def test_motors_stop_a_second_after_the_last_command(kind: str, seed: int) -> None:
     bench = Bench(kind)
     chance = random.Random(seed)
     last = 0.0
     for _ in range(20):
-        bench.say(b"M %.3f %.3f" % (chance.uniform(0.1, 1.0), chance.uniform(0.1, 1.0)))
-        bench.say(chance.choice([b"L 1 1 1", b"F 0 1 0 0.1", b"nonsense", b"x" * 300, b"M", b""]))
+        bench.send(b"M %.3f %.3f" % (chance.uniform(0.1, 1.0), chance.uniform(0.1, 1.0)))
+        bench.send(chance.choice([b"L 1 1 1", b"F 0 1 0 0.1", b"nonsense", b"x" * 300, b"M", b""]))
         last = bench.clock.now()
         bench.run(chance.uniform(0.0, 0.9))
     bench.run(2.0)
@@ -95,7 +109,7 @@ def test_a_host_that_does_not_read_blocks_nothing(kind: str) -> None:
     bench = Bench(kind)
     bench.board.console.reading = False
     bench.run(20.0)
-    bench.say(b"M 0.5 0.5")
+    bench.send(b"M 0.5 0.5")
     bench.run(0.1)
     assert bench.motors[-1][1] != (0.0, 0.0)
     bench.run(2.0)
@@ -112,9 +126,9 @@ def test_lines_stay_whole_when_the_host_was_away(kind: str) -> None:
     bench.run(20.0)
     bench.board.console.reading = True
     bench.run(3.0)
-    said = bench.board.said()
+    output = bench.board.take_output()
     assert bench.board.console.lost == 0
-    *lines, rest = said.split(b"\r\n")
+    *lines, rest = output.split(b"\r\n")
     assert rest == b""
     assert {line.split()[0] for line in lines} <= {b"Starting", b"Done!", b"T", b"C"}
     assert all(line.count(b"=") == (3 if kind == "goob" else 4) for line in lines if line.startswith(b"T"))
@@ -124,17 +138,17 @@ def test_lines_stay_whole_when_the_host_was_away(kind: str) -> None:
 def test_ctrl_c_does_not_stop_the_firmware(kind: str) -> None:
     bench = Bench(kind)
     bench.run(0.01)
-    bench.board.said()
+    bench.board.take_output()
     bench.board.type(b"\x03\x03\nM 0.5 0.5\n")
     bench.run(0.05)
-    assert b"ERR unknown command\r\nOK M\r\n" in bench.board.said()
+    assert b"ERR unknown command\r\nOK M\r\n" in bench.board.take_output()
     assert bench.motors[-1][1] != (0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_flood_does_not_keep_the_motors_running(kind: str) -> None:
     bench = Bench(kind)
-    bench.say(b"M 1 1")
+    bench.send(b"M 1 1")
     bench.run(0.05)
     bench.board.type(b"x" * 1_000_000)
     bench.run(2.0)
@@ -151,22 +165,22 @@ def test_noise(kind: str) -> None:
     for _ in range(20_000):
         bench.board.type(chance.randbytes(chance.randrange(30)) + chance.choice([b"\n", b"\r\n", b" ", b""]))
         bench.robot.step()
-        bench.board.said()
+        bench.board.take_output()
     bench.board.type(b"\n")
     while bench.board.unread:
         bench.robot.step()
-    bench.board.said()
-    bench.say(b"M 0.5 0.5")
+    bench.board.take_output()
+    bench.send(b"M 0.5 0.5")
     bench.run(0.02)
-    assert b"OK M\r\n" in bench.board.said()
+    assert b"OK M\r\n" in bench.board.take_output()
 
 
 def test_goobs_headlights_show_the_brightest_part() -> None:
     bench = Bench("goob")
-    bench.say(b"L 0.1 0.6 0.3")
+    bench.send(b"L 0.1 0.6 0.3")
     bench.run(0.1)
     assert bench.body.light().red == pytest.approx(0.6, abs=0.001)
-    bench.say(b"L 0 0 0")
+    bench.send(b"L 0 0 0")
     bench.run(0.1)
     assert bench.body.light().red == 0.0
 
@@ -174,7 +188,7 @@ def test_goobs_headlights_show_the_brightest_part() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_lights_fade(kind: str) -> None:
     bench = Bench(kind)
-    bench.say(b"F 0 0 1 1")
+    bench.send(b"F 0 0 1 1")
     seen = []
     for _ in range(40):
         bench.run(0.05)
@@ -186,7 +200,7 @@ def test_lights_fade(kind: str) -> None:
 
 def test_fred_shows_three_colours() -> None:
     bench = Bench("fred")
-    bench.say(b"L 0.25 0.5 1")
+    bench.send(b"L 0.25 0.5 1")
     bench.run(0.1)
     light = bench.body.light()
     assert (light.blue, light.green, light.red) == pytest.approx((0.25, 0.5, 1.0), abs=0.001)
@@ -195,11 +209,11 @@ def test_fred_shows_three_colours() -> None:
 def test_freds_motors_and_lights_share_no_signal() -> None:
     """Seven signals on six timer channels: a motor's two pins take turns on one."""
     bench = Bench("fred")
-    bench.say(b"L 0.25 0.5 0.75")
+    bench.send(b"L 0.25 0.5 0.75")
     bench.run(0.4)
     for left, right in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (0.0, 0.0), (-1.0, -1.0), (0.5, -0.25)):
         bench.run(0.4)
-        bench.say(b"M %.3f %.3f" % (left, right))
+        bench.send(b"M %.3f %.3f" % (left, right))
         bench.run(0.05)
         light = bench.body.light()
         assert (light.blue, light.green, light.red) == pytest.approx((0.25, 0.5, 0.75), abs=0.001)

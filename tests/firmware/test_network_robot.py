@@ -1,14 +1,16 @@
-"""What MiniLAMP and BenJr say and do, in virtual time."""
+"""MiniLAMP's and BenJr's messages and motions, in virtual time."""
 
 from __future__ import annotations
 
 import json
+import re
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
+from tests.simulation.virtual_broker import Session, VirtualBroker
 
 KINDS = ("minilamp", "benjr")
 WEEK_S = 7 * 86_400.0  # more than half a period of the ticks
@@ -16,32 +18,39 @@ EPOCH_MS = 1_800_000_000_000  # of the virtual time server at virtual time 0
 AHEAD = {"minilamp": (1.0, 1.0, 0.0), "benjr": (-0.5, -0.5)}
 
 
-def online(kind: str, seed: int = 1, **weather: str) -> Drill:
+def online(kind: str, seed: int = 1, **conditions: str) -> Drill:
     drill = Drill(kind, seed)
-    for name, value in weather.items():
-        setattr(drill.network.weather, name, value)
-    while drill.robot.link.state != "online":
+    for name, value in conditions.items():
+        setattr(drill.network.conditions, name, value)
+    while drill.robot.connection.state != "online":
         drill.turn(0.01)
-        assert drill.seconds < 30, drill.robot.link.reason
+        assert drill.seconds < 30, drill.robot.connection.reason
     drill.run(drill.seconds + 0.5)
     return drill
 
 
-def said(drill: Drill, metric: str) -> list[Any]:
-    return [json.loads(payload) for payload in drill.heard(f"{BASE}/outgoing/{metric}")]
+def published(drill: Drill, metric: str) -> list[Any]:
+    return [json.loads(payload) for payload in drill.received(f"{BASE}/outgoing/{metric}")]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_says_what_it_is_and_keeps_that_with_the_broker(kind: str) -> None:
+def test_its_capabilities_are_a_retained_message(kind: str) -> None:
     drill = online(kind)
-    (message,) = [one.message for one in drill.broker.heard if one.message.topic == f"{BASE}/outgoing/capabilities"]
+    (message,) = [one.message for one in drill.broker.received if one.message.topic == f"{BASE}/outgoing/capabilities"]
     assert message.retain
     envelope = json.loads(message.payload)
     assert envelope["schema"] == "pebble-capabilities/v1"
     value = envelope["value"]
     assert value["identity"] == {"system": "pebble", "type": "robots", "id": "rover"}
     assert value["transport"] == {"kind": "mqtt"}
-    assert value["drive"] == {"available": True, "controls": True, "topic": DRIVE}
+    assert value["drive"] == {"available": True, "controls": True, "arbitrates": True, "topic": DRIVE}
+    assert value["estop"] == {
+        "available": True,
+        "topic": f"{BASE}/incoming/estop",
+        "reset_topic": f"{BASE}/incoming/estop-reset",
+        "owners": ["mcu"],
+        "status_topics": [f"{BASE}/outgoing/estop/mcu"],
+    }
     assert value["telemetry"]["charging_level_topic"] == f"{BASE}/outgoing/charging-level"
     assert value["telemetry"]["charging_status"] is (kind == "benjr")
     absent = {"available": False, "controls": False}
@@ -50,22 +59,42 @@ def test_it_says_what_it_is_and_keeps_that_with_the_broker(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_heart_beats_in_real_milliseconds(kind: str) -> None:
+def test_its_client_id_is_its_own_and_as_long_as_any_broker_takes(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that knows it can disconnect the robot. It lasts until the next boot, to end an old connection."""
+    ids: list[str] = []
+    accept = VirtualBroker.taken_over
+
+    def taken_over(broker: VirtualBroker, by: Session) -> None:
+        ids.append(by.client_id)
+        accept(broker, by)
+
+    monkeypatch.setattr(VirtualBroker, "taken_over", taken_over)
+    drill = online(kind)
+    drill.drop_robot()
+    drill.run(drill.seconds + 10)
+    online(kind, seed=2)
+    assert len(ids) == 3
+    assert ids[0] == ids[1] != ids[2]
+    assert all(re.fullmatch("pebble-[0-9a-f]{16}", one) for one in ids)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_heartbeat_is_stamped_in_real_milliseconds(kind: str) -> None:
     drill = online(kind)
     start = drill.seconds
     drill.run(start + 10)
-    beats = [
-        (one.at, json.loads(one.message.payload)["t"]) for one in drill.broker.heard if one.message.topic == ONLINE
+    heartbeats = [
+        (one.at, json.loads(one.message.payload)["t"]) for one in drill.broker.received if one.message.topic == ONLINE
     ]
-    beats = [(at, t) for at, t in beats if at > START_S + start]
-    assert 38 <= len(beats) <= 42
-    for at, t in beats:
+    heartbeats = [(at, t) for at, t in heartbeats if at > START_S + start]
+    assert 38 <= len(heartbeats) <= 42
+    for at, t in heartbeats:
         assert abs(EPOCH_MS + at * 1000 - t) < 150  # the way of the message and half of the time server's
 
 
 def test_without_a_time_server_it_counts_from_its_start() -> None:
     drill = online("benjr", ntp="silent")
-    assert all(beat["t"] < 60_000 for beat in said(drill, "online"))
+    assert all(heartbeat["t"] < 60_000 for heartbeat in published(drill, "online"))
 
 
 def test_a_time_server_that_cannot_be_asked_disturbs_nothing() -> None:
@@ -73,22 +102,22 @@ def test_a_time_server_that_cannot_be_asked_disturbs_nothing() -> None:
     settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}, "ntp": "no..name"}
     drill.robot = drill.board.load("benjr", settings)
     drill.run(10)
-    assert drill.robot.link.state == "online"
-    assert drill.robot.link.losses == 0
+    assert drill.robot.connection.state == "online"
+    assert drill.robot.connection.losses == 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_battery_every_five_seconds_and_not_kept(kind: str) -> None:
+def test_the_battery_every_five_seconds_and_not_retained(kind: str) -> None:
     drill = Drill(kind, 1)
     drill.board.set_volts(drill.board.firmware.module(f"{kind}.pins").BATTERY, 0.8)
     drill.run(20)
-    told = [one.message for one in drill.broker.heard if one.message.topic.endswith("charging-level")]
-    assert 3 <= len(told) <= 4
-    assert not any(message.retain for message in told)
-    volts = json.loads(told[0].payload)
+    levels = [one.message for one in drill.broker.received if one.message.topic.endswith("charging-level")]
+    assert 3 <= len(levels) <= 4
+    assert not any(message.retain for message in levels)
+    volts = json.loads(levels[0].payload)
     assert volts["unit"] == "v"
     assert volts["value"] == pytest.approx({"minilamp": 1.6, "benjr": 3.6}[kind], abs=0.01)
-    assert said(drill, "charging-status") == ([{"value": False}] * len(told) if kind == "benjr" else [])
+    assert published(drill, "charging-status") == ([{"value": False}] * len(levels) if kind == "benjr" else [])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -99,16 +128,16 @@ def test_reports_get_through_however_long_the_names_are(kind: str) -> None:
     drill.robot = drill.board.load(kind, settings)
     drill.run(10)
     base = "/".join(identity.values())
-    heard = [one.message.topic for one in drill.broker.heard]
-    assert heard.count(f"{base}/outgoing/capabilities") == 1
-    assert heard.count(f"{base}/outgoing/charging-level") >= 1
-    assert heard.count(f"{base}/outgoing/charging-status") == heard.count(f"{base}/outgoing/charging-level") * (
+    received = [one.message.topic for one in drill.broker.received]
+    assert received.count(f"{base}/outgoing/capabilities") == 1
+    assert received.count(f"{base}/outgoing/charging-level") >= 1
+    assert received.count(f"{base}/outgoing/charging-status") == received.count(f"{base}/outgoing/charging-level") * (
         kind == "benjr"
     )
 
 
 @pytest.mark.parametrize("loss", ["broker", "wifi"])
-def test_it_comes_back_after_more_days_than_ticks_can_tell(loss: str) -> None:
+def test_it_reconnects_after_more_days_than_ticks_can_measure(loss: str) -> None:
     drill = online("benjr")
     drill.run(drill.seconds + 5)
     lose, restore = {
@@ -118,11 +147,11 @@ def test_it_comes_back_after_more_days_than_ticks_can_tell(loss: str) -> None:
     lose()
     while drill.seconds < WEEK_S:
         drill.turn(30.0)
-    drill.network.weather.ntp = "silent"
+    drill.network.conditions.ntp = "silent"
     restore()
     drill.run(drill.seconds + 15)
-    assert drill.robot.link.state == "online"
-    assert abs(EPOCH_MS + drill.clock.now() * 1000 - said(drill, "online")[-1]["t"]) < 500
+    assert drill.robot.connection.state == "online"
+    assert abs(EPOCH_MS + drill.clock.now() * 1000 - published(drill, "online")[-1]["t"]) < 500
 
 
 def test_a_backlog_does_not_drive_a_robot() -> None:
@@ -156,10 +185,10 @@ def test_of_a_burst_only_the_newest_acts(kind: str) -> None:
 def test_a_command_right_behind_the_subscription_acts_at_once_or_never(kind: str) -> None:
     drill = online(kind)
     drill.drop_robot()
-    while drill.robot.link.state != "connecting":
+    while drill.robot.connection.state != "connecting":
         drill.turn(0.01)
     start = drill.seconds
-    while drill.robot.link.state != "online":
+    while drill.robot.connection.state != "online":
         drill.command(0.0, 0.5)
         drill.turn(0.005)
     drill.run(start + 5)  # the rule is checked at every turn
@@ -175,20 +204,20 @@ def test_who_loses_the_broker_stops_at_once(kind: str) -> None:
     drill.network.radio.lose()
     drill.turn(0.01)
     assert not any(drill.outputs())
-    assert drill.robot.link.state == "offline"
+    assert drill.robot.connection.state == "offline"
 
 
-def test_a_stop_is_said_until_the_shield_has_heard_it() -> None:
+def test_a_stop_is_repeated_until_the_shield_acknowledges_it() -> None:
     drill = online("benjr")
     drill.command(0.0, 0.5)
     drill.run(drill.seconds + 0.2)
     drill.failing_i2c(2.0)
     drill.run(drill.seconds + 1.9)
-    assert any(drill.outputs())  # it cannot have heard
-    drill.board.bus.mend(0x30)
+    assert any(drill.outputs())  # the shield did not receive it
+    drill.board.bus.restore(0x30)
     drill.turn(0.01)
     assert not any(drill.outputs())
-    assert drill.robot.trips == 1
+    assert drill.robot.deadman.trips == 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -205,16 +234,16 @@ def test_settings_that_are_missing_are_named_when_the_motors_are_off(kind: str) 
 def test_a_certificate_needs_the_date() -> None:
     drill = Drill("minilamp", 1)
     wrapper = drill.board.firmware.module("common.tls").Wrapper({"ca": "/ca.der"}, "broker")
-    wrapper.tell(5_000)  # since boot
+    wrapper.set_time(5_000)  # since boot
     assert drill.board.rtc[0] == 2000
-    wrapper.tell(1_700_000_000_999)
+    wrapper.set_time(1_700_000_000_999)
     assert drill.board.rtc == (2023, 11, 14, 1, 22, 13, 20, 0)
-    wrapper.tell(4_200_000_000_000)  # a time server's nonsense
+    wrapper.set_time(4_200_000_000_000)  # a time server's nonsense
     assert drill.board.rtc[0] == 2023
 
 
 @pytest.mark.parametrize(
-    ("asked", "answers", "heard"),
+    ("asked", "answers", "received"),
     [
         ("8.8.8.8", "8.8.8.8", b"answer"),
         ("8.8.8.8", "6.6.6.6", b""),
@@ -222,16 +251,16 @@ def test_a_certificate_needs_the_date() -> None:
         ("224.0.0.251", "192.168.1.7", b"answer"),
     ],
 )
-def test_only_who_was_asked_may_answer(asked: str, answers: str, heard: bytes) -> None:
-    from common.sockets import Question
+def test_only_who_was_asked_may_answer(asked: str, answers: str, received: bytes) -> None:
+    from common.sockets import Query
 
-    question = Question.__new__(Question)
-    question._host, question._port, question._due, question.data = asked, 53, 0, b"question"
-    question.socket = SimpleNamespace(sendto=lambda *_: None, recvfrom=lambda _: (b"answer", (answers, 53)))
-    assert question.step(0) == heard
+    query = Query.__new__(Query)
+    query._host, query._port, query._due, query.data = asked, 53, 0, b"question"
+    query.socket = SimpleNamespace(sendto=lambda *_: None, recvfrom=lambda _: (b"answer", (answers, 53)))
+    assert query.step(0) == received
 
 
-def test_the_end_of_a_connection_is_said_in_words() -> None:
+def test_the_end_of_a_connection_has_a_readable_reason() -> None:
     from common.sockets import Stream
 
     stream = Stream.__new__(Stream)

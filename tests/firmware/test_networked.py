@@ -15,10 +15,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from pebble.simulation.mcu import Look
+from pebble.simulation.mcu import Snapshot
 from pebble.simulation.trace import read_trace
 from pebble.simulation.wireless import KINDS
-from tests.firmware.wireless_rig import Pilot, Robots
+from tests.firmware.wireless_rig import Operator, Robots
 from tests.support import ROOT, Broker, Child, free_port, until
 
 TLS = ROOT / "tests" / "data" / "tls"
@@ -50,9 +50,11 @@ class Program:
     def err(self) -> str:
         return self._files[1].read_text()
 
-    def looks(self) -> list[Look]:
+    def snapshots(self) -> list[Snapshot]:
         return [
-            msgspec.json.decode(line, type=Look) for line in self.out.splitlines(keepends=True) if line[-1:] == b"\n"
+            msgspec.json.decode(line, type=Snapshot)
+            for line in self.out.splitlines(keepends=True)
+            if line[-1:] == b"\n"
         ]
 
 
@@ -77,7 +79,7 @@ def start(tmp_path: Path) -> Iterator[Any]:
         program.process.wait()
 
 
-def kept(port: int, topic: str) -> Any:
+def retained(port: int, topic: str) -> Any:
     """What the broker keeps there; None if nothing within a second."""
     command = ["mosquitto_sub", "-p", str(port), "-t", topic, "-C", "1", "-W", "1", "--retained-only"]
     raw = subprocess.run(command, capture_output=True).stdout
@@ -85,25 +87,26 @@ def kept(port: int, topic: str) -> Any:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_is_driven_and_tells_what_it_does(start: Any, broker: Broker, tmp_path: Path, kind: str) -> None:
+def test_it_is_driven_and_reports_its_state(start: Any, broker: Broker, tmp_path: Path, kind: str) -> None:
     trace = tmp_path / "trace.jsonl"
     program = start(kind, f"127.0.0.1:{broker.port}", "--id", kind, "--report", "--trace", str(trace))
-    with Pilot(broker.port) as pilot:
-        assert until(lambda: pilot.beating(kind, 0.0) > 1, 15), program.err
-        pilot.drive(kind, 0.0, 1.0)
-        assert until(lambda: any(look.board.motors != (0.0, 0.0) for look in program.looks()))
+    with Operator(broker.port) as operator:
+        assert until(lambda: operator.beating(kind, 0.0) > 1, 15), program.err
+        operator.drive(kind, 0.0, 1.0)
+        assert until(lambda: any(identify.board.motors != (0.0, 0.0) for identify in program.snapshots()))
         assert until(lambda: [entry.motors for entry in read_trace(trace)] == [(1.0, 1.0), (0.0, 0.0)], 5)
-    last = program.looks()[-1]
+    last = program.snapshots()[-1]
     assert (last.board.kind, last.plugged, last.host) == (kind, True, True)
     assert last.board.pose.x_mm > 50
     changes = read_trace(trace)
-    assert 0.8 <= (changes[1].ns - changes[0].ns) / 1e9 <= 1.2  # until nobody drives it any more
+    assert 0.8 <= (changes[1].ns - changes[0].ns) / 1e9 <= 1.2  # after the last command
     assert f"connected to the broker at 127.0.0.1:{broker.port}" in program.err
-    capabilities = kept(broker.port, f"pebble/robots/{kind}/outgoing/capabilities")
+    capabilities = retained(broker.port, f"pebble/robots/{kind}/outgoing/capabilities")
     assert capabilities["value"]["identity"]["id"] == kind
     assert capabilities["value"]["drive"] == {
         "available": True,
         "controls": True,
+        "arbitrates": True,
         "topic": f"pebble/robots/{kind}/incoming/drive-values",
     }
 
@@ -114,9 +117,9 @@ def test_a_signal_ends_it_at_once_with_motors_off(
 ) -> None:
     trace = tmp_path / "trace.jsonl"
     program = start("minilamp", f"127.0.0.1:{broker.port}", "--trace", str(trace))
-    with Pilot(broker.port) as pilot:
-        assert until(lambda: pilot.beating("minilamp", 0.0) > 1, 15), program.err
-        pilot.drive("minilamp", 0.0, 1.0)
+    with Operator(broker.port) as operator:
+        assert until(lambda: operator.beating("minilamp", 0.0) > 1, 15), program.err
+        operator.drive("minilamp", 0.0, 1.0)
         assert until(lambda: bool(read_trace(trace)))
         program.process.send_signal(number)
         began = time.monotonic()
@@ -125,21 +128,36 @@ def test_a_signal_ends_it_at_once_with_motors_off(
     assert [entry.motors for entry in read_trace(trace)] == [(1.0, 1.0), (0.0, 0.0)]
 
 
-def test_a_killed_robot_is_told_to_be_offline(start: Any, broker: Broker) -> None:
+def test_its_files_survive_the_program(start: Any, broker: Broker, tmp_path: Path) -> None:
+    arguments = ("benjr", f"127.0.0.1:{broker.port}", "--files", str(tmp_path / "board"))
+    topic = "pebble/robots/benjr/outgoing/estop/mcu"
+    program = start(*arguments)
+    assert until(lambda: (retained(broker.port, topic) or {}).get("latched") is False, 15), program.err
+    with Operator(broker.port) as operator:
+        operator.send("benjr", b'{"stop": "00000000000000aa"}', metric="estop")
+        assert until(lambda: retained(broker.port, topic)["persisted"] and retained(broker.port, topic)["latched"])
+    first = retained(broker.port, topic)
+    program.process.kill()
+    program.process.wait()
+    start(*arguments)
+    assert until(lambda: retained(broker.port, topic)["boot"] != first["boot"], 15)
+    assert retained(broker.port, topic)["latched"] is True
+    assert retained(broker.port, topic)["recent"] == ["00000000000000aa"]
+
+
+def test_a_killed_robot_is_published_as_offline(start: Any, broker: Broker) -> None:
     program = start("benjr", f"127.0.0.1:{broker.port}")
     online = "pebble/robots/benjr/outgoing/online"
-    assert until(lambda: (kept(broker.port, online) or {}).get("online") is True, 15), program.err
+    assert until(lambda: (retained(broker.port, online) or {}).get("online") is True, 15), program.err
     program.process.kill()
-    assert until(lambda: kept(broker.port, online) == {"t": 0, "online": False})
+    assert until(lambda: retained(broker.port, online) == {"t": 0, "online": False})
 
 
 def test_a_broker_that_is_not_there_is_named_and_waited_for(start: Any, tmp_path: Path) -> None:
     port = free_port()
     program = start("minilamp", f"localhost:{port}")
     assert until(lambda: "cannot reach" in program.err, 15)
-    assert (
-        f"minilamp: cannot reach the broker at localhost:{port}: Connection refused; it goes on trying" in program.err
-    )
+    assert f"minilamp: cannot reach the broker at localhost:{port}: Connection refused; it keeps trying" in program.err
     broker = Broker(tmp_path, port=port)
     try:
         assert until(lambda: "connected to the broker" in program.err, 20), program.err
@@ -194,16 +212,16 @@ def test_what_makes_no_sense_is_one_line(start: Any, options: tuple[str, ...], n
 
 
 def test_firmware_that_fails_stops_its_motors_and_boots_anew(broker: Broker) -> None:
-    with Robots("127.0.0.1", broker.port) as robots, Pilot(broker.port) as pilot:
+    with Robots("127.0.0.1", broker.port) as robots, Operator(broker.port) as operator:
         robots.wait_online()
-        pilot.drive("benjr", 0.0, 0.8)
+        operator.drive("benjr", 0.0, 0.8)
         assert until(lambda: robots.moving("benjr"))
         failing = robots.robots["benjr"]
         before = failing.firmware
         before.step = lambda: 1 // 0
         assert until(lambda: failing.board.resets == 1)
         assert until(lambda: not robots.moving("benjr"))
-        assert until(lambda: failing.firmware is not before and failing.online, 15), failing.trouble
+        assert until(lambda: failing.firmware is not before and failing.online, 15), failing.problem
         assert robots.robots["minilamp"].board.resets == 0
-        pilot.drive("benjr", 0.0, 0.8)
+        operator.drive("benjr", 0.0, 0.8)
         assert until(lambda: robots.moving("benjr"))

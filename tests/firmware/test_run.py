@@ -1,4 +1,4 @@
-"""The loop on a board: the door for `pebble flash`, the watchdog, and what happens when a robot fails."""
+"""The loop on a board: interruption by `pebble flash`, the watchdog, and a robot that fails."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ class WasReset(BaseException):
 
 
 class Board:
-    """Just enough of a board for the loop: what it is told, in order."""
+    """Records the calls of the loop, in order."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.calls: list[str] = []
         self.ctrl_c_while_waiting = False
 
     def modules(self) -> dict[str, Any]:
-        watchdog = SimpleNamespace(feed=lambda: self.told.append("feed"))
+        watchdog = SimpleNamespace(feed=lambda: self.calls.append("feed"))
 
         def wdt(timeout: int) -> SimpleNamespace:
-            self.told.append("watchdog")
+            self.calls.append("watchdog")
             return watchdog
 
         def reset() -> None:
-            self.told.append("reset")
+            self.calls.append("reset")
             raise WasReset
 
         def sleep_ms(ms: int) -> None:
-            self.told.append(f"wait {ms}")
+            self.calls.append(f"wait {ms}")
             if self.ctrl_c_while_waiting:
                 raise KeyboardInterrupt
 
         return {
             "machine": SimpleNamespace(WDT=wdt, reset=reset),
             "time": SimpleNamespace(sleep_ms=sleep_ms),
-            "micropython": SimpleNamespace(kbd_intr=lambda char: self.told.append(f"ctrl-c {char}"), const=int),
+            "micropython": SimpleNamespace(kbd_intr=lambda char: self.calls.append(f"ctrl-c {char}"), const=int),
         }
 
 
@@ -60,7 +60,7 @@ class Robot:
             raise self._error
 
     def stop(self) -> None:
-        self._board.told.append("stop")
+        self._board.calls.append("stop")
         if not self.stops:
             raise self._error
 
@@ -85,24 +85,24 @@ def run(board: Board, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> 
 def test_a_robot_that_fails_stops_and_starts_anew(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(WasReset):
         run(board, monkeypatch, MemoryError("memory allocation failed"))
-    assert board.told[-4:] == ["feed", "feed", "stop", "reset"]
+    assert board.calls[-4:] == ["feed", "feed", "stop", "reset"]
 
 
 def test_a_robot_that_cannot_even_stop_starts_anew(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Robot, "stops", False)
     with pytest.raises(WasReset):
         run(board, monkeypatch, MemoryError("memory allocation failed"))
-    assert board.told[-2:] == ["stop", "reset"]
+    assert board.calls[-2:] == ["stop", "reset"]
 
 
 def test_ctrl_c_works_before_the_watchdog_and_not_after(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(WasReset):
         run(board, monkeypatch, OSError())
-    assert board.told[:4] == ["ctrl-c 3", "wait 1000", "ctrl-c -1", "watchdog"]
+    assert board.calls[:4] == ["ctrl-c 3", "wait 1000", "ctrl-c -1", "watchdog"]
 
 
 def test_who_comes_in_by_that_door_finds_no_watchdog(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     board.ctrl_c_while_waiting = True
     with pytest.raises(KeyboardInterrupt):
         run(board, monkeypatch, OSError())
-    assert "watchdog" not in board.told
+    assert "watchdog" not in board.calls

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.frame import Frame, Type, decode, encode
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, Type, decode, encode
 from pebble.simulation.bodies import body_of
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.micropython.ports import SAMD21_OFFICIAL
-from pebble.simulation.micropython.watchdog import BoardReset
+from pebble.simulation.micropython.timers import BoardReset
 
 
 class SwitchedOff(BaseException):
@@ -30,10 +30,10 @@ class Bench:
         self.board = Board(self.clock, port=SAMD21_OFFICIAL)
         self.body = body_of(kind, self.board)
         self.robot: Any = self.board.load(kind, {})
-        self.said = b""
+        self.output = b""
         self._plan: list[tuple[float, Callable[[], None]]] = []
         self._end = 0.0
-        self.board.timers.on_wait = self._look
+        self.board.timers.on_wait = self._check
 
     def at(self, seconds: float, act: Callable[[], None]) -> None:
         self._plan.append((seconds, act))
@@ -42,11 +42,11 @@ class Bench:
         self._end = seconds
         self.board.firmware.module("common.run").run(lambda _settings: self.robot, {})
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         now = self.clock.now()
-        self.body.settle()
+        self.body.end_turn()
         if self.board.console.reading:
-            self.said += self.board.said()
+            self.output += self.board.take_output()
         for entry in [entry for entry in self._plan if entry[0] <= now]:
             self._plan.remove(entry)
             entry[1]()
@@ -57,15 +57,15 @@ class Bench:
 def test_it_speaks_again_when_the_host_reads_again() -> None:
     bench = Bench()
     console = bench.board.console
-    heard: list[int] = []
+    received: list[int] = []
     bench.at(2.0, lambda: setattr(console, "reading", False))
     bench.at(4.0, lambda: setattr(console, "reading", True))
-    bench.at(5.6, lambda: heard.append(len(bench.said)))
+    bench.at(5.6, lambda: received.append(len(bench.output)))
     with pytest.raises(SwitchedOff):
         bench.run(6.6)
-    lines = bench.said[heard[0] :].split(b"\r\n")
+    lines = bench.output[received[0] :].split(b"\r\n")
     assert len([line for line in lines if line.startswith(b"T a0=")]) >= 49
-    assert b"\r\r" not in bench.said
+    assert b"\r\r" not in bench.output
 
 
 def test_a_flood_does_not_keep_the_motors_running() -> None:
@@ -81,7 +81,7 @@ def test_a_flood_does_not_keep_the_motors_running() -> None:
 
 
 def test_a_fault_in_a_turn_stops_the_motors_and_resets() -> None:
-    """A callback's exception goes nowhere: nobody above would hear of it."""
+    """A callback's exception is not propagated."""
     bench = Bench()
 
     def fail() -> None:
@@ -97,13 +97,13 @@ def test_a_fault_in_a_turn_stops_the_motors_and_resets() -> None:
 
 def test_the_imu_speaks_on_its_two_pins() -> None:
     bench = Bench("goob_imu")
-    assert bench.robot.door, "USB is free there, so Ctrl-C may be let in"
+    assert bench.robot.ctrl_c, "USB is free there, so Ctrl-C may be let in"
     assert bench.robot.port._uart.baudrate == 115200
     bench.board.type(encode(Frame(Type.DESCRIBE_REQ)))
     for _ in range(1000):
         bench.clock.advance(0.001)
         bench.robot.step()
-    kinds = [frame.type for frame in _frames(bench.board.said())]
+    kinds = [frame.type for frame in _frames(bench.board.take_output())]
     assert kinds.count(Type.SAMPLE) == 99
     assert kinds.count(Type.DESCRIBE) == 1
 
@@ -147,5 +147,5 @@ def test_with_an_image_that_has_both_ctrl_c_stays_out_of_the_imus_usb() -> None:
     body_of("goob_imu", board)
     robot: Any = board.load("goob_imu", {})
     assert encode(Frame(Type.DESCRIBE_REQ))[0] == 3
-    assert not robot.door
+    assert not robot.ctrl_c
     assert board.console.interrupt == -1

@@ -12,7 +12,7 @@ from typing import Any, Self
 from paho.mqtt.client import Client, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion
 
-from pebble.identity import Identity
+from pebble.contract.identity import Identity
 from pebble.simulation.fleet import Fleet
 from pebble.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
 from tests.support import until
@@ -21,7 +21,7 @@ START_S = 10.0
 
 
 class Robots:
-    """One of each kind, running. ``moves[kind]`` says what its motors did from which time.monotonic() on."""
+    """One of each kind, running. ``moves[kind]`` has each change of its motors, with its time.monotonic()."""
 
     def __init__(self, host: str, port: int, **options: Any) -> None:
         self.fleet = Fleet(BrokerAddress(host=host, port=port, **options))
@@ -44,7 +44,7 @@ class Robots:
 
     def wait_online(self, timeout: float = START_S) -> None:
         online = until(lambda: all(robot.online for robot in self.robots.values()), timeout)
-        assert online, {kind: robot.trouble for kind, robot in self.robots.items()}
+        assert online, {kind: robot.problem for kind, robot in self.robots.items()}
 
     def moving(self, kind: str) -> bool:
         return bool(self.moves[kind]) and any(self.moves[kind][-1][1])
@@ -67,15 +67,15 @@ class Robots:
         self.fleet.run(lambda: not self._ending.is_set())
 
 
-class Pilot:
-    """An operator who drives robots and hears their hearts; it connects again by itself."""
+class Operator:
+    """An operator that drives robots and receives their heartbeats; it reconnects by itself."""
 
     def __init__(self, port: int) -> None:
-        self.beats: dict[str, list[tuple[float, dict[str, Any]]]] = {kind: [] for kind in KINDS}
+        self.heartbeats: dict[str, list[tuple[float, dict[str, Any]]]] = {kind: [] for kind in KINDS}
         self._client = Client(CallbackAPIVersion.VERSION2)
         self._client.reconnect_delay_set(1, 1)
         self._client.on_connect = lambda client, *_: client.subscribe("pebble/robots/+/outgoing/online", 0)
-        self._client.on_message = self._hear
+        self._client.on_message = self._receive
         self._client.connect("127.0.0.1", port)
         self._client.loop_start()
 
@@ -87,22 +87,24 @@ class Pilot:
         self._client.disconnect()
         self._client.loop_stop()
 
-    def send(self, kind: str, payload: bytes | str, *, qos: int = 1, retain: bool = False) -> MQTTMessageInfo | None:
+    def send(
+        self, kind: str, payload: bytes | str, *, qos: int = 1, retain: bool = False, metric: str = "drive-values"
+    ) -> MQTTMessageInfo | None:
         """Nothing while there is no connection: no command waits in here."""
         if not self._client.is_connected():
             return None
-        return self._client.publish(f"pebble/robots/{kind}/incoming/drive-values", payload, qos, retain)
+        return self._client.publish(f"pebble/robots/{kind}/incoming/{metric}", payload, qos, retain)
 
     def drive(self, kind: str, x: float, z: float, *, qos: int = 1) -> MQTTMessageInfo | None:
         return self.send(kind, json.dumps({"x": x, "z": z}), qos=qos)
 
     def beating(self, kind: str, since: float) -> int:
         """Live heartbeats after that time."""
-        return sum(at > since and body["online"] for at, body in list(self.beats[kind]))
+        return sum(at > since and body["online"] for at, body in list(self.heartbeats[kind]))
 
-    def _hear(self, _client: Client, _data: Any, message: Any) -> None:
+    def _receive(self, _client: Client, _data: Any, message: Any) -> None:
         if not message.retain:
-            self.beats[message.topic.split("/")[2]].append((time.monotonic(), json.loads(message.payload)))
+            self.heartbeats[message.topic.split("/")[2]].append((time.monotonic(), json.loads(message.payload)))
 
 
 def _note(moves: list[tuple[float, tuple[float, float]]], at: float, motors: tuple[float, float]) -> None:

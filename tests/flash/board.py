@@ -14,10 +14,10 @@ from tests.support import Child
 
 
 class NodeBoard:
-    """``port`` is its path; files and prompt are MicroPython's own, also after a reset."""
+    """``port`` is the path of its terminal; files and prompt are MicroPython's own, also after a reset."""
 
     def __init__(self, *, rom: bool = False) -> None:
-        """``rom``: with flash from which code runs in place."""
+        """``rom``: with a ROM file system, from which code runs in place."""
         self._options = ["rom"] if rom else []
 
     def __enter__(self) -> Self:

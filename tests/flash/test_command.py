@@ -24,7 +24,7 @@ def lamp(folder: Path, **robot: str) -> Path:
     return path
 
 
-def test_a_config_says_which_firmware(
+def test_the_config_selects_the_firmware(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     dry = ("--port", "/dev/ttyNOWHERE", "--wifi", "Lab", "--dry-run")
@@ -38,7 +38,7 @@ def test_a_config_says_which_firmware(
     assert "-march=armv6m" in capsys.readouterr().out
 
 
-def test_a_name_will_do_for_robots_on_a_line(
+def test_robots_on_a_serial_line_need_only_a_name(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert flash(monkeypatch, "goob_imu", "--port", "/dev/ttyNOWHERE", "--dry-run") == 0
@@ -51,14 +51,14 @@ def test_a_name_will_do_for_robots_on_a_line(
     ("arguments", "named"),
     [
         (("goob",), "--port"),
-        (("goob", "--port", "/dev/ttyNOWHERE"), "/dev/ttyNOWHERE: is not there"),
+        (("goob", "--port", "/dev/ttyNOWHERE"), "/dev/ttyNOWHERE: does not exist"),
         (("minilamp", "--port", "/dev/ttyNOWHERE"), "--wifi"),
         (("minilamp", "--port", "/dev/ttyNOWHERE", "--wifi", "Lab"), "broker.example is only an example"),
         (("goob", "--port", "/dev/null", "--firmware", "bob"), "bob"),
         (("/nowhere.json", "--port", "/dev/null"), "/nowhere.json"),
     ],
 )
-def test_what_is_missing_is_said(
+def test_the_error_names_the_missing_setting(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], named: str
 ) -> None:
     monkeypatch.setattr(ports, "described", list)
@@ -66,7 +66,7 @@ def test_what_is_missing_is_said(
     assert named in capsys.readouterr().err
 
 
-def test_without_the_tools_it_says_how_to_get_them(
+def test_missing_tools_are_reported_with_the_install_command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(tools, "find_spec", lambda _: None)
@@ -81,16 +81,16 @@ def test_the_wifi_password_is_from_a_file_or_the_environment_or_asked_for(
     file.write_text("zu kurz\n")  # seven characters: refused, so nothing further happens
     there = ("--port", "/dev/ttyNOWHERE", "--wifi", "Lab")
     assert flash(monkeypatch, lamp(tmp_path), *there, "--wifi-password-file", file) == 1
-    assert "the Wi-Fi password has 8 to 63 characters" in capsys.readouterr().err
+    assert "the Wi-Fi password must have 8 to 63 characters" in capsys.readouterr().err
     monkeypatch.setenv("PEBBLE_WIFI_PASSWORD", "zu kurz")
     assert flash(monkeypatch, lamp(tmp_path), *there) == 1
-    assert "the Wi-Fi password has 8 to 63 characters" in capsys.readouterr().err
+    assert "the Wi-Fi password must have 8 to 63 characters" in capsys.readouterr().err
     monkeypatch.delenv("PEBBLE_WIFI_PASSWORD")
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
     assert flash(monkeypatch, lamp(tmp_path), *there) == 1
-    assert "nobody is here to ask" in capsys.readouterr().err
+    assert "stdin is not a terminal" in capsys.readouterr().err
 
 
-def test_a_password_is_no_option(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_there_is_no_password_option(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert flash(monkeypatch, "goob", "--wifi-password", "geheim") == 2
     assert "geheim" not in capsys.readouterr().err

@@ -25,7 +25,7 @@ def uf2(family: int, flags: int = 0x2000) -> bytes:
     ("board", "content"),
     [(ESP32_C6, esp(13)), (ESP8266, esp(0)), (SAMD21, uf2(0x68ED2B88)), (SAMD21, uf2(0, flags=0))],
 )
-def test_the_right_ones(board, content: bytes, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_an_image_for_the_board_is_accepted(board, content: bytes, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     image = tmp_path / "image"
     image.write_bytes(content)
     check_image(image, board)
@@ -34,22 +34,22 @@ def test_the_right_ones(board, content: bytes, tmp_path: Path) -> None:  # type:
 @pytest.mark.parametrize(
     ("board", "content", "problem"),
     [
-        (ESP32_C6, esp(9), "is for another chip than esp32c6"),  # an ESP32-S3
-        (ESP32_C6, uf2(0x68ED2B88), "is no image for an Espressif chip"),
-        (ESP8266, b"", "is no image for an Espressif chip"),
-        (SAMD21, uf2(0xE48BFF56), "is for another chip than SAMD21"),  # an RP2040
-        (SAMD21, esp(13), "is no UF2 file"),
+        (ESP32_C6, esp(9), "an image for another chip than esp32c6"),  # an ESP32-S3
+        (ESP32_C6, uf2(0x68ED2B88), "not an image for an Espressif chip"),
+        (ESP8266, b"", "not an image for an Espressif chip"),
+        (SAMD21, uf2(0xE48BFF56), "an image for another chip than SAMD21"),  # an RP2040
+        (SAMD21, esp(13), "not a UF2 file"),
     ],
 )
-def test_the_wrong_ones(board, content: bytes, problem: str, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_an_image_for_another_board_is_refused(board, content: bytes, problem: str, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     image = tmp_path / "image"
     image.write_bytes(content)
     with pytest.raises(
-        PebbleError, match=rf"image: {problem}; the one .* {board.build}.*/micropython.org/download/{board.build}"
+        PebbleError, match=rf"image: {problem}; download .*{board.build}.*/micropython.org/download/{board.build}"
     ):
         check_image(image, board)
 
 
-def test_no_file(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match="No such file"):
         check_image(tmp_path / "nothing.bin", SAMD21)

@@ -1,4 +1,4 @@
-"""What a board answers about itself, and what follows."""
+"""The answer of a board about itself is parsed and checked."""
 
 from __future__ import annotations
 
@@ -17,22 +17,25 @@ from pebble.flash.on_board import check_answer
         (ESP8266, "MPY: soft reboot\r\nmicropython (1, 28, 0) 9990 True 1032192 ESP module with ESP8266\r\n", True),
     ],
 )
-def test_our_boards(board: Board, answer: str, binary: bool) -> None:
-    found = check_answer(answer, board)
-    assert found.binary is binary
-    assert found.text.startswith("MicroPython 1.2")
+def test_the_answers_of_our_boards_are_parsed(board: Board, answer: str, binary: bool) -> None:
+    info = check_answer(answer, board)
+    assert info.binary is binary
+    assert info.text.startswith("MicroPython 1.2")
 
 
 @pytest.mark.parametrize(
     ("answer", "problem"),
     [
-        ("micropython (1, 29, 0) 774 True 0 ESP32C3 module with ESP32C3", "this is a ESP32C3 module"),
-        ("micropython (1, 21, 0) 262 True 0 ESP32C6 module with ESP32C6", r"1\.21\.0 does not take our \.mpy"),
+        ("micropython (1, 29, 0) 774 True 0 ESP32C3 module with ESP32C3", "the board is a ESP32C3 module"),
+        (
+            "micropython (1, 21, 0) 262 True 0 ESP32C6 module with ESP32C6",
+            r"1\.21\.0 on the board cannot load our \.mpy",
+        ),
         ("circuitpython (9, 2, 0) 517 True 0 ESP32C6", "the board runs circuitpython"),
-        ("Traceback (most recent call last):", "makes no sense"),
-        ("", "makes no sense"),
+        ("Traceback (most recent call last):", "unexpected answer"),
+        ("", "unexpected answer"),
     ],
 )
-def test_others(answer: str, problem: str) -> None:
+def test_other_boards_are_refused(answer: str, problem: str) -> None:
     with pytest.raises(PebbleError, match=problem):
         check_answer(answer, ESP32_C6)

@@ -1,4 +1,4 @@
-"""Finding a board's port, and breaking into what runs on it."""
+"""Finding a board's port, and interrupting the program on the board."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from pebble.errors import LinkError
+from pebble.errors import DeviceError
 from pebble.flash import ports, uf2
 from tests.flash.board import NodeBoard
 
 
-class Deaf:
-    """A board whose firmware does not hear Ctrl-C until somebody presses reset."""
+class UninterruptibleBoard:
+    """A board whose firmware ignores Ctrl-C until the board is reset."""
 
     def __init__(self) -> None:
         self._master, self._slave = os.openpty()
@@ -43,8 +43,8 @@ class Deaf:
 
 
 @pytest.fixture
-def deaf() -> Iterator[Deaf]:
-    board = Deaf()
+def uninterruptible() -> Iterator[UninterruptibleBoard]:
+    board = UninterruptibleBoard()
     yield board
     board.close()
 
@@ -56,30 +56,36 @@ def test_a_prompt_is_found_at_once() -> None:
     assert asked == []
 
 
-def test_the_user_is_asked_to_reset_a_board_that_does_not_listen(deaf: Deaf, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ports, "_PATIENCE_S", 0.3)
-    ports.break_in(deaf.port, deaf.ask, pulse=True, timeout_s=10)
-    assert len(deaf.asked) == 1
-    assert "press its reset button" in deaf.asked[0]
+def test_the_user_is_asked_to_reset_a_board_that_does_not_listen(
+    uninterruptible: UninterruptibleBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ports, "_AUTOMATIC_S", 0.3)
+    ports.break_in(uninterruptible.port, uninterruptible.ask, pulse=True, timeout_s=10)
+    assert len(uninterruptible.asked) == 1
+    assert "press its reset button" in uninterruptible.asked[0]
 
 
-def test_a_board_without_micropython_is_an_error(deaf: Deaf, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ports, "_PATIENCE_S", 0.1)
-    with pytest.raises(LinkError, match=r"MicroPython does not answer; .* --micropython"):
-        ports.break_in(deaf.port, lambda _: None, pulse=False, timeout_s=0.5)
+def test_a_board_without_micropython_is_an_error(
+    uninterruptible: UninterruptibleBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ports, "_AUTOMATIC_S", 0.1)
+    with pytest.raises(DeviceError, match=r"MicroPython does not answer; .* --micropython"):
+        ports.break_in(uninterruptible.port, lambda _: None, pulse=False, timeout_s=0.5)
 
 
-def test_no_port_is_answered_with_those_there_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_port_lists_the_available_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(ports, "described", lambda: ["/dev/ttyACM0  Seeed XIAO M0 [2886:802f]"])
-    with pytest.raises(LinkError, match=r"/dev/ttyNOWHERE: is not there; there is:\n  /dev/ttyACM0  Seeed XIAO M0"):
+    with pytest.raises(
+        DeviceError, match=r"/dev/ttyNOWHERE: does not exist; available ports:\n  /dev/ttyACM0  Seeed XIAO M0"
+    ):
         ports.check("/dev/ttyNOWHERE")
-    with pytest.raises(LinkError, match="is no serial port"):
+    with pytest.raises(DeviceError, match="is not a serial port"):
         ports.check(str(tmp_path))
     monkeypatch.setattr(ports, "described", list)
     assert "no board is plugged in" in ports.hint()
 
 
-def test_the_boot_loaders_drive_is_told_from_others(tmp_path: Path) -> None:
+def test_the_boot_loaders_drive_is_distinguished_from_others(tmp_path: Path) -> None:
     stick, drive = tmp_path / "stick", tmp_path / "Seeed XIAO"
     stick.mkdir()
     drive.mkdir()
@@ -95,9 +101,9 @@ def test_the_boot_loaders_drive_is_told_from_others(tmp_path: Path) -> None:
     assert (drive / "firmware.uf2").read_bytes() == image.read_bytes()
 
 
-def test_a_drive_that_does_not_come_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(uf2, "_PATIENCE_S", 0.0)
+def test_the_user_is_asked_for_a_drive_that_does_not_appear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uf2, "_AUTOMATIC_S", 0.0)
     asked: list[str] = []
-    with pytest.raises(LinkError, match="drive has not appeared"):
+    with pytest.raises(DeviceError, match="drive did not appear"):
         uf2.wait_for_drive(asked.append, tmp_path / "mounts", timeout_s=0.3)
     assert "reset twice, quickly" in asked[0]

@@ -1,4 +1,4 @@
-"""The sign of life at the end: a live heartbeat counts, the kept one of an older life does not."""
+"""The last step of flashing accepts a live heartbeat, and ignores a retained one."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from pebble.config import Config, parse
-from pebble.errors import LinkError
+from pebble.errors import DeviceError
 from pebble.flash import verify
 from pebble.flash.boards import FIRMWARE
-from pebble.flash.verify import at_broker, on_line
+from pebble.flash.verify import at_broker, on_serial_port
 from tests.support import Broker, free_port
 
 TOPIC = "pebble/robots/lamp/outgoing/online"
@@ -39,25 +39,34 @@ def publish(broker: Broker, payload: str, *options: str) -> None:
     subprocess.run(command, check=True, timeout=10)
 
 
-def test_the_kept_heartbeat_and_the_will_do_not_count(broker: Broker) -> None:
+def test_a_retained_heartbeat_and_a_will_are_ignored(broker: Broker) -> None:
     publish(broker, '{"t": 1700000000000, "online": true}', "-r")
     dead = threading.Timer(0.2, publish, (broker, '{"t": 0, "online": false}'))
     dead.start()
-    with pytest.raises(LinkError, match=r"no heartbeat of pebble/robots/lamp within 0\.6 s"):
+    with pytest.raises(DeviceError, match=r"no heartbeat from pebble/robots/lamp within 0\.6 s"):
         at_broker(config(broker.port), timeout_s=0.6)
     dead.join()
 
 
-def test_a_live_one_does_even_without_the_time_of_day(broker: Broker) -> None:
-    alive = threading.Timer(0.2, publish, (broker, '{"t": 3250, "online": true}', "-r"))
-    alive.start()
-    assert at_broker(config(broker.port), timeout_s=5) == "it is online"
-    alive.join()
+def test_a_live_heartbeat_counts_even_without_the_time_of_day(broker: Broker) -> None:
+    done = threading.Event()
+
+    def send_heartbeats() -> None:
+        while not done.wait(0.2):
+            publish(broker, '{"t": 3250, "online": true}', "-r")
+
+    robot = threading.Thread(target=send_heartbeats)
+    robot.start()
+    try:
+        assert at_broker(config(broker.port), timeout_s=5) == "the robot is online"
+    finally:
+        done.set()
+        robot.join()
 
 
-def test_no_broker_is_said_to_be_this_machines_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_broker_is_reported_as_this_machines_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verify, "BROKER_S", 0.3)
-    with pytest.raises(LinkError, match="this machine cannot reach"):
+    with pytest.raises(DeviceError, match="this machine cannot connect"):
         at_broker(config(free_port()), timeout_s=1)
 
 
@@ -70,7 +79,7 @@ def line() -> Iterator[tuple[str, int]]:
     os.close(slave)
 
 
-def say(master: int, data: bytes) -> threading.Timer:
+def send_later(master: int, data: bytes) -> threading.Timer:
     timer = threading.Timer(0.3, os.write, (master, data))
     timer.start()
     return timer
@@ -84,22 +93,24 @@ def frame() -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("robot", "said"),
+    ("robot", "reported"),
     [
         ("goob", b"1 a2=3\r\nT a0=1 a1=2 a2=3\r\n"),
         ("fred", b"Done!\r\nT t0=1 t1=2 t2=3 chg=0\r\n"),
         ("goob_imu", b"garbage\0" + frame()),
     ],
 )
-def test_a_report_on_the_line(robot: str, said: bytes, line: tuple[str, int]) -> None:
-    timer = say(line[1], said)
-    assert on_line(line[0], FIRMWARE[robot], timeout_s=5) == "it reports"
+def test_a_report_on_the_line(robot: str, reported: bytes, line: tuple[str, int]) -> None:
+    timer = send_later(line[1], reported)
+    assert on_serial_port(line[0], FIRMWARE[robot], timeout_s=5) == "the robot sends reports"
     timer.join()
 
 
-@pytest.mark.parametrize(("robot", "said"), [("goob", b"\r\n>>> \r\n"), ("goob_imu", b"x\0" + frame()[:-3] + b"\1\0")])
-def test_other_noises_are_shown(robot: str, said: bytes, line: tuple[str, int]) -> None:
-    timer = say(line[1], said)
-    with pytest.raises(LinkError, match=f"no report of {robot} within 1 s; it said b'"):
-        on_line(line[0], FIRMWARE[robot], timeout_s=1)
+@pytest.mark.parametrize(
+    ("robot", "reported"), [("goob", b"\r\n>>> \r\n"), ("goob_imu", b"x\0" + frame()[:-3] + b"\1\0")]
+)
+def test_other_bytes_are_shown_in_the_error(robot: str, reported: bytes, line: tuple[str, int]) -> None:
+    timer = send_later(line[1], reported)
+    with pytest.raises(DeviceError, match=f"no report from {robot} within 1 s; received b'"):
+        on_serial_port(line[0], FIRMWARE[robot], timeout_s=1)
     timer.join()

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.forwarding import echoes as echo_book
-from pebble.forwarding.agreement import TOPICS, Agreement, Verdict
-from pebble.forwarding.echoes import EXPIRY_S, Echoes
-from pebble.forwarding.outage import DOUBT_S, EventBuffer
-from pebble.forwarding.routing import Side
+from pebble.forwarding import loopback_filter as loopback_filter
+from pebble.forwarding.event_buffer import RESEND_S, EventBuffer
+from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.loopback_filter import EXPIRY_S, LoopbackFilter
+from pebble.forwarding.probes import PROBE_REQUEST, Probes, new_probe
+from pebble.forwarding.reconciliation import TOPICS, Reconciliation, Resolution
+from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
+from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, QoS, State
 from pebble.transports.counters import Counters
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
 
 LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
 
@@ -24,119 +28,160 @@ class Clock:
         return self.now
 
 
-class TestEchoes:
-    def test_are_told_from_others_words(self) -> None:
-        echoes = Echoes(Clock())
+class TestLoopbackFilter:
+    def test_are_distinguished_from_messages_of_others(self) -> None:
+        loopback = LoopbackFilter(Clock())
         for payload in (b"1", b"0", b"1"):
-            echoes.expect("t", payload)
-        assert [echoes.is_echo("t", payload) for payload in (b"1", b"2", b"0", b"1", b"1")] == [
+            loopback.expect("t", payload)
+        assert [loopback.is_echo("t", payload) for payload in (b"1", b"2", b"0", b"1", b"1")] == [
             True, False, True, True, False,
         ]  # fmt: skip
 
     def test_topics_do_not_mix(self) -> None:
-        echoes = Echoes(Clock())
-        echoes.expect("t", b"1")
-        assert not echoes.is_echo("u", b"1")
+        loopback = LoopbackFilter(Clock())
+        loopback.expect("t", b"1")
+        assert not loopback.is_echo("u", b"1")
 
     def test_lost_ones_are_passed_over(self) -> None:
-        echoes = Echoes(Clock())
+        loopback = LoopbackFilter(Clock())
         for payload in (b"1", b"0"):
-            echoes.expect("t", payload)
-        assert echoes.is_echo("t", b"0")
-        assert not echoes.is_echo("t", b"1")
+            loopback.expect("t", payload)
+        assert loopback.is_echo("t", b"0")
+        assert not loopback.is_echo("t", b"1")
 
     def test_expire(self) -> None:
         clock = Clock()
-        echoes = Echoes(clock)
-        echoes.expect("t", b"1")
+        loopback = LoopbackFilter(clock)
+        loopback.expect("t", b"1")
         clock.now += EXPIRY_S + 0.1
-        assert not echoes.is_echo("t", b"1")
+        assert not loopback.is_echo("t", b"1")
 
     def test_what_was_not_sent_does_not_come_back(self) -> None:
-        echoes = Echoes(Clock())
-        echoes.expect("t", b"1")
-        echoes.forget("t")
-        assert not echoes.is_echo("t", b"1")
+        loopback = LoopbackFilter(Clock())
+        loopback.expect("t", b"1")
+        loopback.forget("t")
+        assert not loopback.is_echo("t", b"1")
 
     def test_many_topics_take_no_memory(self) -> None:
-        echoes = Echoes(Clock())
-        for number in range(2 * echo_book.TOPICS):
-            echoes.expect(f"flag{number}", b"1")
-        assert len(echoes) == echo_book.TOPICS
-        assert all(echoes.is_echo(f"flag{number}", b"1") for number in range(echo_book.TOPICS, 2 * echo_book.TOPICS))
-        assert len(echoes) == 0
+        loopback = LoopbackFilter(Clock())
+        for number in range(2 * loopback_filter.TOPICS):
+            loopback.expect(f"flag{number}", b"1")
+        assert len(loopback) == loopback_filter.TOPICS
+        assert all(
+            loopback.is_echo(f"flag{number}", b"1")
+            for number in range(loopback_filter.TOPICS, 2 * loopback_filter.TOPICS)
+        )
+        assert len(loopback) == 0
 
 
-class TestAgreement:
-    """Table: what each side says, in order, and the verdicts. The remote side is the winner, as on the bridge."""
+class TestReconciliation:
+    """Table: what each side publishes, and the resolutions. The remote side is the winner, as on the bridge."""
 
     @pytest.mark.parametrize(
-        ("history", "verdicts"),
+        ("history", "resolutions"),
         [
             ("L:a", ["hold"]),
-            ("R:b L:a", ["pass", "retell"]),
+            ("R:b L:a", ["pass", "correct"]),
             ("R:a L:a", ["pass", "known"]),
             ("L:a R:b", ["hold", "pass"]),
             ("l:a R:a", ["pass", "known"]),
             ("l:a R:b", ["pass", "pass"]),
             ("l:a l:a", ["pass", "pass"]),
             ("r:a l:b r:a", ["pass", "pass", "pass"]),
-            ("settle L:a", ["pass"]),
+            ("sync L:a", ["pass"]),
             ("r:a l:b L:c", ["pass", "pass", "pass"]),
             ("R:a x:b R:a", ["pass", "pass", "overtaken"]),
-            ("R:a x:b settle R:a", ["pass", "pass", "pass"]),
+            ("R:a x:b sync R:a", ["pass", "pass", "pass"]),
             ("R:a x:b r:c R:d", ["pass", "pass", "pass", "pass"]),
         ],
     )
-    def test_verdicts(self, history: str, verdicts: list[str]) -> None:
-        """L, R: found as a kept copy. l, r: said while we look. x: said locally while the remote side was away."""
-        agreement = Agreement(REMOTE)
+    def test_resolutions(self, history: str, resolutions: list[str]) -> None:
+        """L, R: retained messages. l, r: live ones. x: a live local one while the remote side is away."""
+        reconciliation = Reconciliation(REMOTE)
         given = []
         for word in history.split():
-            if word == "settle":
-                agreement.settle(REMOTE)
+            if word == "sync":
+                reconciliation.synchronize(REMOTE)
                 continue
             who, _, payload = word.partition(":")
             side = REMOTE if who in "Rr" else LOCAL
-            verdict = agreement.hear(side, "t", payload.encode(), kept=who.isupper(), other_away=who == "x")
-            given.append(verdict)
-        assert given == [Verdict[name.upper()] for name in verdicts]
+            resolution = reconciliation.receive(
+                side, "t", payload.encode(), retained=who.isupper(), other_away=who == "x"
+            )
+            given.append(resolution)
+        assert given == [Resolution[name.upper()] for name in resolutions]
 
     def test_held_copies_fill_what_the_winner_does_not_know(self) -> None:
-        agreement = Agreement(REMOTE)
-        agreement.hear(LOCAL, "known", b"local", kept=True)
-        agreement.hear(LOCAL, "unknown", b"local", kept=True)
-        agreement.hear(REMOTE, "known", b"remote", kept=True)
-        agreement.tell(LOCAL, "known", b"remote")
-        assert agreement.settle(REMOTE) == [(REMOTE, "unknown", b"local")]
-        assert agreement.value("unknown") == b"local"
-        assert agreement.settle(LOCAL) == []
+        reconciliation = Reconciliation(REMOTE)
+        reconciliation.receive(LOCAL, "known", b"local", retained=True)
+        reconciliation.receive(LOCAL, "unknown", b"local", retained=True)
+        reconciliation.receive(REMOTE, "known", b"remote", retained=True)
+        reconciliation.note_published(LOCAL, "known", b"remote")
+        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "unknown", b"local")]
+        assert reconciliation.value("unknown") == b"local"
+        assert reconciliation.synchronize(LOCAL) == []
 
-    def test_a_side_that_forgot_is_told(self) -> None:
-        agreement = Agreement(REMOTE)
-        agreement.hear(REMOTE, "t", b"new", kept=False)
-        agreement.begin(REMOTE)
-        assert agreement.settle(REMOTE) == [(REMOTE, "t", b"new")]
-        agreement.begin(REMOTE)
-        agreement.hear(REMOTE, "t", b"new", kept=True)
-        assert agreement.settle(REMOTE) == []
+    def test_a_side_that_lost_a_value_receives_it(self) -> None:
+        reconciliation = Reconciliation(REMOTE)
+        reconciliation.receive(REMOTE, "t", b"new", retained=False)
+        reconciliation.begin(REMOTE)
+        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "t", b"new")]
+        reconciliation.begin(REMOTE)
+        reconciliation.receive(REMOTE, "t", b"new", retained=True)
+        assert reconciliation.synchronize(REMOTE) == []
+
+    def test_a_side_that_missed_a_removal_receives_it(self) -> None:
+        reconciliation = Reconciliation(LOCAL)
+        reconciliation.receive(LOCAL, "t", b"a", retained=False)
+        reconciliation.note_published(REMOTE, "t", b"a")
+        reconciliation.receive(LOCAL, "t", b"", retained=False)
+        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "t", b"")]
 
     def test_a_removed_topic_is_not_brought_back(self) -> None:
-        agreement = Agreement(REMOTE)
-        agreement.hear(LOCAL, "t", b"a", kept=False)
-        agreement.hear(LOCAL, "t", b"", kept=False)
-        agreement.begin(REMOTE)
-        assert agreement.settle(REMOTE) == []
+        reconciliation = Reconciliation(REMOTE)
+        reconciliation.receive(LOCAL, "t", b"a", retained=False)
+        reconciliation.receive(LOCAL, "t", b"", retained=False)
+        reconciliation.begin(REMOTE)
+        assert reconciliation.synchronize(REMOTE) == []
 
     def test_its_memory_is_bounded(self) -> None:
-        agreement = Agreement(REMOTE)
+        reconciliation = Reconciliation(REMOTE)
         for number in range(2 * TOPICS):
-            agreement.hear(LOCAL, f"held/{number}", b"x", kept=True)
-            agreement.hear(REMOTE, f"said/{number}", b"x", kept=False)
-            agreement.tell(LOCAL, f"said/{number}", b"x")
-        assert len(agreement.settle(REMOTE)) <= 2 * TOPICS
-        assert len(agreement._last) <= TOPICS
-        assert all(len(told) <= TOPICS for told in agreement._told.values())
+            reconciliation.receive(LOCAL, f"held/{number}", b"x", retained=True)
+            reconciliation.receive(REMOTE, f"said/{number}", b"x", retained=False)
+            reconciliation.note_published(LOCAL, f"said/{number}", b"x")
+        assert len(reconciliation.synchronize(REMOTE)) <= 2 * TOPICS
+        assert len(reconciliation._last) <= TOPICS
+        assert all(len(published) <= TOPICS for published in reconciliation._published.values())
+
+
+class TestProbes:
+    def test_one_that_is_announced_and_received_is_the_bridges_in_either_order(self) -> None:
+        probes = Probes()
+        first, second = new_probe(1), new_probe(1)
+        assert first != second
+        assert [probes.announce(first), probes.see(first)] == [False, True]
+        assert [probes.see(second), probes.announce(second)] == [False, True]
+
+    @pytest.mark.parametrize(
+        "payload",
+        [b"", b"x", PROBE_REQUEST, new_probe(1), b"x" * 100_000],
+        ids=["empty", "x", "question", "probe", "long"],
+    )
+    def test_others_are_not(self, payload: bytes) -> None:
+        probes = Probes()
+        probes.announce(new_probe(1))
+        assert not probes.see(payload)
+        assert not probes.announce(new_probe(1))
+
+    def test_memory_is_bounded(self) -> None:
+        probes = Probes()
+        for number in range(1000):
+            probes.see(b"%d" % number)
+            probes.announce(b"%d" % -number)
+        probes.see(b"x" * 100_000)
+        assert len(probes._seen) == len(probes._announced) <= 64
+        assert all(len(payload) < 1000 for payload in probes._seen)
 
 
 class Wire(MemoryTransport):
@@ -171,40 +216,99 @@ class TestEventBuffer:
     def events(self, wire: Wire, clock: Clock) -> EventBuffer:
         return EventBuffer(wire, Counters(), clock=clock, limit=4)
 
-    def say(self, events: EventBuffer, *numbers: int) -> None:
+    def publish(self, events: EventBuffer, *numbers: int) -> None:
         for number in numbers:
             events.send(Message("t", b"%d" % number, QoS.DELIVERED))
 
     def test_passes_on_at_once_and_in_order(self, events: EventBuffer, wire: Wire) -> None:
-        self.say(events, 1, 2, 3)
+        self.publish(events, 1, 2, 3)
         assert wire.sent == [b"1", b"2", b"3"]
 
     def test_keeps_the_newest_of_an_outage(self, events: EventBuffer, wire: Wire) -> None:
         wire.up = False
         events.watch(State.CONNECTING)
-        self.say(events, 1, 2, 3, 4, 5, 6)
+        self.publish(events, 1, 2, 3, 4, 5, 6)
         wire.up = True
         events.flush()
         assert wire.sent == [b"3", b"4", b"5", b"6"]
         assert events._counters["events_dropped"] == 2
 
     def test_repeats_what_a_dying_link_may_have_swallowed(self, events: EventBuffer, wire: Wire, clock: Clock) -> None:
-        self.say(events, 1)
-        clock.now += DOUBT_S
-        self.say(events, 2)
-        clock.now += DOUBT_S - 0.1
+        self.publish(events, 1)
+        clock.now += RESEND_S
+        self.publish(events, 2)
+        clock.now += RESEND_S - 0.1
         wire.up = False
         events.watch(State.CONNECTING)
         clock.now += 60
-        self.say(events, 3)
+        self.publish(events, 3)
         wire.up = True
-        self.say(events, 4)  # before the flush: waits its turn
+        self.publish(events, 4)  # before the flush: waits its turn
         events.flush()
         assert wire.sent == [b"1", b"2", b"2", b"3", b"4"]
 
     def test_one_refused_in_between_is_sent_with_the_next(self, events: EventBuffer, wire: Wire) -> None:
         wire.up = False
-        self.say(events, 1)
+        self.publish(events, 1)
         wire.up = True
-        self.say(events, 2)
+        self.publish(events, 2)
         assert wire.sent == [b"1", b"2"]
+
+
+class TestStops:
+    """Until when a stop with the retain flag counts as an old one, on a connection that marks live ones, too."""
+
+    STOP = Message(f"{BASE}/incoming/estop", b"{}", QoS.DELIVERED, True, True)
+    FLAG = Message(f"{BASE}/incoming/flags/mqtt-video", b"true", QoS.DELIVERED, True, True)
+
+    @pytest.fixture
+    def clock(self) -> Clock:
+        return Clock()
+
+    @pytest.fixture
+    def forwarder(self, clock: Clock) -> Forwarder:
+        local, remote = Wire(), Wire()
+        remote.as_published = True
+        forwarder = Forwarder(
+            Subjects(make_config()), TABLE_A1, {LOCAL: local, REMOTE: remote}, winner=REMOTE, clock=clock
+        )
+        forwarder.open()
+        return forwarder
+
+    def first_pass(self, forwarder: Forwarder, clock: Clock, *others: Message) -> float:
+        """How long stops are old, if one comes every 0.125 s, after ``others``."""
+        began = clock.now
+        while True:
+            for other in others:
+                forwarder.receive(REMOTE, other)
+            if isinstance(forwarder.receive(REMOTE, self.STOP).outcome, Forward):
+                return clock.now - began
+            clock.now += 0.125
+
+    def test_before_the_subscription_is_complete(self, forwarder: Forwarder, clock: Clock) -> None:
+        clock.now += 60
+        assert forwarder.receive(REMOTE, self.STOP).outcome is Drop.STALE
+        forwarder.subscribed(REMOTE)
+        assert self.first_pass(forwarder, clock) == pytest.approx(0.125)
+        forwarder.subscribing(REMOTE)
+        assert forwarder.receive(REMOTE, self.STOP).outcome is Drop.STALE
+        forwarder.subscribed(REMOTE)
+        assert self.first_pass(forwarder, clock) == pytest.approx(0.125)
+        forwarder.watch(REMOTE, State.CONNECTING)
+        assert forwarder.receive(REMOTE, self.STOP).outcome is Drop.STALE
+
+    def test_while_other_retained_messages_arrive(self, forwarder: Forwarder, clock: Clock) -> None:
+        forwarder.receive(REMOTE, self.FLAG)
+        clock.now += 0.25
+        forwarder.subscribed(REMOTE)
+        assert self.first_pass(forwarder, clock) == pytest.approx(0.25)
+        forwarder.receive(REMOTE, self.FLAG)  # a live one, long after
+        assert isinstance(forwarder.receive(REMOTE, self.STOP).outcome, Forward)
+
+    def test_not_for_ever(self, forwarder: Forwarder, clock: Clock) -> None:
+        forwarder.subscribed(REMOTE)
+        assert self.first_pass(forwarder, clock, self.FLAG) == pytest.approx(10.0)
+
+    def test_one_without_the_flag_always_passes(self, forwarder: Forwarder) -> None:
+        live = Message(self.STOP.topic, b"{}", QoS.DELIVERED, retain_requested=False)
+        assert forwarder.receive(REMOTE, live).outcome == Forward(QoS.DELIVERED, retain=False, urgent=True)

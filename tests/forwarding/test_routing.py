@@ -8,13 +8,11 @@ import pytest
 
 from pebble.config import Config, parse
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Kind
-from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
+from pebble.forwarding.routing import MIRROR, TABLE_A1, Drop, Forward, Rules, Side, route
 from pebble.forwarding.subjects import Subjects
-from pebble.services.mqtt_bridge.routing import TABLE_A1
-from pebble.services.mqtt_mirror.routing import MIRROR
 from pebble.transports import Message, QoS
 from pebble.transports.topics import matches
-from tests.services.bridge_rig import BASE, make_config
+from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
 
 LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
 SUBJECTS = Subjects(make_config())
@@ -28,11 +26,11 @@ def routed(
     subjects: Subjects = SUBJECTS,
     qos: int = 1,
     retain: bool = False,
-    keep: bool | None = False,
+    retain_requested: bool | None = False,
     mirroring: bool = False,
 ) -> Forward | Drop:
     topic = suffix if suffix.startswith("/") else f"{BASE}/{suffix}"
-    message = Message(topic.removeprefix("/"), b"{}", QoS(qos), retain, True if retain else keep)
+    message = Message(topic.removeprefix("/"), b"{}", QoS(qos), retain, True if retain else retain_requested)
     return route(rules, side, subjects[message.topic], message, mirroring=mirroring)
 
 
@@ -48,6 +46,8 @@ FLAGS = ("incoming/flags/remote-mirror", "incoming/flags/mqtt-audio", "incoming/
 ACTIONS = ("incoming/flags/reboot", "incoming/flags/service-restart", "incoming/flags/git-pull")
 COMMANDS = (
     "incoming/drive-values",
+    "incoming/estop",
+    "incoming/estop-reset",
     "incoming/lights-solid",
     "incoming/lights-flash",
     "incoming/front-camera",
@@ -61,29 +61,33 @@ COMMANDS = (
 
 
 class TestLocalOutgoing:
-    """Row 1: {base}/outgoing/# is always forwarded to remote, same quality, kept as published."""
+    """Row 1: {base}/outgoing/# is always forwarded to remote, same QoS, retained as published."""
 
     @pytest.mark.parametrize("qos", [0, 1])
-    @pytest.mark.parametrize("keep", [False, True])
+    @pytest.mark.parametrize("retain_requested", [False, True])
     @pytest.mark.parametrize("suffix", ["outgoing/status", "outgoing/wheel-odometry", "outgoing/somebody/elses/metric"])
-    def test_is_forwarded_as_published(self, suffix: str, keep: bool, qos: int) -> None:
-        assert routed(LOCAL, suffix, qos=qos, keep=keep) == forward(qos, retain=keep)
+    def test_is_forwarded_as_published(self, suffix: str, retain_requested: bool, qos: int) -> None:
+        assert routed(LOCAL, suffix, qos=qos, retain_requested=retain_requested) == forward(
+            qos, retain=retain_requested
+        )
 
     @pytest.mark.parametrize("suffix", ["outgoing/heartbeat", "outgoing/status", "outgoing/charging-level"])
     def test_compatibility_topics_too(self, suffix: str) -> None:
-        assert routed(LOCAL, suffix, keep=True) == forward(retain=True)
+        assert routed(LOCAL, suffix, retain_requested=True) == forward(retain=True)
 
-    def test_a_kept_copy_stays_kept(self) -> None:
+    def test_a_retained_message_stays_retained(self) -> None:
         assert routed(LOCAL, "outgoing/capabilities", retain=True) == forward(retain=True)
 
     def test_where_the_broker_hides_it_the_contract_knows(self) -> None:
-        assert routed(LOCAL, "outgoing/capabilities", keep=None) == forward(retain=True)
-        assert routed(LOCAL, "outgoing/wheel-odometry", keep=None) == forward(retain=False)
-        assert routed(LOCAL, "outgoing/strange", keep=None) == forward(retain=False)
+        assert routed(LOCAL, "outgoing/capabilities", retain_requested=None) == forward(retain=True)
+        assert routed(LOCAL, "outgoing/wheel-odometry", retain_requested=None) == forward(retain=False)
+        assert routed(LOCAL, "outgoing/strange", retain_requested=None) == forward(retain=False)
 
     def test_every_channel_that_may_leave_leaves(self) -> None:
         leaving = [c for c in CHANNELS if c.direction == OUTGOING and c.remote and c.bridged]
-        assert {type(routed(LOCAL, c.suffix.format(uid="u", name="n", outlet="o1"))) for c in leaving} == {Forward}
+        assert {type(routed(LOCAL, c.suffix.format(uid="u", name="n", outlet="o1", owner="mcu"))) for c in leaving} == {
+            Forward
+        }
 
     def test_what_stays_on_the_robot_stays(self) -> None:
         assert routed(LOCAL, "outgoing/sensors/imu-fast", qos=0) is Drop.STAYS
@@ -102,22 +106,22 @@ class TestRemoteIncoming:
         assert routed(REMOTE, suffix, mirroring=mirroring) == COMMAND
 
     @pytest.mark.parametrize("suffix", ACTIONS)
-    def test_actions_are_forwarded_but_not_kept(self, suffix: str) -> None:
+    def test_actions_are_forwarded_but_not_retained(self, suffix: str) -> None:
         assert routed(REMOTE, suffix) == ACTION
 
     @pytest.mark.parametrize("suffix", FLAGS)
-    @pytest.mark.parametrize("keep", [None, False, True])
-    def test_flags_are_forwarded_to_be_kept(self, suffix: str, keep: bool | None) -> None:
-        assert routed(REMOTE, suffix, keep=keep) == FLAG
+    @pytest.mark.parametrize("retain_requested", [None, False, True])
+    def test_flags_are_forwarded_as_retained(self, suffix: str, retain_requested: bool | None) -> None:
+        assert routed(REMOTE, suffix, retain_requested=retain_requested) == FLAG
 
     @pytest.mark.parametrize("suffix", FLAGS)
-    def test_kept_flags_too(self, suffix: str) -> None:
+    def test_retained_flags_too(self, suffix: str) -> None:
         assert routed(REMOTE, suffix, retain=True) == FLAG
 
-    def test_a_strangers_flag_is_kept_as_published(self) -> None:
-        assert routed(REMOTE, "incoming/flags/night", keep=True) == forward(retain=True, urgent=True)
+    def test_an_unknown_flag_is_retained_as_published(self) -> None:
+        assert routed(REMOTE, "incoming/flags/night", retain_requested=True) == forward(retain=True, urgent=True)
         assert routed(REMOTE, "incoming/flags/night", retain=True) == forward(retain=True, urgent=True)
-        assert routed(REMOTE, "incoming/flags/night", keep=False) == forward(urgent=True)
+        assert routed(REMOTE, "incoming/flags/night", retain_requested=False) == forward(urgent=True)
 
     def test_a_known_command_gets_its_quality(self) -> None:
         assert routed(REMOTE, "incoming/drive-values", qos=0) == COMMAND
@@ -152,7 +156,7 @@ class TestLocalFlags:
         assert routed(LOCAL, suffix) == ACTION
 
     def test_strangers(self) -> None:
-        assert routed(LOCAL, "incoming/flags/night", keep=True) == forward(retain=True, urgent=True)
+        assert routed(LOCAL, "incoming/flags/night", retain_requested=True) == forward(retain=True, urgent=True)
 
 
 class TestLocalIncoming:
@@ -164,18 +168,18 @@ class TestLocalIncoming:
         assert routed(LOCAL, suffix, mirroring=True) == COMMAND
 
 
-class TestKeptOneShots:
-    """What happens once is never forwarded as a kept copy, nor when published to become one."""
+class TestRetainedOneShots:
+    """What happens once is never forwarded if it is retained, or was published to be retained."""
 
     @pytest.mark.parametrize("suffix", [*COMMANDS, *ACTIONS])
     @pytest.mark.parametrize("side", list(Side))
     @pytest.mark.parametrize("rules", [TABLE_A1, MIRROR], ids=["bridge", "mirror"])
     def test_neither_way(self, rules: Rules, side: Side, suffix: str) -> None:
         assert routed(side, suffix, rules=rules, retain=True, mirroring=True) is Drop.STALE
-        assert routed(side, suffix, rules=rules, keep=True, mirroring=True) is Drop.STALE
+        assert routed(side, suffix, rules=rules, retain_requested=True, mirroring=True) is Drop.STALE
 
     def test_executed_where_the_broker_hides_it(self) -> None:
-        assert routed(REMOTE, "incoming/drive-values", keep=None) == COMMAND
+        assert routed(REMOTE, "incoming/drive-values", retain_requested=None) == COMMAND
 
 
 class TestOthers:
@@ -273,7 +277,7 @@ class TestMirrorTable:
 
     @pytest.mark.parametrize("side", list(Side))
     def test_both_ways(self, side: Side) -> None:
-        assert routed(side, "outgoing/status", rules=MIRROR, keep=True) == forward(retain=True)
+        assert routed(side, "outgoing/status", rules=MIRROR, retain_requested=True) == forward(retain=True)
         assert routed(side, "outgoing/sensors/imu-fast", rules=MIRROR, qos=0) == forward(0)
         assert routed(side, "incoming/drive-values", rules=MIRROR) == COMMAND
         assert routed(side, "incoming/flags/reboot", rules=MIRROR) == ACTION

@@ -1,4 +1,4 @@
-"""A real launcher with real children that misbehave in every way a child can, seen from outside."""
+"""A real launcher with real children that misbehave in every possible way, observed from outside."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pebble.launcher.program import Stage
+from pebble.launcher.programs import Stage
 from tests.support import ROOT, gone, until
 
 BASE = "pebble/robots/rover"
 FAKES = ROOT / "tests" / "fakes"
-FABRIC, NEWS, DEVICE, LINK = (int(stage) for stage in Stage)
+LOCAL_TRANSPORT, ANNOUNCER, DEVICE, CONNECTION = (int(stage) for stage in Stage)
 
 Row = tuple[Any, ...]  # name, behaviour, stage; perhaps a dict of more that a program is
 
 
 class Robot:
-    """A launcher under test, seen from outside: its children's journal, what it published, what it wrote."""
+    """A launcher under test, observed from outside: its children's journal, its messages and its stderr."""
 
     def __init__(self, folder: Path, rows: list[Row], *options: str, env: dict[str, str], **launcher: Any) -> None:
         self.journal, self.record, self.errors = folder / "journal", folder / "record", folder / "errors"
@@ -59,7 +59,7 @@ class Robot:
         return self.process.wait(20)
 
     def order(self, asker: str, *orders: str) -> None:
-        """Have an ``asker`` that is ready want something: ``media 1``."""
+        """Have an ``asker`` that is ready request a program: ``media 1``."""
         with Path(f"{self.journal}.orders.{asker}").open("a") as out:
             out.writelines(f"{order}\n" for order in orders)
 
@@ -69,7 +69,7 @@ class Robot:
         return [int(pid) for who, what, pid in lines if (who, what) == (name, event)]
 
     def end_leftovers(self) -> list[int]:
-        """Every process the journal knows that is still there; none should be."""
+        """Kill and return the processes in the journal that still run; there should be none."""
         pids = [int(pid) for pid in re.findall(r"(?:start |child:)(\d+)", "\n".join(lines_of(self.journal)))]
         until(lambda: all(gone(pid) for pid in pids))
         left = [pid for pid in pids if not gone(pid)]
@@ -82,7 +82,7 @@ class Robot:
         return [line for line in lines if line["topic"] == f"{BASE}/outgoing/{metric}" and line["what"] == what]
 
     def states(self) -> dict[str, str]:
-        """What the robot says of its services just now."""
+        """The state of each service in the newest status."""
         return {name: one["state"] for name, one in self.services().items()}
 
     def children(self) -> dict[str, int]:
@@ -92,8 +92,8 @@ class Robot:
         return {Path(f"/proc/{pid}/comm").read_text().strip(): pid for pid in pids}
 
     def services(self) -> dict[str, Any]:
-        said = self.published("status")
-        return said[-1]["payload"]["value"]["services"] if said else {}
+        statuses = self.published("status")
+        return statuses[-1]["payload"]["value"]["services"] if statuses else {}
 
     def ready(self, *names: str) -> bool:
         return until(lambda: all(self.states().get(name) == "ready" for name in names), 20)

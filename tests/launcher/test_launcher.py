@@ -16,19 +16,18 @@ import pytest
 
 from pebble.config import Config, load, parse
 from pebble.errors import ConfigError
-from pebble.launched import NOTIFY_FD
 from pebble.launcher.launcher import Launcher
-from pebble.launcher.program import Program, Stage
-from pebble.launcher.programs import programs, shared_modules, transport_modules
+from pebble.launcher.programs import Program, Stage, programs, shared_modules
 from pebble.launcher.run_lock import RunLock
-from tests.launcher.robot import BASE, DEVICE, FABRIC, LINK, Launch, lines_of
+from pebble.runtime.parent import NOTIFY_FD
+from tests.launcher.robot import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, gone, until
 
 # -- starting
 
 
-def test_children_start_in_order_and_their_readiness_is_told(launch: Launch) -> None:
-    robot = launch(("hub", "good", FABRIC), ("serial", "good", DEVICE), ("bridge", "good", LINK))
+def test_children_start_in_order_and_their_readiness_is_published(launch: Launch) -> None:
+    robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), ("bridge", "good", CONNECTION))
     assert robot.ready("hub", "serial", "bridge")
     pids = [robot.events(name, "start")[0] for name in ("hub", "serial", "bridge")]
     assert pids == sorted(pids)
@@ -37,15 +36,15 @@ def test_children_start_in_order_and_their_readiness_is_told(launch: Launch) -> 
     last = robot.published("status")[-1]
     assert (last["qos"], last["retain"]) == (1, True)
     assert robot.services()["hub"] == {"state": "ready", "restarts": 0, "last_exit": None}
-    (said,) = robot.published("capabilities")
-    assert said["payload"]["schema"] == "pebble-capabilities/v1"
-    assert said["payload"]["value"]["transport"] == {"kind": "mqtt"}
-    assert (said["qos"], said["retain"]) == (1, True)
+    (message,) = robot.published("capabilities")
+    assert message["payload"]["schema"] == "pebble-capabilities/v1"
+    assert message["payload"]["value"]["transport"] == {"kind": "mqtt"}
+    assert (message["qos"], message["retain"]) == (1, True)
 
 
-def test_kept_state_is_said_again_on_its_interval(launch: Launch) -> None:
+def test_retained_state_is_published_again_on_its_interval(launch: Launch) -> None:
     robot = launch(
-        ("bridge", "good", LINK),
+        ("bridge", "good", CONNECTION),
         retained_publish_interval_seconds=0.1,
         capabilities={"publish_interval_seconds": 0.1},
     )
@@ -56,7 +55,10 @@ def test_kept_state_is_said_again_on_its_interval(launch: Launch) -> None:
 
 def test_what_is_switched_off_is_not_published(launch: Launch) -> None:
     robot = launch(
-        ("bridge", "talker", LINK), restart_delay_seconds=0, capabilities={"enabled": False}, logs={"enabled": False}
+        ("bridge", "talker", CONNECTION),
+        restart_delay_seconds=0,
+        capabilities={"enabled": False},
+        logs={"enabled": False},
     )
     assert until(lambda: robot.states().get("bridge") == "failed", 20)
     assert not robot.published("capabilities")
@@ -64,13 +66,13 @@ def test_what_is_switched_off_is_not_published(launch: Launch) -> None:
 
 
 def test_a_stop_signal_while_starting_starts_no_further_child(launch: Launch) -> None:
-    robot = launch(("hub", "good", FABRIC), ("serial", "good", DEVICE), options=("signal",))
+    robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), options=("signal",))
     assert robot.process.wait(20) == 0
     assert robot.stderr().count("spawned a child") == 1
 
 
 def test_a_second_launcher_for_the_same_robot_is_refused(launch: Launch) -> None:
-    robot = launch(("bridge", "good", LINK))
+    robot = launch(("bridge", "good", CONNECTION))
     assert robot.ready("bridge")
     second = robot.second()
     assert second.returncode == 1
@@ -91,7 +93,7 @@ def test_microcontroller_robots_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_killed_child_is_started_again_at_once(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), ("bridge", "good", LINK), restart_delay_seconds=600)
+    robot = launch(("serial", "good", DEVICE), ("bridge", "good", CONNECTION), restart_delay_seconds=600)
     assert robot.ready("serial", "bridge")
     os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
     assert until(lambda: len(robot.events("serial", "ready")) == 2, 20), "only the second restart may wait"
@@ -101,7 +103,7 @@ def test_a_killed_child_is_started_again_at_once(launch: Launch) -> None:
 
 
 def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:
-    robot = launch(("serial", "crash", DEVICE), ("bridge", "good", LINK), restart_delay_seconds=0)
+    robot = launch(("serial", "crash", DEVICE), ("bridge", "good", CONNECTION), restart_delay_seconds=0)
     assert until(lambda: robot.states().get("serial") == "failed", 20)
     assert robot.ready("bridge")
     assert len(robot.events("serial", "start")) == 5
@@ -109,12 +111,12 @@ def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:
     assert [error["message"] for error in errors] == [
         "[launcher] serial ended 5 times within 60 s, last: exit code 3. Trying again every 10 s"
     ]
-    fared = robot.services()["serial"]
-    assert fared == {"state": "failed", "restarts": 4, "last_exit": "exit code 3"}
+    reported = robot.services()["serial"]
+    assert reported == {"state": "failed", "restarts": 4, "last_exit": "exit code 3"}
 
 
 def test_a_stuck_child_is_killed_and_started_again(launch: Launch) -> None:
-    robot = launch(("serial", "mute", DEVICE), ("bridge", "good", LINK), options=("hasty",))
+    robot = launch(("serial", "mute", DEVICE), ("bridge", "good", CONNECTION), options=("hasty",))
     assert until(lambda: len(robot.events("serial", "ready")) >= 2, 20)
     assert gone(robot.events("serial", "ready")[0])
     assert len(robot.events("bridge", "start")) == 1
@@ -123,7 +125,7 @@ def test_a_stuck_child_is_killed_and_started_again(launch: Launch) -> None:
 
 
 def test_what_a_child_started_ends_with_it(launch: Launch) -> None:
-    robot = launch(("player", "parent", LINK), restart_delay_seconds=600)
+    robot = launch(("player", "parent", CONNECTION), restart_delay_seconds=600)
 
     def grandchildren() -> list[int]:
         return [int(pid) for pid in re.findall(r"child:(\d+)", "\n".join(lines_of(robot.journal)))]
@@ -133,12 +135,12 @@ def test_what_a_child_started_ends_with_it(launch: Launch) -> None:
 
 
 def test_a_killed_launcher_leaves_no_orphans(launch: Launch) -> None:
-    robot = launch(("hub", "good", FABRIC), ("serial", "good", DEVICE))
+    robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE))
     assert robot.ready("hub", "serial")
     pids = robot.events("hub", "start") + robot.events("serial", "start")
     robot.process.kill()
     assert until(lambda: all(gone(pid) for pid in pids))
-    assert robot.events("serial", "stop"), "children are told, so that they can stop their hardware"
+    assert robot.events("serial", "stop"), "children get SIGTERM, so that they can stop their hardware"
 
 
 @pytest.mark.parametrize("trouble", ["hangs", "broken"])
@@ -151,13 +153,13 @@ def test_supervision_does_not_wait_for_a_transport(launch: Launch, trouble: str)
     assert len(robot.events("serial", "stop")) == 1
 
 
-def test_why_nothing_is_published_is_said(launch: Launch) -> None:
+def test_the_reason_why_nothing_is_published_is_logged(launch: Launch) -> None:
     robot = launch(("serial", "good", DEVICE), options=("broken",))
-    said = "[ERROR] [announcer] the launcher publishes nothing: no such certificate"
-    assert until(lambda: said in robot.stderr(), 20)
+    line = "[ERROR] [announcer] the launcher publishes nothing: no such certificate"
+    assert until(lambda: line in robot.stderr(), 20)
 
 
-def test_a_killed_announcer_is_started_again_and_told_what_it_missed(launch: Launch) -> None:
+def test_a_killed_announcer_is_started_again_and_receives_what_it_missed(launch: Launch) -> None:
     robot = launch(("serial", "good", DEVICE), retained_publish_interval_seconds=600)
     assert robot.ready("serial", "announcer")
     os.kill(robot.children()["announcer"], signal.SIGKILL)
@@ -166,7 +168,7 @@ def test_a_killed_announcer_is_started_again_and_told_what_it_missed(launch: Lau
     assert len(robot.events("serial", "start")) == 1
 
 
-def test_a_stopped_announcer_disturbs_nobody_and_is_replaced(launch: Launch) -> None:
+def test_a_stopped_announcer_delays_nothing_and_is_replaced(launch: Launch) -> None:
     robot = launch(("serial", "good", DEVICE), options=("hasty",))
     assert robot.ready("serial", "announcer")
     os.kill(robot.children()["announcer"], signal.SIGSTOP)
@@ -182,18 +184,18 @@ def test_a_stopped_announcer_disturbs_nobody_and_is_replaced(launch: Launch) -> 
 def test_a_child_finds_what_a_fresh_interpreter_would(launch: Launch) -> None:
     robot = launch(("serial", "curious", DEVICE))
     assert robot.ready("serial")
-    words = [line.split()[1] for line in lines_of(robot.journal)]
-    assert words[:4] == ["fds:0=null,1=pipe,2=pipe,3=pipe", "mask:", "handler:SIG_DFL", "group:True"]
+    output = [line.split()[1] for line in lines_of(robot.journal)]
+    assert output[:4] == ["fds:0=null,1=pipe,2=pipe,3=pipe", "mask:", "handler:SIG_DFL", "group:True"]
 
 
 def test_children_have_names(launch: Launch) -> None:
-    robot = launch(("serial_mcu_bridge:arm", "good", DEVICE), ("hub", "good", FABRIC))
+    robot = launch(("serial_mcu_bridge:arm", "good", DEVICE), ("hub", "good", LOCAL_TRANSPORT))
     assert robot.ready("serial_mcu_bridge:arm", "hub", "announcer")
     assert sorted(robot.children()) == ["announcer", "hub", "serial_mcu_brid"]
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "how", "words"),
+    ("behaviour", "how", "output"),
     [
         ("crash", "exit code 3", ""),
         ("word", "exit code 1", "[serial] a last word"),
@@ -202,11 +204,11 @@ def test_children_have_names(launch: Launch) -> None:
         ("done", "exit code 0", ""),
     ],
 )
-def test_the_end_of_a_program_is_the_end_of_its_process(launch: Launch, behaviour: str, how: str, words: str) -> None:
+def test_the_end_of_a_program_is_the_end_of_its_process(launch: Launch, behaviour: str, how: str, output: str) -> None:
     robot = launch(("serial", behaviour, DEVICE), restart_delay_seconds=600)
     assert until(lambda: robot.services().get("serial", {}).get("last_exit") == how, 20)
-    assert until(lambda: words in robot.stderr())
-    assert "pebble/launcher/keeper.py" not in robot.stderr(), "nothing goes back to where the launcher was"
+    assert until(lambda: output in robot.stderr())
+    assert "pebble/launcher/process_supervisor.py" not in robot.stderr(), "nothing goes back to where the launcher was"
 
 
 def test_threads_are_waited_for_before_the_exit_functions_run(launch: Launch) -> None:
@@ -216,7 +218,7 @@ def test_threads_are_waited_for_before_the_exit_functions_run(launch: Launch) ->
 
 
 def test_the_lock_of_a_killed_launcher_is_free_at_once(launch: Launch) -> None:
-    robot = launch(("bridge", "stubborn", LINK))
+    robot = launch(("bridge", "stubborn", CONNECTION))
     assert robot.ready("bridge")
     pid = robot.events("bridge", "start")[0]
     robot.process.kill()
@@ -240,7 +242,7 @@ def test_restarts_leave_no_descriptors_behind(launch: Launch) -> None:
 
 
 def test_a_program_that_cannot_be_imported_is_its_own_trouble(launch: Launch) -> None:
-    robot = launch(("bridge", "good", LINK), options=("missing",), restart_delay_seconds=600)
+    robot = launch(("bridge", "good", CONNECTION), options=("missing",), restart_delay_seconds=600)
     assert robot.ready("bridge")
     assert until(lambda: robot.services()["missing"]["last_exit"] == "exit code 1")
     assert "No module named no_such_module" in robot.stderr()
@@ -250,7 +252,7 @@ def test_a_program_that_cannot_be_imported_is_its_own_trouble(launch: Launch) ->
 
 
 def test_stages_stop_one_after_the_other_and_nothing_is_left(launch: Launch) -> None:
-    robot = launch(("hub", "good", FABRIC), ("serial", "good", DEVICE), ("bridge", "good", LINK))
+    robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), ("bridge", "good", CONNECTION))
     assert robot.ready("hub", "serial", "bridge")
     pids = [robot.events(name, "start")[0] for name in ("hub", "serial", "bridge")]
     assert robot.stop() == 0
@@ -267,7 +269,10 @@ def test_stages_stop_one_after_the_other_and_nothing_is_left(launch: Launch) -> 
 
 def test_who_ignores_the_request_to_stop_is_killed_and_takes_no_time_from_others(launch: Launch) -> None:
     robot = launch(
-        ("hub", "good", FABRIC), ("serial", "good", DEVICE), ("bridge", "stubborn", LINK), shutdown_timeout_seconds=1.5
+        ("hub", "good", LOCAL_TRANSPORT),
+        ("serial", "good", DEVICE),
+        ("bridge", "stubborn", CONNECTION),
+        shutdown_timeout_seconds=1.5,
     )
     assert robot.ready("hub", "serial", "bridge")
     stubborn = robot.events("bridge", "start")[0]
@@ -279,7 +284,7 @@ def test_who_ignores_the_request_to_stop_is_killed_and_takes_no_time_from_others
 
 
 def test_a_second_signal_ends_everything_at_once(launch: Launch) -> None:
-    robot = launch(("bridge", "stubborn", LINK), shutdown_timeout_seconds=600)
+    robot = launch(("bridge", "stubborn", CONNECTION), shutdown_timeout_seconds=600)
     assert robot.ready("bridge")
     robot.process.send_signal(signal.SIGINT)
     assert until(lambda: "[launcher] stopping" in robot.stderr())
@@ -298,8 +303,8 @@ def test_childrens_lines_become_records(launch: Launch) -> None:
     records = [record for record in robot.logs() if record["service"] == "serial_mcu_bridge:imu"]
     first = records[0]["pid"]
     assert first == robot.events("serial_mcu_bridge:imu", "start")[0]
-    said = [(r["level"], r["message"].removeprefix("[serial_mcu_bridge:imu] ")) for r in records if r["pid"] == first]
-    assert said == [
+    texts = [(r["level"], r["message"].removeprefix("[serial_mcu_bridge:imu] ")) for r in records if r["pid"] == first]
+    assert texts == [
         ("WARNING", "mind the gap"),
         ("INFO", "just a print"),
         ("ERROR", "it broke"),
@@ -317,32 +322,32 @@ def test_childrens_lines_become_records(launch: Launch) -> None:
     assert "[ERROR] [serial_mcu_bridge:imu] ValueError: seven" in robot.stderr()
 
 
-def test_systemd_hears_of_readiness_life_and_end(launch: Launch, tmp_path: Path) -> None:
+def test_systemd_is_notified_of_readiness_life_and_end(launch: Launch, tmp_path: Path) -> None:
     path = tmp_path / "systemd"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(path))
         systemd.settimeout(20)
-        heard: list[str] = []
+        received: list[str] = []
 
-        def hear(text: str) -> bool:
-            while text not in heard:
-                heard.append(systemd.recv(1000).decode())
+        def notified(text: str) -> bool:
+            while text not in received:
+                received.append(systemd.recv(1000).decode())
             return True
 
         robot = launch(
-            ("hub", "environment", FABRIC),
+            ("hub", "environment", LOCAL_TRANSPORT),
             ("serial", "crash", DEVICE),
             restart_delay_seconds=0,
             env={"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "200000"},
         )
-        assert hear("READY=1")
-        assert robot.events("hub", "ready"), "not before everybody has had a chance"
+        assert notified("READY=1")
+        assert robot.events("hub", "ready"), "not before every program has been started"
         assert robot.events("serial", "start")
-        assert hear("STATUS=2 of 3 ready; serial failed")
-        assert hear("WATCHDOG=1")
+        assert notified("STATUS=2 of 3 ready; serial failed")
+        assert notified("WATCHDOG=1")
         assert robot.events("hub", "systemd:False"), "children do not speak to systemd"
         assert robot.stop() == 0
-        assert hear("STOPPING=1")
+        assert notified("STOPPING=1")
 
 
 # -- the table
@@ -390,21 +395,24 @@ CONTROLS = {
 }
 
 
+MEDIA_MODULES = {"pebble.transports.frames", "pebble.media.sound"}
+
+
 def _programs(devices: dict[str, Any], **bridge: Any) -> dict[str, Program]:
     services = {"av_daemon": devices, "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}, **bridge}}
     return {program.name: program for program in programs(_parsed(services=services))}
 
 
-def test_camera_and_microphone_start_with_the_robot_and_media_only_when_they_are_wanted() -> None:
+def test_camera_and_microphone_start_with_the_robot_and_media_only_when_they_are_requested() -> None:
     table = _programs(DEVICES, **CONTROLS)
     assert list(table) == [
         *("announcer", "av_daemon", "mqtt_bridge"),
         *("camera_publisher", "audio_publisher", "audio_receiver"),
     ]
     assert [name for name, program in table.items() if program.on_demand] == list(table)[3:]
-    assert [name for name, program in table.items() if program.asks] == ["mqtt_bridge"]
+    assert [name for name, program in table.items() if program.may_request] == ["mqtt_bridge"]
     assert [name for name, program in table.items() if program.preloaded] == ["announcer", "mqtt_bridge"]
-    assert (table["av_daemon"].stage, table["camera_publisher"].stage) == (Stage.DEVICE, Stage.LINK)
+    assert (table["av_daemon"].stage, table["camera_publisher"].stage) == (Stage.DEVICE, Stage.CONNECTION)
     assert (table["av_daemon"].environment, table["av_daemon"].folder) == ({"MARK": "d"}, Path("/robots/cameras"))
     environments = [table[name].environment for name in list(table)[3:]]
     assert environments == [{"MARK": "v"}, {"MARK": "p"}, {"MARK": "a", "MORE": "r"}]
@@ -425,15 +433,14 @@ def test_there_are_media_for_what_there_is(devices: dict[str, Any], bridge: dict
 
 
 def test_the_launcher_of_a_robot_with_a_camera_imports_only_what_several_share_and_stays_single_threaded() -> None:
-    names = ", ".join(f'"{one.name}": "{one.module}"' for one in _programs(DEVICES).values() if one.preloaded)
     services = {"av_daemon": DEVICES, "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}}
-    shared = shared_modules(_parsed(services=services))
-    assert shared
+    shared = shared_modules(_parsed(services=services), _programs(DEVICES).values())
+    assert {*shared} >= MEDIA_MODULES
     code = f"""
 import os, sys
 from pebble.launcher import launcher
-from pebble.launcher.preload import preload
-preload([*{{{names}}}.values(), *{shared}, "pebble.transports.mqtt", "pebble.transports.zenoh"])
+from pebble.launcher.programs import preload
+preload([*{shared}, "pebble.transports.mqtt.transport", "pebble.transports.zenoh.transport"])
 print([name for name in ("numpy", "cv2", "av") if name in sys.modules], len(os.listdir("/proc/self/task")))
 """
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
@@ -448,11 +455,12 @@ def test_a_foreign_streaming_program_is_one_more_program_on_demand() -> None:
     table = _table(services=services)
     assert [row[:2] for row in table][-1] == ("video_stream", "pebble.services.video_stream")
     assert {one.name for one in programs(_parsed(services=services)) if one.on_demand} == {"video_stream"}
-    assert shared_modules(_parsed(services=services)) == ()
+    assert not MEDIA_MODULES & {*shared_modules(_parsed(services=services), ())}
 
 
 def test_the_launcher_of_a_robot_without_media_carries_nothing_for_them() -> None:
-    assert shared_modules(_parsed(services={"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}})) == ()
+    config = _parsed(services={"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}})
+    assert not MEDIA_MODULES & {*shared_modules(config, programs(config))}
 
 
 def test_a_zenoh_robot_starts_its_hub_first() -> None:
@@ -461,9 +469,9 @@ def test_a_zenoh_robot_starts_its_hub_first() -> None:
     table = _table(services=services, transport=transport)
     assert [row[0] for row in table] == ["zenoh_hub", "announcer", "mqtt_bridge", "mqtt_mirror"]
     name, module, (settings,), stage = table[0]
-    assert (name, module, stage) == ("zenoh_hub", "pebble.hub", Stage.FABRIC)
-    said = json.loads(settings)
-    assert (said["run_dir"], said["lease_ms"], said["journal"]) == ("/run/rover", 700, "/robots/kept")
+    assert (name, module, stage) == ("zenoh_hub", "pebble.runtime.hub", Stage.LOCAL_TRANSPORT)
+    decoded = json.loads(settings)
+    assert (decoded["run_dir"], decoded["lease_ms"], decoded["journal"]) == ("/run/rover", 700, "/robots/kept")
 
 
 @pytest.mark.parametrize(
@@ -483,15 +491,15 @@ def test_a_zenoh_robot_starts_its_hub_first() -> None:
     ],
 )
 def test_the_transports_a_robot_uses_are_known_beforehand(sections: dict[str, Any], modules: set[str]) -> None:
-    assert set(transport_modules(_parsed(**sections))) == {f"pebble.transports.{kind}" for kind in modules}
+    assert {*shared_modules(_parsed(**sections), ())} == {f"pebble.transports.{kind}.transport" for kind in modules}
 
 
-def test_the_hub_process_tells_that_it_listens_and_stops_when_asked(tmp_path: Path) -> None:
+def test_the_hub_process_notifies_that_it_is_ready_and_stops_when_asked(tmp_path: Path) -> None:
     settings = json.dumps({"run_dir": str(tmp_path / "run")})
-    said, notes = os.pipe()
+    read_end, notes = os.pipe()
     environment = {**os.environ, NOTIFY_FD: str(notes)}
-    command = [sys.executable, "-m", "pebble.hub", settings]
-    with subprocess.Popen(command, cwd=ROOT, env=environment, pass_fds=(notes,)) as hub, os.fdopen(said) as signs:
+    command = [sys.executable, "-m", "pebble.runtime.hub", settings]
+    with subprocess.Popen(command, cwd=ROOT, env=environment, pass_fds=(notes,)) as hub, os.fdopen(read_end) as signs:
         try:
             os.close(notes)
             assert signs.readline() == "READY\n"

@@ -7,19 +7,19 @@ from collections.abc import Iterator
 import pytest
 
 from pebble.config.tree import LogsSection
-from pebble.launcher.log_forwarding import Echo, LogForwarder, OwnRecords
-from pebble.payloads import LogRecord
+from pebble.contract.payloads import LogRecord
+from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, cut, text_of
 
 
 class Forwarded:
-    """A forwarder whose echo is a pipe."""
+    """A forwarder whose stderr is a pipe."""
 
     def __init__(self, logs: LogsSection) -> None:
         self.read_end, self.write_end = os.pipe2(os.O_NONBLOCK)
         self.records: list[LogRecord] = []
-        self.forwarder = LogForwarder(self.records.append, logs, echo=self.write_end)
+        self.forwarder = LogForwarder(self.records.append, logs, stderr=self.write_end)
 
-    def echoed(self) -> str:
+    def written(self) -> str:
         try:
             return os.read(self.read_end, 65536).decode()
         except BlockingIOError:
@@ -37,19 +37,19 @@ def forwarded() -> Iterator[Forwarded]:
     made.close()
 
 
-def test_a_childs_line_is_echoed_and_published_under_its_name(forwarded: Forwarded) -> None:
+def test_a_childs_line_is_written_and_published_under_its_name(forwarded: Forwarded) -> None:
     forwarded.forwarder.child_line("mqtt_bridge", 42, "12:00:00 [ERROR] far away")
     (record,) = forwarded.records
     assert (record.level, record.service, record.message) == ("ERROR", "mqtt_bridge", "[mqtt_bridge] far away")
     assert (record.pid, record.logger) == (42, "root")
     assert record.t > 1_600_000_000_000
-    assert forwarded.echoed().endswith("[ERROR] [mqtt_bridge] far away\n")
+    assert forwarded.written().endswith("[ERROR] [mqtt_bridge] far away\n")
 
 
 def test_what_is_below_the_least_level_stays_here(forwarded: Forwarded) -> None:
     forwarded.forwarder.child_line("mqtt_bridge", 42, "12:00:00 [INFO] routine")
     assert forwarded.records == []
-    assert "routine" in forwarded.echoed()
+    assert "routine" in forwarded.written()
 
 
 def test_a_message_is_cut_with_its_name_counted(forwarded: Forwarded) -> None:
@@ -67,22 +67,25 @@ def test_children_do_not_share_a_traceback(forwarded: Forwarded) -> None:
 
 
 def test_the_launchers_own_records_go_the_same_way(forwarded: Forwarded) -> None:
-    log = logging.getLogger("pebble.launcher.keeper")
+    log = logging.getLogger("pebble.launcher.process_supervisor")
     with OwnRecords(forwarded.forwarder, "INFO"):
         log.warning("child %s ended", "x")
         log.info("quiet")
-        log.debug("not even echoed")
+        log.debug("not even written")
         log.log(35, "between the levels")
     log.warning("after the end")
     assert [(record.level, record.message) for record in forwarded.records] == [
         ("WARNING", "[launcher] child x ended"),
         ("WARNING", "[launcher] between the levels"),
     ]
-    assert (forwarded.records[0].pid, forwarded.records[0].logger) == (os.getpid(), "pebble.launcher.keeper")
-    echoed = forwarded.echoed()
-    assert "[INFO] [launcher] quiet" in echoed
-    assert "not even" not in echoed
-    assert "after the end" not in echoed
+    assert (forwarded.records[0].pid, forwarded.records[0].logger) == (
+        os.getpid(),
+        "pebble.launcher.process_supervisor",
+    )
+    written = forwarded.written()
+    assert "[INFO] [launcher] quiet" in written
+    assert "not even" not in written
+    assert "after the end" not in written
 
 
 def test_an_exception_is_one_record_and_several_lines(forwarded: Forwarded) -> None:
@@ -90,27 +93,97 @@ def test_an_exception_is_one_record_and_several_lines(forwarded: Forwarded) -> N
         raise ValueError("seven")
     except ValueError:
         with OwnRecords(forwarded.forwarder, "INFO"):
-            logging.getLogger("pebble.launcher.keeper").exception("it broke")
+            logging.getLogger("pebble.launcher.process_supervisor").exception("it broke")
     assert len(forwarded.records) == 1
-    assert "[ERROR] [launcher] ValueError: seven" in forwarded.echoed()
+    assert "[ERROR] [launcher] ValueError: seven" in forwarded.written()
 
 
 def test_what_publishing_itself_causes_is_not_published(forwarded: Forwarded) -> None:
     forwarded.forwarder.child_line("announcer", 42, "12:00:00 [ERROR] broken pipe", published=False)
     assert forwarded.records == []
-    assert "broken pipe" in forwarded.echoed()
+    assert "broken pipe" in forwarded.written()
 
 
-def test_an_echo_nobody_reads_stops_nothing() -> None:
+def test_writing_never_waits_for_a_reader() -> None:
     read_end, write_end = os.pipe()  # blocking, as a terminal is
     try:
-        echo = Echo(write_end)
+        writer = NonBlockingWriter(write_end)
         for _ in range(1000):
-            echo.write("x" * 1000)
-        assert echo.dropped > 0
+            writer.write("x" * 1000)
+        assert writer.dropped > 0
         os.close(read_end)
-        dropped = echo.dropped
-        echo.write("nobody is there any more")
-        assert echo.dropped == dropped + 1
+        dropped = writer.dropped
+        writer.write("the reader has gone")
+        assert writer.dropped == dropped + 1
     finally:
         os.close(write_end)
+
+
+# -- levels
+
+
+def test_a_line_becomes_text_without_its_end() -> None:
+    assert [text_of(line) for line in (b"two\r", b"", b"  three  ")] == ["two", "", "  three"]
+
+
+def test_bytes_that_are_no_text_are_replaced() -> None:
+    assert text_of(b"a\xff\xfeb") == "a\ufffd\ufffdb"
+
+
+@pytest.mark.parametrize(
+    ("line", "level", "text"),
+    [
+        ("12:00:00 [INFO] hello", "INFO", "hello"),
+        ("12:00:00 [WARNING] hello", "WARNING", "hello"),
+        ("12:00:00 [WARN] hello", "WARNING", "hello"),
+        ("12:00:00,123 [ERROR] hello", "ERROR", "hello"),
+        ("12:00:00 [CRITICAL] [x] y", "CRITICAL", "[x] y"),
+        ("12:00:00 [DEBUG] ", "DEBUG", ""),
+        ("12:00:00 [SHOUT] hello", "INFO", "12:00:00 [SHOUT] hello"),
+        ("12:00 [ERROR] hello", "INFO", "12:00 [ERROR] hello"),
+        ("ERROR hello", "INFO", "ERROR hello"),
+    ],
+)
+def test_a_line_of_the_log_format_names_its_level(line: str, level: str, text: str) -> None:
+    assert LevelReader().read(line) == (level, text)
+
+
+def levels(*lines: str) -> list[str]:
+    reader = LevelReader()
+    return [reader.read(line)[0] for line in lines]
+
+
+def test_a_traceback_has_the_level_of_the_line_it_belongs_to() -> None:
+    assert (
+        levels(
+            "12:00:00 [WARNING] it broke",
+            "Traceback (most recent call last):",
+            '  File "x.py", line 1',
+            "ValueError: no",
+            "During handling of the above exception, another exception occurred:",
+            "Traceback (most recent call last):",
+            "KeyError: 1",
+            "12:00:01 [INFO] goes on",
+            "a print",
+        )
+        == ["WARNING"] * 7 + ["INFO"] * 2
+    )
+
+
+def test_a_traceback_of_its_own_is_an_error() -> None:
+    assert levels("a print", "Traceback (most recent call last):", "  File", "ImportError: no") == [
+        "INFO",
+        *["ERROR"] * 3,
+    ]
+
+
+def test_indented_lines_continue_and_others_do_not() -> None:
+    assert levels("12:00:00 [ERROR] two reasons:", "  one", "  two", "a print", "  of its own") == [
+        *["ERROR"] * 3,
+        *["INFO"] * 2,
+    ]
+
+
+def test_cut() -> None:
+    assert cut("x" * 64, 64) == "x" * 64
+    assert cut("x" * 65, 64) == "x" * 61 + "..."

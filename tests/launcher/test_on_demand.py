@@ -1,4 +1,4 @@
-"""Programs that run only while they are wanted: a real launcher, a stand-in for the bridge, media that misbehave."""
+"""Programs that run only while they are requested: a real launcher, a stand-in for the bridge, media that misbehave."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from typing import Any, cast
 import pytest
 
 from pebble.launcher import on_demand
-from pebble.launcher.keeper import Keeper
 from pebble.launcher.on_demand import OnDemand
-from pebble.launcher.program import Program, Stage
+from pebble.launcher.process_supervisor import ProcessSupervisor
+from pebble.launcher.programs import Program, Stage
 from pebble.launcher.reactor import Reactor
-from tests.launcher.robot import DEVICE, LINK, Launch, Robot, Row, lines_of
+from tests.launcher.robot import CONNECTION, DEVICE, Launch, Robot, Row, lines_of
 from tests.support import gone, until
 
-ASKER: Row = ("bridge", "asker", LINK, {"asks": True})
+ASKER: Row = ("bridge", "asker", CONNECTION, {"may_request": True})
 
 
 def media(behaviour: str, name: str = "media", **more: Any) -> Row:
-    return (name, behaviour, LINK, {"on_demand": True, "preloaded": False, **more})
+    return (name, behaviour, CONNECTION, {"on_demand": True, "preloaded": False, **more})
 
 
 def started(robot: Robot, name: str, times: int = 1) -> bool:
@@ -36,7 +36,7 @@ def state_of(robot: Robot, name: str = "media") -> Any:
     return robot.services().get(name, {}).get("state")
 
 
-def test_runs_while_it_is_wanted_and_shows_from_then_on(launch: Launch) -> None:
+def test_runs_while_requested_and_shows_from_then_on(launch: Launch) -> None:
     robot = launch(ASKER, media("good"))
     assert robot.ready("bridge", "announcer")
     assert set(robot.services()) == {"bridge", "announcer"}
@@ -52,27 +52,27 @@ def test_runs_while_it_is_wanted_and_shows_from_then_on(launch: Launch) -> None:
     assert len(robot.events("media", "start")) == 2
 
 
-def test_nobody_waits_for_what_nobody_wants(launch: Launch, tmp_path: Path) -> None:
+def test_programs_that_are_not_requested_are_left_out_of_the_summary(launch: Launch, tmp_path: Path) -> None:
     path = tmp_path / "systemd"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(path))
         systemd.settimeout(20)
 
-        def hear(text: str) -> bool:
+        def received(text: str) -> bool:
             while systemd.recv(1000).decode() != text:
                 pass
             return True
 
         robot = launch(ASKER, media("good"), env={"NOTIFY_SOCKET": str(path)})
-        assert hear("READY=1")
-        assert hear("STATUS=2 of 2 ready")
+        assert received("READY=1")
+        assert received("STATUS=2 of 2 ready")
         robot.order("bridge", "media 1")
-        assert hear("STATUS=3 of 3 ready")
+        assert received("STATUS=3 of 3 ready")
         robot.order("bridge", "media 0")
-        assert hear("STATUS=2 of 2 ready"), "what rests is nothing to worry about"
+        assert received("STATUS=2 of 2 ready"), "a program that is not requested is left out"
 
 
-def test_what_ends_while_it_is_wanted_is_started_again_at_once(launch: Launch) -> None:
+def test_a_requested_program_that_ends_is_started_again_at_once(launch: Launch) -> None:
     robot = launch(ASKER, media("good"), restart_delay_seconds=600)
     assert robot.ready("bridge")
     robot.order("bridge", "media 1")
@@ -83,7 +83,7 @@ def test_what_ends_while_it_is_wanted_is_started_again_at_once(launch: Launch) -
     assert until(lambda: robot.services()["media"] == again)
 
 
-def test_a_crash_loop_shows_until_it_is_not_wanted(launch: Launch) -> None:
+def test_a_crash_loop_shows_until_the_program_is_released(launch: Launch) -> None:
     robot = launch(ASKER, media("crash"), restart_delay_seconds=0)
     assert robot.ready("bridge")
     robot.order("bridge", "media 1")
@@ -95,14 +95,14 @@ def test_a_crash_loop_shows_until_it_is_not_wanted(launch: Launch) -> None:
     assert len(robot.events("bridge", "ready")) == 1
 
 
-def test_who_does_not_stop_is_killed_and_nobody_waits(launch: Launch) -> None:
+def test_a_released_program_that_does_not_stop_is_killed_without_a_wait(launch: Launch) -> None:
     robot = launch(ASKER, media("stubborn", stop_timeout_s=2.0), ("serial", "good", DEVICE))
     assert robot.ready("bridge", "serial")
     robot.order("bridge", "media 1")
     assert robot.ready("media")
     (stubborn,) = robot.events("media", "start")
     robot.order("bridge", "media 0")
-    assert until(lambda: "media is not wanted any more" in robot.stderr())
+    assert until(lambda: "media is released" in robot.stderr())
     os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
     assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
     assert not gone(stubborn), "the other one was back before this one had to end"
@@ -112,7 +112,7 @@ def test_who_does_not_stop_is_killed_and_nobody_waits(launch: Launch) -> None:
     assert robot.services()["media"]["last_exit"] == "signal 9"
 
 
-def test_wanted_again_while_it_stops_it_is_started_after_the_exit(launch: Launch) -> None:
+def test_a_program_requested_again_while_it_stops_is_started_after_its_exit(launch: Launch) -> None:
     robot = launch(ASKER, media("stubborn", stop_timeout_s=0.5), shutdown_timeout_seconds=0.5)
     assert robot.ready("bridge")
     robot.order("bridge", "media 1")
@@ -126,7 +126,7 @@ def test_wanted_again_while_it_stops_it_is_started_after_the_exit(launch: Launch
     assert robot.stop() == 0
 
 
-def test_changing_ones_mind_all_the_time_starts_few_processes(launch: Launch) -> None:
+def test_rapidly_changing_requests_start_few_processes(launch: Launch) -> None:
     robot = launch(ASKER, media("good"))
     assert robot.ready("bridge")
     began = time.monotonic()
@@ -142,10 +142,10 @@ def test_an_environment_and_a_folder_of_its_own(launch: Launch, tmp_path: Path) 
     assert robot.ready("bridge")
     robot.order("bridge", "media 1")
     assert robot.ready("media")
-    assert said_of_itself(robot) == ["env:red:elsewhere:None"]
+    assert environment_notes(robot) == ["env:red:elsewhere:None"]
 
 
-def test_each_start_knows_which_encoding_was_asked_for_last(launch: Launch) -> None:
+def test_each_start_gets_the_encoding_that_was_requested_last(launch: Launch) -> None:
     robot = launch(ASKER, media("curious about itself"))
     assert robot.ready("bridge")
     robot.order("bridge", "media 1 h264")
@@ -154,39 +154,39 @@ def test_each_start_knows_which_encoding_was_asked_for_last(launch: Launch) -> N
     os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
     assert until(lambda: robot.events("bridge", "before:media=pbvz") or robot.events("bridge", "before:media=h264"))
     robot.order("bridge", "media 1 pbvz", "other 1")
-    assert until(lambda: "no say in" in robot.stderr()), "it has been heard"
+    assert until(lambda: "may not request" in robot.stderr()), "it has been received"
     os.kill(robot.events("media", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(said_of_itself(robot)) == 2)
+    assert until(lambda: len(environment_notes(robot)) == 2)
     robot.order("bridge", "media 1", "media 0")
     assert until(lambda: robot.events("media", "stop"))
     robot.order("bridge", "media 1")
-    assert until(lambda: len(said_of_itself(robot)) == 3)
-    assert [said.rpartition(":")[2] for said in said_of_itself(robot)] == ["h264", "pbvz", "None"]
+    assert until(lambda: len(environment_notes(robot)) == 3)
+    assert [note.rpartition(":")[2] for note in environment_notes(robot)] == ["h264", "pbvz", "None"]
 
 
-def said_of_itself(robot: Robot) -> list[str]:
-    words = (line.split() for line in lines_of(robot.journal))
-    return [word for name, word, _ in words if name == "media" and word.startswith("env:")]
+def environment_notes(robot: Robot) -> list[str]:
+    output = (line.split() for line in lines_of(robot.journal))
+    return [word for name, word, _ in output if name == "media" and word.startswith("env:")]
 
 
 @pytest.mark.parametrize("how", ["half", "noise"])
-def test_what_is_said_in_pieces_or_after_noise_is_understood(launch: Launch, how: str) -> None:
+def test_a_request_in_pieces_or_after_noise_is_understood(launch: Launch, how: str) -> None:
     robot = launch(ASKER, media("good"))
     assert robot.ready("bridge")
     robot.order("bridge", f"{how} media 1")
     assert robot.ready("media")
 
 
-def test_only_the_bridge_may_want_and_only_what_there_is(launch: Launch) -> None:
-    robot = launch(ASKER, ("other", "asker", LINK), media("good"))
+def test_only_the_bridge_may_request_and_only_existing_programs(launch: Launch) -> None:
+    robot = launch(ASKER, ("other", "asker", CONNECTION), media("good"))
     assert robot.ready("bridge", "other")
     robot.order("other", "media 1", "media 1", "media 1")
     robot.order("bridge", "nothing 1", "other 0", "nothing 1")
-    said = "bridge says what it has no say in, ignored: WANT nothing 1"
-    assert until(lambda: said in robot.stderr() and "other says what it has no say in" in robot.stderr())
+    refusal = "bridge may not request this, ignored: WANT nothing 1"
+    assert until(lambda: refusal in robot.stderr() and "other may not request this" in robot.stderr())
     robot.order("bridge", "media 0")
     assert until(lambda: robot.states() == {"bridge": "ready", "other": "ready", "announcer": "ready"})
-    assert robot.stderr().count("no say in") == 2, "one line each"
+    assert robot.stderr().count("may not request") == 2, "one line each"
     assert not robot.events("media", "start")
 
 
@@ -203,7 +203,7 @@ def test_the_robot_stops_with_all_it_has(launch: Launch) -> None:
 
 
 class TestBridgeThatDies:
-    def test_the_next_one_knows_and_what_it_says_again_runs_on(self, launch: Launch) -> None:
+    def test_its_successor_gets_the_requests_and_those_it_repeats_last(self, launch: Launch) -> None:
         robot = launch(ASKER, media("good"), media("good", "other"), options=("forgetful",))
         assert robot.ready("bridge")
         robot.order("bridge", "media 1", "other 1")
@@ -212,14 +212,14 @@ class TestBridgeThatDies:
         assert until(lambda: len(robot.events("bridge", "ready")) == 2, 20)
         assert robot.events("bridge", "before:media=,other=")
         robot.order("bridge", "media 1")
-        assert until(lambda: robot.events("other", "stop"), 20), "withdrawn: nobody has said it again"
-        assert "other: who wanted it has ended, and nobody has wanted it again" in robot.stderr()
+        assert until(lambda: robot.events("other", "stop"), 20), "expired: the request was not repeated"
+        assert "other: the program that requested it has ended, and the request was not repeated" in robot.stderr()
         assert until(lambda: state_of(robot, "other") == "stopped")
         assert robot.states()["media"] == "ready"
         assert len(robot.events("media", "start")) == 1
         assert not robot.events("media", "stop")
 
-    def test_its_wants_count_for_a_while(self, launch: Launch) -> None:
+    def test_its_requests_last_for_a_while(self, launch: Launch) -> None:
         robot = launch(ASKER, media("good"), restart_delay_seconds=600)
         assert robot.ready("bridge")
         robot.order("bridge", "media 1")
@@ -232,26 +232,26 @@ class TestBridgeThatDies:
 
     def test_dying_again_and_again_prolongs_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(on_demand, "OUTLIVE_S", 0.3)
-        reactor, keeper = Reactor(), StandIn()
-        bridge = Program("bridge", "bridge", (), Stage.LINK, asks=True)
-        programs = OnDemand(reactor, {"media": cast(Keeper, keeper)})
-        programs.hear(bridge, "WANT media 1")
+        reactor, supervisor = Reactor(), StandIn()
+        bridge = Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True)
+        programs = OnDemand(reactor, [cast(ProcessSupervisor, supervisor)])
+        programs.receive(bridge, "WANT media 1")
         reactor.every(0.1, lambda: programs.ended(bridge))
-        assert reactor.run_until(lambda: not keeper.wanted, 10)
-        programs.hear(bridge, "WANT media 1")
-        assert not reactor.run_until(lambda: not keeper.wanted, 0.2), "that was another want"
+        assert reactor.run_until(lambda: not supervisor.requested, 10)
+        programs.receive(bridge, "WANT media 1")
+        assert not reactor.run_until(lambda: not supervisor.requested, 0.2), "that was another request"
         reactor.close()
 
 
-@pytest.mark.parametrize(("state", "ended"), [("init", 1), ("ready", 0)])
-def test_one_that_still_starts_begins_again_with_what_is_asked_for_now(state: str, ended: int) -> None:
-    """One that is ready hears the request itself."""
-    keeper = StandIn(state)
-    programs = OnDemand(Reactor(), {"media": cast(Keeper, keeper)})
-    bridge = Program("bridge", "bridge", (), Stage.LINK, asks=True)
+@pytest.mark.parametrize(("state", "releases"), [("init", 1), ("ready", 0)])
+def test_one_that_still_starts_begins_again_with_what_is_requested_now(state: str, releases: int) -> None:
+    """One that is ready receives the new request itself."""
+    supervisor = StandIn(state)
+    programs = OnDemand(Reactor(), [cast(ProcessSupervisor, supervisor)])
+    bridge = Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True)
     for line in ("WANT media 1", "WANT media 1", "WANT media 1 h264"):
-        programs.hear(bridge, line)
-    assert (keeper.wanted, keeper.ended) == (True, ended)
+        programs.receive(bridge, line)
+    assert (supervisor.requested, supervisor.releases) == (True, releases)
 
 
 @pytest.mark.parametrize(
@@ -272,25 +272,25 @@ def test_one_that_still_starts_begins_again_with_what_is_asked_for_now(state: st
 )
 def test_nonsense_is_ignored(line: str, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
-    keeper = StandIn()
-    programs = OnDemand(Reactor(), {"media": cast(Keeper, keeper)})
-    programs.hear(Program("bridge", "bridge", (), Stage.LINK, asks=True), line)
-    assert not keeper.wanted
+    supervisor = StandIn()
+    programs = OnDemand(Reactor(), [cast(ProcessSupervisor, supervisor)])
+    programs.receive(Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True), line)
+    assert not supervisor.requested
     assert len(caplog.records) == 1
 
 
 class StandIn:
-    """What OnDemand sees of a keeper."""
-
-    wanted = False
-    ended = 0  # how often it was told to end
+    """What OnDemand uses of a supervisor."""
 
     def __init__(self, state: str = "ready") -> None:
-        self.life = SimpleNamespace(state=state)
+        self.program = Program("media", "media", (), Stage.CONNECTION, on_demand=True)
+        self.policy = SimpleNamespace(state=state)
+        self.requested = False
+        self.releases = 0
 
-    def want(self) -> None:
-        self.wanted = True
+    def request(self) -> None:
+        self.requested = True
 
-    def unwant(self) -> None:
-        self.ended += self.wanted
-        self.wanted = False
+    def release(self) -> None:
+        self.releases += self.requested
+        self.requested = False

@@ -14,7 +14,7 @@ def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return {"path": str(tmp_path / "notify"), "abstract": f"@pebble-test-{os.getpid()}"}[request.param]
 
 
-def test_what_is_said_arrives(address: str) -> None:
+def test_notifications_arrive(address: str) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(address.replace("@", "\0"))
         systemd.settimeout(10)
@@ -23,8 +23,8 @@ def test_what_is_said_arrives(address: str) -> None:
         notifier.status("3 of 4 ready")
         notifier.watchdog()
         notifier.stopping()
-        heard = [systemd.recv(100).decode() for _ in range(4)]
-    assert heard == ["READY=1", "STATUS=3 of 4 ready", "WATCHDOG=1", "STOPPING=1"]
+        received = [systemd.recv(100).decode() for _ in range(4)]
+    assert received == ["READY=1", "STATUS=3 of 4 ready", "WATCHDOG=1", "STOPPING=1"]
 
 
 @pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "/nowhere/at/all"}])

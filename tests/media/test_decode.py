@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from pebble.contract.packets import Picture, PictureKind
 from pebble.errors import PayloadError
 from pebble.media.decode import MAX_PAYLOAD, Decoded, VideoDecoder
-from pebble.media.inflate import inflate
 from pebble.media.jpeg import decode_jpeg, jpeg_size
-from pebble.media.json_video import JsonPicture
+from pebble.media.json_video import JsonPicture, inflate
 from pebble.media.video import make_encoder
-from pebble.packets import Picture, PictureKind
 
 T0 = 1_710_969_600_000
 FORMS = ("json", "pbvd", "pbvz", "h264")
@@ -71,7 +70,7 @@ def test_a_sender_that_began_again(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_a_new_sender_whose_number_fits_by_chance_is_told_by_its_time(name: str) -> None:
+def test_a_new_sender_whose_number_fits_by_chance_is_detected_by_its_time(name: str) -> None:
     old, new = stream(name), stream(name, start_ms=T0 + 8000, first=3)
     assert frames(VideoDecoder(), [*old[:3], *new[3:8]]) == [0, 1, 2, None, None, None, 6, 7]
     late = stream(name, start_ms=T0 - 1000, first=3)

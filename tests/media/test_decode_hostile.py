@@ -17,11 +17,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from pebble.contract.packets import Picture, PictureKind
 from pebble.media import h264
 from pebble.media.decode import Decoded, VideoDecoder
 from pebble.media.jpeg import MAX_EDGE, Pixels
 from pebble.media.video import make_encoder
-from pebble.packets import Picture, PictureKind
 
 PACKETS = int(os.environ.get("PEBBLE_HOSTILE_PACKETS", "8000"))
 SEED = int(os.environ.get("PEBBLE_HOSTILE_SEED", "1"))

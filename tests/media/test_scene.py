@@ -66,7 +66,7 @@ def test_the_counter_survives_being_sent_as_differences() -> None:
         assert read_counter(shown) == number
 
 
-def test_a_torn_counter_is_told_as_none() -> None:
+def test_a_torn_counter_is_read_as_none() -> None:
     """The upper half of one picture above the lower half of another, as a lost slice leaves them."""
     scene, mixed, other = Scene(640, 480), *np.empty((2, 480, 640, 3), np.uint8)
     for number in range(100, 400):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pebble.media.noise import noise
+from pebble.media.scene import noise
 from pebble.media.speech import PERIOD_S, Speech
 
 
@@ -19,7 +19,7 @@ def test_any_piece_is_cut_from_the_same_sound() -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 2, 8])
-def test_all_channels_say_the_same(channels: int) -> None:
+def test_all_channels_are_the_same(channels: int) -> None:
     samples = Speech(8_000, channels).samples(100, 160)
     assert samples.shape == (160, channels)
     assert samples.dtype == np.int16
@@ -40,7 +40,7 @@ def test_it_has_syllables_and_pauses() -> None:
     assert 20 < rises.sum() < 120
 
 
-def test_a_shift_is_told_exactly_and_only_once() -> None:
+def test_a_shift_is_measured_exactly_and_is_unambiguous() -> None:
     """What a comparison at the other end needs: the sound is like itself at no other place."""
     whole = Speech(16_000).samples(0, 160_000)[:, 0].astype(float)
     piece = whole[70_000:86_000]

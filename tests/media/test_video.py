@@ -11,7 +11,7 @@ import pytest
 
 from pebble.bench.similarity import psnr, squared_error
 from pebble.errors import ConfigError, PebbleError
-from pebble.media import h264
+from pebble.media import h264, pyav
 from pebble.media.decode import VideoDecoder
 from pebble.media.jpeg import Pixels, decode_jpeg
 from pebble.media.jpeg_delta import add, subtract
@@ -48,6 +48,14 @@ def test_what_is_sent_is_shown(name: str) -> None:
         assert psnr(squared_error(shown.picture, picture(number))) > 22
     assert decoder.counters.pictures == 12
     assert not decoder.wants_keyframe
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_clock_before_1970_is_no_reason_not_to_send(name: str) -> None:
+    decoder = VideoDecoder()
+    shown = decoder.feed(make_encoder(name, fps=15).encode(picture(0), -1))
+    assert shown is not None, decoder.problem
+    assert shown.captured_ms is None
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -166,10 +174,10 @@ def test_a_name_that_does_not_exist() -> None:
         make_encoder("mpeg2", fps=15)
 
 
-def test_without_pyav_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyav_the_error_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     packets = send(make_encoder("h264", fps=15), 2)
     monkeypatch.setitem(sys.modules, "av", None)
-    assert not h264.installed()
+    assert not pyav.installed()
     with pytest.raises(PebbleError, match=r"pip install 'pebble-robot\[media\]'"):
         make_encoder("h264", fps=15)
     decoder = VideoDecoder()

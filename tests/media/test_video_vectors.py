@@ -33,10 +33,10 @@ def test_the_vectors_are_what_their_script_makes() -> None:
     made = make_video.streams()
     assert list(made) == list(VECTORS)
     for name, steps in made.items():
-        for step, kept in zip(steps, VECTORS[name], strict=True):
-            assert (step["shows"] is None) is (kept["shows"] is None)
+        for step, retained in zip(steps, VECTORS[name], strict=True):
+            assert (step["shows"] is None) is (retained["shows"] is None)
             # Not the compressed bytes: another zlib or libjpeg may pack the same picture in another way.
-            assert base64.b64decode(step["packet"])[:19] == base64.b64decode(kept["packet"])[:19]
+            assert base64.b64decode(step["packet"])[:19] == base64.b64decode(retained["packet"])[:19]
 
 
 @pytest.mark.parametrize("keyframe_interval", [1, 4])

@@ -1,5 +1,5 @@
-// A robot's program in another language: MQTT 3.1.1 in the little that this needs, and nothing of Pebble's.
-// node client.mjs PORT FILTER TOPIC PAYLOAD — subscribes, publishes once (QoS 1), prints what it hears as JSON lines.
+// A robot's program in another language: the part of MQTT 3.1.1 that this needs, and no code of Pebble's.
+// node client.mjs PORT FILTER TOPIC PAYLOAD — subscribes, publishes once (QoS 1), prints what it receives as JSON lines.
 import net from "node:net";
 
 const [port, filter, topic, payload] = process.argv.slice(2);
@@ -44,8 +44,8 @@ function handle(head, body) {
   if (type !== 3) return;
   const qos = (head >> 1) & 3;
   const size = body.readUInt16BE(0);
-  const heard = { topic: body.toString("utf8", 2, 2 + size), retain: Boolean(head & 1) };
+  const received = { topic: body.toString("utf8", 2, 2 + size), retain: Boolean(head & 1) };
   if (qos) socket.write(packet(0x40, body.subarray(2 + size, 4 + size)));
-  heard.payload = body.toString("utf8", 2 + size + (qos ? 2 : 0));
-  console.log(JSON.stringify(heard));
+  received.payload = body.toString("utf8", 2 + size + (qos ? 2 : 0));
+  console.log(JSON.stringify(received));
 }

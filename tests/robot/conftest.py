@@ -12,36 +12,36 @@ from tests.robot.rig import BASE, Rig
 
 
 @dataclass
-class Seat:
+class Station:
     """A robot and an operator who drives it from one of its brokers."""
 
     rig: Rig
     operator: Operator
 
 
-def _seat(wiring: str) -> Iterator[Seat]:
+def _station(wiring: str) -> Iterator[Station]:
     if wiring == "mirror":
         with Rig("zenoh", mirror=True) as rig:
             assert rig.local is not None
             operator = Operator(rig.local.port, BASE)
             operator.wait_for("outgoing/status")
-            yield Seat(rig, operator)
+            yield Station(rig, operator)
             operator.close()
     else:
         with Rig(wiring) as rig:
-            yield Seat(rig, rig.operator)
+            yield Station(rig, rig.operator)
 
 
 @pytest.fixture(scope="module", params=["mqtt", "zenoh", "single", "mirror"])
-def seat(request: pytest.FixtureRequest) -> Iterator[Seat]:
-    """Whatever the operator sits at: the remote broker, the one and only broker, or a Zenoh robot's local broker."""
-    yield from _seat(request.param)
+def station(request: pytest.FixtureRequest) -> Iterator[Station]:
+    """An operator at the remote broker, at the only broker, or at the local broker of a Zenoh robot."""
+    yield from _station(request.param)
 
 
 @pytest.fixture(scope="module", params=["mqtt", "zenoh", "single"])
-def uplinked(request: pytest.FixtureRequest) -> Iterator[Seat]:
-    """What concerns the way to the remote broker: heartbeat, wills, uplink."""
-    yield from _seat(request.param)
+def uplinked(request: pytest.FixtureRequest) -> Iterator[Station]:
+    """Only robots with an uplink to a remote broker: for tests of heartbeat, wills and uplink."""
+    yield from _station(request.param)
 
 
 @pytest.fixture(scope="module", params=["mqtt", "zenoh"])

@@ -1,4 +1,4 @@
-"""An operator made of nothing but a stock MQTT client and the contract: no code of ours between it and the wire."""
+"""An operator that is a stock MQTT client plus the contract, without any code of Pebble."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support import until
 
 
 @dataclass(frozen=True)
-class Seen:
+class ReceivedMessage:
     """One message as the operator received it."""
 
     at: float  # time.monotonic()
@@ -29,11 +29,11 @@ class Seen:
 
 
 class Operator:
-    """Connects to one broker, listens to one robot, remembers what it saw, and sends what it is told."""
+    """Connects to one broker, subscribes to one robot, records every message, and publishes on request."""
 
     def __init__(self, port: int, base: str) -> None:
         self.base = base
-        self.seen: list[Seen] = []
+        self.seen: list[ReceivedMessage] = []
         self._client = paho.Client(CallbackAPIVersion.VERSION2)
         self._client.on_connect = self._subscribe
         self._client.on_message = self._remember
@@ -47,7 +47,7 @@ class Operator:
         self._client.loop_stop()
 
     def drop(self) -> None:
-        """Vanish without a goodbye, as a laptop that is shut does."""
+        """Close the socket without DISCONNECT, as when a laptop is shut."""
         self._client.loop_stop()
         sock = self._client.socket()
         if sock is not None:
@@ -58,15 +58,15 @@ class Operator:
         raw = body if isinstance(body, bytes) else json.dumps(body).encode()
         self._client.publish(f"{self.base}/{suffix}", raw, qos=qos, retain=retain)
 
-    def on(self, suffix: str, since: float = 0.0) -> list[Seen]:
+    def on(self, suffix: str, since: float = 0.0) -> list[ReceivedMessage]:
         """Everything seen on one topic after ``since`` (monotonic)."""
         return [seen for seen in list(self.seen) if seen.topic == f"{self.base}/{suffix}" and seen.at >= since]
 
-    def last(self, suffix: str) -> Seen | None:
+    def last(self, suffix: str) -> ReceivedMessage | None:
         seen = self.on(suffix)
         return seen[-1] if seen else None
 
-    def wait_for(self, suffix: str, timeout: float = 10.0, since: float = 0.0) -> Seen:
+    def wait_for(self, suffix: str, timeout: float = 10.0, since: float = 0.0) -> ReceivedMessage:
         """The first message on a topic after ``since``; fails when none comes in time."""
         assert until(lambda: self.on(suffix, since), timeout), f"nothing on {suffix} within {timeout} s"
         return self.on(suffix, since)[0]
@@ -75,18 +75,18 @@ class Operator:
         client.subscribe(f"{self.base}/#", qos=1)
 
     def _remember(self, _client: paho.Client, _data: Any, message: paho.MQTTMessage) -> None:
-        self.seen.append(Seen(time.monotonic(), message.topic, bytes(message.payload), bool(message.retain)))
+        self.seen.append(ReceivedMessage(time.monotonic(), message.topic, bytes(message.payload), bool(message.retain)))
 
 
-def kept_copies(port: int, base: str, settle_s: float = 0.5) -> dict[str, bytes]:
-    """What a late operator finds below ``base``: kept copies only, by suffix."""
+def retained_messages(port: int, base: str, wait_s: float = 0.5) -> dict[str, bytes]:
+    """The retained messages below ``base`` that a late subscriber receives, by suffix."""
     late = Operator(port, base)
-    time.sleep(settle_s)  # nothing announces that the last kept copy has come
+    time.sleep(wait_s)  # nothing announces the last retained message
     late.close()
     return {seen.topic.removeprefix(f"{base}/"): seen.payload for seen in late.seen if seen.retain}
 
 
-# -- numbered driving: every command is told apart by what it makes the wheels do
+# -- numbered driving: each command sets the wheels to values of its own
 
 _STEPS = 800  # wheel values 0.100 … 0.899, three decimals as on the serial line
 

@@ -1,4 +1,4 @@
-"""A whole robot as real processes, to be looked at from outside only: the remote broker and the MCU's pty."""
+"""A whole robot as real processes, observed only from outside: at the remote broker and at the MCU's pty."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+from pebble.bench.usage import children
 from pebble.simulation.trace import Entry, read_trace
-from tests.link import Link
 from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, gone, until
+from tests.tcp_proxy import TcpProxy
 
 BASE = "pebble/robots/rover"
 STOP = (0.0, 0.0)
@@ -32,7 +33,7 @@ DEVICES = {
 
 
 class Mcu:
-    """The simulated motor MCU in its own process, and the trace of what it was told."""
+    """The simulated motor MCU in its own process, and the trace of what it received."""
 
     def __init__(self, folder: Path, kind: str = "goob") -> None:
         self.port, self._trace = folder / "tty", folder / "trace.jsonl"
@@ -43,10 +44,10 @@ class Mcu:
         )  # fmt: skip
         assert until(self.port.exists, 10), "the simulated MCU did not start"
 
-    def tell(self, word: str) -> None:
+    def command(self, name: str) -> None:
         """``unplug``, ``replug``, ``charge``, …"""
         assert self._process.stdin is not None
-        self._process.stdin.write(f"{word}\n".encode())
+        self._process.stdin.write(f"{name}\n".encode())
         self._process.stdin.flush()
 
     def entries(self, since: float = 0.0) -> list[Entry]:
@@ -69,8 +70,9 @@ class Mcu:
 class Rig:
     """Brokers, MCU, robot and operator. ``kind`` is ``mqtt``, ``zenoh`` or ``single`` (one broker for both sides).
 
-    The way to the remote broker leads through ``uplink``, which can fail; ``direct`` goes without it, because a program
-    in between answers TCP in the robot's place and so changes the timing.
+    The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
+    the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
+    replace its own brokers; ``login`` is the robot's user name there.
     """
 
     def __init__(
@@ -81,15 +83,19 @@ class Rig:
         mcu: str = "goob",
         start: bool = True,
         direct: bool = False,
+        remote: Broker | None = None,
+        local: Broker | None = None,
+        login: str | None = None,
         **config: Any,
     ) -> None:
         self.kind, self._extra, self._direct = kind, config, direct
-        self.charge_later = "charge"  # what to tell the MCU in the middle of a fault
+        self._login = {} if login is None else {"username": login}
+        self.charge_later = "charge"  # the MCU command in the middle of a fault
         self._folder = tempfile.TemporaryDirectory(prefix="pbl")
         self.folder = Path(self._folder.name)
-        self.remote = Broker(self.folder)
-        self.uplink = Link(self.remote.port)
-        self.local = Broker(self.folder) if kind == "mqtt" or mirror else None
+        self.remote = remote or Broker(self.folder)
+        self.uplink = TcpProxy(self.remote.port)
+        self.local = local or Broker(self.folder) if kind == "mqtt" or mirror else None
         self.mirror = mirror
         self.mcu = Mcu(self.folder, mcu)
         self.config = self.folder / "robot.json"
@@ -101,7 +107,7 @@ class Rig:
             try:
                 self.start()
             except BaseException:
-                self.close()  # nobody else can: there is no rig yet
+                self.close()  # the caller cannot: it has no rig yet
                 raise
 
     def __enter__(self) -> Rig:
@@ -124,11 +130,11 @@ class Rig:
         return began
 
     def wait_until_up(self, since: float, timeout: float = 15.0) -> None:
-        """Every service says ready, and the heart beats."""
+        """Every service is ready, and heartbeats arrive."""
         assert until(lambda: self._up(since), timeout), f"the robot is not up:\n{self.log.read_text()[-4000:]}"
 
     def stop(self) -> int:
-        """Stop the robot politely; returns the launcher's exit code."""
+        """Stop the robot with SIGTERM; returns the launcher's exit code."""
         assert self._robot is not None
         self._robot.send_signal(signal.SIGTERM)
         return self._robot.wait(20)
@@ -142,7 +148,7 @@ class Rig:
         return children
 
     def processes(self) -> dict[str, int]:
-        """The launcher's children by program: ``{"mqtt_bridge": pid, …}``."""
+        """The launcher's children by program name: ``{"mqtt_bridge": pid, …}``."""
         assert self._robot is not None
         task = Path(f"/proc/{self._robot.pid}/task/{self._robot.pid}/children")
         named = ((_program(pid), pid) for pid in map(int, task.read_text().split()))
@@ -160,7 +166,7 @@ class Rig:
         return time.monotonic()
 
     def kill_local_broker(self) -> None:
-        """The robot's own broker dies, is away for a second, and has forgotten everything."""
+        """Kill the robot's own broker; it starts again after a second, without its retained messages."""
         assert self.local is not None
         self.local.kill()
         time.sleep(1)
@@ -198,6 +204,7 @@ class Rig:
                 "remote_mqtt": {
                     "host": "127.0.0.1",
                     "port": self.remote.port if self._direct else self.uplink.port,
+                    **self._login,
                 },
                 **self._actions(),
             },
@@ -213,16 +220,20 @@ class Rig:
 
     def _transport(self) -> dict[str, Any]:
         if self.kind == "zenoh":
-            own: dict[str, Any] = {"kind": "zenoh", "run_dir": str(self.folder / "run")}
+            own: dict[str, Any] = {
+                "kind": "zenoh",
+                "run_dir": str(self.folder / "run"),
+                "state_dir": str(self.folder / "state"),
+            }
             if self.mirror:
                 assert self.local is not None
                 own["mqtt_mirror"] = {"host": "127.0.0.1", "port": self.local.port}
             return {"transport": own}
-        # localhost here and 127.0.0.1 there: one broker under two names must be recognised, too
+        # localhost here and 127.0.0.1 there: one broker under two names must be recognised
         port = self.remote.port if self.kind == "single" or self.local is None else self.local.port
         return {
-            "local_mqtt": {"host": "localhost", "port": port},
-            "transport": {"kind": "mqtt", "run_dir": str(self.folder / "run")},
+            "local_mqtt": {"host": "localhost", "port": port, **self._login},
+            "transport": {"kind": "mqtt", "run_dir": str(self.folder / "run"), "state_dir": str(self.folder / "state")},
         }
 
     def recorded(self) -> list[str]:
@@ -240,7 +251,12 @@ class Rig:
 def _program(pid: int) -> str:
     """What a child of the launcher is; "" if it has just ended. The kernel knows the first 15 bytes of its name."""
     try:
-        said = Path(f"/proc/{pid}/comm").read_text().strip()
+        comm = Path(f"/proc/{pid}/comm").read_text().strip()
     except FileNotFoundError:
         return ""
-    return next((name for name in PROGRAMS if name[:15] == said), said)
+    return next((name for name in PROGRAMS if name[:15] == comm), comm)
+
+
+def descendants(pid: int) -> list[int]:
+    """The processes that ``pid`` and its descendants have started and that still run."""
+    return [found for child in children(pid) for found in (child, *descendants(child))]

@@ -1,4 +1,4 @@
-"""Whole robots driven for a moment by ``pebble bench bridge``, and what it reports."""
+"""Short runs of ``pebble bench bridge`` with whole robots, and their results."""
 
 import io
 import os
@@ -17,8 +17,7 @@ from pebble.bench.bridge_robot import KINDS
 from pebble.bench.results import Cell, load
 from pebble.bench.usage import children
 from pebble.errors import PebbleError
-from tests.robot.rig import Rig
-from tests.robot.test_bench_robot import descendants
+from tests.robot.rig import Rig, descendants
 from tests.support import until
 
 pytestmark = pytest.mark.alone
@@ -27,17 +26,17 @@ pytestmark = pytest.mark.alone
 @pytest.fixture(autouse=True)
 def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output, "find_spec", lambda _name: None)  # pictures have tests of their own
-    monkeypatch.setattr(bridge, "_SETTLE_S", 0.2)
-    monkeypatch.setattr(bridge, "_MEDIA_SETTLE_S", 0.0)
-    monkeypatch.setattr(bridge_null, "_SETTLE_S", 0.5)  # the serial port is open, and the pilot quick
+    monkeypatch.setattr(bridge, "_STARTUP_S", 0.2)
+    monkeypatch.setattr(bridge, "_MEDIA_STARTUP_S", 0.0)
+    monkeypatch.setattr(bridge_null, "_STARTUP_S", 0.5)  # the serial port is open, and the pilot quick
     monkeypatch.setattr(bridge_null, "_PILOT_S", 0.2)
-    monkeypatch.setattr(bridge_profile, "_SETTLE_S", 0.2)
+    monkeypatch.setattr(bridge_profile, "_STARTUP_S", 0.2)
 
 
 def test_both_robots_are_driven_also_with_media_and_leave_nothing(tmp_path: Path) -> None:
-    said = io.StringIO()
+    printed = io.StringIO()
     wanted = plan(Mode.MEDIA, quick=True, rounds=1, seconds=0.4, output=tmp_path)
-    assert bridge.run(wanted, Console(file=said, width=120)) == 0
+    assert bridge.run(wanted, Console(file=printed, width=120)) == 0
     results = load(tmp_path / "bridge.json")
     robots = {(kind, load_, way) for kind in KINDS for load_ in ("none", "media") for way in ("down", "up")}
     assert {_name(cell) for cell in results.cells} == {*robots, ("one hop", "none", "down")}
@@ -45,8 +44,8 @@ def test_both_robots_are_driven_also_with_media_and_leave_nothing(tmp_path: Path
     assert all(min(cell.samples) > 0 for cell in results.cells)
     assert all(cell.figures[f"{flow}_per_s"] for cell in results.cells if _name(cell)[1] == "media" for flow in FLOWS)
     assert (results.quick, results.command[:3]) == (True, ["pebble", "bench", "bridge"])
-    assert "zenoh" in said.getvalue()
-    assert any(line.startswith("aim: ") for line in results.verdict)
+    assert "zenoh" in printed.getvalue()
+    assert any(line.startswith("aim: ") for line in results.assessment)
     assert children(os.getpid()) == []
 
 
@@ -60,29 +59,29 @@ def test_one_robot_is_compared_with_itself(tmp_path: Path) -> None:
     results = load(tmp_path / "bridge-null.json")
     assert [cell.variant for cell in results.cells] == ["zenoh", "zenoh again", "zenoh +20 %"]
     assert [len(cell.rounds) for cell in results.cells] == [2, 2, 2]
-    assert any("turns of one running robot" in line for line in results.verdict)
+    assert any("turns of one running robot" in line for line in results.assessment)
 
 
-def test_commands_are_followed_hop_by_hop(tmp_path: Path) -> None:
-    said = io.StringIO()
+def test_commands_are_traced_hop_by_hop(tmp_path: Path) -> None:
+    printed = io.StringIO()
     wanted = plan(Mode.PROFILE, rounds=1, seconds=0.3, output=tmp_path)
     if os.geteuid() != 0:
         with pytest.raises(PebbleError, match="listens on loopback, which takes root: run it with sudo"):
-            bridge_profile.run(wanted, Console(file=said, width=100))
+            bridge_profile.run(wanted, Console(file=printed, width=100))
         return
-    assert bridge_profile.run(wanted, Console(file=said, width=100)) == 0
+    assert bridge_profile.run(wanted, Console(file=printed, width=100)) == 0
     results = load(tmp_path / "bridge-profile.json")
-    assert "robot's broker" in said.getvalue()
+    assert "robot's broker" in printed.getvalue()
     for cell in results.cells:
         assert min(cell.samples) > 0, cell.params
 
 
-def test_ctrl_c_ends_it_in_order(tmp_path: Path) -> None:
+def test_ctrl_c_ends_all_processes(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pebble.cli", "bench", "bridge", "--output", str(tmp_path / "results")]
     folders = tmp_path / "folders"
     folders.mkdir()
     with subprocess.Popen(command, env={**os.environ, "TMPDIR": str(folders)}, stdout=subprocess.DEVNULL) as program:
-        assert until(lambda: len(list(folders.glob("*/run/*"))) > 0, 30)  # a robot is there
+        assert until(lambda: len(list(folders.glob("*/run/*"))) > 0, 30)  # a robot has started
         left = descendants(program.pid)
         program.send_signal(signal.SIGINT)
         assert program.wait(30) != 0

@@ -1,4 +1,4 @@
-"""Whole robots are launched and weighed for a moment, and leave nothing behind."""
+"""Short runs of startup and cost with whole robots, which leave nothing behind."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pebble.bench import cost, cost_robot, startup
 from pebble.bench.bridge_robot import KINDS
 from pebble.bench.results import load
 from pebble.bench.usage import children
-from tests.robot.rig import Rig
+from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, Child, until
 
 pytestmark = pytest.mark.alone  # whole robots
@@ -23,13 +23,15 @@ pytestmark = pytest.mark.alone  # whole robots
 
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They have tests of their own, and take as long as a robot."""
+    """Plots have tests of their own, and take as long as a robot."""
     monkeypatch.setattr("pebble.bench.plots.draw", lambda *_: [])
 
 
 def test_startup_of_both_kinds(tmp_path: Path) -> None:
-    said = io.StringIO()
-    assert startup.run(startup.Plan(rounds=1, quick=True, output=tmp_path), Console(file=said, width=100)) == 0
+    printed = io.StringIO()
+    assert (
+        startup.run(startup.StartupPlan(rounds=1, quick=True, output=tmp_path), Console(file=printed, width=100)) == 0
+    )
     results = load(tmp_path / "startup.json")
     assert (results.bench, results.quick) == ("startup", True)
     assert results.command == ["pebble", "bench", "startup", "--rounds", "1", "--quick"]
@@ -37,21 +39,21 @@ def test_startup_of_both_kinds(tmp_path: Path) -> None:
         (measure.name, kind) for measure in startup.MEASURES for kind in KINDS
     }
     for kind in KINDS:
-        beat, ready, obeyed, operator, paho, service = (
+        heartbeat, ready, obeyed, operator, paho, service = (
             cell for measure in startup.MEASURES if (cell := results.find(kind, measure.name)) is not None
         )
-        assert all(0 < cell.samples[0] < 60 for cell in (beat, ready, obeyed))
+        assert all(0 < cell.samples[0] < 60 for cell in (heartbeat, ready, obeyed))
         assert all(len(cell.samples) == startup.QUICK_JOINS for cell in (operator, paho, service))
         assert all(cell.figures["topics"] for cell in (operator, paho, service))
-    assert "first drive obeyed" in said.getvalue()
+    assert "first drive obeyed" in printed.getvalue()
     assert children(os.getpid()) == []
 
 
 def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost_robot, "_SETTLE_S", 0.0)
-    said = io.StringIO()
-    plan = cost.Plan(rounds=1, seconds=0.4, quick=True, output=tmp_path)
-    assert cost.run(plan, Console(file=said, width=100)) == 0
+    monkeypatch.setattr(cost_robot, "_STARTUP_S", 0.0)
+    printed = io.StringIO()
+    plan = cost.CostPlan(rounds=1, seconds=0.4, quick=True, output=tmp_path)
+    assert cost.run(plan, Console(file=printed, width=100)) == 0
     results = load(tmp_path / "cost.json")
     assert results.command == ["pebble", "bench", "cost", "--rounds", "1", "--seconds", "0.4", "--quick"]
     for kind, own in (("mqtt", "mosquitto"), ("zenoh", "zenoh_hub")):
@@ -87,7 +89,3 @@ def test_the_end_of_a_command_ends_its_robots(tmp_path: Path) -> None:
         assert bench.wait(60) == 130
     assert until(lambda: not any(map(Rig.alive, started)), 10)
     assert not (tmp_path / "startup.json").exists()
-
-
-def descendants(pid: int) -> list[int]:
-    return [found for child in children(pid) for found in (child, *descendants(child))]

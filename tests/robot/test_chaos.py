@@ -1,4 +1,4 @@
-"""Several processes stand still at once, as on a machine that swaps, while the uplink fails and somebody drives."""
+"""Several processes stand still at once, as on a machine that swaps, while the uplink fails and an operator drives."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def stand_still(pid: int, seconds: float) -> None:
         os.kill(pid, signal.SIGCONT)
 
 
-def a_hole(rig: Rig, seconds: float) -> None:
-    rig.uplink.hole()
+def a_blackhole(rig: Rig, seconds: float) -> None:
+    rig.uplink.blackhole()
     time.sleep(seconds)
     rig.uplink.resume()
 
 
 def faults(rig: Rig) -> dict[str, Callable[[float], None]]:
-    """What can happen for some seconds, but for the serial bridge: nobody else can stop the wheels."""
+    """What can happen for some seconds, except to the serial bridge: only it can stop the wheels."""
 
     def still(pid: int) -> Callable[[float], None]:
         return lambda seconds: stand_still(pid, seconds)
@@ -45,7 +45,7 @@ def faults(rig: Rig) -> dict[str, Callable[[float], None]]:
     pids = {name: pid for name, pid in rig.processes().items() if name != "serial_mcu_bridge"}
     brokers = {"remote broker": rig.remote.pid} | ({} if rig.local is None else {"local broker": rig.local.pid})
     return {
-        "uplink": lambda seconds: a_hole(rig, seconds),
+        "uplink": lambda seconds: a_blackhole(rig, seconds),
         **{name: still(pid) for name, pid in sorted((pids | brokers).items())},
     }
 

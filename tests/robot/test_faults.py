@@ -1,4 +1,4 @@
-"""Things break while somebody drives: the wheels stop in time, nothing old ever moves them, and driving comes back."""
+"""Faults while an operator drives: the wheels stop in time, no stale command moves them, and driving resumes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from tests.robot.operator import Driver, Operator, kept_copies, number_of
+from tests.robot.operator import Driver, Operator, number_of, retained_messages
 from tests.robot.rig import BASE, STOP, Rig
 from tests.support import until
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 
 STOP_LIMIT_S = 0.85  # after the last command seen at the pty
 AGE_LIMIT_S = 2.5  # no older command ever reaches the pty
-BACK_LIMIT_S = 5.0  # after the fault's end somebody can drive again
+BACK_LIMIT_S = 5.0  # after the fault's end commands reach the wheels again
 
 _numbers = itertools.count(1, 2000)
 _drivers: list[Driver] = []
@@ -35,7 +35,7 @@ class Drive:
         assert until(lambda: rig.mcu.moving(self.began), 5), "the robot did not even start to move"
 
     def end(self, fault_over: float) -> None:
-        """Commands sent after the fault get through soon; then the driver falls silent."""
+        """Commands sent after the fault get through soon; then the driver stops sending."""
         assert until(lambda: self._arrived_after(fault_over), BACK_LIMIT_S), "no driving within 5 s of the fault's end"
         assert min(at for at, _ in self._commands(fault_over)) - fault_over <= BACK_LIMIT_S
         self.finish()
@@ -66,8 +66,8 @@ class Drive:
 
 
 @pytest.fixture(autouse=True)
-def kept_state_is_right_afterwards(driven: Rig) -> Iterator[None]:
-    """Whatever happened: a late operator finds all kept state, and none of it is old."""
+def retained_state_is_current_afterwards(driven: Rig) -> Iterator[None]:
+    """After every fault a late subscriber finds all retained state, and all of it is current."""
     charging = (
         driven.operator.last("outgoing/charging-status") or driven.operator.wait_for("outgoing/charging-status")
     ).json
@@ -76,19 +76,19 @@ def kept_state_is_right_afterwards(driven: Rig) -> Iterator[None]:
     yield
     for driver in _drivers:  # of a test that failed half-way
         driver.stop()
-    assert until(lambda: _kept_is_current(driven, change), 10), kept_copies(driven.remote.port, BASE)
+    assert until(lambda: _retained_is_current(driven, change), 10), retained_messages(driven.remote.port, BASE)
 
 
-def _kept_is_current(rig: Rig, charging: bool) -> bool:
-    kept = {topic: json.loads(raw) for topic, raw in kept_copies(rig.remote.port, BASE, 0.3).items()}
-    services = kept.get("outgoing/status", {}).get("value", {}).get("services", {})
+def _retained_is_current(rig: Rig, charging: bool) -> bool:
+    retained = {topic: json.loads(raw) for topic, raw in retained_messages(rig.remote.port, BASE, 0.3).items()}
+    services = retained.get("outgoing/status", {}).get("value", {}).get("services", {})
     return (
-        kept.get("outgoing/charging-status") == {"value": charging}
-        and "outgoing/capabilities" in kept
+        retained.get("outgoing/charging-status") == {"value": charging}
+        and "outgoing/capabilities" in retained
         and bool(services)
         and {service["state"] for service in services.values()} == {"ready"}
-        and abs(kept["outgoing/online"]["t"] / 1000 - time.time()) < 2
-        and kept["outgoing/online"].get("online") is not False
+        and abs(retained["outgoing/online"]["t"] / 1000 - time.time()) < 2
+        and retained["outgoing/online"].get("online") is not False
     )
 
 
@@ -96,7 +96,7 @@ def _kept_is_current(rig: Rig, charging: bool) -> bool:
 def fault(rig: Rig) -> Iterator[None]:
     """The time of the fault; what the MCU reports changes in the middle of it."""
     yield
-    rig.mcu.tell(rig.charge_later)
+    rig.mcu.command(rig.charge_later)
 
 
 def test_serial_bridge_killed(driven: Rig) -> None:
@@ -122,11 +122,11 @@ def test_another_process_killed(driven: Rig, program: str) -> None:
     drive.check_stops()
 
 
-def test_fabric_killed(driven: Rig) -> None:
-    """The local broker dies and comes back; on Zenoh, the hub, whose death nobody who drives should notice."""
+def test_local_transport_killed(driven: Rig) -> None:
+    """The local broker is killed and restarted; on Zenoh the hub, whose death must not interrupt driving."""
     drive = Drive(driven)
     with fault(driven):
-        back = _kill_fabric(driven)
+        back = _kill_local_transport(driven)
     drive.end(back)
     drive.check_stops()
 
@@ -144,7 +144,7 @@ def test_remote_broker_restarted(driven: Rig) -> None:
 def test_uplink_cut(driven: Rig, seconds: float) -> None:
     drive = Drive(driven)
     with fault(driven):
-        driven.uplink.hole()
+        driven.uplink.blackhole()
         time.sleep(seconds / 2)
     time.sleep(seconds / 2)
     driven.uplink.resume()
@@ -156,15 +156,15 @@ def test_uplink_cut_and_the_operator_dies_meanwhile(driven: Rig) -> None:
     operator = Operator(driven.remote.port, BASE)
     drive = Drive(driven, operator)
     with fault(driven):
-        driven.uplink.hole()
+        driven.uplink.blackhole()
         time.sleep(1)
     drive.driver.stop()
     operator.drop()
     time.sleep(2)
     restored = time.monotonic()
     driven.uplink.resume()
-    beat_again = driven.operator.wait_for("outgoing/online", since=restored + 0.5)
-    assert not driven.mcu.moving(beat_again.at)
+    heartbeat = driven.operator.wait_for("outgoing/online", since=restored + 0.5)
+    assert not driven.mcu.moving(heartbeat.at)
     drive.finish()
     drive.check_stops()
 
@@ -173,10 +173,10 @@ def test_serial_port_unplugged(driven: Rig) -> None:
     drive = Drive(driven)
     with fault(driven):
         unplugged = time.monotonic()
-        driven.mcu.tell("unplug")
+        driven.mcu.command("unplug")
         time.sleep(3)
         replugged = time.monotonic()
-        driven.mcu.tell("replug")
+        driven.mcu.command("replug")
     drive.end(replugged)
     first_at, first_wheels = driven.mcu.drives(replugged)[0]
     assert first_wheels == STOP
@@ -205,7 +205,7 @@ def _opened(rig: Rig, since: float) -> float:
     return next((entry.ns / 1e9 for entry in rig.mcu.entries(since) if entry.event == "opened"), 0.0)
 
 
-def _kill_fabric(rig: Rig) -> float:
+def _kill_local_transport(rig: Rig) -> float:
     kill: Callable[[], object] = rig.kill_local_broker if rig.local is not None else lambda: rig.kill("zenoh_hub")
     kill()
     return time.monotonic()

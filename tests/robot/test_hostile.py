@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
-from pebble.contract import CHANNELS, INCOMING, Channel
-from pebble.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, MediaRequest, SoundboardCommand
+from pebble.contract import CHANNELS, ESTOP, INCOMING, Channel
+from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, MediaRequest, SoundboardCommand
 from pebble.services.mqtt_bridge.service import MqttBridge
-from pebble.services.serial_mcu_bridge.service import SerialMcuBridge
+from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.robot.rig import Rig
 from tests.support import until
 
@@ -30,13 +30,13 @@ CHUNK = 800  # messages before waiting for a sign that the robot has read them: 
 LINES = 400  # the same for lines: together fewer bytes than may wait unread
 
 
-# -- an oracle of its own: what the contract accepts, written with nothing but the standard library
+# -- an independent oracle: what the contract accepts, written with nothing but the standard library
 
 
 def valid(channel: Channel, raw: bytes) -> bool:
-    """Might this do something? Generous: everything doubtful counts as valid and is not sent."""
+    """Could this have an effect? What is doubtful counts as valid and is not sent."""
     if channel.payload is bool and not raw:
-        return True  # takes a kept flag away
+        return True  # removes a retained flag
     try:
         body = json.loads(raw.decode())
     except (ValueError, RecursionError):
@@ -111,9 +111,14 @@ def _oversized(chance: random.Random) -> bytes:
 _KINDS = (_noise, _wrong_number, _nested, _scalar, _broken_utf8, _truncated, _oversized)
 
 STOP = b"M 0.000 0.000\n"
-SERVICES = (MqttBridge, SerialMcuBridge)
+SERVICES = (MqttBridge, MotorBridge)
 
-_TARGETS = [channel for channel in CHANNELS if channel.direction == INCOMING and channel.payload is not bytes]
+#: Without emergency stops: there garbage is a stop, too (tests/services/serial_mcu_bridge).
+_TARGETS = [
+    channel
+    for channel in CHANNELS
+    if channel.direction == INCOMING and channel.payload is not bytes and channel is not ESTOP
+]
 
 
 @pytest.fixture(params=["mqtt", "zenoh"])
@@ -132,7 +137,7 @@ def test_malformed_messages(rig: Rig) -> None:
             topic = channel.suffix.format(uid="u", name="n", outlet="o1")
             sent[channel.metric] += 1
             rig.operator.send(topic, garbage(channel, chance), qos=0)
-        assert _listens(rig, first / MESSAGES), f"deaf after {first + CHUNK} messages"
+        assert _still_responds(rig, first / MESSAGES), f"no response after {first + CHUNK} messages"
     assert rig.processes() == processes
     assert not rig.mcu.moving(began)
     assert rig.recorded() == []
@@ -140,8 +145,13 @@ def test_malformed_messages(rig: Rig) -> None:
     assert until(lambda: any("refused" in seen.json["message"] for seen in rig.operator.on("outgoing/logs", began)), 10)
     assert rig.stop() == 0
     refused = _totals(rig, "refused in all")
-    heard = {channel.metric for service in SERVICES for channel in service.handles()}
-    assert refused == {metric: number for metric, number in sent.items() if metric in heard}
+    received = {channel.metric for service in SERVICES for channel in service.handles()}
+    expected = {metric: number for metric, number in sent.items() if metric in received}
+    assert refused.keys() == expected.keys()
+    # QoS 0: a connection that is reset on a busy machine loses what is on its way. A kind of garbage that was accepted
+    # would be a seventh of a channel's messages.
+    lost = {metric: number - refused[metric] for metric, number in expected.items()}
+    assert all(0 <= lost[metric] < 0.02 * number for metric, number in expected.items()), lost
 
 
 @pytest.mark.timeout(180)
@@ -150,7 +160,7 @@ def test_garbage_lines(rig: Rig) -> None:
     """Written by something at the other end of the line, as fast as the host reads."""
     chance = random.Random(11)
     processes, memory, began = rig.processes(), _memory(rig), time.monotonic()
-    rig.mcu.tell("unplug")
+    rig.mcu.command("unplug")
     master, slave = os.openpty()
     tty.setraw(slave)
     assert until(lambda: not rig.mcu.port.is_symlink(), 5)
@@ -165,37 +175,37 @@ def test_garbage_lines(rig: Rig) -> None:
         lines += sum(bool(line.strip()) for line in rubbish.split(b"\n"))
         answers += _write(master, rubbish + _good_line(number))
         assert until(lambda: _touched(rig) == number, 10), "a good line behind all the bad ones is not read"  # noqa: B023
-    assert answers.startswith(STOP)
-    assert set(answers.splitlines()) == {STOP.strip()}
+    assert answers.startswith(b"\n" + STOP), "the first line ends whatever half a line is at the other end, and stops"
+    assert set(answers.splitlines()) == {b"", STOP.strip()}
     rig.mcu.port.unlink()
     os.close(slave)
     os.close(master)
-    rig.mcu.tell("replug")
-    assert until(lambda: _listens(rig, 0.5), 10)
+    rig.mcu.command("replug")
+    assert until(lambda: _still_responds(rig, 0.5), 10)
     assert rig.processes() == processes
     assert not rig.mcu.moving(began)
     assert _memory(rig) - memory < 30 * 1024
     assert rig.recorded() == []
     assert rig.stop() == 0
-    counted = sum(_totals(rig, "no report").values())
-    assert lines <= counted < lines + 10  # the simulated MCU has said a few words, too
+    counted = sum(_totals(rig, "log lines of the MCU").values())
+    assert lines <= counted < lines + 10  # the simulated MCU has sent a few lines, too
 
 
 def a_report(line: bytes) -> bool:
-    """Might the host take this for a measurement? Generous: any field that is a short number."""
+    """Could the host parse this as a measurement? Any field that is a short number counts."""
     values = [field.partition(b"=")[2] for field in line.split()]
     return any(value and len(value) < 20 and not value.strip(b"+-.0123456789") for value in values)
 
 
 def garbage_line(chance: random.Random) -> bytes:
-    """What a broken, confused or malicious MCU might say."""
+    """A line that a broken or malicious MCU might send."""
     while True:
-        said = _babble(chance)
-        if not any(map(a_report, said.split(b"\n"))):
-            return said
+        line = _random_line(chance)
+        if not any(map(a_report, line.split(b"\n"))):
+            return line
 
 
-def _babble(chance: random.Random) -> bytes:
+def _random_line(chance: random.Random) -> bytes:
     junk = chance.randbytes(chance.randrange(0, 40))
     value = chance.choice([b"nan", b"inf", b"1e999", b"-", b"", b"9" * 300, b"0x10", junk])
     return chance.choice(
@@ -212,20 +222,20 @@ def _babble(chance: random.Random) -> bytes:
 
 
 def _write(master: int, data: bytes) -> bytes:
-    """Push ``data`` into the line; returns what the host said meanwhile. Fails if the host stops reading."""
-    heard, deadline = b"", time.monotonic() + 30
+    """Push ``data`` into the line; returns what the host sent meanwhile. Fails if the host stops reading."""
+    received, deadline = b"", time.monotonic() + 30
     os.set_blocking(master, False)
     while data:
         assert time.monotonic() < deadline, "the host has stopped reading the line"
         readable, writable, _ = select.select([master], [master], [], 1)
         if readable:
-            heard += os.read(master, 65536)
+            received += os.read(master, 65536)
         if writable:
             data = data[os.write(master, data[:4096]) :]
-    return heard
+    return received
 
 
-def _listens(rig: Rig, shade: float) -> bool:
+def _still_responds(rig: Rig, shade: float) -> bool:
     """A good message behind all the bad ones still arrives."""
     began = time.monotonic()
     rig.operator.send("incoming/lights-solid", {"g": round(shade, 3)})
@@ -243,9 +253,9 @@ def _touched(rig: Rig) -> int | None:
 
 
 def _totals(rig: Rig, text: str) -> dict[str, int]:
-    """The sums in the last words of all services that say ``text`` and a dictionary."""
-    said = re.findall(text + r"[^{\n]*(\{.*?\})", rig.log.read_text())
-    return dict(sum((Counter[str](ast.literal_eval(totals)) for totals in said), Counter[str]()))
+    """The sums over all services of the dictionaries that they log after ``text`` when they stop."""
+    logged = re.findall(text + r"[^{\n]*(\{.*?\})", rig.log.read_text())
+    return dict(sum((Counter[str](ast.literal_eval(totals)) for totals in logged), Counter[str]()))
 
 
 def _memory(rig: Rig) -> int:

@@ -1,4 +1,4 @@
-"""One short trial of whole robots over each kind of link, and an interrupted one: nothing stays behind."""
+"""One short trial of whole robots over each kind of network, and an interrupted one: nothing is left behind."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from pebble.bench.impair import cells
+from pebble.bench.impair.messages import TrialRequest
+from pebble.bench.impair.network import why_no_namespaces
+from pebble.bench.impair.plan import ImpairPlan
+from pebble.bench.impair.run import run
 from pebble.bench.results import load
 from pebble.bench.usage import children
-from pebble.impair import cells
-from pebble.impair.link import why_no_namespaces
-from pebble.impair.messages import Order
-from pebble.impair.plan import Plan
-from pebble.impair.run import run
-from tests.robot.rig import Rig
+from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, until
 
 pytestmark = pytest.mark.alone  # whole robots
@@ -29,26 +29,28 @@ SHORT = {"alone_s": 0.3, "window_s": 1.0, "grace_s": 0.2}
 
 @pytest.fixture
 def permitted(kind: str) -> None:
-    """Skips namespaces where there are none: they are made to find out."""
+    """Skips namespaces without permission; checked by creating them."""
     if kind == "namespaces" and (obstacle := why_no_namespaces()):
         pytest.skip(f"no namespaces: {obstacle}")
 
 
 @pytest.mark.usefixtures("permitted")
 @pytest.mark.parametrize(("kind", "subject"), [("namespaces", "mqtt original"), ("proxy", "zenoh h264 opus")])
-def test_a_robot_is_driven_watched_and_listened_to_over_a_slow_link(
+def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     kind: str, subject: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pebble.bench.output.find_spec", lambda _name: None)  # no plots
-    monkeypatch.setattr("pebble.impair.run._QUIET_QUICK_S", 0.1)
-    monkeypatch.setattr(Plan, "order", lambda _plan, one: Order(video=one.video, audio=one.audio, **SHORT))
-    said = io.StringIO()
-    plan = Plan(trials=["512k"], subjects=[subject], link=kind, window_s=1.0, quick=True, output=tmp_path)
-    assert run(plan, Console(file=said, width=120)) == 0
+    monkeypatch.setattr("pebble.bench.impair.run._QUIET_QUICK_S", 0.1)
+    monkeypatch.setattr(
+        ImpairPlan, "request", lambda _plan, one: TrialRequest(video=one.video, audio=one.audio, **SHORT)
+    )
+    printed = io.StringIO()
+    plan = ImpairPlan(trials=["512k"], subjects=[subject], network=kind, window_s=1.0, quick=True, output=tmp_path)
+    assert run(plan, Console(file=printed, width=120)) == 0
     results = load(tmp_path / "impair.json")
-    sound, video, drive, heart = (
+    sound, video, drive, heartbeat = (
         results.find(subject, measure, trial="512k")
-        for measure in (cells.SOUND, cells.PICTURES, cells.DRIVE, cells.BEAT_GAP)
+        for measure in (cells.SOUND, cells.PICTURES, cells.DRIVE, cells.HEARTBEAT_GAP)
     )
     assert sound is not None
     assert sound.samples
@@ -58,10 +60,10 @@ def test_a_robot_is_driven_watched_and_listened_to_over_a_slow_link(
     assert drive is not None
     assert drive.samples
     assert min(drive.samples) > 0
-    assert heart is not None
-    assert len(heart.samples) > 1
+    assert heartbeat is not None
+    assert len(heartbeat.samples) > 1
     assert results.options["link"] == kind
-    assert {"namespaces": "network namespaces", "proxy": "loss modelled"}[kind] in said.getvalue()
+    assert {"namespaces": "network namespaces", "proxy": "loss modelled"}[kind] in printed.getvalue()
     assert "512k@" in str(results.options["marks"])
     assert children(os.getpid()) == []
 
@@ -82,8 +84,3 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     assert len(started) > 4
     assert until(lambda: not any(map(Rig.alive, started)))
     assert not list(tmp_path.glob("pbl-*"))
-
-
-def descendants(pid: int) -> list[int]:
-    found = children(pid)
-    return [*found, *(below for child in found for below in descendants(child))]

@@ -1,4 +1,4 @@
-"""Sight and sound of a whole robot, as an operator has them: asked for by the original's messages, over MQTT only."""
+"""Pictures and sound of a whole robot, requested by an operator over MQTT with the original Pebble's messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pebble.media.decode import Decoded, VideoDecoder
 from pebble.media.scene import read_counter
 from pebble.media.sound import SoundDecoder
 from pebble.media.video import VIDEO_ENCODINGS
-from tests.robot.operator import Operator, Seen
+from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, DEVICES, Rig
 from tests.support import until
 
@@ -40,7 +40,7 @@ two_kinds = pytest.mark.parametrize("rig", ["mqtt", "zenoh"], indirect=True)
 
 @pytest.fixture(autouse=True)
 def _quiet(rig: Rig) -> Iterator[None]:
-    """Every test ends with nothing wanted, nothing running and nothing coming."""
+    """Every test ends with no request, no running media process and no media messages."""
     yield
     for ask, flag in ((ASK_VIDEO, VIDEO_FLAG), (ASK_AUDIO, AUDIO_FLAG)):
         rig.operator.send(ask, {"enabled": False})
@@ -52,14 +52,14 @@ def media_programs(rig: Rig) -> set[str]:
     return {"camera_publisher", "audio_publisher", "audio_receiver"} & set(rig.processes())
 
 
-def shown(seen: list[Seen]) -> list[Decoded]:
+def shown(seen: list[ReceivedMessage]) -> list[Decoded]:
     """The pictures that may be shown."""
     decoder = VideoDecoder()
     return [picture for one in seen if (picture := decoder.feed(one.payload)) is not None]
 
 
-def counters(seen: list[Seen]) -> list[int]:
-    """What the frame counter said in every one of them."""
+def counters(seen: list[ReceivedMessage]) -> list[int]:
+    """The frame counters in these pictures."""
     return [counter for one in shown(seen) if (counter := read_counter(one.picture)) is not None]
 
 
@@ -108,9 +108,9 @@ def test_sound_in_every_encoding(rig: Rig, encoding: str) -> None:
     assert until(lambda: len(rig.operator.on(AUDIO, began)) > 20, 15)
     assert media_programs(rig) == {"audio_publisher", "audio_receiver"}
     decoder = SoundDecoder()
-    heard = [decoder.feed(one.payload) for one in rig.operator.on(AUDIO, began)]
-    assert all(one is not None for one in heard)
-    assert {one.encoding for one in heard[-5:] if one is not None} == {encoding}
+    received = [decoder.feed(one.payload) for one in rig.operator.on(AUDIO, began)]
+    assert all(one is not None for one in received)
+    assert {one.encoding for one in received[-5:] if one is not None} == {encoding}
 
 
 @two_kinds
@@ -124,11 +124,11 @@ def test_a_killed_media_process_is_back_while_it_is_wanted(rig: Rig, program: st
 
 
 @two_kinds
-def test_a_kept_request_starts_nothing(rig: Rig) -> None:
+def test_a_retained_request_starts_nothing(rig: Rig) -> None:
     rig.operator.send(VIDEO_FLAG, True, retain=True)
     rig.operator.send(ASK_VIDEO, {"enabled": True}, retain=True)
     assert until(lambda: rig.operator.on(ASK_VIDEO), 5)
-    rig.kill("mqtt_bridge")  # it finds the request as a kept copy when it is back
+    rig.kill("mqtt_bridge")  # after its restart it receives the request as a retained message
     began = time.monotonic()
     try:
         assert not until(lambda: rig.operator.on(CAMERA, began + 1.0), 4.0)
@@ -168,7 +168,7 @@ def test_media_do_not_pass_the_robots_own_side() -> None:
 
 
 def status(operator: Operator) -> dict[str, Any]:
-    """What media-status says now."""
+    """The value of media-status now."""
     last = operator.last("outgoing/media-status")
     return {} if last is None else dict(last.json["value"])
 
@@ -177,7 +177,7 @@ def status(operator: Operator) -> dict[str, Any]:
 def test_after_an_uplink_outage_pictures_are_new_ones(rig: Rig) -> None:
     began = want_video(rig, encoding="pbvz")
     assert pictures_come(rig, began)
-    rig.uplink.hole()
+    rig.uplink.blackhole()
     time.sleep(3)
     rig.uplink.resume()
     back = time.monotonic()

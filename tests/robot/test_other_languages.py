@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.robot.operator import Operator, kept_copies
+from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, Rig
 from tests.support import until
 
@@ -46,13 +46,13 @@ def sub(rig: Rig, filter_: str, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
-def test_a_c_client_hears_kept_state_and_streams(rig: Rig) -> None:
+def test_a_c_client_receives_retained_state_and_streams(rig: Rig) -> None:
     out, _ = sub(rig, f"{BASE}/outgoing/#", "-W", "2").communicate(timeout=10)
-    heard = [line.split(" ", 2)[:2] for line in out.splitlines()]
-    kept = {topic.removeprefix(f"{BASE}/outgoing/") for retained, topic in heard if retained == "1"}
-    live = {topic.removeprefix(f"{BASE}/outgoing/") for retained, topic in heard if retained == "0"}
-    assert kept >= {"capabilities", "status", "charging-level", "charging-status"}
-    assert "touch-sensors" in live - kept
+    received = [line.split(" ", 2)[:2] for line in out.splitlines()]
+    retained = {topic.removeprefix(f"{BASE}/outgoing/") for retained, topic in received if retained == "1"}
+    live = {topic.removeprefix(f"{BASE}/outgoing/") for retained, topic in received if retained == "0"}
+    assert retained >= {"capabilities", "status", "charging-level", "charging-status"}
+    assert "touch-sensors" in live - retained
 
 
 def test_a_c_client_drives(rig: Rig) -> None:
@@ -61,29 +61,32 @@ def test_a_c_client_drives(rig: Rig) -> None:
     assert until(lambda: (0.5, 0.3) in [wheels for _, wheels in rig.mcu.drives(began)], 3)
 
 
-def test_a_c_client_hears_each_command_once(rig: Rig) -> None:
-    """Its own publish, the operator's from afar: neither comes twice, neither is kept."""
+def test_a_c_client_receives_each_command_once(rig: Rig) -> None:
+    """Its own command and the operator's: neither arrives twice, neither is retained."""
     listener = sub(rig, DRIVE, "-C", "3", "-W", "5")
-    time.sleep(0.5)  # nothing tells when mosquitto_sub has subscribed
+    time.sleep(0.5)  # nothing announces that mosquitto_sub has subscribed
     pub(rig, DRIVE, {"z": 0.11})
     rig.operator.send("incoming/drive-values", {"z": 0.22})
     out, _ = listener.communicate(timeout=10)
     assert sorted(out.splitlines()) == [f'0 {DRIVE} {{"z": 0.11}}', f'0 {DRIVE} {{"z": 0.22}}']
 
 
-def test_a_c_client_sets_a_flag_for_everybody(rig: Rig) -> None:
+def test_a_c_client_sets_a_flag_for_every_client(rig: Rig) -> None:
     pub(rig, f"{BASE}/incoming/flags/mqtt-video", {"value": True}, "-r")
     assert until(lambda: rig.operator.last("incoming/flags/mqtt-video") is not None, 5)
     assert until(
-        lambda: kept_copies(rig.remote.port, BASE, 0.2).get("incoming/flags/mqtt-video") == b'{"value": true}', 5
+        lambda: retained_messages(rig.remote.port, BASE, 0.2).get("incoming/flags/mqtt-video") == b'{"value": true}', 5
     )
     rig.operator.send("incoming/flags/mqtt-video", {"value": False}, retain=True)
     assert until(
-        lambda: kept_copies(int(local_port(rig)), BASE, 0.2).get("incoming/flags/mqtt-video") == b'{"value": false}', 5
+        lambda: (
+            retained_messages(int(local_port(rig)), BASE, 0.2).get("incoming/flags/mqtt-video") == b'{"value": false}'
+        ),
+        5,
     )
 
 
-def test_a_javascript_program_hears_and_drives(rig: Rig) -> None:
+def test_a_javascript_program_receives_and_drives(rig: Rig) -> None:
     began = time.monotonic()
     program = subprocess.Popen(
         ["node", str(CLIENT), local_port(rig), f"{BASE}/#", DRIVE, '{"x": -0.1, "z": 0.6}'],
@@ -94,9 +97,9 @@ def test_a_javascript_program_hears_and_drives(rig: Rig) -> None:
         time.sleep(0.5)  # some of the stream
     finally:
         program.terminate()
-    heard = [json.loads(line) for line in program.communicate()[0].splitlines() if line.endswith("}")]
-    kept = {message["topic"] for message in heard if message["retain"]}
-    assert {f"{BASE}/outgoing/capabilities", f"{BASE}/outgoing/charging-level"} <= kept
-    assert [m["payload"] for m in heard if m["topic"] == DRIVE] == ['{"x": -0.1, "z": 0.6}']
-    touch = next(m for m in heard if m["topic"] == f"{BASE}/outgoing/touch-sensors")
+    received = [json.loads(line) for line in program.communicate()[0].splitlines() if line.endswith("}")]
+    retained = {message["topic"] for message in received if message["retain"]}
+    assert {f"{BASE}/outgoing/capabilities", f"{BASE}/outgoing/charging-level"} <= retained
+    assert [m["payload"] for m in received if m["topic"] == DRIVE] == ['{"x": -0.1, "z": 0.6}']
+    touch = next(m for m in received if m["topic"] == f"{BASE}/outgoing/touch-sensors")
     assert set(json.loads(touch["payload"])["value"]) == {"a0", "a1", "a2"}

@@ -1,4 +1,4 @@
-"""What an operator may expect of a robot, whichever transport it runs on and whichever broker he sits at."""
+"""What an operator may expect of a robot on any transport, from any of its brokers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.robot.conftest import Seat
-from tests.robot.operator import kept_copies
+from tests.robot.conftest import Station
+from tests.robot.operator import retained_messages
 from tests.robot.rig import BASE, STOP
 from tests.support import until
 
@@ -17,16 +17,16 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 DRIVE = "incoming/drive-values"
 
 
-def settle(seat: Seat) -> None:
-    """Stand still and wait until the wheels were told: a serial line that was just opened takes half a second."""
+def stop_and_wait(station: Station) -> None:
+    """Send a stop and wait until it reaches the wheels: a serial line that was just opened takes half a second."""
     began = time.monotonic()
-    seat.operator.send(DRIVE, {"x": 0, "z": 0})
-    assert until(lambda: seat.rig.mcu.drives(began) and not seat.rig.mcu.moving(), 3)
+    station.operator.send(DRIVE, {"x": 0, "z": 0})
+    assert until(lambda: station.rig.mcu.drives(began) and not station.rig.mcu.moving(), 3)
 
 
-def first_motion(seat: Seat, since: float) -> tuple[float, tuple[float, float]]:
+def first_motion(station: Station, since: float) -> tuple[float, tuple[float, float]]:
     """When the wheels first turned after ``since``, and how fast."""
-    return next((at, wheels) for at, wheels in seat.rig.mcu.drives(since) if wheels != STOP)
+    return next((at, wheels) for at, wheels in station.rig.mcu.drives(since) if wheels != STOP)
 
 
 @pytest.mark.parametrize(
@@ -43,12 +43,12 @@ def first_motion(seat: Seat, since: float) -> tuple[float, tuple[float, float]]:
         ({"z": 0.6, "extra": [1, {"deep": None}]}, (0.6, 0.6)),
     ],
 )
-def test_drive_forms_reach_the_wheels(seat: Seat, body: Any, wheels: tuple[float, float]) -> None:
-    settle(seat)
+def test_drive_forms_reach_the_wheels(station: Station, body: Any, wheels: tuple[float, float]) -> None:
+    stop_and_wait(station)
     began = time.monotonic()
-    seat.operator.send(DRIVE, body)
-    assert until(lambda: seat.rig.mcu.moving(began), 3)
-    assert first_motion(seat, began)[1] == pytest.approx(wheels)
+    station.operator.send(DRIVE, body)
+    assert until(lambda: station.rig.mcu.moving(began), 3)
+    assert first_motion(station, began)[1] == pytest.approx(wheels)
 
 
 @pytest.mark.parametrize(
@@ -71,33 +71,33 @@ def test_drive_forms_reach_the_wheels(seat: Seat, body: Any, wheels: tuple[float
     ],
     ids=range(14),
 )
-def test_malformed_drive_moves_nothing(seat: Seat, body: bytes) -> None:
-    settle(seat)
+def test_malformed_drive_moves_nothing(station: Station, body: bytes) -> None:
+    stop_and_wait(station)
     began = time.monotonic()
-    seat.operator.send(DRIVE, body)
-    seat.operator.send("incoming/lights-solid", {"r": 0.123})  # in order behind it
-    assert until(lambda: any(entry.line == "L 0.000 0.000 0.123" for entry in seat.rig.mcu.entries(began)), 3)
-    assert not seat.rig.mcu.moving(began)
+    station.operator.send(DRIVE, body)
+    station.operator.send("incoming/lights-solid", {"r": 0.123})  # in order behind it
+    assert until(lambda: any(entry.line == "L 0.000 0.000 0.123" for entry in station.rig.mcu.entries(began)), 3)
+    assert not station.rig.mcu.moving(began)
 
 
-def test_silence_stops_the_wheels(seat: Seat) -> None:
-    settle(seat)
+def test_silence_stops_the_wheels(station: Station) -> None:
+    stop_and_wait(station)
     began = time.monotonic()
-    seat.operator.send(DRIVE, {"x": 0.1, "z": 0.3})
-    assert until(lambda: seat.rig.mcu.moving(began), 3)
-    assert until(lambda: not seat.rig.mcu.moving(began), 3)
-    started, _ = first_motion(seat, began)
-    stopped, _ = next((at, wheels) for at, wheels in seat.rig.mcu.drives(started) if wheels == STOP)
+    station.operator.send(DRIVE, {"x": 0.1, "z": 0.3})
+    assert until(lambda: station.rig.mcu.moving(began), 3)
+    assert until(lambda: not station.rig.mcu.moving(began), 3)
+    started, _ = first_motion(station, began)
+    stopped, _ = next((at, wheels) for at, wheels in station.rig.mcu.drives(started) if wheels == STOP)
     assert 0.70 <= stopped - started <= 0.85
 
 
-def test_a_burst_of_commands_ends_with_the_last_one(seat: Seat) -> None:
-    settle(seat)
+def test_a_burst_of_commands_ends_with_the_last_one(station: Station) -> None:
+    stop_and_wait(station)
     began = time.monotonic()
     for step in range(1, 301):
-        seat.operator.send(DRIVE, {"x": 0, "z": step / 1000})
-    assert until(lambda: seat.rig.mcu.drives(began)[-1:] and seat.rig.mcu.drives(began)[-1][1] == (0.3, 0.3), 3)
-    speeds = [wheels[0] for _, wheels in seat.rig.mcu.drives(began)]
+        station.operator.send(DRIVE, {"x": 0, "z": step / 1000})
+    assert until(lambda: station.rig.mcu.drives(began)[-1:] and station.rig.mcu.drives(began)[-1][1] == (0.3, 0.3), 3)
+    speeds = [wheels[0] for _, wheels in station.rig.mcu.drives(began)]
     assert speeds == sorted(speeds)
 
 
@@ -111,73 +111,73 @@ def test_a_burst_of_commands_ends_with_the_last_one(seat: Seat) -> None:
         ("incoming/lights-flash", {"g": 0.5, "period": 0}, "F 0.000 0.500 0.000 0.050"),
     ],
 )
-def test_lights(seat: Seat, topic: str, body: Any, line: str) -> None:
+def test_lights(station: Station, topic: str, body: Any, line: str) -> None:
     began = time.monotonic()
-    seat.operator.send(topic, body)
-    assert until(lambda: any(entry.line == line for entry in seat.rig.mcu.entries(began)), 3)
+    station.operator.send(topic, body)
+    assert until(lambda: any(entry.line == line for entry in station.rig.mcu.entries(began)), 3)
 
 
-def test_telemetry(seat: Seat) -> None:
-    touch = seat.operator.wait_for("outgoing/touch-sensors").json
+def test_telemetry(station: Station) -> None:
+    touch = station.operator.wait_for("outgoing/touch-sensors").json
     assert set(touch["value"]) == {"a0", "a1", "a2"}
     assert touch["unit"] == "adc"
-    level = seat.operator.wait_for("outgoing/charging-level").json
+    level = station.operator.wait_for("outgoing/charging-level").json
     assert level["unit"] == "v"
     assert 5 < level["value"] < 9
-    assert seat.operator.wait_for("outgoing/charging-status").json == {"value": None}
+    assert station.operator.wait_for("outgoing/charging-status").json == {"value": None}
 
 
-@pytest.mark.parametrize("seat", ["mqtt", "zenoh", "mirror"], indirect=True)  # one plain broker alone hides the flag
-def test_a_kept_drive_command_never_moves_the_robot(seat: Seat) -> None:
-    settle(seat)
+@pytest.mark.parametrize("station", ["mqtt", "zenoh", "mirror"], indirect=True)  # one plain broker alone hides the flag
+def test_a_retained_drive_command_never_moves_the_robot(station: Station) -> None:
+    stop_and_wait(station)
     began = time.monotonic()
-    seat.operator.send(DRIVE, {"x": 0, "z": 0.9}, retain=True)
-    seat.operator.send(DRIVE, b"", retain=True)
-    seat.operator.send("incoming/lights-solid", {"r": 0.321})
-    assert until(lambda: any(entry.line == "L 0.000 0.000 0.321" for entry in seat.rig.mcu.entries(began)), 3)
-    assert not seat.rig.mcu.moving(began)
+    station.operator.send(DRIVE, {"x": 0, "z": 0.9}, retain=True)
+    station.operator.send(DRIVE, b"", retain=True)
+    station.operator.send("incoming/lights-solid", {"r": 0.321})
+    assert until(lambda: any(entry.line == "L 0.000 0.000 0.321" for entry in station.rig.mcu.entries(began)), 3)
+    assert not station.rig.mcu.moving(began)
 
 
-def test_actions_run_once_and_only_for_true(seat: Seat) -> None:
-    before = len(seat.rig.recorded())
+def test_actions_run_once_and_only_for_true(station: Station) -> None:
+    before = len(station.rig.recorded())
     for body in (False, {"value": False}, 1, "true", {"value": 1}, None, {"on": True}, b"true\xff"):
-        seat.operator.send("incoming/flags/reboot", body)
-    seat.operator.send("incoming/flags/reboot", True, retain=True)
-    seat.operator.send("incoming/flags/reboot", b"", retain=True)
-    seat.operator.send("incoming/flags/service-restart", {"enabled": True})
-    assert until(lambda: len(seat.rig.recorded()) > before, 3)
-    assert seat.rig.recorded()[before:] == ["service_restart"]
+        station.operator.send("incoming/flags/reboot", body)
+    station.operator.send("incoming/flags/reboot", True, retain=True)
+    station.operator.send("incoming/flags/reboot", b"", retain=True)
+    station.operator.send("incoming/flags/service-restart", {"enabled": True})
+    assert until(lambda: len(station.rig.recorded()) > before, 3)
+    assert station.rig.recorded()[before:] == ["service_restart"]
 
 
-def test_kept_state_is_there_for_a_late_operator(seat: Seat) -> None:
-    port = seat.rig.remote.port
-    kept = kept_copies(port, BASE)
+def test_a_late_operator_finds_retained_state(station: Station) -> None:
+    port = station.rig.remote.port
+    retained = retained_messages(port, BASE)
     assert {"outgoing/capabilities", "outgoing/status", "outgoing/charging-level", "outgoing/charging-status"} <= set(
-        kept
+        retained
     )
-    assert not [topic for topic in kept if topic.startswith(("outgoing/touch", "outgoing/logs", "incoming/drive"))]
+    assert not [topic for topic in retained if topic.startswith(("outgoing/touch", "outgoing/logs", "incoming/drive"))]
 
 
-def test_capabilities_name_the_transport_and_the_topics(seat: Seat) -> None:
-    said = seat.operator.wait_for("outgoing/capabilities").json
-    assert said["schema"] == "pebble-capabilities/v1"
-    assert said["value"]["transport"]["kind"] == ("zenoh" if seat.rig.kind == "zenoh" else "mqtt")
-    assert said["value"]["drive"]["topic"] == f"{BASE}/{DRIVE}"
+def test_capabilities_name_the_transport_and_the_topics(station: Station) -> None:
+    capabilities = station.operator.wait_for("outgoing/capabilities").json
+    assert capabilities["schema"] == "pebble-capabilities/v1"
+    assert capabilities["value"]["transport"]["kind"] == ("zenoh" if station.rig.kind == "zenoh" else "mqtt")
+    assert capabilities["value"]["drive"]["topic"] == f"{BASE}/{DRIVE}"
 
 
 # -- the way to the remote broker
 
 
-def test_the_heart_beats_four_times_a_second(uplinked: Seat) -> None:
+def test_four_heartbeats_a_second(uplinked: Station) -> None:
     began = time.monotonic()
     assert until(lambda: len(uplinked.operator.on("outgoing/online", began)) >= 9, 5)
-    beats = uplinked.operator.on("outgoing/online", began)[:9]
-    assert 1.5 <= beats[-1].at - beats[0].at <= 3.0
-    assert abs(beats[-1].json["t"] / 1000 - time.time()) < 3
-    assert "outgoing/online" in kept_copies(uplinked.rig.remote.port, BASE)
+    heartbeats = uplinked.operator.on("outgoing/online", began)[:9]
+    assert 1.5 <= heartbeats[-1].at - heartbeats[0].at <= 3.0
+    assert abs(heartbeats[-1].json["t"] / 1000 - time.time()) < 3
+    assert "outgoing/online" in retained_messages(uplinked.rig.remote.port, BASE)
 
 
-def test_goodbye_stops_the_wheels_and_tells_the_world(uplinked: Seat) -> None:
+def test_stopping_the_robot_stops_the_wheels_and_reports_offline(uplinked: Station) -> None:
     rig = uplinked.rig
     began = time.monotonic()
     uplinked.operator.send(DRIVE, {"x": 0, "z": 0.5})

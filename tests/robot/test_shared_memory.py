@@ -28,7 +28,7 @@ def test_a_robot_that_has_stopped_leaves_no_shared_memory(kind: str) -> None:
         rig.operator.send("incoming/front-camera", {"enabled": True})
         rig.operator.send("incoming/flags/mqtt-video", {"value": True}, retain=True)
         assert until(lambda: "camera_publisher" in rig.processes() and len(segments_of(rig)) >= 2, 20)
-        time.sleep(2 * YOUNG_S)  # younger ones are left to whoever may just be making them
+        time.sleep(2 * YOUNG_S)  # younger ones may still be in the making and are left alone
         used = segments_of(rig)
         assert rig.stop() == 0
         assert [path for path in used if Path(path).exists()] == []

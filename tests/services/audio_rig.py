@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from pebble.media.sound import Heard, SoundDecoder
+from pebble.media.sound import ReceivedSound, SoundDecoder
 from pebble.media.speech import Speech
 from pebble.transports import Message, QoS
 from pebble.transports.frames import FrameInfo, FrameWriter
@@ -67,7 +67,7 @@ class Ear:
 
     def __init__(self, port: int) -> None:
         self.transport = client("ear", port)
-        self.heard: list[Heard] = []
+        self.received: list[ReceivedSound] = []
         self.arrived: list[float] = []  # epoch seconds
         self.decoder = SoundDecoder()
         self.transport.subscribe(f"{BASE}/outgoing/audio", self._listen, qos=QoS.LATEST)
@@ -75,20 +75,22 @@ class Ear:
     def close(self) -> None:
         self.transport.close()
 
-    def wait(self, count: int, timeout: float = 20.0) -> list[Heard]:
+    def wait(self, count: int, timeout: float = 20.0) -> list[ReceivedSound]:
         """Until so many packets more have come; returns these."""
-        before = len(self.heard)
-        assert until(lambda: len(self.heard) >= before + count, timeout), f"{len(self.heard) - before} packets came"
-        return self.heard[before:]
+        before = len(self.received)
+        assert until(lambda: len(self.received) >= before + count, timeout), (
+            f"{len(self.received) - before} packets came"
+        )
+        return self.received[before:]
 
     def wait_for(self, encoding: str) -> None:
-        assert until(lambda: bool(self.heard) and self.heard[-1].encoding == encoding, 20), f"no {encoding} came"
+        assert until(lambda: bool(self.received) and self.received[-1].encoding == encoding, 20), f"no {encoding} came"
 
     def _listen(self, message: Message) -> None:
         one = self.decoder.feed(message.payload)
         if one is not None:
             self.arrived.append(time.time())
-            self.heard.append(one)
+            self.received.append(one)
 
 
 class Program(MediaProgram):

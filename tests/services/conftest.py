@@ -1,4 +1,4 @@
-"""What surrounds a program under test: two brokers, or a fabric with MCUs on serial lines."""
+"""What surrounds a program under test: two brokers, or a local transport with MCUs on serial lines."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.services.mcu_rig import Rig
+from tests.services.serial_mcu_bridge.mcu_rig import Rig
 from tests.support import Broker
 
 

@@ -1,4 +1,4 @@
-"""One media program as a process of its own, with the robot's fabric around it and a broker for operators."""
+"""One media program as a process of its own, with the robot's local transport and a broker for operators."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from typing import Any, Self
 import msgspec
 
 from pebble.config import Config, load
-from pebble.links import hub_settings, local_transport
-from pebble.payloads import MediaReport
+from pebble.contract.payloads import MediaReport
+from pebble.runtime.connections import hub_settings, local_transport
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 from tests.support import ROOT, Child, until
 
 BASE = "pebble/robots/rover"
-_SILENCE_S = 10.0  # a machine that does too much at once is not a broker that stopped answering
+_SILENCE_S = 5.0  # a machine that does too much at once is not a broker that stopped answering
 
 
 class MediaProgram:
@@ -43,7 +43,7 @@ class MediaProgram:
 
     def __enter__(self) -> Self:
         if self._kind == "zenoh":
-            self._start("pebble.hub", msgspec.json.encode(hub_settings(self.config), enc_hook=str).decode())
+            self._start("pebble.runtime.hub", msgspec.json.encode(hub_settings(self.config), enc_hook=str).decode())
         self.local = local_transport(self.config, "somebody").open(10)
         self._ends.callback(self.local.close)
         assert self.local.state is State.CONNECTED, self.local.problem

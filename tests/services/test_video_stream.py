@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from pebble.contract import MQTT_VIDEO, VIDEO_CONTROL
-from pebble.launched import Want
-from pebble.payloads import MediaRequest
+from pebble.contract.payloads import MediaRequest
+from pebble.runtime.parent import ProgramRequest
 from pebble.services.mqtt_bridge.media import Media
 from tests.support import Child, until
 
@@ -54,8 +54,8 @@ class Stream:
         return [int(word) for word in (self.folder / "pids").read_text().split()]
 
     def ended(self) -> tuple[int, str]:
-        said, _ = self.process.communicate(timeout=15)
-        return self.process.returncode, said
+        output, _ = self.process.communicate(timeout=15)
+        return self.process.returncode, output
 
 
 @pytest.fixture
@@ -77,8 +77,8 @@ def test_the_program_runs_and_ends_with_all_it_started(streaming: Stream) -> Non
     pids = streaming.pids()
     assert all(alive(pid) for pid in pids)
     streaming.process.terminate()
-    code, said = streaming.ended()
-    assert (code, "streaming as pit" in said) == (0, True)
+    code, output = streaming.ended()
+    assert (code, "streaming as pit" in output) == (0, True)
     assert until(lambda: not any(alive(pid) for pid in pids), 5)
 
 
@@ -109,15 +109,15 @@ def test_a_killed_service_leaves_no_program(streaming: Stream) -> None:
 def test_a_program_that_ends_or_never_starts_ends_the_service_with_the_reason(
     tmp_path: Path, command: list[str], reason: str
 ) -> None:
-    code, said = Stream(tmp_path, command).ended()
+    code, output = Stream(tmp_path, command).ended()
     assert code == 1
-    assert reason in said
+    assert reason in output
 
 
 def test_operators_switch_it_as_they_switch_a_camera() -> None:
     media = Media(("video_stream",))
     media.allow(MQTT_VIDEO, True)
     media.request(VIDEO_CONTROL, MediaRequest(enabled=True))
-    assert media.wants() == {"video_stream": Want(on=True)}
+    assert media.requests() == {"video_stream": ProgramRequest(on=True)}
     media.request(VIDEO_CONTROL, MediaRequest(enabled=False))
-    assert media.wants() == {"video_stream": Want(on=False)}
+    assert media.requests() == {"video_stream": ProgramRequest(on=False)}

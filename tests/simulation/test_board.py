@@ -6,20 +6,20 @@ import random
 import pytest
 
 from pebble.errors import ConfigError
-from pebble.services.serial_mcu_bridge.goob_base import Charging, Level, Touch, parse
+from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch, parse
 from pebble.simulation.board import Light, SimulatedMcu
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM, RobotMotion
 
 
 def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -> bytes:
-    """Tick for ``seconds``, giving ``command`` at 10 Hz. Returns what the MCU said."""
-    said = b""
+    """Tick for ``seconds``, sending ``command`` at 10 Hz. Returns the MCU's output."""
+    output = b""
     for step in range(round(seconds / 0.01)):
         now = start + 0.01 * (step + 1)
         if command and step % 10 == 0:
-            said += mcu.receive(command, now)
-        said += mcu.tick(now)
-    return said
+            output += mcu.receive(command, now)
+        output += mcu.tick(now)
+    return output
 
 
 @pytest.mark.parametrize(
@@ -87,6 +87,14 @@ def test_a_command_may_arrive_in_pieces() -> None:
     assert b"".join(mcu.receive(bytes([byte]), 0.0) for byte in b"M 0.5 0.5\nL 0 0 0\n") == b"OK M\r\nOK L\r\n"
 
 
+def test_half_a_command_of_a_dead_host_is_none() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.receive(b"M 0.900", 0.0)
+    run(mcu, 0.0, 0.3)
+    assert mcu.receive(b"M 0.000 0.500\n", 0.31) == b"OK M\r\n"
+    assert mcu.state().drive == (0.0, 0.5)
+
+
 def test_goob_reports() -> None:
     mcu = SimulatedMcu("goob", 0.0)
     lines = run(mcu, 0.0, 10.0).splitlines()
@@ -117,12 +125,12 @@ def test_after_a_pause_there_is_one_report_and_not_all_that_were_missed() -> Non
 
 def test_driving_ahead_moves_both_wheels_and_the_magnets() -> None:
     mcu = SimulatedMcu("goob", 0.0)
-    said = run(mcu, 0.0, 2.0, b"M 1 1\n")
+    output = run(mcu, 0.0, 2.0, b"M 1 1\n")
     state = mcu.state()
     assert state.left_mm_s == state.right_mm_s == pytest.approx(FULL_SPEED_MM_S)
     assert state.pose.x_mm == pytest.approx(FULL_SPEED_MM_S * (2.0 - 0.07), rel=0.02)
     assert abs(state.pose.y_mm) < 1e-6
-    touches = [report for line in said.splitlines() for report in parse(line) if isinstance(report, Touch)]
+    touches = [report for line in output.splitlines() for report in parse(line) if isinstance(report, Touch)]
     for wave in zip(*((touch.a0, touch.a1, touch.a2) for touch in touches), strict=True):
         assert max(wave) > 750
         assert min(wave) < 270
@@ -166,20 +174,20 @@ def test_the_failsafe_stops_the_wheels(failsafe_s: float) -> None:
     assert mcu.state().left_mm_s == 0.0
 
 
-def test_the_failsafe_stops_at_its_time_even_if_nobody_ticks() -> None:
+def test_the_failsafe_stops_at_its_time_even_without_ticks() -> None:
     mcu = SimulatedMcu("goob", 0.0)
     mcu.receive(b"M 1 1\n", 0.0)
     mcu.tick(100.0)
     assert mcu.state().pose.x_mm < 1.1 * FULL_SPEED_MM_S
 
 
-def test_each_change_of_the_motors_is_told_with_its_time() -> None:
-    told = []
-    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: told.append((now, motors)))
+def test_each_change_of_the_motors_is_reported_with_its_time() -> None:
+    changes = []
+    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: changes.append((now, motors)))
     mcu.receive(b"M 0.5 -0.25\n", 0.1)
     mcu.receive(b"M 0.5 -0.25\n", 0.2)
     mcu.tick(5.0)
-    assert told == [(0.1, (0.5, -0.25)), (pytest.approx(1.2, abs=0.005), (0.0, 0.0))], "+ is ahead on both sides"
+    assert changes == [(0.1, (0.5, -0.25)), (pytest.approx(1.2, abs=0.005), (0.0, 0.0))], "+ is ahead on both sides"
 
 
 def test_a_command_after_a_long_pause_is_obeyed_at_once() -> None:
@@ -189,17 +197,17 @@ def test_a_command_after_a_long_pause_is_obeyed_at_once() -> None:
 
 
 def test_commands_that_arrive_together_are_obeyed_in_turn() -> None:
-    told = []
-    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: told.append(motors))
+    changes = []
+    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: changes.append(motors))
     assert mcu.receive(b"M 1 1\nM 0 0\nM 0.5 0.5\nM 0", 0.0) == b"OK M\r\n" * 3
-    assert told == [(1.0, 1.0), (0.0, 0.0), (0.5, 0.5)]
+    assert changes == [(1.0, 1.0), (0.0, 0.0), (0.5, 0.5)]
     assert mcu.state().commands == 3
 
 
 def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     mcu = SimulatedMcu("goob", 0.0)
     mcu.receive(b"M 1 1\n", 0.0)
-    monkeypatch.setattr(mcu._robot.port, "read", lambda: 1 / 0)
+    monkeypatch.setattr(mcu._firmware.port, "read", lambda: 1 / 0)
     assert mcu.tick(0.1).startswith(b"Starting setup...")
     assert mcu.state().motors == (0.0, 0.0)
     assert mcu.resets == 1
@@ -210,10 +218,10 @@ def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatc
 
 def test_firmware_that_fails_at_every_turn_keeps_starting(monkeypatch: pytest.MonkeyPatch) -> None:
     mcu = SimulatedMcu("goob", 0.0)
-    monkeypatch.setattr(type(mcu._robot), "step", lambda _robot: 1 / 0)
+    monkeypatch.setattr(type(mcu._firmware), "step", lambda _robot: 1 / 0)
     for turn in range(5):
         mcu.tick(turn * 0.001)
-        monkeypatch.setattr(type(mcu._robot), "step", lambda _robot: 1 / 0)  # each boot has classes of its own
+        monkeypatch.setattr(type(mcu._firmware), "step", lambda _robot: 1 / 0)  # each boot has classes of its own
     assert mcu.resets == 5
     assert mcu.state().motors == (0.0, 0.0)
 
@@ -230,9 +238,9 @@ def test_freds_trims_and_reverse_block() -> None:
     mcu.receive(b"M 1 1\n", 0.0)
     assert mcu.state().motors == pytest.approx((0.93, 1.0))
     mcu.receive(b"M -1 -1\n", 0.3)
-    assert mcu.state().motors == (0.0, 0.0), "no way back at once"
+    assert mcu.state().motors == (0.0, 0.0), "reverse is blocked at first"
     mcu.receive(b"M -1 0\n", 0.33)
-    assert mcu.state().motors == pytest.approx((-0.5 * 0.93, 0.5)), "but the turn is kept"
+    assert mcu.state().motors == pytest.approx((-0.5 * 0.93, 0.5)), "but turning is not blocked"
     mcu.receive(b"M -1 -1\n", 0.35)
     assert mcu.state().motors == pytest.approx((-0.7 * 0.93, -0.7))
     assert mcu.state().drive == (-1.0, -1.0)
@@ -250,7 +258,7 @@ def test_the_battery_drains_with_driving_and_fills_on_the_charger() -> None:
     assert charging.state().volts == pytest.approx(8.4)
 
 
-def test_a_reboot_stops_and_says_so() -> None:
+def test_a_reboot_stops_the_motors_and_reports_the_start() -> None:
     mcu = SimulatedMcu("goob", 0.0)
     run(mcu, 0.0, 1.0, b"M 1 1\n")
     way = mcu.state().pose
@@ -270,5 +278,5 @@ def test_garbage_moves_nothing() -> None:
 
 
 def test_an_unknown_kind_is_refused() -> None:
-    with pytest.raises(ConfigError, match="goob and fred"):
+    with pytest.raises(ConfigError, match="goob, fred"):
         SimulatedMcu("pitcam", 0.0)

@@ -1,4 +1,4 @@
-"""The network of a simulated board, real and virtual: MicroPython's semantics, and the faults of the world around."""
+"""The network of a simulated board, real and virtual: MicroPython's semantics, and network faults."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import pytest
 
 from pebble.simulation.micropython.answers import name_answer, time_answer
 from pebble.simulation.micropython.clock import RealClock, VirtualClock
+from pebble.simulation.micropython.modules.sockets import MAX_SOCKETS, HostNetwork
+from pebble.simulation.micropython.modules.streams import POLLERR, POLLIN, POLLOUT
 from pebble.simulation.micropython.servers import LoopbackServers
-from pebble.simulation.micropython.sockets import MOST_SOCKETS, HostNetwork
-from pebble.simulation.micropython.streams import POLLERR, POLLIN, POLLOUT
-from pebble.simulation.micropython.virtual_broker import VirtualBroker
-from pebble.simulation.micropython.virtual_network import BROKER, VirtualNetwork
+from tests.simulation.virtual_broker import VirtualBroker
+from tests.simulation.virtual_network import BROKER, VirtualNetwork
 from tests.support import free_port, until
 
 TLS = Path(__file__).parent.parent / "data" / "tls"
@@ -119,7 +119,7 @@ class TestHostTcp:
     def test_nothing_waits(self, listener: socket.socket) -> None:
         network = HostNetwork(RealClock(), routes={BROKER: listener.getsockname()})
         sock = joined(network)["socket"].socket()
-        assert network.fresh
+        assert network.new_sockets
         with pytest.raises(OSError) as raised:
             sock.connect(BROKER)
         assert raised.value.errno == errno.EINPROGRESS
@@ -138,7 +138,7 @@ class TestHostTcp:
             assert until(lambda: sock.ready(POLLIN))
             assert sock.read(10) == b""
 
-    def test_a_write_is_partial_once_nobody_reads(self, listener: socket.socket) -> None:
+    def test_a_write_is_partial_when_the_peer_does_not_read(self, listener: socket.socket) -> None:
         sock = joined(HostNetwork(RealClock(), routes={BROKER: listener.getsockname()}))["socket"].socket()
         with pytest.raises(OSError):
             sock.connect(BROKER)
@@ -182,11 +182,11 @@ class TestHostTcp:
     def test_sockets_that_are_not_closed_run_out(self) -> None:
         network = HostNetwork(RealClock())
         modules = joined(network)
-        kept = [modules["socket"].socket() for _ in range(MOST_SOCKETS)]
+        retained = [modules["socket"].socket() for _ in range(MAX_SOCKETS)]
         with pytest.raises(OSError):
             modules["socket"].socket()
-        kept[0].close()
-        kept[0].close()
+        retained[0].close()
+        retained[0].close()
         modules["socket"].socket()
         network.modules()
         assert not network.open
@@ -229,7 +229,7 @@ class TestTls:
             assert tls.read(10) is None
 
     def test_reads_and_writes_do_not_wait_for_it(self, listener: socket.socket) -> None:
-        with closing(self.wrapped(listener, "ca.crt", "localhost")) as tls:  # nobody answers there
+        with closing(self.wrapped(listener, "ca.crt", "localhost")) as tls:  # nothing listens there
             assert (tls.write(b"early"), tls.read(1)) == (None, None)
 
     @pytest.mark.parametrize(("ca", "name"), [("other-ca.crt", "localhost"), ("ca.crt", "elsewhere.lan")])
@@ -313,12 +313,12 @@ class TestVirtual:
 
     def test_a_hole_delivers_everything_at_once_when_it_ends(self) -> None:
         clock, broker, network, sock = self.subscribed()
-        network.weather.hole = True
+        network.conditions.hole = True
         for number in b"123":
             broker.publish("t", bytes([number]))
             clock.advance(0.5)
         assert sock.read(100) is None
-        network.weather.hole = False
+        network.conditions.hole = False
         assert sock.read(100) == b"\x30\x04\x00\x01t1\x30\x04\x00\x01t2\x30\x04\x00\x01t3"
 
     def test_at_most_twenty_messages_wait_for_their_acknowledgement(self) -> None:
@@ -333,7 +333,7 @@ class TestVirtual:
         clock.advance(0.1)
         assert sock.read(1000) == b"\x32\x06\x00\x01t\x00\x15\x14"
 
-    def test_kept_copies_are_marked(self) -> None:
+    def test_retained_messages_are_marked(self) -> None:
         clock, broker, network, sock = self.world()
         broker.publish("t", b"old", retain=True)
         clock.advance(0.1)
@@ -343,7 +343,7 @@ class TestVirtual:
         network.step()
         clock.advance(0.1)
         assert sock.read(100).endswith(b"\x31\x06\x00\x01told")
-        assert [command.kept for _, command in network.arrivals] == [True]
+        assert [command.retained for _, command in network.arrivals] == [True]
 
     def test_a_killed_broker_resets_and_then_refuses(self) -> None:
         clock, broker, network, sock = self.subscribed()
@@ -370,10 +370,10 @@ class TestVirtual:
         network.step()
         clock.advance(0.1)
         network.step()
-        network.weather.hole = True
+        network.conditions.hole = True
         clock.advance(5.0)
         network.step()
-        assert broker.kept["w"].payload == b"off"
+        assert broker.retained["w"].payload == b"off"
 
     def test_what_no_client_may_send_is_remembered(self) -> None:
         clock, broker, network, sock = self.subscribed()

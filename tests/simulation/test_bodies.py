@@ -1,15 +1,14 @@
-"""What hangs on the boards: from pins to wheels, batteries, lights and I2C devices."""
+"""Simulated bodies, from pins to wheels, batteries, lights and I2C devices."""
 
 from __future__ import annotations
 
 import pytest
 
 from pebble.errors import ConfigError
-from pebble.simulation.bodies import Benjr, Body, Minilamp, body_of
+from pebble.simulation.bodies import Benjr, Body, Light, Minilamp, body_of
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.motion import FULL_SPEED_MM_S
-from pebble.simulation.state import Light
 
 SERIAL = ("goob", "fred", "goob_imu")  # those with a radio start in test_board_network.py
 
@@ -20,7 +19,7 @@ def clock() -> VirtualClock:
 
 
 def put(body: Body, pin: str | int, level: float) -> None:
-    """What the firmware would do."""
+    """Put out a PWM level as firmware does."""
     machine = body.board.firmware.module("machine")
     machine.PWM(machine.Pin(pin), freq=1000, duty_u16=round(level * 65535))
 
@@ -50,28 +49,28 @@ def test_both_inputs_of_a_bridge_high_brake(clock: VirtualClock) -> None:
     assert body.outputs() == (0.0, 0.0)
 
 
-def test_motors_are_told_once_per_turn_at_the_moment_they_changed(clock: VirtualClock) -> None:
+def test_motors_are_reported_once_per_turn_with_the_time_of_the_change(clock: VirtualClock) -> None:
     body = body_of("minilamp", Board(clock))
-    told: list[tuple[float, tuple[float, float]]] = []
-    body.on_motors = lambda now, motors: told.append((now, motors))
+    changes: list[tuple[float, tuple[float, float]]] = []
+    body.on_motors = lambda now, motors: changes.append((now, motors))
     drive(body, 1.0, 1.0)
-    assert told == [], "the turn is not over"
+    assert changes == [], "the turn is not over"
     clock.advance(0.3)
-    body.settle()
-    body.settle()
-    assert told == [(50.0, (1.0, 1.0))]
+    body.end_turn()
+    body.end_turn()
+    assert changes == [(50.0, (1.0, 1.0))]
 
 
-def test_a_turn_that_takes_long_tells_what_happened_in_it(clock: VirtualClock) -> None:
+def test_a_long_turn_reports_each_change_within_it(clock: VirtualClock) -> None:
     body = body_of("minilamp", Board(clock))
-    told: list[tuple[float, tuple[float, float]]] = []
-    body.on_motors = lambda now, motors: told.append((now, motors))
+    changes: list[tuple[float, tuple[float, float]]] = []
+    body.on_motors = lambda now, motors: changes.append((now, motors))
     drive(body, 1.0, 1.0)
     clock.advance(2.0)
     body.board.pins.float_all()
     clock.advance(3.0)
-    body.settle()
-    assert told == [(50.0, (1.0, 1.0)), (52.0, (0.0, 0.0))]
+    body.end_turn()
+    assert changes == [(50.0, (1.0, 1.0)), (52.0, (0.0, 0.0))]
     assert body.state().pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"
 
 
@@ -174,5 +173,5 @@ def test_every_firmware_starts_in_its_body_with_its_motors_off(clock: VirtualClo
 
 
 def test_an_unknown_robot_is_refused(clock: VirtualClock) -> None:
-    with pytest.raises(ConfigError, match="'pitcam', only goob, fred, minilamp, benjr, goob_imu"):
+    with pytest.raises(ConfigError, match="'pitcam'; known: goob, fred, minilamp, benjr, goob_imu"):
         body_of("pitcam", Board(clock))

@@ -10,7 +10,7 @@ from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.micropython.faults import WouldHang
 from pebble.simulation.micropython.ports import SAMD21_OFFICIAL
-from pebble.simulation.micropython.watchdog import BoardReset
+from pebble.simulation.micropython.timers import BoardReset
 
 
 def machine(board: Board) -> Any:
@@ -31,7 +31,7 @@ def test_stdin_and_stdout(board: Board) -> None:
     sys.stdout.buffer.write(b"abcdef", 1, 2)
     sys.stdout.write("ä\n")
     board.print("x", 5)
-    assert board.said() == "OK\nbcä\r\nx 5\r\n".encode()
+    assert board.take_output() == "OK\nbcä\r\nx 5\r\n".encode()
 
 
 def test_reading_more_than_there_is_would_hang(board: Board) -> None:
@@ -98,7 +98,7 @@ def test_a_host_that_does_not_read_costs_half_a_second_per_write(board: Board, c
     assert poll.poll(0) == []
     poll.poll(20)
     assert clock.now() == pytest.approx(1000.52)
-    assert board.said() == bytes(256)
+    assert board.take_output() == bytes(256)
     assert poll.poll(20) == [(sys.stdout, select.POLLOUT)]
     assert clock.now() == pytest.approx(1000.52)
 
@@ -113,4 +113,4 @@ def test_the_official_image_of_a_xiao_has_no_select_but_a_uart(clock: VirtualClo
     assert (uart.any(), uart.read(), uart.readinto(buffer)) == (0, None, None)
     board.type(b"a\x03c")
     assert (uart.any(), uart.readinto(buffer), uart.read()) == (3, 2, b"c")
-    assert (buffer, uart.write(b"xyz"), board.said()) == (b"a\x03", 3, b"xyz")
+    assert (buffer, uart.write(b"xyz"), board.take_output()) == (b"a\x03", 3, b"xyz")

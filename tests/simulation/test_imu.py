@@ -1,4 +1,4 @@
-"""The simulated IMU board behind its pty, as a host hears it."""
+"""The simulated IMU board behind its pty, seen from a host."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import ConfigError
-from pebble.services.serial_mcu_bridge.frame import END, Frame, Type, decode, encode
-from pebble.services.serial_mcu_bridge.manifest import parse_describe
-from pebble.services.serial_mcu_bridge.struct_v1 import unpack
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END, Frame, Type, decode, encode
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
 from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.pty import PtyMcu
 from tests.support import until
 
 
 class Listener:
-    """A host: the frames it heard, without doubtful ones."""
+    """A host: the valid frames that it received."""
 
     def __init__(self, mcu: PtyMcu) -> None:
         self.frames: list[Frame] = []
-        self._port = os.open(mcu.link, os.O_RDWR | os.O_NOCTTY)
+        self._port = os.open(mcu.symlink, os.O_RDWR | os.O_NOCTTY)
         assert until(lambda: mcu.host)
         self._rest = b""
 
@@ -84,15 +84,15 @@ def test_a_disturbed_bus_is_reported_and_recovers(tmp_path: Path) -> None:
         host.listen(0.2)
         mcu.disturb(True)
         host.listen(0.3)
-        heard = len(host.of(Type.SAMPLE))
+        received = len(host.of(Type.SAMPLE))
         host.listen(0.3)
-        assert len(host.of(Type.SAMPLE)) == heard
+        assert len(host.of(Type.SAMPLE)) == received
         mcu.disturb(False)
         host.listen(1.5)
         host.close()
-    assert len(host.of(Type.SAMPLE)) > heard + 20
-    said = [frame.payload for frame in host.of(Type.LOG)]
-    assert said[-2:] == [b"imu_read_failed", b"imu_reinit"]
+    assert len(host.of(Type.SAMPLE)) > received + 20
+    messages = [frame.payload for frame in host.of(Type.LOG)]
+    assert messages[-2:] == [b"imu_read_failed", b"imu_reinit"]
 
 
 def test_two_boards_differ_by_their_uid() -> None:
@@ -103,8 +103,8 @@ def test_two_boards_differ_by_their_uid() -> None:
 def test_a_host_that_was_away_for_a_while_misses_no_sample() -> None:
     """As long as half a second, which is more than the scheduler of a busy machine takes away."""
     mcu = SimulatedMcu("goob_imu", 0.0)
-    said = b"".join(mcu.tick(now) for now in (0.0, 0.1, 0.55, 1.0))
-    frames = [decode(stuffed) for stuffed in said.split(END) if stuffed]
+    messages = b"".join(mcu.tick(now) for now in (0.0, 0.1, 0.55, 1.0))
+    frames = [decode(stuffed) for stuffed in messages.split(END) if stuffed]
     samples = [frame.timestamp for frame in frames if frame.type == Type.SAMPLE]
     assert [b - a for a, b in pairwise(samples)] == [10] * (len(samples) - 1)
     assert len(samples) >= 98

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pebble.simulation.micropython.loader import Firmware, firmware_root
+from pebble.simulation.micropython.loader import FirmwareModules, firmware_root
 
 ROBOT = """
 from common.counter import up
@@ -36,8 +36,8 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def world(root: Path, name: str = "a") -> Firmware:
-    return Firmware({"machine": SimpleNamespace(name=name)}, root=root)
+def world(root: Path, name: str = "a") -> FirmwareModules:
+    return FirmwareModules({"machine": SimpleNamespace(name=name)}, root=root)
 
 
 def test_two_boards_know_nothing_of_each_other_nor_of_the_host(root: Path) -> None:
@@ -109,9 +109,9 @@ def test_a_changed_file_is_compiled_anew(root: Path) -> None:
 
 
 def test_main_is_executed_as_main(root: Path) -> None:
-    (root / "toy/main.py").write_text("from toy.robot import step\nname = __name__\nsaid = step()\n")
+    (root / "toy/main.py").write_text("from toy.robot import step\nname = __name__\nresult = step()\n")
     main = world(root).run("toy/main.py")
-    assert (main.name, main.said) == ("__main__", (1, "a"))
+    assert (main.name, main.result) == ("__main__", (1, "a"))
 
 
 def test_the_firmware_is_found() -> None:

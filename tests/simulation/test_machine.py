@@ -11,7 +11,7 @@ from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.micropython.faults import SharedPwm
 from pebble.simulation.micropython.ports import ESP32_C6, ESP8266, SAMD21
-from pebble.simulation.micropython.watchdog import BoardReset
+from pebble.simulation.micropython.timers import BoardReset
 
 
 def machine(board: Board) -> Any:
@@ -30,7 +30,7 @@ def test_an_output(board: Board) -> None:
     assert (board.duty(3), pin.value()) == (1.0, 1)
 
 
-def test_an_input_shows_its_pull_until_somebody_drives_it(board: Board) -> None:
+def test_an_input_reads_its_pull_resistor_until_it_is_driven(board: Board) -> None:
     kind = machine(board).Pin
     assert kind(3, kind.IN).value() == 0
     pin = kind(3, kind.IN, kind.PULL_UP)
@@ -45,13 +45,13 @@ def test_an_input_shows_its_pull_until_somebody_drives_it(board: Board) -> None:
     assert board.duty(3) == 0.0, "an input puts out nothing"
 
 
-def test_each_change_of_an_output_is_heard(board: Board) -> None:
-    heard: list[float] = []
-    board.pins.before_change = lambda: heard.append(board.duty(3))
+def test_each_change_of_an_output_is_reported(board: Board) -> None:
+    received: list[float] = []
+    board.pins.before_change = lambda: received.append(board.duty(3))
     pwm = machine(board).PWM(machine(board).Pin(3), freq=1000, duty_u16=0)
     for duty in (65535, 65535, 0):
         pwm.duty_u16(duty)
-    assert heard == [0.0, 1.0], "what was until then"
+    assert received == [0.0, 1.0], "what was until then"
 
 
 def test_pwm(board: Board) -> None:
@@ -74,11 +74,11 @@ def test_pwm(board: Board) -> None:
 
 
 def test_a_reset_lets_every_output_go(board: Board) -> None:
-    heard: list[bool] = []
+    received: list[bool] = []
     machine(board).PWM(3, freq=1000, duty_u16=65535)
-    board.pins.before_change = lambda: heard.append(True)
+    board.pins.before_change = lambda: received.append(True)
     board.boot()
-    assert (board.duty(3), heard) == (0.0, [True])
+    assert (board.duty(3), received) == (0.0, [True])
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_a_device_may_be_absent_or_fail(board: Board) -> None:
     assert (code(), i2c.scan()) == (errno.EIO, [])
     board.bus.fail(0x68, errno.ETIMEDOUT)
     assert code() == errno.ETIMEDOUT
-    board.bus.mend(0x68)
+    board.bus.restore(0x68)
     assert code() is None
     board.bus.disturbed = True
     assert (code(), i2c.scan()) == (errno.EIO, [])
@@ -214,7 +214,7 @@ def test_the_watchdog_counts_and_starves(board: Board, clock: VirtualClock) -> N
         dog.feed()
 
 
-def test_whoever_sleeps_too_long_is_reset_at_that_moment(board: Board, clock: VirtualClock) -> None:
+def test_sleeping_too_long_resets_the_board_at_that_moment(board: Board, clock: VirtualClock) -> None:
     machine(board).WDT(timeout=2000)
     with pytest.raises(BoardReset):
         board.firmware.module("time").sleep(60)

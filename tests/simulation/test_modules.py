@@ -76,12 +76,12 @@ def test_random_numbers_are_the_boards_own_and_repeat(clock: VirtualClock) -> No
 
 def test_files(board: Board) -> None:
     board.files["/ca.der"] = b"\x30\x82"
-    assert board.open("/ca.der", "rb").read() == b"\x30\x82"
+    assert board.files.open("/ca.der", "rb").read() == b"\x30\x82"
     assert board.firmware.module("os").stat("/ca.der")[6] == 2
     assert board.firmware.module("os").listdir("/") == ["ca.der"]
     for action in (
-        lambda: board.open("/none"),
-        lambda: board.open("/ca.der", "w"),
+        lambda: board.files.open("/none"),
+        lambda: board.files.open("/ca.der", "r+"),
         lambda: board.firmware.module("os").stat("/none"),
     ):
         with pytest.raises(OSError):

@@ -17,7 +17,7 @@ class Over(BaseException):
 
 
 class Host:
-    """Types at given seconds, and notes when the board said what and when its motors changed."""
+    """Types at given times, and records the board's output and motor changes with their times."""
 
     def __init__(self, kind: str, script: dict[float, bytes], ends: float) -> None:
         self.clock = VirtualClock()
@@ -25,21 +25,21 @@ class Host:
         self.body: Body = body_of(kind, self.board)
         self.motors: list[tuple[float, tuple[float, float]]] = []
         self.body.on_motors = lambda now, motors: self.motors.append((now, motors))
-        self.said: list[tuple[float, bytes]] = []
+        self.output: list[tuple[float, bytes]] = []
         self._script, self._ends = dict(script), ends
-        self.board.timers.on_wait = self._look
+        self.board.timers.on_wait = self._check
         with pytest.raises(Over):
             self.board.firmware.run(f"{kind}/main.py")
 
     def lines(self, pattern: bytes) -> list[float]:
-        """When the board said lines like this."""
-        return [when for when, data in self.said for line in data.splitlines() if re.fullmatch(pattern, line)]
+        """The times of output lines like this."""
+        return [when for when, data in self.output for line in data.splitlines() if re.fullmatch(pattern, line)]
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         now = self.clock.now()
-        self.body.settle()
-        if said := self.board.said():
-            self.said.append((now, said))
+        self.body.end_turn()
+        if output := self.board.take_output():
+            self.output.append((now, output))
         for when in [when for when in self._script if when <= now]:
             self.board.type(self._script.pop(when))
         if now >= self._ends:
@@ -74,10 +74,10 @@ def test_a_host_that_does_not_read_does_not_keep_the_motors_running() -> None:
 class Deaf(Host):
     """Holds the port open and reads nothing."""
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         self.board.console.reading = False
         now = self.clock.now()
-        self.body.settle()
+        self.body.end_turn()
         for when in [when for when in self._script if when <= now]:
             self.board.type(self._script.pop(when))
         if now >= self._ends:

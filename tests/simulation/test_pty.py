@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from pebble.errors import LinkError
+from pebble.errors import DeviceError
 from pebble.simulation.pty import PtyMcu
 from pebble.simulation.trace import Entry, motors_entry, read_trace
 from tests.support import until
@@ -20,7 +20,7 @@ from tests.support import until
 def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> None:
     with PtyMcu("goob", tmp_path / "port", trace=tmp_path / "trace") as mcu:
         before = time.monotonic_ns()
-        with serial.Serial(str(mcu.link), 460800, timeout=5) as port:
+        with serial.Serial(str(mcu.symlink), 460800, timeout=5) as port:
             port.write(b"M 0.5 0.25\nL 1 ")
             assert until(lambda: "M 0.5 0.25" in mcu.trace.lines())
             port.write(b"0 0\r\n")
@@ -40,23 +40,23 @@ def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> 
     assert read_trace(tmp_path / "trace") == [*entries, mcu.trace.entries()[-1]]
 
 
-def test_on_request_the_trace_has_what_the_mcu_said_and_when(tmp_path: Path) -> None:
-    with PtyMcu("goob", tmp_path / "port", trace_said=True) as mcu:
-        with serial.Serial(str(mcu.link), 460800, timeout=5) as port:
+def test_on_request_the_trace_has_the_mcus_output_with_its_time(tmp_path: Path) -> None:
+    with PtyMcu("goob", tmp_path / "port", trace_output=True) as mcu:
+        with serial.Serial(str(mcu.symlink), 460800, timeout=5) as port:
             port.write(b"M 0.5 0.25\n")
             assert port.read_until(b"OK M\r\n").endswith(b"OK M\r\n")
-            heard = time.monotonic_ns()
+            received = time.monotonic_ns()
             assert until(lambda: any(entry.line == "OK M" for entry in mcu.trace.entries()))
         (answer,) = [entry for entry in mcu.trace.entries() if entry.line == "OK M"]
         (asked,) = [entry for entry in mcu.trace.entries() if entry.event == "line"]
     assert answer.event == "said"
-    assert asked.ns <= answer.ns <= heard
+    assert asked.ns <= answer.ns <= received
 
 
-def test_the_line_is_raw_before_anybody_configures_it(tmp_path: Path) -> None:
+def test_the_line_is_raw_before_the_host_configures_it(tmp_path: Path) -> None:
     """A terminal's echo would feed the MCU its own reports; its line editing would keep and alter bytes."""
     with PtyMcu("goob", tmp_path / "port") as mcu:
-        host = os.open(mcu.link, os.O_RDWR | os.O_NOCTTY)
+        host = os.open(mcu.symlink, os.O_RDWR | os.O_NOCTTY)
         assert until(lambda: mcu.host)
         os.write(host, b"\x03\x04\x7fM 1 1\r\n")
         assert until(lambda: mcu.trace.lines() == ["\x03\x04\x7fM 1 1"])
@@ -72,7 +72,7 @@ def test_the_line_is_raw_before_anybody_configures_it(tmp_path: Path) -> None:
 def test_bytes_written_just_before_the_host_closes_are_not_lost(tmp_path: Path) -> None:
     with PtyMcu("fred", tmp_path / "port") as mcu:
         for number in range(50):
-            host = os.open(mcu.link, os.O_RDWR | os.O_NOCTTY)
+            host = os.open(mcu.symlink, os.O_RDWR | os.O_NOCTTY)
             os.write(host, b"M 0 0.%03d\n" % number)
             os.close(host)
             assert until(lambda n=number: mcu.trace.lines()[-1:] == [f"M 0 0.{n:03d}"])  # type: ignore[misc]
@@ -80,29 +80,29 @@ def test_bytes_written_just_before_the_host_closes_are_not_lost(tmp_path: Path) 
 
 
 def test_unplug_and_replug(tmp_path: Path) -> None:
-    link = tmp_path / "port"
-    with PtyMcu("goob", link) as mcu, serial.Serial(str(link), 460800, timeout=5) as port:
+    symlink = tmp_path / "port"
+    with PtyMcu("goob", symlink) as mcu, serial.Serial(str(symlink), 460800, timeout=5) as port:
         port.write(b"M 1 1\n")
         assert until(lambda: mcu.state().drive == (1.0, 1.0))
         mcu.unplug()
         mcu.unplug()
-        assert not link.is_symlink()
+        assert not symlink.is_symlink()
         with pytest.raises(serial.SerialException):
             port.read(100_000)
         assert until(lambda: mcu.state().drive == (0.0, 0.0)), "the failsafe works without a host"
         mcu.replug()
         mcu.replug()
-        with serial.Serial(str(link), 460800, timeout=5) as again:
+        with serial.Serial(str(symlink), 460800, timeout=5) as again:
             again.write(b"M 0.5 0.5\n")
             assert until(lambda: mcu.state().drive == (0.5, 0.5))
         assert until(lambda: not mcu.host)
     events = [entry.event for entry in mcu.trace.entries() if entry.event not in ("line", "motors")]
     assert events == ["plugged", "opened", "unplugged", "plugged", "opened", "closed", "unplugged"]
-    assert not link.is_symlink()
+    assert not symlink.is_symlink()
 
 
 def test_a_host_that_does_not_read_loses_reports_and_stops_nothing(tmp_path: Path) -> None:
-    with PtyMcu("goob", tmp_path / "port") as mcu, serial.Serial(str(mcu.link), 460800) as port:
+    with PtyMcu("goob", tmp_path / "port") as mcu, serial.Serial(str(mcu.symlink), 460800) as port:
         assert until(lambda: mcu.host)
         dropped = mcu.dropped
         while mcu.dropped == dropped:
@@ -112,11 +112,11 @@ def test_a_host_that_does_not_read_loses_reports_and_stops_nothing(tmp_path: Pat
         assert until(lambda: mcu.state().drive == (0.1, 0.1))
 
 
-def test_after_its_end_it_says_so(tmp_path: Path) -> None:
+def test_a_closed_mcu_refuses_requests(tmp_path: Path) -> None:
     mcu = PtyMcu("goob", tmp_path / "port").open()
     mcu.close()
     mcu.close()
-    with pytest.raises(LinkError):
+    with pytest.raises(DeviceError):
         mcu.state()
 
 
@@ -134,34 +134,34 @@ def test_a_motors_entry_has_three_decimals_and_no_minus_zero() -> None:
 
 
 def test_the_program(tmp_path: Path) -> None:
-    link, trace = tmp_path / "port", tmp_path / "trace"
-    command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "fred", "--link", str(link)]
+    symlink, trace = tmp_path / "port", tmp_path / "trace"
+    command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "fred", "--link", str(symlink)]
     command += ["--trace", str(trace), "--report", "--control", "--charging", "--failsafe", "5"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) as program:
         assert program.stdin is not None
         assert program.stdout is not None
-        looks = (json.loads(line) for line in program.stdout)
-        first = next(looks)
+        snapshots = (json.loads(line) for line in program.stdout)
+        first = next(snapshots)
         assert (first["plugged"], first["host"], first["board"]["kind"]) == (True, False, "fred")
-        with serial.Serial(str(link), 115200) as port:
+        with serial.Serial(str(symlink), 115200) as port:
             port.write(b"M 1 1\n")
-            moving = next(look for look in looks if look["board"]["left_mm_s"] > 0)
+            moving = next(snapshot for snapshot in snapshots if snapshot["board"]["left_mm_s"] > 0)
             assert moving["board"]["last_command"] == "M 1 1"
             assert moving["board"]["charging"] is True
             program.stdin.write("discharge\nnonsense\nunplug\n")
-            assert not next(look for look in looks if not look["plugged"])["board"]["charging"]
+            assert not next(snapshot for snapshot in snapshots if not snapshot["plugged"])["board"]["charging"]
         program.stdin.write("replug\n")
-        assert next(look for look in looks if look["plugged"])
+        assert next(snapshot for snapshot in snapshots if snapshot["plugged"])
         program.stdin.close()
         assert program.wait(10) == 0
     assert [entry.line for entry in read_trace(trace) if entry.event == "line"] == ["M 1 1"]
-    assert not link.is_symlink()
+    assert not symlink.is_symlink()
 
 
 def test_it_never_takes_a_file_away(tmp_path: Path) -> None:
     notes = tmp_path / "notes.txt"
     notes.write_text("precious")
-    with pytest.raises(LinkError, match=r"notes\.txt: there is something else"):
+    with pytest.raises(DeviceError, match=r"notes\.txt: the path exists and is not a symlink"):
         PtyMcu("goob", notes).open()
     assert notes.read_text() == "precious"
 
@@ -170,22 +170,24 @@ def test_who_takes_over_a_link_keeps_it(tmp_path: Path) -> None:
     first = PtyMcu("goob", tmp_path / "port").open()
     with PtyMcu("goob", tmp_path / "port") as second:
         first.close()
-        with serial.Serial(str(second.link), 460800):
+        with serial.Serial(str(second.symlink), 460800):
             assert until(lambda: second.host)
 
 
-def test_the_program_says_in_one_line_where_no_port_can_be(tmp_path: Path) -> None:
+def test_a_port_that_cannot_be_created_is_a_one_line_error(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", str(tmp_path / "no" / "port")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=20)
     assert done.returncode == 1
-    assert done.stderr == f"there can be no serial port at {tmp_path}/no/port: No such file or directory\n"
+    assert done.stderr == f"cannot create a serial port at {tmp_path}/no/port: No such file or directory\n"
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_the_program_ends_on_a_signal_and_takes_its_link_along(tmp_path: Path, how: signal.Signals) -> None:
-    link = tmp_path / "port"
-    with subprocess.Popen([sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", link]) as program:
-        assert until(link.is_symlink)
+    symlink = tmp_path / "port"
+    with subprocess.Popen(
+        [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", symlink]
+    ) as program:
+        assert until(symlink.is_symlink)
         program.send_signal(how)
         assert program.wait(10) == 0
-    assert not link.is_symlink()
+    assert not symlink.is_symlink()

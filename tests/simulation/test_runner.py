@@ -13,7 +13,7 @@ from pebble.simulation.micropython.faults import FirmwareFault
 from pebble.simulation.micropython.loader import firmware_root
 from pebble.simulation.micropython.ports import ESP32_C6, ESP8266
 from pebble.simulation.micropython.runner import Runner
-from pebble.simulation.micropython.watchdog import BoardReset
+from pebble.simulation.micropython.timers import BoardReset
 
 ROBOT = """
 import machine

@@ -43,20 +43,20 @@ _numbers = itertools.count(1)
 
 
 @pytest.fixture(scope="module", params=list(NETS))
-def fabric(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
+def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
     """One per module and kind; its broker or hub is started."""
     net = NETS[request.param](tmp_path_factory.mktemp("net"))
-    net.start_fabric()
+    net.start_network()
     yield net
     net.stop()
 
 
 @pytest.fixture
-def net(fabric: Net) -> Iterator[Net]:
-    """The fabric, without anybody else's clients."""
-    yield fabric
-    fabric.heal()
-    fabric.close_clients()
+def net(network: Net) -> Iterator[Net]:
+    """The network, without the clients of other tests."""
+    yield network
+    network.heal()
+    network.close_clients()
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The fabric inside this process, for the shared suite."""
+"""The network inside this process, for the shared suite."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ class MemoryNet(Net):
     def portable_settings(self) -> Any:
         return MemoryHub()
 
-    def start_fabric(self) -> None:
+    def start_network(self) -> None:
         self._hub.start()
 
-    def stop_fabric(self, *, forget: bool = False) -> None:
+    def stop_network(self, *, forget: bool = False) -> None:
         self._hub.stop(forget=forget)
 
-    def freeze_fabric(self) -> None:
+    def freeze_network(self) -> None:
         """There is no connection that could stay open without answering: an outage is all there can be."""
         self._hub.stop()
 
-    def thaw_fabric(self) -> None:
+    def thaw_network(self) -> None:
         self._hub.start()
 
     def heal(self) -> None:
@@ -40,8 +40,8 @@ class MemoryNet(Net):
             self._hub.start()
 
     def peer(self, name: str, *, will: Message | None = None) -> Peer:
-        client = MemoryTransport(name, self._hub, will=will)
-        self._clients.append(client)
+        client = self.client(name, will=will)
+        assert isinstance(client, MemoryTransport)
         return MemoryPeer(self._hub, client)
 
 
@@ -50,7 +50,6 @@ class MemoryPeer:
 
     def __init__(self, hub: MemoryHub, client: MemoryTransport) -> None:
         self._hub, self._client = hub, client
-        client.open(10)
 
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
         return self._client.publish(topic, payload, qos=qos, retain=retain)

@@ -25,21 +25,21 @@ class MqttNet(Net):
     def echoless_settings(self) -> Any:
         return self.settings(as_published=True)
 
-    def start_fabric(self) -> None:
+    def start_network(self) -> None:
         if not self._broker.running:
             self._broker.start()
 
-    def stop_fabric(self, *, forget: bool = False) -> None:
+    def stop_network(self, *, forget: bool = False) -> None:
         if self._broker.running:
             self._broker.save()
             self._broker.kill()
         if forget:
             self._broker.forget()
 
-    def freeze_fabric(self) -> None:
+    def freeze_network(self) -> None:
         self._broker.freeze()
 
-    def thaw_fabric(self) -> None:
+    def thaw_network(self) -> None:
         self._broker.thaw()
 
     def heal(self) -> None:

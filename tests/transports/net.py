@@ -1,7 +1,7 @@
-"""A fabric and its clients, as the shared transport suite sees them: one `Net` per kind of transport.
+"""A network and its clients, as the shared transport suite uses them: one `Net` per kind of transport.
 
-A `Net` owns what the clients meet at (a broker, a hub, a Python object) and every client a test makes. The fabric
-lives as long as a module's tests of one kind; `close_clients` ends what one test made. Tests keep apart by topic.
+A `Net` owns the broker or hub (or a Python object) and every client a test makes. The network
+runs as long as a module's tests of one kind; `close_clients` ends what one test made. Tests keep apart by topic.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.support import ROOT, Child
 
 
 class Peer(Protocol):
-    """A client that can die: in a process of its own where the fabric is real."""
+    """A client that can die: in a process of its own where the network is real."""
 
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool: ...
 
@@ -27,11 +27,11 @@ class Peer(Protocol):
         """SIGKILL, and wait until the process is gone."""
 
     def close(self) -> None:
-        """A polite close, then the end of the process."""
+        """An orderly close, then the end of the process."""
 
 
 class Net(ABC):
-    """What the suite needs from a kind of transport. A subclass supplies `kind`, `settings` and the fabric."""
+    """What the suite needs from a kind of transport. A subclass supplies `kind`, `settings` and the network."""
 
     #: What `pebble.transports.create` calls it.
     kind: str
@@ -47,19 +47,19 @@ class Net(ABC):
         """Settings of a client, changed by keyword (the settings class's field names)."""
 
     @abstractmethod
-    def start_fabric(self) -> None:
+    def start_network(self) -> None:
         """Start the broker or hub (again): same address, what it had saved is there again."""
 
     @abstractmethod
-    def stop_fabric(self, *, forget: bool = False) -> None:
-        """SIGKILL the broker or hub, after what it saves has surely been saved; `forget` then wipes what it saved."""
+    def stop_network(self, *, forget: bool = False) -> None:
+        """SIGKILL the broker or hub, once its data is saved; `forget` then deletes that."""
 
     @abstractmethod
-    def freeze_fabric(self) -> None:
+    def freeze_network(self) -> None:
         """It stops answering without closing a connection (SIGSTOP)."""
 
     @abstractmethod
-    def thaw_fabric(self) -> None: ...
+    def thaw_network(self) -> None: ...
 
     def echoless_settings(self) -> Any:
         """Settings of a client whose `echo=False` is exact (T16)."""
@@ -67,7 +67,7 @@ class Net(ABC):
 
     @abstractmethod
     def heal(self) -> None:
-        """After a test that failed half-way: the fabric runs again. Does nothing if it does."""
+        """After a test that failed half-way: make the network run again. Does nothing if it runs."""
 
     def portable_settings(self) -> Any:
         """Settings a program of its own can use; they must pickle."""
@@ -88,9 +88,9 @@ class Net(ABC):
         self._peers.append(peer)
         return peer
 
-    def restart_fabric(self, *, forget: bool = False) -> None:
-        self.stop_fabric(forget=forget)
-        self.start_fabric()
+    def restart_network(self, *, forget: bool = False) -> None:
+        self.stop_network(forget=forget)
+        self.start_network()
 
     def close_clients(self) -> None:
         """End every client and peer made so far."""
@@ -102,9 +102,9 @@ class Net(ABC):
         self._clients.clear()
 
     def stop(self) -> None:
-        """End everything, the fabric included."""
+        """End everything, the network included."""
         self.close_clients()
-        self.stop_fabric()
+        self.stop_network()
 
     def _client(self, name: str, settings: Any, will: Message | None, opened: bool) -> Transport:
         client = create(self.kind, name, settings, will=will)

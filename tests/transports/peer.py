@@ -1,4 +1,4 @@
-"""The program behind `ProcessPeer`: one client that does what lines of JSON on stdin tell it."""
+"""The program behind `ProcessPeer`: one client that follows the commands in lines of JSON on stdin."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from pebble.transports import QoS, State, create
 def main(recipe: str) -> None:
     kind, name, settings, will = pickle.loads(base64.b64decode(recipe))
     client = create(kind, name, settings, will=will).open(10)
-    say(client.state is State.CONNECTED)
+    report(client.state is State.CONNECTED)
     for line in sys.stdin:
         request = json.loads(line)
         if "close" in request:
             client.close()
-            say(True)
+            report(True)
             return
         payload = bytes.fromhex(request["payload"])
-        say(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
+        report(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
 
 
-def say(answer: bool) -> None:
+def report(answer: bool) -> None:
     sys.stdout.write(json.dumps(answer) + "\n")
     sys.stdout.flush()
 

@@ -1,4 +1,4 @@
-"""What every transport promises (docs/transports.md, T1 to T19), on every transport."""
+"""What every transport promises (docs/transports.md, T1 to T21), on every transport."""
 
 # ruff: noqa: N802  (a test is named after its promise)
 
@@ -21,15 +21,15 @@ from paho.mqtt.client import topic_matches_sub
 from pebble.errors import TransportError
 from pebble.transports import Message, QoS, State, Transport
 from tests.support import ROOT, until
-from tests.transports.heard import Heard
 from tests.transports.net import Net
+from tests.transports.received import Received
 
 LATEST, DELIVERED = QoS.LATEST, QoS.DELIVERED
 
 
-def settled(sender: Transport, receiver: Transport, base: str) -> None:
-    """Wait until whatever ``sender`` said before has reached ``receiver``: a last word on another topic has."""
-    last = Heard()
+def drained(sender: Transport, receiver: Transport, base: str) -> None:
+    """Wait until all that ``sender`` published before has reached ``receiver``: a last message on another topic has."""
+    last = Received()
     subscription = receiver.subscribe(f"{base}/last-word", last)
     assert sender.publish(f"{base}/last-word", b"", qos=DELIVERED)
     assert until(lambda: last.messages)
@@ -66,24 +66,24 @@ def sample_pairs(count: int, seed: int) -> list[tuple[str, str]]:
     return pairs
 
 
-def test_T01_filters_match_as_paho_says(net: Net, base: str) -> None:
+def test_T01_filters_match_as_in_paho(net: Net, base: str) -> None:
     client = net.client("matcher")
     pairs = sample_pairs(60, seed=7)
-    handlers = {filter_: Heard() for filter_, _ in pairs}
-    for filter_, heard in handlers.items():
-        client.subscribe(f"{base}/{filter_}", heard, limit=10_000)
+    handlers = {filter_: Received() for filter_, _ in pairs}
+    for filter_, received in handlers.items():
+        client.subscribe(f"{base}/{filter_}", received, limit=10_000)
     topics = sorted({topic for _, topic in pairs})
     for topic in topics:
         assert client.publish(f"{base}/{topic}", topic.encode(), qos=DELIVERED)
-    for filter_, heard in handlers.items():
+    for filter_, received in handlers.items():
         wanted = [t.encode() for t in topics if topic_matches_sub(f"{base}/{filter_}", f"{base}/{t}")]
-        assert heard.until(*wanted), (filter_, heard.payloads, wanted)
-    assert sum(len(heard.payloads) for heard in handlers.values()) > 60
+        assert received.until(*wanted), (filter_, received.payloads, wanted)
+    assert sum(len(received.payloads) for received in handlers.values()) > 60
 
 
 def test_T01_a_hash_matches_its_parent_and_a_plus_one_level(net: Net, base: str) -> None:
     client = net.client("matcher")
-    rest, one, empty = Heard(), Heard(), Heard()
+    rest, one, empty = Received(), Received(), Received()
     client.subscribe(f"{base}/a/#", rest)
     client.subscribe(f"{base}/a/+", one)
     client.subscribe(f"{base}/a//+", empty)
@@ -95,8 +95,8 @@ def test_T01_a_hash_matches_its_parent_and_a_plus_one_level(net: Net, base: str)
 
 
 def test_T02_every_allowed_topic_works(net: Net, base: str) -> None:
-    client, heard, rooted = net.client("odd-topics"), Heard(), Heard()
-    client.subscribe(f"{base}/#", heard)
+    client, received, rooted = net.client("odd-topics"), Received(), Received()
+    client.subscribe(f"{base}/#", received)
     client.subscribe(f"/{base}", rooted)
     topics = [
         f"{base}/{rest}"
@@ -122,9 +122,9 @@ def test_T02_every_allowed_topic_works(net: Net, base: str) -> None:
     topics += [f"{base}/" + "x" * (1024 - len(base) - 1), base + "/l" * (199 - base.count("/"))]
     for topic in topics:
         assert client.publish(topic, topic.encode(), qos=DELIVERED, retain=topic.endswith("*"))
-    assert until(lambda: len(heard.messages) == len(topics))
-    assert [message.topic for message in heard.messages] == topics
-    assert all(message.topic.encode() == message.payload for message in heard.messages)
+    assert until(lambda: len(received.messages) == len(topics))
+    assert [message.topic for message in received.messages] == topics
+    assert all(message.topic.encode() == message.payload for message in received.messages)
     assert client.publish(f"/{base}", b"root", qos=DELIVERED)
     assert rooted.until(b"root")
 
@@ -170,11 +170,11 @@ def test_T02_what_no_transport_may_carry_is_refused_before_anything_is_sent(net:
             client.publish(topic, b"x", qos=DELIVERED)  # type: ignore[arg-type]
     for filter_ in BAD_FILTERS.values():
         with pytest.raises(TransportError):
-            client.subscribe(filter_, Heard())
+            client.subscribe(filter_, Received())
     with pytest.raises(TransportError):
         client.publish(base, "text", qos=DELIVERED)  # type: ignore[arg-type]
     assert client.counters["sent"] == before
-    settled(client, client, base)
+    drained(client, client, base)
 
 
 def test_T02_a_will_on_a_bad_topic_is_refused(net: Net) -> None:
@@ -187,52 +187,52 @@ def test_T02_a_will_on_a_bad_topic_is_refused(net: Net) -> None:
 
 def test_T03_a_message_put_right_after_open_and_subscribe_arrives(net: Net, base: str) -> None:
     for turn in range(10):
-        heard = Heard()
+        received = Received()
         receiver = net.client(f"receiver{turn}")
-        receiver.subscribe(f"{base}/{turn}/#", heard)
+        receiver.subscribe(f"{base}/{turn}/#", received)
         sender = net.client(f"sender{turn}")
         assert sender.publish(f"{base}/{turn}/x", b"now", qos=DELIVERED)
-        assert heard.until(b"now")
+        assert received.until(b"now")
         sender.close()
         receiver.close()
 
 
-def test_T03_a_short_lived_sender_is_heard(net: Net, base: str) -> None:
-    heard = Heard()
-    net.client("receiver").subscribe(f"{base}/#", heard)
+def test_T03_a_short_lived_publisher_is_received(net: Net, base: str) -> None:
+    received = Received()
+    net.client("receiver").subscribe(f"{base}/#", received)
     for number in range(5):
         sender = net.client(f"short-lived{number}")
         assert sender.publish(f"{base}/x", b"%d" % number, qos=DELIVERED)
         sender.close()
-    assert heard.until(*(b"%d" % number for number in range(5)))
+    assert received.until(*(b"%d" % number for number in range(5)))
 
 
 def test_T03_delivered_messages_arrive_in_order(net: Net, base: str) -> None:
-    sender, receiver, heard = net.client("sender"), net.client("receiver"), Heard()
-    receiver.subscribe(f"{base}/+", heard, limit=5000)
+    sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
+    receiver.subscribe(f"{base}/+", received, limit=5000)
     wanted = []
     for number in range(900):  # mosquitto queues 1000 for a receiver that falls behind
         payload = b"%d" % number
         assert sender.publish(f"{base}/{number % 3}", payload, qos=DELIVERED)
         wanted.append(payload)
-    assert until(lambda: len(heard.payloads) >= len(wanted), 30)
+    assert until(lambda: len(received.payloads) >= len(wanted), 30)
     for lane in range(3):
-        assert [p for p in heard.payloads if int(p) % 3 == lane] == wanted[lane::3]
+        assert [p for p in received.payloads if int(p) % 3 == lane] == wanted[lane::3]
 
 
 def test_T03_latest_messages_arrive_when_nothing_is_in_the_way(net: Net, base: str) -> None:
-    sender, receiver, heard = net.client("sender"), net.client("receiver"), Heard()
-    receiver.subscribe(base, heard, qos=LATEST)
+    sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
+    receiver.subscribe(base, received, qos=LATEST)
     for number in range(20):
         assert sender.publish(base, b"%d" % number)
-    assert heard.until(*(b"%d" % number for number in range(20)))
+    assert received.until(*(b"%d" % number for number in range(20)))
 
 
 def test_T04_what_was_not_accepted_is_never_delivered(net: Net, base: str) -> None:
-    sender, receiver, heard = net.client("sender"), net.client("receiver"), Heard()
-    receiver.subscribe(base, heard)
+    sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
+    receiver.subscribe(base, received)
     with reconnecting(sender, receiver):
-        net.stop_fabric()
+        net.stop_network()
         assert until(lambda: sender.state is State.CONNECTING)
         accepted, refused_before = [], sender.counters["refused"]
         for number in range(100):
@@ -241,9 +241,9 @@ def test_T04_what_was_not_accepted_is_never_delivered(net: Net, base: str) -> No
                 accepted.append(payload)
             assert time.monotonic() - began < 1.0
         assert sender.counters["refused"] - refused_before == 100 - len(accepted)
-        net.start_fabric()
-    settled(sender, receiver, base)
-    assert heard.payloads == accepted
+        net.start_network()
+    drained(sender, receiver, base)
+    assert received.payloads == accepted
 
 
 def test_T04_a_transport_that_is_not_open_refuses(net: Net, base: str) -> None:
@@ -253,58 +253,58 @@ def test_T04_a_transport_that_is_not_open_refuses(net: Net, base: str) -> None:
     client.close()
     assert client.publish(base, b"x", qos=DELIVERED, retain=True) is False
     with pytest.raises(TransportError):
-        client.subscribe(base, Heard())
+        client.subscribe(base, Received())
 
 
-# -- T5 to T9: kept messages
+# -- T5 to T9: retained messages
 
 
-def test_T05_kept_copy_reaches_late_subscribers(net: Net, base: str) -> None:
+def test_T05_a_retained_message_reaches_late_subscribers(net: Net, base: str) -> None:
     sender = net.client("sender")
     for value in (b"old", b"new"):
         assert sender.publish(f"{base}/state", value, qos=DELIVERED, retain=True)
-    settled(sender, sender, base)
-    heard = Heard()
+    drained(sender, sender, base)
+    received = Received()
     late = net.client("late")
-    late.subscribe(f"{base}/#", heard)
-    assert heard.until(b"new")
-    assert heard.messages[0].retain
-    settled(late, late, base)
-    assert [payload for payload in heard.payloads if payload] == [b"new"]
+    late.subscribe(f"{base}/#", received)
+    assert received.until(b"new")
+    assert received.messages[0].retain
+    drained(late, late, base)
+    assert [payload for payload in received.payloads if payload] == [b"new"]
 
 
-def test_T05_kept_copy_outlives_its_publisher(net: Net, base: str) -> None:
+def test_T05_a_retained_message_outlives_its_publisher(net: Net, base: str) -> None:
     for how in ("kill", "close"):
         peer = net.peer(f"publisher-{how}")
         assert peer.publish(f"{base}/{how}", b"value", retain=True)
-        settled_peer(net, peer, base)
+        peer_drained(net, peer, base)
         getattr(peer, how)()
-    heard = Heard()
-    net.client("late").subscribe(f"{base}/+", heard)
-    assert until(lambda: len(heard.messages) == 2)
-    assert {(m.topic, m.payload, m.retain) for m in heard.messages} == {
+    received = Received()
+    net.client("late").subscribe(f"{base}/+", received)
+    assert until(lambda: len(received.messages) == 2)
+    assert {(m.topic, m.payload, m.retain) for m in received.messages} == {
         (f"{base}/kill", b"value", True),
         (f"{base}/close", b"value", True),
     }
 
 
-def settled_peer(net: Net, peer: object, base: str) -> None:
-    """What ``peer`` said before has arrived where it is kept."""
-    heard = Heard()
+def peer_drained(net: Net, peer: object, base: str) -> None:
+    """Wait until what ``peer`` published before is stored."""
+    received = Received()
     watcher = net.client(f"watcher-{id(peer)}")
-    watcher.subscribe(f"{base}/word/peer", heard)
+    watcher.subscribe(f"{base}/word/peer", received)
     assert peer.publish(f"{base}/word/peer", b"x")  # type: ignore[attr-defined]
-    assert until(lambda: heard.messages)
+    assert until(lambda: received.messages)
     watcher.close()
 
 
-def test_T05_kept_copies_come_once_per_subscription_and_connection(net: Net, base: str) -> None:
+def test_T05_retained_messages_come_once_per_subscription_and_connection(net: Net, base: str) -> None:
     sender = net.client("sender")
     sender.publish(f"{base}/a", b"A", qos=DELIVERED, retain=True)
     sender.publish(f"{base}/b", b"B", qos=DELIVERED, retain=True)
-    settled(sender, sender, base)
+    drained(sender, sender, base)
     client = net.client("late")
-    first, same, wider, narrower = Heard(), Heard(), Heard(), Heard()
+    first, same, wider, narrower = Received(), Received(), Received(), Received()
     client.subscribe(f"{base}/+", first)
     assert until(lambda: sorted(first.payloads) == [b"A", b"B"])
     client.subscribe(f"{base}/+", same)
@@ -313,51 +313,51 @@ def test_T05_kept_copies_come_once_per_subscription_and_connection(net: Net, bas
     assert until(lambda: sorted(wider.payloads) == [b"A", b"B"])
     client.subscribe(f"{base}/a", narrower)
     assert narrower.until(b"A")
-    settled(sender, client, f"{base}/deep/er")
-    for heard in (first, same):
-        assert sorted(heard.payloads) == [b"A", b"B"]
+    drained(sender, client, f"{base}/deep/er")
+    for received in (first, same):
+        assert sorted(received.payloads) == [b"A", b"B"]
     with reconnecting(sender, client):
-        net.restart_fabric()
-    for heard in (first, same):
-        assert until(lambda: sorted(heard.payloads) == [b"A", b"A", b"B", b"B"]), heard.payloads  # noqa: B023
-    settled(sender, client, f"{base}/deep/er")
-    for heard in (first, same):
-        assert sorted(heard.payloads) == [b"A", b"A", b"B", b"B"]
+        net.restart_network()
+    for received in (first, same):
+        assert until(lambda: sorted(received.payloads) == [b"A", b"A", b"B", b"B"]), received.payloads  # noqa: B023
+    drained(sender, client, f"{base}/deep/er")
+    for received in (first, same):
+        assert sorted(received.payloads) == [b"A", b"A", b"B", b"B"]
     assert narrower.payloads == [b"A", b"A"]
 
 
-def test_T06_an_empty_kept_payload_removes_the_kept_copy(net: Net, base: str) -> None:
-    client, live = net.client("sender"), Heard()
+def test_T06_an_empty_retained_payload_removes_the_retained_message(net: Net, base: str) -> None:
+    client, live = net.client("sender"), Received()
     client.subscribe(f"{base}/state", live)
     client.publish(f"{base}/state", b"value", qos=DELIVERED, retain=True)
     client.publish(f"{base}/state", b"", qos=DELIVERED, retain=True)
     assert live.until(b"value", b"")
-    late, heard = net.client("late"), Heard()
-    late.subscribe(f"{base}/state", heard)
-    settled(client, late, base)
-    assert heard.messages == []
+    late, received = net.client("late"), Received()
+    late.subscribe(f"{base}/state", received)
+    drained(client, late, base)
+    assert received.messages == []
     with reconnecting(client, late):
-        net.restart_fabric()
-    settled(client, late, base)
-    assert heard.messages == []
+        net.restart_network()
+    drained(client, late, base)
+    assert received.messages == []
 
 
-def test_T07_live_messages_are_not_marked_as_kept_copies(net: Net, base: str) -> None:
-    sender, receiver, heard = net.client("sender"), net.client("receiver"), Heard()
-    receiver.subscribe(base, heard)
+def test_T07_live_messages_are_not_marked_as_retained(net: Net, base: str) -> None:
+    sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
+    receiver.subscribe(base, received)
     sender.publish(base, b"fleeting", qos=DELIVERED, retain=False)
     sender.publish(base, b"to be kept", qos=DELIVERED, retain=True)
-    assert heard.until(b"fleeting", b"to be kept")
-    assert [message.retain for message in heard.messages] == [False, False]
-    assert heard.messages[0].keep in (False, None)
-    assert heard.messages[1].keep in (True, None)
+    assert received.until(b"fleeting", b"to be kept")
+    assert [message.retain for message in received.messages] == [False, False]
+    assert received.messages[0].retain_requested in (False, None)
+    assert received.messages[1].retain_requested in (True, None)
 
 
 def test_T08_the_newest_value_is_seen_last(net: Net, base: str) -> None:
     sender = net.client("sender")
     for number in range(300):
         assert sender.publish(f"{base}/{number}", b"0", qos=DELIVERED, retain=True)
-    settled(sender, sender, f"{base}-x")
+    drained(sender, sender, f"{base}-x")
     stop = threading.Event()
     rounds = [0]
 
@@ -372,12 +372,12 @@ def test_T08_the_newest_value_is_seen_last(net: Net, base: str) -> None:
     writer.start()
     try:
         for turn in range(3):
-            late, heard = net.client(f"late{turn}"), Heard()
-            late.subscribe(f"{base}/+", heard, limit=100_000)
-            assert until(lambda: len({m.topic for m in heard.messages}) == 300)  # noqa: B023
+            late, received = net.client(f"late{turn}"), Received()
+            late.subscribe(f"{base}/+", received, limit=100_000)
+            assert until(lambda: len({m.topic for m in received.messages}) == 300)  # noqa: B023
             late.close()
             newest: dict[str, int] = {}
-            for message in heard.messages:
+            for message in received.messages:
                 assert newest.get(message.topic, -1) <= int(message.payload), "an older value came after a newer one"
                 newest[message.topic] = int(message.payload)
     finally:
@@ -385,129 +385,129 @@ def test_T08_the_newest_value_is_seen_last(net: Net, base: str) -> None:
         writer.join()
 
 
-def test_T09_kept_copies_survive_the_fabric_and_dead_clients(net: Net, base: str) -> None:
+def test_T09_retained_messages_survive_the_network_and_dead_clients(net: Net, base: str) -> None:
     peer = net.peer("gone")
     assert peer.publish(f"{base}/gone", b"still here", retain=True)
-    settled_peer(net, peer, base)
+    peer_drained(net, peer, base)
     peer.kill()
-    net.restart_fabric()
-    heard = Heard()
-    net.client("late").subscribe(f"{base}/gone", heard)
-    assert heard.until(b"still here")
+    net.restart_network()
+    received = Received()
+    net.client("late").subscribe(f"{base}/gone", received)
+    assert received.until(b"still here")
 
 
-def test_T09_living_clients_bring_their_kept_state_back(net: Net, base: str) -> None:
-    keeper = net.client("keeper")
+def test_T09_running_clients_restore_their_retained_state(net: Net, base: str) -> None:
+    retainer = net.client("keeper")
     for name, qos in (("a", DELIVERED), ("b", LATEST)):
-        assert keeper.publish(f"{base}/{name}", b"value", qos=qos, retain=True)
-    settled(keeper, keeper, base)
-    with reconnecting(keeper):
-        net.restart_fabric(forget=True)
-    heard = Heard()
-    net.client("late").subscribe(f"{base}/+", heard)
-    assert until(lambda: len(heard.messages) == 2, 2.0)
+        assert retainer.publish(f"{base}/{name}", b"value", qos=qos, retain=True)
+    drained(retainer, retainer, base)
+    with reconnecting(retainer):
+        net.restart_network(forget=True)
+    received = Received()
+    net.client("late").subscribe(f"{base}/+", received)
+    assert until(lambda: len(received.messages) == 2, 2.0)
 
 
-def test_T09_what_changed_during_the_outage_is_told_and_nothing_else(net: Net, base: str) -> None:
-    keeper, heard = net.client("keeper"), Heard()
-    keeper.publish(f"{base}/same", b"1", qos=DELIVERED, retain=True)
-    keeper.publish(f"{base}/changed", b"1", qos=DELIVERED, retain=True)
-    keeper.publish(f"{base}/removed", b"1", qos=DELIVERED, retain=True)
-    keeper.publish(f"{base}/flag", b"by keeper", qos=DELIVERED, retain=True)
-    settled(keeper, keeper, base)
+def test_T09_only_what_changed_during_the_outage_is_sent(net: Net, base: str) -> None:
+    retainer, received = net.client("keeper"), Received()
+    retainer.publish(f"{base}/same", b"1", qos=DELIVERED, retain=True)
+    retainer.publish(f"{base}/changed", b"1", qos=DELIVERED, retain=True)
+    retainer.publish(f"{base}/removed", b"1", qos=DELIVERED, retain=True)
+    retainer.publish(f"{base}/flag", b"by keeper", qos=DELIVERED, retain=True)
+    drained(retainer, retainer, base)
     other = net.client("other")
     other.publish(f"{base}/flag", b"by other", qos=DELIVERED, retain=True)
-    settled(other, other, base)
-    with reconnecting(keeper):
-        net.stop_fabric()
-        assert until(lambda: keeper.state is State.CONNECTING)
-        assert keeper.publish(f"{base}/changed", b"2", qos=DELIVERED, retain=True)
-        assert keeper.publish(f"{base}/removed", b"", qos=DELIVERED, retain=True)
+    drained(other, other, base)
+    with reconnecting(retainer):
+        net.stop_network()
+        assert until(lambda: retainer.state is State.CONNECTING)
+        assert retainer.publish(f"{base}/changed", b"2", qos=DELIVERED, retain=True)
+        assert retainer.publish(f"{base}/removed", b"", qos=DELIVERED, retain=True)
         other.close()
-        net.start_fabric()
-    net.client("late").subscribe(f"{base}/+", heard)
+        net.start_network()
+    net.client("late").subscribe(f"{base}/+", received)
     wanted = {f"{base}/same": b"1", f"{base}/changed": b"2", f"{base}/flag": b"by other"}
-    assert until(lambda: {m.topic: m.payload for m in heard.messages} == wanted, 2.0)
+    assert until(lambda: {m.topic: m.payload for m in received.messages} == wanted, 2.0)
 
 
 # -- T10: wills
 
 
 def test_T10_the_will_is_spoken_once_when_a_client_is_killed(net: Net, base: str) -> None:
-    heard = Heard()
-    net.client("watcher").subscribe(f"{base}/will", heard)
+    received = Received()
+    net.client("watcher").subscribe(f"{base}/will", received)
     peer = net.peer("mortal", will=Message(f"{base}/will", b"gone", DELIVERED, True))
     peer.kill()
-    assert heard.until(b"gone", timeout=5)
-    late, kept = net.client("late"), Heard()
-    late.subscribe(f"{base}/will", kept)
-    assert kept.until(b"gone")
-    settled(late, late, base)
-    assert heard.payloads == [b"gone"]
+    assert received.until(b"gone", timeout=5)
+    late, retained = net.client("late"), Received()
+    late.subscribe(f"{base}/will", retained)
+    assert retained.until(b"gone")
+    drained(late, late, base)
+    assert received.payloads == [b"gone"]
 
 
 def test_T10_the_will_is_spoken_once_on_a_polite_close(net: Net, base: str) -> None:
-    watcher, heard = net.client("watcher"), Heard()
-    watcher.subscribe(f"{base}/will", heard)
+    watcher, received = net.client("watcher"), Received()
+    watcher.subscribe(f"{base}/will", received)
     net.client("polite", will=Message(f"{base}/will", b"bye", DELIVERED)).close()
-    assert heard.until(b"bye")
+    assert received.until(b"bye")
     peer = net.peer("polite-too", will=Message(f"{base}/will", b"bye too", DELIVERED))
     peer.close()
-    assert heard.until(b"bye", b"bye too")
-    settled(watcher, watcher, base)
-    assert heard.payloads == [b"bye", b"bye too"]
+    assert received.until(b"bye", b"bye too")
+    drained(watcher, watcher, base)
+    assert received.payloads == [b"bye", b"bye too"]
 
 
-def test_T10_a_client_that_comes_back_takes_its_kept_will_back(net: Net, base: str) -> None:
-    """The fabric may have spoken the will of a client that only lost its connection."""
+def test_T10_a_client_that_comes_back_replaces_its_retained_will(net: Net, base: str) -> None:
+    """The network may have published the will of a client that only lost its connection."""
     client = net.client("alive", will=Message(f"{base}/status", b"offline", DELIVERED, True))
     assert client.publish(f"{base}/status", b"online", qos=DELIVERED, retain=True)
-    settled(client, client, base)
+    drained(client, client, base)
     with reconnecting(client):
-        net.freeze_fabric()
+        net.freeze_network()
         assert until(lambda: client.state is State.CONNECTING)
-        net.thaw_fabric()
-    heard = Heard()
-    net.client("late").subscribe(f"{base}/status", heard)
-    assert until(lambda: heard.payloads and heard.payloads[-1] == b"online")
+        net.thaw_network()
+    received = Received()
+    net.client("late").subscribe(f"{base}/status", received)
+    assert until(lambda: received.payloads and received.payloads[-1] == b"online")
 
 
 def test_T10_a_client_that_is_started_again_at_once_is_believed(net: Net, base: str) -> None:
-    """Its former will comes before what it says now, or not at all."""
+    """Its former will comes before its new messages, or not at all."""
     will = Message(f"{base}/will", b"gone", DELIVERED, True)
-    heard, kept = Heard(), Heard()
-    net.client("watcher").subscribe(f"{base}/will", heard)
+    received, retained = Received(), Received()
+    net.client("watcher").subscribe(f"{base}/will", received)
     net.peer("mortal", will=will).kill()
     again = net.client("mortal", will=will)
     again.publish(f"{base}/will", b"back", qos=DELIVERED, retain=True)
-    time.sleep(0.5)  # several times as long as a fabric may hesitate before it speaks a will
-    assert heard.payloads[-1] == b"back"
-    net.client("late").subscribe(f"{base}/will", kept)
-    assert kept.until(b"back")
+    time.sleep(0.5)  # several times as long as a network may wait before it publishes a will
+    assert received.payloads[-1] == b"back"
+    net.client("late").subscribe(f"{base}/will", retained)
+    assert retained.until(b"back")
 
 
 # -- T11: overlapping filters
 
 
-def test_T11_every_handler_hears_a_message_once(net: Net, base: str) -> None:
+def test_T11_every_handler_receives_a_message_once(net: Net, base: str) -> None:
     client, sender = net.client("many-filters"), net.client("sender")
     filters = ["a/b", "a/b", "a/+", "a/#", "#", "+/b", "a/b/#", "+/+"]
-    handlers = [Heard() for _ in filters]
-    for filter_, heard in zip(filters, handlers, strict=True):
-        client.subscribe(f"{base}/{filter_}", heard)
+    handlers = [Received() for _ in filters]
+    for filter_, received in zip(filters, handlers, strict=True):
+        client.subscribe(f"{base}/{filter_}", received)
     wanted = []
     for number in range(20):
         payload = b"%d" % number
         sender.publish(f"{base}/a/b", payload, qos=QoS.DELIVERED, retain=number % 2 == 1)
         wanted.append(payload)
-    for heard in handlers:
-        assert heard.until(*wanted), heard.payloads
-    settled(sender, client, f"{base}-else/where")
-    assert all(heard.payloads == wanted for heard in handlers)
+    for received in handlers:
+        assert received.until(*wanted), received.payloads
+    drained(sender, client, f"{base}-else/where")
+    assert all(received.payloads == wanted for received in handlers)
 
 
 def test_T11_closing_one_of_two_overlapping_subscriptions_leaves_the_other(net: Net, base: str) -> None:
-    client, wide, narrow = net.client("two"), Heard(), Heard()
+    client, wide, narrow = net.client("two"), Received(), Received()
     client.subscribe(f"{base}/a/b", narrow)
     subscription = client.subscribe(f"{base}/a/#", wide)
     subscription.close()
@@ -519,46 +519,46 @@ def test_T11_closing_one_of_two_overlapping_subscriptions_leaves_the_other(net: 
 # -- T12, T19: reconnecting
 
 
-def test_T12_reconnects_resubscribes_and_tells(net: Net, base: str) -> None:
-    client, sender, heard, states = net.client("client"), net.client("sender"), Heard(), []
+def test_T12_reconnects_resubscribes_and_notifies_watchers(net: Net, base: str) -> None:
+    client, sender, received, states = net.client("client"), net.client("sender"), Received(), []
     client.on_state(states.append)
-    client.subscribe(base, heard)
+    client.subscribe(base, received)
     for turn in range(2):
         with reconnecting(client, sender):
-            net.restart_fabric()
+            net.restart_network()
         assert sender.publish(base, b"%d" % turn, qos=DELIVERED)
-        assert until(lambda: len(heard.payloads) == turn + 1)  # noqa: B023
+        assert until(lambda: len(received.payloads) == turn + 1)  # noqa: B023
     assert states == [State.CONNECTING, State.CONNECTED] * 2
     client.close()
     assert until(lambda: states[-1] is State.CLOSED)
 
 
-def test_T12_a_client_may_come_before_its_fabric(net: Net, base: str) -> None:
-    net.stop_fabric()
-    early, heard = net.client("early", opened=False), Heard()
+def test_T12_a_client_may_start_before_its_network(net: Net, base: str) -> None:
+    net.stop_network()
+    early, received = net.client("early", opened=False), Received()
     early.open(0.1)
     assert early.state is State.CONNECTING
     assert until(lambda: early.problem)
-    early.subscribe(base, heard)
+    early.subscribe(base, received)
     assert early.publish(f"{base}/kept", b"parked", qos=DELIVERED, retain=True)
     with reconnecting(early):
-        net.start_fabric()
+        net.start_network()
     assert early.problem == ""
-    late, kept = net.client("late"), Heard()
-    late.subscribe(f"{base}/kept", kept)
-    assert kept.until(b"parked")
+    late, retained = net.client("late"), Received()
+    late.subscribe(f"{base}/kept", retained)
+    assert retained.until(b"parked")
     late.publish(base, b"hello", qos=DELIVERED)
-    assert heard.until(b"hello")
+    assert received.until(b"hello")
 
 
-def test_T19_a_fabric_that_stopped_answering_is_not_connected(net: Net, base: str) -> None:
+def test_T19_a_network_that_stopped_answering_is_not_connected(net: Net, base: str) -> None:
     client, states = net.client("client"), []
     client.on_state(states.append)
     with reconnecting(client):
-        net.freeze_fabric()
+        net.freeze_network()
         assert until(lambda: client.state is State.CONNECTING)
-        net.thaw_fabric()
-    settled(client, client, base)
+        net.thaw_network()
+    drained(client, client, base)
 
 
 # -- T13, T14: handlers
@@ -592,22 +592,22 @@ def test_T13_one_call_at_a_time_and_never_on_the_publishers_thread(net: Net, bas
 def test_T13_a_handler_that_raises_does_not_end_delivery(
     net: Net, base: str, direct: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    client, heard = net.client("client"), Heard()
+    client, received = net.client("client"), Received()
 
     def fragile(message: Message) -> None:
-        heard(message)
+        received(message)
         raise ValueError("a bug in a handler")
 
     client.subscribe(base, fragile, direct=direct)
     client.publish(base, b"1", qos=DELIVERED)
     client.publish(base, b"2", qos=DELIVERED)
-    assert heard.until(b"1", b"2")
+    assert received.until(b"1", b"2")
     assert until(lambda: client.counters["handler_errors"] == 2)
     assert "a bug in a handler" in caplog.text
 
 
 def test_T13_publish_subscribe_and_close_work_inside_a_handler(net: Net, base: str) -> None:
-    client, inner, closed = net.client("client"), Heard(), threading.Event()
+    client, inner, closed = net.client("client"), Received(), threading.Event()
 
     def ask(message: Message) -> None:
         client.subscribe(f"{base}/answer", inner)
@@ -630,16 +630,16 @@ def test_T13_publish_subscribe_and_close_work_inside_a_handler(net: Net, base: s
 
 
 def test_T13_a_direct_handler_may_publish_and_close_the_transport(net: Net, base: str) -> None:
-    client, heard = net.client("client"), Heard()
+    client, received = net.client("client"), Received()
 
     def relay(message: Message) -> None:
         client.publish(f"{base}/out", message.payload, qos=DELIVERED)
 
     client.subscribe(f"{base}/in", relay, direct=True)
-    client.subscribe(f"{base}/out", heard)
+    client.subscribe(f"{base}/out", received)
     client.subscribe(f"{base}/end", lambda _message: client.close(), direct=True)
     client.publish(f"{base}/in", b"1", qos=DELIVERED)
-    assert heard.until(b"1")
+    assert received.until(b"1")
     client.publish(f"{base}/end", b"", qos=DELIVERED)
     assert until(lambda: client.state is State.CLOSED)
 
@@ -649,23 +649,23 @@ def test_T13_nothing_is_delivered_once_close_returned(net: Net, base: str, direc
     client, sender = net.client("client"), net.client("sender")
     stop = threading.Event()
 
-    def chatter() -> None:
+    def steady() -> None:
         while not stop.is_set():
             sender.publish(base, b"x", qos=LATEST)
             stop.wait(0.0005)
 
-    talker = threading.Thread(target=chatter)
+    talker = threading.Thread(target=steady)
     talker.start()
     try:
         for _ in range(20):
-            closed, late, heard = threading.Event(), [], Heard()
+            closed, late, received = threading.Event(), [], Received()
 
             def handler(message: Message) -> None:
                 late.append(closed.is_set())  # noqa: B023
-                heard(message)  # noqa: B023
+                received(message)  # noqa: B023
 
             subscription = client.subscribe(base, handler, direct=direct)
-            assert until(lambda: heard.messages)  # noqa: B023
+            assert until(lambda: received.messages)  # noqa: B023
             subscription.close()
             closed.set()
             assert not any(late)
@@ -692,7 +692,7 @@ def test_T13_close_waits_for_a_quick_handler_that_is_running(net: Net, base: str
 
 
 def test_T13_two_transports_that_feed_each_other_do_not_lock_up(net: Net, base: str) -> None:
-    left, right, ended = net.client("left"), net.client("right"), Heard()
+    left, right, ended = net.client("left"), net.client("right"), Received()
 
     def bounce(to: Transport, topic: str) -> Callable[[Message], None]:
         def handler(message: Message) -> None:
@@ -713,7 +713,7 @@ def test_T13_two_transports_that_feed_each_other_do_not_lock_up(net: Net, base: 
 
 def test_T14_a_slow_handler_delays_only_itself(net: Net, base: str, caplog: pytest.LogCaptureFixture) -> None:
     client, sender = net.client("client"), net.client("sender")
-    release, slow, fast = threading.Event(), Heard(), Heard()
+    release, slow, fast = threading.Event(), Received(), Received()
 
     def stuck(message: Message) -> None:
         slow(message)
@@ -740,41 +740,41 @@ def test_T14_a_slow_handler_delays_only_itself(net: Net, base: str, caplog: pyte
 
 @pytest.mark.parametrize("qos", [LATEST, DELIVERED])
 def test_T15_payloads_arrive_untouched(net: Net, base: str, qos: QoS) -> None:
-    sender, receiver, heard = net.client("sender"), net.client("receiver"), Heard()
-    receiver.subscribe(base, heard)
+    sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
+    receiver.subscribe(base, received)
     payloads = [b"", bytes(range(256)), b"\x00", b"\xff\xfe", random.Random(1).randbytes(1_000_000), b"null", b"{}"]
     for payload in payloads:
         assert sender.publish(base, payload, qos=qos)
-        assert until(lambda: heard.payloads[-1:] == [payload]), len(payload)  # noqa: B023
-    assert heard.payloads == payloads
-    assert all(type(message.payload) is bytes for message in heard.messages)
+        assert until(lambda: received.payloads[-1:] == [payload]), len(payload)  # noqa: B023
+    assert received.payloads == payloads
+    assert all(type(message.payload) is bytes for message in received.messages)
 
 
 def test_T16_own_publishes_do_not_come_back_where_that_is_promised(net: Net, base: str) -> None:
     bridge, other = net.echoless_client("bridge"), net.client("other")
     assert bridge.exact_echo
-    heard, elsewhere = Heard(), Heard()
+    received, elsewhere = Received(), Received()
     bridge.publish(f"{base}/kept-before", b"own", qos=DELIVERED, retain=True)
-    bridge.subscribe(f"{base}/#", heard, echo=False)
+    bridge.subscribe(f"{base}/#", received, echo=False)
     other.subscribe(f"{base}/#", elsewhere)
     for number in range(20):
         bridge.publish(f"{base}/x", b"own", qos=DELIVERED, retain=number % 2 == 1)
         other.publish(f"{base}/y", b"%d" % number, qos=DELIVERED)
-    settled(bridge, other, f"{base}/z")
-    assert heard.until(*(b"%d" % number for number in range(20)))
+    drained(bridge, other, f"{base}/z")
+    assert received.until(*(b"%d" % number for number in range(20)))
     assert until(lambda: elsewhere.payloads.count(b"own") >= 20)
     with reconnecting(bridge, other):
-        net.restart_fabric()
+        net.restart_network()
     other.publish(f"{base}/y", b"after", qos=DELIVERED)
-    assert until(lambda: heard.payloads[-1:] == [b"after"])
-    assert b"own" not in heard.payloads
+    assert until(lambda: received.payloads[-1:] == [b"after"])
+    assert b"own" not in received.payloads
 
 
 def test_T16_an_echo_is_the_default(net: Net, base: str) -> None:
-    client, heard = net.client("client"), Heard()
-    client.subscribe(base, heard)
+    client, received = net.client("client"), Received()
+    client.subscribe(base, received)
     client.publish(base, b"own", qos=DELIVERED)
-    assert heard.until(b"own")
+    assert received.until(b"own")
 
 
 def test_T17_close_is_idempotent_and_leaves_nothing_behind(net: Net, base: str) -> None:
@@ -782,7 +782,7 @@ def test_T17_close_is_idempotent_and_leaves_nothing_behind(net: Net, base: str) 
     threads, files = set(threading.enumerate()), open_files()
     for _ in range(3):
         client = net.client("client")
-        client.subscribe(base, Heard())
+        client.subscribe(base, Received())
         client.publish(base, b"x", qos=DELIVERED)
         client.close()
         client.close()
@@ -792,12 +792,12 @@ def test_T17_close_is_idempotent_and_leaves_nothing_behind(net: Net, base: str) 
 
 
 def test_T17_a_closed_transport_can_be_opened_again(net: Net, base: str) -> None:
-    client, heard = net.client("client"), Heard()
+    client, received = net.client("client"), Received()
     client.close()
     client.open(10)
-    client.subscribe(base, heard)
+    client.subscribe(base, received)
     client.publish(base, b"again", qos=DELIVERED)
-    assert heard.until(b"again")
+    assert received.until(b"again")
 
 
 def open_files() -> int:
@@ -826,19 +826,19 @@ def test_T17_a_process_that_forgets_to_close_still_exits(net: Net, base: str, ra
 
 
 def test_T18_everything_is_counted(net: Net, base: str) -> None:
-    client, heard = net.client("client"), Heard()
+    client, received = net.client("client"), Received()
     assert client.publish(f"{base}/elsewhere", b"early", qos=DELIVERED)
-    client.subscribe(base, heard)
+    client.subscribe(base, received)
     for _ in range(5):
         client.publish(base, b"x", qos=DELIVERED)
-    assert until(lambda: len(heard.messages) == 5)
+    assert until(lambda: len(received.messages) == 5)
     counts = client.counters.snapshot()
     assert counts["sent"] == 6
     assert counts["received"] >= 5
     assert counts["delivered"] == 5
     assert counts["connected"] == 1
     with reconnecting(client):
-        net.restart_fabric()
+        net.restart_network()
     assert client.counters["connected"] == 2
     client.close()
     client.publish(base, b"x")
@@ -846,13 +846,25 @@ def test_T18_everything_is_counted(net: Net, base: str) -> None:
 
 
 def test_T20_nothing_is_on_its_way_once_everything_has_arrived(net: Net, base: str) -> None:
-    client, heard = net.client("client"), Heard()
-    client.subscribe(base, heard)
+    client, received = net.client("client"), Received()
+    client.subscribe(base, received)
     for _ in range(50):
         client.publish(base, bytes(10_000), qos=DELIVERED)
         assert client.outgoing.waiting >= 0
-    assert until(lambda: len(heard.messages) == 50)
+    assert until(lambda: len(received.messages) == 50)
     assert until(lambda: client.outgoing.waiting == 0)
     assert 0 <= client.outgoing.round_trip_s < 5
     client.close()
     assert client.outgoing.waiting == 0
+
+
+def test_T21_a_granted_subscription_is_not_refused_on_any_connection(net: Net, base: str) -> None:
+    client, received = net.client("client"), Received()
+    seen: list[bool] = []
+    subscription = client.subscribe(base, received)
+    assert not subscription.refused
+    client.on_state(lambda _state: seen.append(subscription.refused))
+    with reconnecting(client):
+        net.restart_network()
+    assert seen
+    assert not any(seen)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import threading
 import time
@@ -16,10 +17,10 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, create
-from pebble.transports.mqtt_connection import UNACKED_LIMIT
-from tests.link import Link
-from tests.support import ROOT, AmqttBroker, Broker, free_port, until
-from tests.transports.heard import Heard
+from pebble.transports.mqtt.connection import UNACKED_LIMIT
+from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
+from tests.tcp_proxy import TcpProxy
+from tests.transports.received import Received
 
 DELIVERED = QoS.DELIVERED
 CERTS = ROOT / "tests" / "data" / "tls"
@@ -69,9 +70,9 @@ def clients() -> Iterator[Clients]:
 
 
 @pytest.fixture
-def link(broker: Broker) -> Iterator[Link]:
-    with Link(broker.port) as link:
-        yield link
+def proxy(broker: Broker) -> Iterator[TcpProxy]:
+    with TcpProxy(broker.port) as proxy:
+        yield proxy
 
 
 @pytest.fixture
@@ -90,46 +91,51 @@ def reconnected(client: Transport, times: int = 2) -> bool:
 
 
 @both_protocols
-def test_as_published_shows_what_was_to_be_kept(broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
-    bridge, other, heard = (
+def test_as_published_shows_what_was_published_with_retain(
+    broker: Broker, clients: Clients, topic: str, protocol: str
+) -> None:
+    bridge, other, received = (
         clients(broker.port, "bridge", as_published=True, protocol=protocol),
         clients(broker.port),
-        Heard(),
+        Received(),
     )
     assert bridge.as_published
     assert bridge.exact_echo
-    bridge.subscribe(topic, heard, echo=False)
+    bridge.subscribe(topic, received, echo=False)
     other.publish(topic, b"fleeting", qos=DELIVERED)
     other.publish(topic, b"kept", qos=DELIVERED, retain=True)
-    assert heard.until(b"fleeting", b"kept")
-    assert [(message.retain, message.keep) for message in heard.messages] == [(False, False), (True, True)]
+    assert received.until(b"fleeting", b"kept")
+    assert [(message.retain, message.retain_requested) for message in received.messages] == [
+        (False, False),
+        (True, True),
+    ]
 
 
 @both_protocols
-def test_as_published_drops_own_kept_copies_but_not_other_peoples(
+def test_as_published_drops_own_retained_messages_but_not_those_of_others(
     broker: Broker, clients: Clients, topic: str, protocol: str
 ) -> None:
-    bridge, other, heard = (
+    bridge, other, received = (
         clients(broker.port, "bridge", as_published=True, protocol=protocol),
         clients(broker.port),
-        Heard(),
+        Received(),
     )
     other.publish(f"{topic}/theirs", b"theirs", qos=DELIVERED, retain=True)
     bridge.publish(f"{topic}/flag", b"true", qos=DELIVERED, retain=True)
     assert until(lambda: bridge.counters["sent"] == 1)
-    bridge.subscribe(f"{topic}/#", heard, echo=False)
-    assert heard.until(b"theirs")
-    for value in (b"false", b"true", b"false"):  # "true" is what we said ourselves, but not what was said last
+    bridge.subscribe(f"{topic}/#", received, echo=False)
+    assert received.until(b"theirs")
+    for value in (b"false", b"true", b"false"):  # "true" is our own value, but not the newest
         other.publish(f"{topic}/flag", value, qos=DELIVERED, retain=True)
-    assert heard.until(b"theirs", b"false", b"true", b"false")
+    assert received.until(b"theirs", b"false", b"true", b"false")
 
 
 @both_protocols
-def test_as_published_gives_kept_copies_once_to_each_subscription(
+def test_as_published_delivers_retained_messages_once_per_subscription(
     broker: Broker, clients: Clients, topic: str, protocol: str
 ) -> None:
     bridge, other = clients(broker.port, "bridge", as_published=True, protocol=protocol), clients(broker.port)
-    first, second = Heard(), Heard()
+    first, second = Received(), Received()
     other.publish(f"{topic}/a", b"A", qos=DELIVERED, retain=True)
     bridge.subscribe(f"{topic}/#", first, echo=False)
     assert first.until(b"A")
@@ -143,44 +149,44 @@ def test_as_published_gives_kept_copies_once_to_each_subscription(
 
 
 @both_protocols
-def test_subscribed_means_that_kept_copies_have_come_however_long_after_the_suback(
+def test_subscribe_returns_after_the_retained_messages_however_long_after_the_suback(
     broker: Broker, clients: Clients, protocol: str
 ) -> None:
-    """And so none of them reaches, as news, whoever subscribes next."""
+    """So none of them reaches the next subscription as a live message."""
     topic = f"crumbs/{protocol}"
     clients(broker.port).publish(topic, b"kept", qos=DELIVERED, retain=True)
-    with Link(broker.port, delay_s=0.02, piece=5) as crumbs:
+    with TcpProxy(broker.port, delay_s=0.02, piece=5) as crumbs:
         bridge = clients(crumbs.port, "bridge", as_published=True, protocol=protocol)
         for _ in range(2):
-            heard = Heard()
-            subscription = bridge.subscribe(topic, heard, echo=False, direct=True)
-            assert heard.payloads == [b"kept"]
+            received = Received()
+            subscription = bridge.subscribe(topic, received, echo=False, direct=True)
+            assert received.payloads == [b"kept"]
             subscription.close()
 
 
 def test_as_published_refuses_to_promise_an_echo(broker: Broker, clients: Clients, topic: str) -> None:
     with pytest.raises(TransportError, match="echo=False"):
-        clients(broker.port, as_published=True).subscribe(topic, Heard())
+        clients(broker.port, as_published=True).subscribe(topic, Received())
 
 
 def test_a_broker_without_bridge_mode_gets_a_plain_connection(
     amqtt: AmqttBroker, clients: Clients, topic: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    bridge, heard = clients(amqtt.port, "bridge", as_published=True), Heard()
+    bridge, received = clients(amqtt.port, "bridge", as_published=True), Received()
     assert not bridge.as_published
     assert not bridge.exact_echo
     assert "no bridge mode" in caplog.text
-    bridge.subscribe(topic, heard, echo=False)
+    bridge.subscribe(topic, received, echo=False)
     clients(amqtt.port, "other").publish(topic, b"x", qos=DELIVERED)
-    assert heard.until(b"x")
+    assert received.until(b"x")
 
 
 def test_a_broker_that_restarts_is_not_taken_for_one_without_bridge_mode(broker: Broker, clients: Clients) -> None:
-    with Link(broker.port) as link:
-        bridge = clients(link.port, "bridge", as_published=True)
-        link.cut()
+    with TcpProxy(broker.port) as proxy:
+        bridge = clients(proxy.port, "bridge", as_published=True)
+        proxy.cut()
         assert until(lambda: bridge.state is State.CONNECTING)
-        link.mend()
+        proxy.mend()
         assert reconnected(bridge)
         assert bridge.as_published
         assert bridge.exact_echo
@@ -192,8 +198,8 @@ def test_a_broker_without_mqtt_5_is_a_problem_in_words(amqtt: AmqttBroker, clien
     assert until(lambda: f"broker 127.0.0.1:{amqtt.port} refused us: unsupported protocol version" in client.problem)
 
 
-def test_mixed_echo_on_mqtt_5_is_said_to_be_inexact(broker: Broker, clients: Clients, topic: str) -> None:
-    client, quiet, loud = clients(broker.port, protocol="5"), Heard(), Heard()
+def test_mixed_echo_on_mqtt_5_is_reported_as_inexact(broker: Broker, clients: Clients, topic: str) -> None:
+    client, quiet, loud = clients(broker.port, protocol="5"), Received(), Received()
     assert client.exact_echo
     client.subscribe(f"{topic}/a", quiet, echo=False)
     client.subscribe(f"{topic}/b", loud)
@@ -207,7 +213,7 @@ def test_mixed_echo_on_mqtt_5_is_said_to_be_inexact(broker: Broker, clients: Cli
 
 
 def test_urgent_messages_expire_on_mqtt_5(broker: Broker, clients: Clients, topic: str) -> None:
-    """A command that waits in the broker for a slow robot is stale after a while; a flag to be kept never is."""
+    """A command that waits in the broker for a slow robot is stale after a while; a retained flag never is."""
     expiries = []
     listener = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
     listener.on_connect = lambda client, *_: client.subscribe(f"{topic}/#", 1)
@@ -241,54 +247,54 @@ def test_a_protocol_that_does_not_exist_is_refused(broker: Broker, clients: Clie
 
 @both_protocols
 def test_what_was_typed_into_a_silent_link_never_arrives(
-    broker: Broker, clients: Clients, link: Link, topic: str, protocol: str
+    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str, protocol: str
 ) -> None:
-    operator, robot, heard = (
-        clients(link.port, "operator", protocol=protocol, silence_s=0.7),
+    operator, robot, received = (
+        clients(proxy.port, "operator", protocol=protocol, silence_s=0.7),
         clients(broker.port),
-        Heard(),
+        Received(),
     )
-    robot.subscribe(topic, heard)
+    robot.subscribe(topic, received)
     operator.publish(topic, b"before", qos=DELIVERED)
-    assert heard.until(b"before")
-    link.hole()
+    assert received.until(b"before")
+    proxy.blackhole()
     for _ in range(20):
         operator.publish(topic, b"into the hole", qos=DELIVERED)
         operator.publish(f"{topic}/latest", b"into the hole")
     assert until(lambda: operator.state is State.CONNECTING, 5)
     assert "has not answered" in operator.problem
     assert operator.publish(topic, b"without a connection", qos=DELIVERED) is False
-    link.resume()
+    proxy.resume()
     assert reconnected(operator)
     assert operator.publish(topic, b"after", qos=DELIVERED)
-    assert heard.until(b"before", b"after")
+    assert received.until(b"before", b"after")
     assert operator.counters["silences"] == 1
 
 
 @both_protocols
 def test_what_a_silent_link_held_back_for_us_never_arrives(
-    broker: Broker, clients: Clients, link: Link, topic: str, protocol: str
+    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str, protocol: str
 ) -> None:
-    robot, operator, heard = (
-        clients(link.port, "robot", protocol=protocol, silence_s=0.7),
+    robot, operator, received = (
+        clients(proxy.port, "robot", protocol=protocol, silence_s=0.7),
         clients(broker.port),
-        Heard(),
+        Received(),
     )
-    robot.subscribe(topic, heard)
-    link.hole()
+    robot.subscribe(topic, received)
+    proxy.blackhole()
     for _ in range(20):
         operator.publish(topic, b"into the hole", qos=DELIVERED)
     assert until(lambda: robot.state is State.CONNECTING, 5)
-    link.resume()
+    proxy.resume()
     assert reconnected(robot)
     operator.publish(topic, b"after", qos=DELIVERED)
-    assert heard.until(b"after")
+    assert received.until(b"after")
 
 
 def test_what_a_frozen_broker_found_when_it_woke_up_never_arrives(tmp_path: Path, clients: Clients, topic: str) -> None:
     broker = Broker(tmp_path)
-    robot, heard = clients(broker.port, "robot", silence_s=0.7, reconnect_max_s=0.1), Heard()
-    robot.subscribe(topic, heard)
+    robot, received = clients(broker.port, "robot", silence_s=0.7, reconnect_max_s=0.1), Received()
+    robot.subscribe(topic, received)
     operator = paho.Client(CallbackAPIVersion.VERSION2)
     operator.connect("127.0.0.1", broker.port)
     operator.loop_start()
@@ -300,73 +306,93 @@ def test_what_a_frozen_broker_found_when_it_woke_up_never_arrives(tmp_path: Path
     broker.thaw()
     assert reconnected(robot)
     operator.publish(topic, b"after", qos=1).wait_for_publish(10)
-    assert heard.until(b"after")
+    assert received.until(b"after")
     operator.disconnect()
     operator.loop_stop()
     broker.stop()
 
 
-def test_a_short_hole_is_no_silence(broker: Broker, clients: Clients, link: Link, topic: str) -> None:
-    client, heard = clients(link.port, silence_s=30), Heard()
-    client.subscribe(topic, heard)
-    link.hole()
+@pytest.mark.parametrize(("keepalive_s", "silence_s", "interval_s"), [(0, 2.0, 0.5), (0, 0.001, 0.05)])
+def test_pings_are_never_a_storm(
+    tmp_path: Path, clients: Clients, keepalive_s: int, silence_s: float, interval_s: float
+) -> None:
+    log = tmp_path / "log"
+    broker = Broker(tmp_path, f"log_dest file {log}", "log_type debug")
+    clients(broker.port, keepalive_s=keepalive_s, silence_s=silence_s)
+    began, before = time.monotonic(), log.read_text().count("PINGREQ")
+    assert until(lambda: log.read_text().count("PINGREQ") >= before + 5)
+    assert time.monotonic() - began >= 4 * interval_s  # the first may be due at once
+    broker.stop()
+
+
+def test_four_pings_are_always_waited_for(clients: Clients, proxy: TcpProxy) -> None:
+    client = clients(proxy.port, silence_s=0.001)
+    proxy.blackhole()
+    assert until(lambda: client.state is State.CONNECTING)
+    assert "has not answered for 0.2 s" in client.problem
+
+
+def test_a_short_hole_is_no_silence(broker: Broker, clients: Clients, proxy: TcpProxy, topic: str) -> None:
+    client, received = clients(proxy.port, silence_s=30), Received()
+    client.subscribe(topic, received)
+    proxy.blackhole()
     assert client.publish(topic, b"held", qos=DELIVERED)
-    link.resume()
-    assert heard.until(b"held")
+    proxy.resume()
+    assert received.until(b"held")
     assert client.counters["connected"] == 1
 
 
 def test_a_slow_link_is_not_a_silent_one(broker: Broker, clients: Clients, topic: str) -> None:
     """Four measured round trips are always granted."""
-    with Link(broker.port, delay_s=0.15) as far:
-        client, heard = clients(far.port, silence_s=0.2), Heard()
-        client.subscribe(topic, heard)
+    with TcpProxy(broker.port, delay_s=0.15) as far:
+        client, received = clients(far.port, silence_s=0.2), Received()
+        client.subscribe(topic, received)
         for number in range(6):
             assert client.publish(topic, b"%d" % number, qos=DELIVERED)
-            assert until(lambda: len(heard.messages) == number + 1)  # noqa: B023
+            assert until(lambda: len(received.messages) == number + 1)  # noqa: B023
         assert client.counters["connected"] == 1
 
 
 def test_a_long_message_on_a_slow_link_is_not_a_silence(broker: Broker, clients: Clients, topic: str) -> None:
-    with Link(broker.port, delay_s=0.02) as slow:
-        client, heard = clients(slow.port, silence_s=0.8), Heard()
-        client.subscribe(topic, heard)
+    with TcpProxy(broker.port, delay_s=0.02) as slow:
+        client, received = clients(slow.port, silence_s=0.8), Received()
+        client.subscribe(topic, received)
         payload = bytes(3_000_000)  # some 50 pieces of 64 KB, 20 ms each, in either direction
         assert client.publish(topic, payload, qos=DELIVERED)
-        assert heard.until(payload, timeout=30)
+        assert received.until(payload, timeout=30)
         assert client.counters["silences"] == 0
 
 
 @pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
-def test_a_kept_message_lost_in_a_hole_is_sent_again(
-    broker: Broker, clients: Clients, link: Link, topic: str, qos: QoS
+def test_a_retained_message_lost_in_a_hole_is_sent_again(
+    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str, qos: QoS
 ) -> None:
-    client, late, heard = clients(link.port, "client", silence_s=0.7), clients(broker.port), Heard()
+    client, late, received = clients(proxy.port, "client", silence_s=0.7), clients(broker.port), Received()
     client.publish(topic, b"old", qos=qos, retain=True)
     client.publish(f"{topic}/gone", b"old", qos=qos, retain=True)
-    late.subscribe(f"{topic}/#", heard)
-    assert heard.until(b"old", b"old")
-    link.hole()
+    late.subscribe(f"{topic}/#", received)
+    assert received.until(b"old", b"old")
+    proxy.blackhole()
     assert client.publish(topic, b"new", qos=qos, retain=True)
     assert client.publish(f"{topic}/gone", b"", qos=qos, retain=True)
     assert until(lambda: client.state is State.CONNECTING, 5)
-    link.resume()
-    assert heard.until(b"old", b"old", b"new", b""), heard.messages
+    proxy.resume()
+    assert received.until(b"old", b"old", b"new", b""), received.messages
 
 
-def test_a_hole_at_the_start_is_a_problem_in_words(clients: Clients, link: Link, topic: str) -> None:
-    link.hole()
-    client = clients(link.port, opened=False)
+def test_a_hole_at_the_start_is_a_problem_in_words(clients: Clients, proxy: TcpProxy, topic: str) -> None:
+    proxy.blackhole()
+    client = clients(proxy.port, opened=False)
     client.open(0.1)
     assert client.state is State.CONNECTING
-    client.subscribe(topic, Heard())
+    client.subscribe(topic, Received())
     assert client.publish(topic, b"x", qos=DELIVERED) is False
     assert until(lambda: "does not speak MQTT" in client.problem)
 
 
-def test_close_does_not_wait_for_a_silent_broker(clients: Clients, link: Link) -> None:
-    link.hole()
-    client = clients(link.port, opened=False)
+def test_close_does_not_wait_for_a_silent_broker(clients: Clients, proxy: TcpProxy) -> None:
+    proxy.blackhole()
+    client = clients(proxy.port, opened=False)
     client.open(0.1)
     before = {thread for thread in threading.enumerate() if thread.name.startswith("pebble-mqtt")}
     assert before
@@ -376,8 +402,50 @@ def test_close_does_not_wait_for_a_silent_broker(clients: Clients, link: Link) -
     assert until(lambda: not before & set(threading.enumerate()))
 
 
-def test_two_clients_with_one_name_do_not_fight_at_full_speed(broker: Broker, clients: Clients) -> None:
+def connect_as(broker: Broker, client_id: str) -> paho.Client:
+    """A stock client with an id of its own choice, connected."""
+    client = paho.Client(CallbackAPIVersion.VERSION2, client_id=client_id, reconnect_on_failure=False)
+    client.connect("127.0.0.1", broker.port)
+    client.loop_start()
+    assert until(client.is_connected)
+    return client
+
+
+@both_protocols
+def test_a_client_that_connects_with_our_name_does_not_disturb_us(
+    broker: Broker, clients: Clients, topic: str, protocol: str
+) -> None:
+    name = "pebble/robots/goob-remote-bridge"
+    robot, received = clients(broker.port, name, protocol=protocol), Received()
+    robot.subscribe(topic, received)
+    other = connect_as(broker, name)
+    other.publish(topic, b"after", qos=1).wait_for_publish(10)
+    assert received.until(b"after")
+    assert robot.counters["connected"] == 1
+    other.disconnect()
+    other.loop_stop()
+
+
+def test_a_client_has_one_id_for_all_its_connections(tmp_path: Path, clients: Clients) -> None:
+    """So a broker closes a half-dead one as soon as the client is back. Another client of that name has another id."""
+    log = tmp_path / "log"
+    broker = Broker(tmp_path, f"log_dest file {log}", "log_type notice")
+    client = clients(broker.port, "twin")
+    broker.stop()
+    broker.start()
+    assert reconnected(client)
+    clients(broker.port, "twin")
+    ids = re.findall(r" as (twin-[0-9a-f]{16}) ", log.read_text())
+    assert len(ids) == 3
+    assert ids[0] == ids[1] != ids[2]
+    broker.stop()
+
+
+def test_two_clients_with_one_id_do_not_fight_at_full_speed(
+    broker: Broker, clients: Clients, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each throws the other out; without a pause that would be thousands of times a second."""
+    monkeypatch.setattr("secrets.token_hex", lambda size: "0" * 2 * size)
     first = clients(broker.port, "twin", reconnect_max_s=0.5)
     clients(broker.port, "twin", opened=False, reconnect_max_s=0.5).open(0.0)  # it may be thrown out again at once
     assert until(lambda: first.counters["connected"] >= 3)
@@ -390,34 +458,42 @@ def test_two_clients_with_one_name_do_not_fight_at_full_speed(broker: Broker, cl
 
 
 def test_a_stream_into_a_full_socket_is_bounded_and_the_newest_wins(
-    broker: Broker, clients: Clients, link: Link, topic: str
+    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
 ) -> None:
-    client, receiver, heard = clients(link.port, "client", silence_s=60, keepalive_s=60), clients(broker.port), Heard()
-    receiver.subscribe(topic, heard, limit=100_000)
-    link.hole()
+    client, receiver, received = (
+        clients(proxy.port, "client", silence_s=60, keepalive_s=60),
+        clients(broker.port),
+        Received(),
+    )
+    receiver.subscribe(topic, received, limit=100_000)
+    proxy.blackhole()
     filler = bytes(20_000)
     for number in range(1000):  # 20 MB: more than the kernel and the link hold
         began = time.monotonic()
         assert client.publish(topic, b"%d " % number + filler)
         assert time.monotonic() - began < 1.0
     assert client.counters["dropped"] > 500
-    link.resume()
-    assert until(lambda: heard.payloads and heard.payloads[-1].startswith(b"999 "), 30)
-    numbers = [int(payload.split()[0]) for payload in heard.payloads if payload]
+    proxy.resume()
+    assert until(lambda: received.payloads and received.payloads[-1].startswith(b"999 "), 30)
+    numbers = [int(payload.split()[0]) for payload in received.payloads if payload]
     assert numbers == sorted(numbers)
     assert len(numbers) == 1000 - client.counters["dropped"]
 
 
-def test_unacknowledged_messages_are_bounded(broker: Broker, clients: Clients, link: Link, topic: str) -> None:
-    client, receiver, heard = clients(link.port, "client", silence_s=60, keepalive_s=60), clients(broker.port), Heard()
-    receiver.subscribe(f"{topic}/#", heard, limit=100_000)
-    link.hole()
+def test_unacknowledged_messages_are_bounded(broker: Broker, clients: Clients, proxy: TcpProxy, topic: str) -> None:
+    client, receiver, received = (
+        clients(proxy.port, "client", silence_s=60, keepalive_s=60),
+        clients(broker.port),
+        Received(),
+    )
+    receiver.subscribe(f"{topic}/#", received, limit=100_000)
+    proxy.blackhole()
     accepted = [client.publish(topic, b"%d" % number, qos=DELIVERED) for number in range(UNACKED_LIMIT + 100)]
     assert accepted == [True] * UNACKED_LIMIT + [False] * 100
     assert client.publish(f"{topic}/kept", b"parked", qos=DELIVERED, retain=True)
-    link.resume()
-    assert until(lambda: len(heard.messages) == UNACKED_LIMIT + 1, 30)
-    assert heard.payloads == [*(b"%d" % number for number in range(UNACKED_LIMIT)), b"parked"]
+    proxy.resume()
+    assert until(lambda: len(received.messages) == UNACKED_LIMIT + 1, 30)
+    assert received.payloads == [*(b"%d" % number for number in range(UNACKED_LIMIT)), b"parked"]
 
 
 # -- brokers that lack things
@@ -426,31 +502,31 @@ def test_unacknowledged_messages_are_bounded(broker: Broker, clients: Clients, l
 def test_living_clients_bring_state_back_to_a_broker_without_persistence(tmp_path: Path, clients: Clients) -> None:
     broker = Broker(tmp_path)
     try:
-        keeper, heard = clients(broker.port, "keeper"), Heard()
-        keeper.publish("state", b"value", qos=DELIVERED, retain=True)
+        retainer, received = clients(broker.port, "retainer"), Received()
+        retainer.publish("state", b"value", qos=DELIVERED, retain=True)
         broker.kill()
         broker.start()
-        assert reconnected(keeper)
-        clients(broker.port, "late").subscribe("state", heard)
-        assert heard.until(b"value", timeout=2)
+        assert reconnected(retainer)
+        clients(broker.port, "late").subscribe("state", received)
+        assert received.until(b"value", timeout=2)
     finally:
         broker.stop()
 
 
 def test_nothing_is_announced_again_to_a_broker_that_still_has_it(
-    broker: Broker, clients: Clients, link: Link, topic: str
+    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
 ) -> None:
-    keeper, watcher, heard, echo = clients(link.port, "keeper"), clients(broker.port), Heard(), Heard()
-    watcher.subscribe(f"{topic}/#", heard)
+    retainer, watcher, received, echo = clients(proxy.port, "retainer"), clients(broker.port), Received(), Received()
+    watcher.subscribe(f"{topic}/#", received)
     for number in range(30):
-        keeper.publish(f"{topic}/{number}", b"%d" % number, qos=DELIVERED, retain=True)
-    assert until(lambda: len(heard.messages) == 30)
-    keeper.subscribe(f"{topic}/echo", echo)  # its answer comes after all acknowledgements
-    link.drop()
-    assert reconnected(keeper)
-    keeper.publish(topic, b"last", qos=DELIVERED)
-    assert until(lambda: heard.payloads[-1] == b"last")
-    assert len([message for message in heard.messages if message.topic != topic]) == 30
+        retainer.publish(f"{topic}/{number}", b"%d" % number, qos=DELIVERED, retain=True)
+    assert until(lambda: len(received.messages) == 30)
+    retainer.subscribe(f"{topic}/echo", echo)  # its answer comes after all acknowledgements
+    proxy.drop()
+    assert reconnected(retainer)
+    retainer.publish(topic, b"last", qos=DELIVERED)
+    assert until(lambda: received.payloads[-1] == b"last")
+    assert len([message for message in received.messages if message.topic != topic]) == 30
 
 
 def test_no_broker_is_a_problem_in_words(clients: Clients, caplog: pytest.LogCaptureFixture) -> None:
@@ -466,7 +542,7 @@ def test_no_broker_is_a_problem_in_words(clients: Clients, caplog: pytest.LogCap
 
 
 @both_protocols
-def test_what_a_broker_does_not_take_is_told_whole(broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
+def test_a_refused_connection_is_explained_in_full(broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
     client = clients(broker.port, protocol=protocol, silence_s=30)
     assert until(lambda: client.outgoing.waiting == 0)
     broker.freeze()
@@ -477,11 +553,78 @@ def test_what_a_broker_does_not_take_is_told_whole(broker: Broker, clients: Clie
             sent += 50_000
             waiting = client.outgoing.waiting
             assert waiting <= sent + 10_000
-        assert waiting > 256 * 1024  # more than a full backlog: the kernel's part is told, too
+        assert waiting > 256 * 1024  # more than a full backlog: the kernel's part is included
     finally:
         broker.thaw()
     assert until(lambda: client.outgoing.waiting == 0)
     assert 0 < client.outgoing.round_trip_s < 5
+
+
+# -- refused subscriptions (T21)
+
+
+@pytest.fixture
+def refusing(tmp_path: Path) -> Iterator[RefusingBroker]:
+    broker = RefusingBroker(tmp_path)
+    yield broker
+    broker.stop()
+
+
+@both_protocols
+def test_a_refused_subscription_is_known_at_once_and_renewed_with_every_connection(
+    refusing: RefusingBroker, clients: Clients, topic: str, protocol: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    refusing.refuse(f"{topic}/secret")
+    client, other, received = clients(refusing.port, protocol=protocol), clients(refusing.port), Received()
+    secret = client.subscribe(f"{topic}/secret", received)
+    public = client.subscribe(f"{topic}/public", received)
+    assert (secret.refused, public.refused) == (True, False)
+    assert f"refused to subscribe us to {topic}/secret (" in caplog.text
+    assert client.counters["subscriptions_refused"] == 1
+    for metric in ("secret", "public"):
+        other.publish(f"{topic}/{metric}", metric.encode(), qos=DELIVERED)
+    assert received.until(b"public")
+    seen: list[tuple[State, bool, bool]] = []
+    client.on_state(lambda state: seen.append((state, secret.refused, public.refused)))
+    refusing.refuse(f"{topic}/public")
+    assert reconnected(client)
+    refusing.refuse()
+    assert reconnected(client, 3)
+    assert seen == [
+        (State.CONNECTING, True, False),
+        (State.CONNECTED, False, True),
+        (State.CONNECTING, False, True),
+        (State.CONNECTED, False, False),
+    ]
+
+
+def test_a_merged_filter_is_refused_for_all_it_covers(refusing: RefusingBroker, clients: Clients) -> None:
+    refusing.refuse("+/+")
+    client, received = clients(refusing.port), Received()
+    one, apart = client.subscribe("a/+", received), client.subscribe("a/b/c", received)
+    assert not one.refused
+    other = client.subscribe("+/b", received)
+    assert (one.refused, other.refused, apart.refused) == (True, True, False)
+
+
+def test_a_refused_query_of_own_retained_topics_refuses_no_subscription(
+    refusing: RefusingBroker, clients: Clients, topic: str
+) -> None:
+    client, received = clients(refusing.port), Received()
+    client.publish(f"{topic}/own", b"1", qos=DELIVERED, retain=True)
+    subscription = client.subscribe(f"{topic}/+", received)
+    answers: list[tuple[list[str], bool]] = []
+    note = client._note_answers  # type: ignore[attr-defined]
+
+    def note_answers(refused: dict[str, bool]) -> None:
+        note(refused)
+        answers.append((list(refused), subscription.refused))
+
+    client._note_answers = note_answers  # type: ignore[attr-defined]
+    refusing.refuse(f"{topic}/own")
+    assert reconnected(client)
+    assert client.counters["subscriptions_refused"] == 1
+    assert answers == [([f"{topic}/own"], False), ([f"{topic}/+"], False)]
 
 
 # -- logins and TLS
@@ -538,15 +681,15 @@ def tls(**changes: Any) -> TlsSettings:
 
 @both_protocols
 def test_tls_with_client_certificates(tls_broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
-    client, heard = clients(tls_broker.port, host="localhost", tls=tls(), protocol=protocol), Heard()
-    client.subscribe(topic, heard)
+    client, received = clients(tls_broker.port, host="localhost", tls=tls(), protocol=protocol), Received()
+    client.subscribe(topic, received)
     payload = bytes(range(256)) * 4000
     client.publish(topic, b"small", qos=DELIVERED)
     client.publish(topic, payload, qos=DELIVERED)
-    assert heard.until(b"small", payload)
+    assert received.until(b"small", payload)
 
 
-def test_tls_checks_the_host_name_unless_told_not_to(tls_broker: Broker, clients: Clients) -> None:
+def test_tls_checks_the_host_name_unless_configured_not_to(tls_broker: Broker, clients: Clients) -> None:
     client = clients(tls_broker.port, tls=tls(), opened=False)
     client.open(0.3)
     assert until(lambda: "certificate verify failed" in client.problem)

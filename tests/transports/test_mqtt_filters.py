@@ -1,11 +1,12 @@
-"""Filters a broker is told never overlap, and catch everything that is wanted."""
+"""Subscribed filters never overlap and match everything that is wanted; own and repeated messages are recognised."""
 
 from __future__ import annotations
 
 import itertools
 import random
 
-from pebble.transports.mqtt_filters import BrokerFilters, cover, overlap
+from pebble.transports import Message
+from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, cover, overlap
 from pebble.transports.topics import matches
 
 LEVELS = ["a", "b", "$x", "+"]
@@ -40,31 +41,74 @@ def test_a_cover_catches_what_both_catch() -> None:
             assert CAUGHT[one] | CAUGHT[other] <= caught(cover(one, other)), (one, other)
 
 
-def test_filters_told_never_overlap_and_miss_nothing() -> None:
+def test_subscribed_filters_never_overlap_and_miss_nothing() -> None:
     chosen = random.Random(3)
     for _ in range(300):
-        told, wanted = BrokerFilters(), []
+        stop_requested, wanted = BrokerFilters(), []
         for filter_ in chosen.sample(FILTERS, 6):
             wanted.append(filter_)
-            subscribe, replaced = told.add(filter_)
-            assert subscribe in told
-            assert not set(replaced) & set(told)
-            check(told, wanted)
+            subscribe, replaced = stop_requested.add(filter_)
+            assert subscribe in stop_requested
+            assert not set(replaced) & set(stop_requested)
+            check(stop_requested, wanted)
         while wanted:
             wanted.remove(chosen.choice(wanted))
-            told.prune(wanted)
-            check(told, wanted)
-        assert list(told) == []
+            stop_requested.prune(wanted)
+            check(stop_requested, wanted)
+        assert list(stop_requested) == []
 
 
-def check(told: BrokerFilters, wanted: list[str]) -> None:
-    assert not any(overlap(one, other) for one, other in itertools.combinations(told, 2))
+def check(stop_requested: BrokerFilters, wanted: list[str]) -> None:
+    assert not any(overlap(one, other) for one, other in itertools.combinations(stop_requested, 2))
     needed = frozenset().union(*(CAUGHT[filter_] for filter_ in wanted))
-    assert needed <= frozenset().union(*(caught(filter_) for filter_ in told))
+    assert needed <= frozenset().union(*(caught(filter_) for filter_ in stop_requested))
 
 
 def test_the_same_filter_again_is_asked_for_again() -> None:
-    told = BrokerFilters()
-    assert told.add("a/#") == ("a/#", [])
-    assert told.add("a/b") == ("a/#", [])
-    assert told.add("+/b") == ("+/#", ["a/#"])
+    stop_requested = BrokerFilters()
+    assert stop_requested.add("a/#") == ("a/#", [])
+    assert stop_requested.add("a/b") == ("a/#", [])
+    assert stop_requested.add("+/b") == ("+/#", ["a/#"])
+
+
+def retained(payload: bytes, topic: str = "flag") -> Message:
+    return Message(topic, payload, retain=True)
+
+
+def test_own_messages_are_recognised_until_another_client_publishes_something_else() -> None:
+    own_filter = OwnMessageFilter()
+    own_filter.note_own(retained(b"true"))
+    assert own_filter.is_echo(retained(b"true"))
+    assert not own_filter.is_echo(retained(b"false"))
+    assert not own_filter.is_echo(retained(b"true"))
+    own_filter.note_own(retained(b"true"))
+    own_filter.begin()
+    assert own_filter.is_echo(retained(b"true"))
+    assert not own_filter.is_echo(retained(b"true", "other"))
+
+
+def test_a_copy_is_a_repeat_only_when_one_is_due() -> None:
+    own_filter = OwnMessageFilter()
+    assert not own_filter.is_repeat(retained(b"1"))
+    assert not own_filter.is_repeat(retained(b"1"))  # published again by another client: a new message
+    own_filter.subscribe_again("#")
+    assert own_filter.is_repeat(retained(b"1"))
+    assert not own_filter.is_repeat(retained(b"1"))
+
+
+def test_a_new_value_that_overtakes_a_due_repeat_is_delivered() -> None:
+    own_filter = OwnMessageFilter()
+    own_filter.is_repeat(retained(b"1"))
+    own_filter.is_repeat(retained(b"1", "elsewhere"))
+    own_filter.subscribe_again("flag")
+    assert not own_filter.is_repeat(retained(b"2"))
+    assert own_filter.is_repeat(retained(b"2"))
+    assert not own_filter.is_repeat(retained(b"1", "elsewhere"))
+
+
+def test_a_new_connection_starts_afresh() -> None:
+    own_filter = OwnMessageFilter()
+    own_filter.is_repeat(retained(b"1"))
+    own_filter.subscribe_again("#")
+    own_filter.begin()
+    assert not own_filter.is_repeat(retained(b"1"))

@@ -1,4 +1,4 @@
-"""The Zenoh fabric of the shared suite: our hub, with a journal, as a process of its own."""
+"""The Zenoh network of the shared suite: our hub, with a journal, as a process of its own."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from pebble.transports import Message, QoS, State, ZenohSettings, create
 from tests.support import ROOT, until
 from tests.transports.net import Net
 
 
 class HubProcess:
-    """`python -m pebble.transports.zenoh_hub` in `run_dir`; `start` waits until it serves."""
+    """`python -m pebble.runtime.hub` in `run_dir`; `start` waits until it serves."""
 
     def __init__(self, run_dir: Path, journal: Path | None = None) -> None:
         self.settings = ZenohSettings(run_dir=run_dir, journal=journal)
         self._process: subprocess.Popen[str] | None = None
 
     def start(self) -> HubProcess:
-        options = [] if self.settings.journal is None else ["--journal", str(self.settings.journal)]
-        command = [sys.executable, "-m", "pebble.transports.zenoh_hub", str(self.settings.run_dir), *options]
+        settings = msgspec.json.encode(self.settings, enc_hook=str).decode()
+        command = [sys.executable, "-m", "pebble.runtime.hub", settings]
         self._process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
         probe = create("zenoh", "probe", dataclasses.replace(self.settings, client=True)).open(10)
         assert probe.state is State.CONNECTED, probe.problem
@@ -40,8 +42,8 @@ class HubProcess:
         assert process is not None
         process.send_signal(signal.SIGCONT)
         process.send_signal(number)
-        _, said = process.communicate(timeout=10)
-        return process.returncode, said
+        _, printed = process.communicate(timeout=10)
+        return process.returncode, printed
 
     def signal(self, number: int) -> None:
         os.kill(self.pid, number)
@@ -55,10 +57,10 @@ class HubProcess:
         assert self._process is not None
         return self._process.pid
 
-    def settle(self) -> None:
-        """Wait until every message to be kept that living clients have published is in the hub's memory.
+    def wait_until_stored(self) -> None:
+        """Wait until the hub has stored every retained message that running clients have published.
 
-        The hub answers a subscriber only then; our own kept copy tells that it has.
+        The hub answers a subscriber only then; our own retained message shows that it has.
         """
         answered: list[Message] = []
         with create("zenoh", "settler", dataclasses.replace(self.settings, client=True)) as client:
@@ -79,14 +81,14 @@ class ZenohNet(Net):
     def settings(self, **changes: Any) -> ZenohSettings:
         return dataclasses.replace(self.hub.settings, **changes)
 
-    def start_fabric(self) -> None:
+    def start_network(self) -> None:
         if not self.hub.running:
             self.hub.start()
 
-    def stop_fabric(self, *, forget: bool = False) -> None:
+    def stop_network(self, *, forget: bool = False) -> None:
         if self.hub.running:
             try:
-                self.hub.settle()
+                self.hub.wait_until_stored()
             finally:
                 self.hub.kill()
         if forget:
@@ -94,12 +96,12 @@ class ZenohNet(Net):
 
     def heal(self) -> None:
         if self.hub.running:
-            self.thaw_fabric()
+            self.thaw_network()
         else:
-            self.start_fabric()
+            self.start_network()
 
-    def freeze_fabric(self) -> None:
+    def freeze_network(self) -> None:
         self.hub.signal(signal.SIGSTOP)
 
-    def thaw_fabric(self) -> None:
+    def thaw_network(self) -> None:
         self.hub.signal(signal.SIGCONT)

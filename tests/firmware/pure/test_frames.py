@@ -84,7 +84,7 @@ def test_known_vectors_in():
     assert received(b"\0\0" + DESCRIBE_REQ + b"\0" + CMD) == [(0x02, 0, 0), (0x20, 3, 1)]
 
 
-def test_frames_out_are_what_was_said():
+def test_sent_frames_decode_to_their_content():
     noise = Noise(7)
     sender = Sender(512)
     for count in range(400):

@@ -8,49 +8,49 @@ def near(pair, left, right):
 
 
 def test_the_left_wheel_is_trimmed():
-    assert near(Gears().spare(1.0, 1.0, 0), 0.93, 1.0)
-    assert near(Gears().spare(0.5, -0.5, 0), 0.465, -0.5)
+    assert near(Gears().limit(1.0, 1.0, 0), 0.93, 1.0)
+    assert near(Gears().limit(0.5, -0.5, 0), 0.465, -0.5)
 
 
 def test_the_way_back_is_slow():
-    assert near(Gears().spare(-1.0, -1.0, 0), -0.7 * 0.93, -0.7)
+    assert near(Gears().limit(-1.0, -1.0, 0), -0.7 * 0.93, -0.7)
 
 
 def test_no_way_back_right_after_a_way_ahead():
     gears = Gears()
-    gears.spare(1.0, 1.0, 1000)
-    assert near(gears.spare(-1.0, -1.0, 1000), 0.0, 0.0)
-    assert near(gears.spare(-1.0, -1.0, 1339), 0.0, 0.0)
-    assert near(gears.spare(-1.0, -1.0, 1340), -0.651, -0.7)
+    gears.limit(1.0, 1.0, 1000)
+    assert near(gears.limit(-1.0, -1.0, 1000), 0.0, 0.0)
+    assert near(gears.limit(-1.0, -1.0, 1339), 0.0, 0.0)
+    assert near(gears.limit(-1.0, -1.0, 1340), -0.651, -0.7)
 
 
 def test_turning_stays_possible():
     gears = Gears()
-    gears.spare(1.0, 1.0, 0)
-    assert near(gears.spare(-1.0, 0.0, 100), -0.465, 0.5)
-    assert near(gears.spare(1.0, -1.0, 100), 0.93, -1.0)
+    gears.limit(1.0, 1.0, 0)
+    assert near(gears.limit(-1.0, 0.0, 100), -0.465, 0.5)
+    assert near(gears.limit(1.0, -1.0, 100), 0.93, -1.0)
 
 
 def test_only_more_ahead_than_turning_blocks():
     gears = Gears()
-    gears.spare(1.0, 0.0, 0)  # as much one as the other
-    assert near(gears.spare(-1.0, -1.0, 1), -0.651, -0.7)
-    gears.spare(1.0, 0.1, 10)
-    assert near(gears.spare(-1.0, -1.0, 11), 0.0, 0.0)
+    gears.limit(1.0, 0.0, 0)  # as much one as the other
+    assert near(gears.limit(-1.0, -1.0, 1), -0.651, -0.7)
+    gears.limit(1.0, 0.1, 10)
+    assert near(gears.limit(-1.0, -1.0, 11), 0.0, 0.0)
 
 
 def test_a_stop_is_a_stop():
-    assert Gears().spare(0.0, 0.0, 0) == (0.0, 0.0)
+    assert Gears().limit(0.0, 0.0, 0) == (0.0, 0.0)
 
 
 def test_the_ticks_may_wrap():
     gears = Gears()
-    gears.spare(1.0, 1.0, (1 << 30) - 100)
-    assert near(gears.spare(-1.0, -1.0, 100), 0.0, 0.0)
-    assert near(gears.spare(-1.0, -1.0, 240), -0.651, -0.7)
+    gears.limit(1.0, 1.0, (1 << 30) - 100)
+    assert near(gears.limit(-1.0, -1.0, 100), 0.0, 0.0)
+    assert near(gears.limit(-1.0, -1.0, 240), -0.651, -0.7)
 
 
 def test_a_way_ahead_of_last_week_blocks_nothing():
     gears = Gears()
-    gears.spare(1.0, 1.0, 0)
-    assert near(gears.spare(-1.0, -1.0, (1 << 29) + 5), -0.651, -0.7)
+    gears.limit(1.0, 1.0, 0)
+    assert near(gears.limit(-1.0, -1.0, (1 << 29) + 5), -0.651, -0.7)

@@ -10,7 +10,7 @@ DPS = 65.5  # LSB
 
 
 class Device:
-    """Lies flat and at rest unless told otherwise; fails ``failures`` times."""
+    """Lies flat and at rest by default; fails ``failures`` times."""
 
     def __init__(self):
         self.raw = [0, 0, G, 0, 0, 0, 0]
@@ -36,9 +36,9 @@ class Device:
 class Bench:
     def __init__(self):
         self.device = Device()
-        self.said = []
+        self.messages = []
         self.now = 0
-        self.imu = Imu(self.device, self.said.append)
+        self.imu = Imu(self.device, self.messages.append)
 
     def sample(self, count=1):
         """How many of ``count`` samples, 10 ms apart, brought something."""
@@ -53,10 +53,10 @@ def near(value, wanted, off):
     return abs(value - wanted) <= off
 
 
-def test_it_starts_and_says_so():
+def test_it_starts_and_reports_it():
     bench = Bench()
     assert bench.sample(11) == 10
-    assert bench.said == [b"imu_ready"]
+    assert bench.messages == [b"imu_ready"]
     assert bench.imu.good == 10
 
 
@@ -89,7 +89,7 @@ def test_what_the_wire_cannot_hold_is_cut_off():
     struct.pack("<9h", *bench.imu.values)
 
 
-def test_it_learns_what_the_gyroscope_says_at_rest():
+def test_it_learns_the_bias_of_the_gyroscope_at_rest():
     bench = Bench()
     bench.device.raw = [0, 0, G, 0, 79, -52, 29]
     bench.sample(210)
@@ -140,7 +140,7 @@ def test_turning_is_followed_at_once_and_gravity_in_the_long_run():
     bench = Bench()
     bench.sample(212)
     bench.device.raw[4] = int(90 * DPS)
-    bench.sample(10)  # a tenth of a second at 90 degrees/s, though gravity says it lies flat
+    bench.sample(10)  # a tenth of a second at 90 degrees/s, though gravity is that of lying flat
     assert 780 < bench.imu.values[7] < 900
     bench.device.raw[4] = 0
     bench.sample(50)
@@ -168,12 +168,12 @@ def test_free_fall_keeps_the_attitude():
     assert near(bench.imu.values[7], 4500, 5)
 
 
-def test_one_failure_is_told_and_passed_over():
+def test_one_failure_is_logged_and_ignored():
     bench = Bench()
     bench.sample(10)
     bench.device.failures = 1
     assert bench.sample(10) == 9
-    assert bench.said == [b"imu_ready", b"imu_read_failed"]
+    assert bench.messages == [b"imu_ready", b"imu_read_failed"]
     assert (bench.imu.failed, bench.device.starts) == (1, 1)
 
 
@@ -186,7 +186,7 @@ def test_after_five_failures_it_is_set_up_anew_a_second_later():
     bench.sample(1)
     assert bench.device.starts == 2
     assert bench.sample(10) == 10
-    assert bench.said == [b"imu_ready", b"imu_read_failed", b"imu_reinit"]
+    assert bench.messages == [b"imu_ready", b"imu_read_failed", b"imu_reinit"]
 
 
 def test_a_device_that_fell_asleep_is_set_up_anew():
@@ -196,14 +196,14 @@ def test_a_device_that_fell_asleep_is_set_up_anew():
     assert bench.sample(104) == 0
     bench.device.raw = [0, 0, G, 0, 0, 0, 0]
     assert bench.sample(11) == 10
-    assert bench.said == [b"imu_ready", b"imu_read_failed", b"imu_reinit"]
+    assert bench.messages == [b"imu_ready", b"imu_read_failed", b"imu_reinit"]
 
 
 def test_a_device_that_is_not_there_is_looked_for_every_second():
     bench = Bench()
     bench.device.failures = 3
     assert bench.sample(301) == 0
-    assert bench.said == [b"imu_init_failed"] * 3 + [b"imu_ready"]
+    assert bench.messages == [b"imu_init_failed"] * 3 + [b"imu_ready"]
     assert bench.device.starts == 4
 
 
@@ -211,7 +211,7 @@ def test_another_device_at_its_address_is_refused():
     bench = Bench()
     bench.device.right = False
     assert bench.sample(101) == 0
-    assert bench.said == [b"imu_init_failed"] * 2
+    assert bench.messages == [b"imu_init_failed"] * 2
 
 
 def test_the_ticks_may_wrap():

@@ -5,7 +5,7 @@ from common.light import Light
 WRAP = 1 << 30
 
 
-def test_before_anybody_says_otherwise_it_fades_red_in_two_seconds():
+def test_before_the_first_command_it_fades_red_in_two_seconds():
     light = Light(0)
     assert light.colour == (0.0, 0.0, 1.0)
     assert light.period_ms == 2000

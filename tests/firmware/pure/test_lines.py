@@ -3,34 +3,34 @@
 from common.lines import Lines, clamp, number
 
 
-class Told:
-    """What the robot was told, and what the host hears."""
+class Recorder:
+    """Records the commands to the robot and the lines to the host."""
 
     def __init__(self):
         self.commands = []
-        self.lines = Lines(self.obey)
+        self.lines = Lines(self.act)
 
-    def obey(self, letter, numbers):
+    def act(self, letter, numbers):
         self.commands.append((chr(letter), list(numbers)))
 
     def give(self, data):
         for byte in data:
             self.lines.take(byte)
-        return self.heard()
+        return self.received()
 
-    def heard(self):
+    def received(self):
         lines = self.lines
         size = len(lines.ring)
-        said = bytes([lines.ring[(lines.first + index) % size] for index in range(lines.used)])
+        output = bytes([lines.ring[(lines.first + index) % size] for index in range(lines.used)])
         lines.first = (lines.first + lines.used) % size
         lines.used = 0
-        return said
+        return output
 
 
 def obeyed(data):
-    told = Told()
-    answer = told.give(data)
-    return answer, [(letter, numbers[: {"M": 2, "L": 3, "F": 4}[letter]]) for letter, numbers in told.commands]
+    calls = Recorder()
+    answer = calls.give(data)
+    return answer, [(letter, numbers[: {"M": 2, "L": 3, "F": 4}[letter]]) for letter, numbers in calls.commands]
 
 
 def test_each_command():
@@ -55,32 +55,82 @@ def test_spare_tokens_are_not_looked_at():
     assert obeyed(b"M 1 1 spare tokens are ignored here\n") == (b"OK M\r\n", [("M", [1.0, 1.0])])
 
 
-def test_missing_numbers_are_told():
+def test_missing_numbers_are_reported():
     assert obeyed(b"M 1\n") == (b"ERR M needs 2 values\r\n", [])
     assert obeyed(b"m\n") == (b"ERR M needs 2 values\r\n", [])
     assert obeyed(b"L 1 1\n") == (b"ERR L needs 3 values\r\n", [])
     assert obeyed(b"F 1 1 1\n") == (b"ERR F needs 4 values\r\n", [])
 
 
-def test_unknown_commands_are_told():
+def test_unknown_commands_are_reported():
     assert obeyed(b"X 1 1\n") == (b"ERR unknown command\r\n", [])
     assert obeyed(b"\xffM 1 1\n") == (b"ERR unknown command\r\n", [])
     assert obeyed(b"\x03M 1 1\n") == (b"ERR unknown command\r\n", [])
 
 
 def test_nothing_happens_before_the_line_ends():
-    told = Told()
-    assert told.give(b"M 1 1") == b""
-    assert told.commands == []
-    assert told.give(b"\nL 0 0 0\nF") == b"OK M\r\nOK L\r\n"
-    assert len(told.commands) == 2
+    calls = Recorder()
+    assert calls.give(b"M 1 1") == b""
+    assert calls.commands == []
+    assert calls.give(b"\nL 0 0 0\nF") == b"OK M\r\nOK L\r\n"
+    assert len(calls.commands) == 2
 
 
-def test_a_line_too_long_is_thrown_away_and_told_once():
-    told = Told()
-    assert told.give(b"M 1 1 " + b"x" * 1000) == b"WARN line too long\r\n"
-    assert told.give(b"M 1 1\nM 0.5 0.5\n") == b"OK M\r\n"
-    assert told.commands == [("M", [0.5, 0.5, 0.0, 0.0, 0.0])]
+def test_an_unfinished_line_is_dropped_after_200_ms_of_silence():
+    calls = Recorder()
+    calls.give(b"M 0.9")
+    calls.lines.rest(1000)
+    calls.lines.rest(1199)
+    assert calls.lines.length == 5
+    calls.lines.rest(1200)
+    assert calls.lines.length == 0
+    assert calls.give(b"M 0 0\n") == b"OK M\r\n"
+    assert calls.commands == [("M", [0.0, 0.0, 0.0, 0.0, 0.0])]
+
+
+def test_each_byte_begins_the_silence_anew():
+    calls = Recorder()
+    for at, byte in enumerate(b"M 0.5 0.5"):
+        calls.lines.take(byte)
+        calls.lines.rest(at * 199)
+        calls.lines.rest(at * 199 + 198)
+    assert calls.give(b"\n") == b"OK M\r\n"
+    assert calls.commands[0][1][:2] == [0.5, 0.5]
+
+
+def test_a_pause_in_which_nothing_is_read_is_no_silence():
+    calls = Recorder()
+    calls.lines.rest(0)
+    calls.give(b"M 0.5 ")
+    calls.lines.rest(100)
+    calls.give(b"0.5")  # the next turn begins late, and finds bytes
+    calls.lines.rest(700)
+    assert calls.give(b"\n") == b"OK M\r\n"
+
+
+def test_the_silence_goes_over_the_wrap_of_the_ticks():
+    calls = Recorder()
+    calls.give(b"M")
+    calls.lines.rest((1 << 30) - 100)
+    calls.lines.rest(99)
+    assert calls.lines.length == 1
+    calls.lines.rest(100)
+    assert calls.lines.length == 0
+
+
+def test_the_rest_of_a_line_too_long_is_dropped_by_silence_too():
+    calls = Recorder()
+    calls.give(b"x" * 300)
+    calls.lines.rest(0)
+    calls.lines.rest(200)
+    assert calls.give(b"M 1 1\n")[-6:] == b"OK M\r\n"
+
+
+def test_a_line_too_long_is_discarded_and_reported_once():
+    calls = Recorder()
+    assert calls.give(b"M 1 1 " + b"x" * 1000) == b"WARN line too long\r\n"
+    assert calls.give(b"M 1 1\nM 0.5 0.5\n") == b"OK M\r\n"
+    assert calls.commands == [("M", [0.5, 0.5, 0.0, 0.0, 0.0])]
 
 
 def test_256_bytes_are_not_too_long():
@@ -128,34 +178,34 @@ def test_clamp():
 
 
 def test_a_host_that_does_not_read_loses_whole_lines():
-    told = Told()
-    lines = told.lines
+    calls = Recorder()
+    lines = calls.lines
     for _ in range(20):
-        lines.say(b"T a0=512 a1=512 a2=512")
-    assert told.heard() == b"T a0=512 a1=512 a2=512\r\n" * 5
-    told.give(b"M 1 1\n")
-    assert told.commands, "it is obeyed all the same"
+        lines.put(b"T a0=512 a1=512 a2=512")
+    assert calls.received() == b"T a0=512 a1=512 a2=512\r\n" * 5
+    calls.give(b"M 1 1\n")
+    assert calls.commands, "it is obeyed all the same"
 
 
 def test_lines_go_around_the_end_of_the_ring():
-    told = Told()
+    calls = Recorder()
     for index in range(200):
-        told.lines.say(b"%d" % index)
-        assert told.heard() == b"%d\r\n" % index
+        calls.lines.put(b"%d" % index)
+        assert calls.received() == b"%d\r\n" % index
 
 
 def test_noise():
-    told = Told()
+    calls = Recorder()
     value = 1
     known = 0
     for _ in range(20_000):
         for _ in range(8):
             value = (value * 1103515245 + 12345) & 0x3FFFFFFF
-            told.lines.take(value >> 16 & 0xFF)
-        told.lines.first = told.lines.used = 0
-        for letter, numbers in told.commands:
+            calls.lines.take(value >> 16 & 0xFF)
+        calls.lines.first = calls.lines.used = 0
+        for letter, numbers in calls.commands:
             known += letter in "MLF"
             assert all(-1e9 <= one <= 1e9 for one in numbers)
-        told.commands = []
-    assert told.give(b"\nM 0.5 0.5\n")[-6:] == b"OK M\r\n"
+        calls.commands = []
+    assert calls.give(b"\nM 0.5 0.5\n")[-6:] == b"OK M\r\n"
     assert known < 20_000

@@ -1,22 +1,35 @@
 """Drive commands: what moves a robot, and what never does."""
 
-from common.payload import wanted
+from common.payload import clamp, mix
+from common.payload import parse as parse_all
+
+
+def parse(raw: bytes) -> "tuple | None":
+    """The axes."""
+    command = parse_all(raw)
+    return command[:3] if command else None
+
+
+def order(raw: bytes) -> "tuple | None":
+    """Run and validity."""
+    command = parse_all(raw)
+    return command[3:] if command else None
 
 
 def test_bare_and_wrapped() -> None:
-    assert wanted(b'{"x": 0.5, "z": -0.25, "y": 1}') == (0.5, -0.25, 1.0)
-    assert wanted(b'{"value": {"x": 0.5, "z": -0.25}, "z": 1}') == (0.5, -0.25, 0.0)
-    assert wanted(b'{"value": 3, "z": 0.25}') == (0.0, 0.25, 0.0)
+    assert parse(b'{"x": 0.5, "z": -0.25, "y": 1}') == (0.5, -0.25, 1.0)
+    assert parse(b'{"value": {"x": 0.5, "z": -0.25}, "z": 1}') == (0.5, -0.25, 0.0)
+    assert parse(b'{"value": 3, "z": 0.25}') == (0.0, 0.25, 0.0)
 
 
 def test_missing_axes_are_zero_and_big_ones_are_clamped() -> None:
-    assert wanted(b"{}") == (0.0, 0.0, 0.0)
-    assert wanted(b'{"x": -7, "z": 1e9}') == (-1.0, 1.0, 0.0)
-    assert wanted(b'{"z": 10000000000000000000000000}') == (0.0, 1.0, 0.0)
+    assert parse(b"{}") == (0.0, 0.0, 0.0)
+    assert parse(b'{"x": -7, "z": 1e9}') == (-1.0, 1.0, 0.0)
+    assert parse(b'{"z": 10000000000000000000000000}') == (0.0, 1.0, 0.0)
 
 
 def test_numeric_strings() -> None:
-    assert wanted(b'{"x": "0.5", "z": " -2.5e-1 ", "y": "+1"}') == (0.5, -0.25, 1.0)
+    assert parse(b'{"x": "0.5", "z": " -2.5e-1 ", "y": "+1"}') == (0.5, -0.25, 1.0)
 
 
 def test_what_is_no_number_is_refused() -> None:
@@ -37,30 +50,85 @@ def test_what_is_no_number_is_refused() -> None:
     )
     for text in ("true", "null", "[1]", "{}") + strings:  # noqa: RUF005 - MicroPython has no star there
         for axis in ("x", "z", "y"):
-            assert wanted(('{"' + axis + '": ' + text + "}").encode()) is None, text
+            assert parse(('{"' + axis + '": ' + text + "}").encode()) is None, text
 
 
 def test_nan_and_infinity_are_refused() -> None:
     for text in (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"-1e999", b'"1e999"', b'"NaN"', b"1" + b"0" * 400):
-        assert wanted(b'{"x": 0, "z": ' + text + b"}") is None, text
+        assert parse(b'{"x": 0, "z": ' + text + b"}") is None, text
 
 
 def test_what_is_no_object_is_refused() -> None:
     for raw in (b"", b" ", b"1", b"[1, 1]", b'"x"', b"null", b'{"z": 1', b'{"z": 1}}', b'{"z": 1} x', b"\x00", b"z"):
-        assert wanted(raw) is None, raw
+        assert parse(raw) is None, raw
 
 
 def test_what_is_no_utf8_is_refused() -> None:
-    assert wanted(b"\xff\xfe\x00") is None
-    assert wanted(b'{"z": 1, "n": "\xff"}') is None
-    assert wanted(b'{"z": 1, "n": "\xc3\xab"}') == (0.0, 1.0, 0.0)
+    assert parse(b"\xff\xfe\x00") is None
+    assert parse(b'{"z": 1, "n": "\xff"}') is None
+    assert parse(b'{"z": 1, "n": "\xc3\xab"}') == (0.0, 1.0, 0.0)
 
 
 def test_length_and_depth_have_limits() -> None:
     body = b'{"z": 1, "pad": "%s"}'
-    room = 1024 - len(body % b"")
-    assert wanted(body % (b"x" * room)) == (0.0, 1.0, 0.0)
-    assert wanted(body % (b"x" * (room + 1))) is None
-    assert wanted(b"[" * 1000) is None
-    assert wanted(b'{"a":' * 40 + b"1" + b"}" * 40) is None
-    assert wanted(b'{"z": 1, "a":' + b"[" * 20 + b"]" * 20 + b"}") == (0.0, 1.0, 0.0)
+    room = 512 - len(body % b"")
+    assert parse(body % (b"x" * room)) == (0.0, 1.0, 0.0)
+    assert parse(body % (b"x" * (room + 1))) is None
+    assert parse(b"[" * 1000) is None
+    assert parse(b'{"a":' * 40 + b"1" + b"}" * 40) is None
+    assert parse(b'{"z": 1, "a":' + b"[" * 20 + b"]" * 20 + b"}") == (0.0, 1.0, 0.0)
+
+
+def test_a_command_without_more_is_a_persons_and_has_no_limit() -> None:
+    for more in (b"", b', "source": null, "run": null, "valid_ms": null', b', "source": "joystick"', b', "run": 17'):
+        assert order(b'{"z": 1' + more + b"}") == (0, -1), more
+
+
+def test_a_script_signs_with_its_run() -> None:
+    assert order(b'{"z": 1, "source": "autonomy", "run": 17}') == (17, -1)
+    assert order(b'{"value": {"z": 1, "source": "autonomy", "run": 1073741823}}') == (1073741823, -1)
+    assert order(b'{"z": 0, "source": "autonomy", "run": 17, "valid_ms": 0}') == (17, 0)
+    assert order(b'{"source": "autonomy", "run": 17}') == (17, -1)
+
+
+def test_a_command_may_be_valid_for_a_shorter_time() -> None:
+    assert order(b'{"z": 1, "valid_ms": 400}') == (0, 400)
+    assert order(b'{"z": 1, "valid_ms": 250.9}') == (0, 250)
+    assert order(b'{"z": 0, "valid_ms": 0}') == (0, 0)
+    assert order(b'{"z": 0, "valid_ms": 0.5}') == (0, 0)
+    assert order(b'{"z": 1, "valid_ms": 999999999999}') == (0, 60_000)
+
+
+def test_a_wrong_field_refuses_what_moves_and_never_a_zero() -> None:
+    signed = ', "source": "autonomy"'
+    wrong = []
+    for value in ("5", '["autonomy"]', '{"a": 1}', "true"):
+        wrong.append(('"source": ' + value, (0, -1)))
+    for value in ('"17"', "1.5", "true", "0", "-1", "1073741824"):
+        wrong.append(('"run": ' + value + signed, (-1, -1)))
+        wrong.append(('"run": ' + value, (0, -1)))
+    for value in ('"400"', "-1", "true", "1e300", "1" + "0" * 300):
+        wrong.append(('"valid_ms": ' + value + ', "run": 17' + signed, (17, -1)))
+    for text, zero in wrong:
+        assert order(('{"z": 0.5, ' + text + "}").encode()) is None, text
+        assert order(('{"z": 0, ' + text + "}").encode()) == zero, text
+
+
+def test_a_scripts_command_without_its_run_and_one_that_is_valid_for_no_time_move_nothing() -> None:
+    assert order(b'{"z": 0.5, "source": "autonomy"}') is None
+    assert order(b'{"source": "autonomy"}') == (-1, -1)
+    assert order(b'{"z": 0.5, "valid_ms": 0}') is None
+    assert order(b'{"z": 0.5, "valid_ms": 0.5}') is None
+
+
+def test_mixing() -> None:
+    assert mix(0.0, 1.0) == (1.0, 1.0)
+    assert mix(0.0, -0.5) == (-0.5, -0.5)
+    assert mix(0.25, 0.5) == (0.75, 0.25)  # to the right: the left wheel is faster
+    assert mix(-1.0, 0.0) == (-1.0, 1.0)
+
+
+def test_nothing_beyond_full_speed() -> None:
+    assert mix(1.0, 1.0) == (1.0, 0.0)
+    assert mix(-1.0, -1.0) == (-1.0, 0.0)
+    assert (clamp(7.0), clamp(-7.0), clamp(0.25)) == (1.0, -1.0, 0.25)

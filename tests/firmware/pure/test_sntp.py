@@ -1,10 +1,12 @@
-"""The question to a time server, and which answers count."""
+"""Requests to a time server, which answers are valid, and the clock they set."""
 
 import struct
 
-from common.sntp import epoch_ms, request
+from common.sntp import WallClock, epoch_ms, request
+from common.ticks import add
 
 NONCE = b"abcdefgh"
+LAST = (1 << 30) - 1  # the highest tick
 
 
 def answer(
@@ -39,3 +41,24 @@ def test_what_is_no_answer() -> None:
     assert epoch_ms(answer(stratum=0), NONCE) is None  # kiss of death
     assert epoch_ms(answer(stratum=16), NONCE) is None
     assert epoch_ms(answer(seconds=0), NONCE) is None
+
+
+def test_before_any_answer_it_counts_from_the_start() -> None:
+    wall = WallClock(500)
+    assert wall.read(500) == 0
+    assert wall.read(750) == 250
+
+
+def test_after_an_answer_it_goes_on_from_there() -> None:
+    wall = WallClock(0)
+    wall.set(1700000000123, 1000)
+    assert wall.read(1250) == 1700000000373
+
+
+def test_ticks_may_wrap_as_often_as_they_like() -> None:
+    wall = WallClock(LAST - 1000)
+    wall.set(1700000000000, LAST - 1000)
+    now, day = LAST - 1000, 86400000
+    for days in range(1, 40):
+        now = add(now, day)
+        assert wall.read(now) == 1700000000000 + days * day

@@ -4,6 +4,8 @@ Whatever a real board keeps outside MicroPython's heap (network buffers, what ca
 here, before anything is measured. Time is virtual: `now` is milliseconds.
 """
 
+import gc as _gc
+import os as _os
 import sys
 import time as _time
 
@@ -243,6 +245,19 @@ class Os:
     def urandom(count):
         return bytes([index * 73 + now & 0xFF for index in range(count)])
 
+    listdir, rename = staticmethod(_os.listdir), staticmethod(_os.rename)
+
+
+class Gc:
+    """Garbage is only collected between two turns, so this notes how much there is: ``most`` since ``start``."""
+
+    start = most = 0
+
+    @staticmethod
+    def collect():
+        Gc.most = max(Gc.most, _gc.mem_alloc() - Gc.start)
+        Gc.start = _gc.mem_alloc()
+
 
 class Nothing:
     """A module that this board does not have: `from select import poll` is an ImportError."""
@@ -253,4 +268,5 @@ modules["machine"] = Machine
 modules["select"] = Select
 modules["errno"] = Errno
 modules["os"] = Os
+modules["gc"] = Gc
 modules["sys"] = Sys

@@ -15,6 +15,7 @@ broker_up = True
 datagrams = []  # (socket, data, address) from the board
 answers = {}  # socket: (data, address) for it
 connection = None  # the board's TCP socket
+state = bytearray(300)  # the newest that the robot published of its emergency stop
 counts = {}  # of the packets that the broker got, by kind
 
 
@@ -135,7 +136,13 @@ def packets(data):
         if kind == CONNECT:
             board.to_board.put(b"\x20\x02\0\0")
         elif kind == SUBSCRIBE:
-            board.to_board.put(b"\x90\x03" + data[at : at + 2] + b"\x01")
+            granted = b"\x01" * data[at : at + length].count(b"/incoming/")  # one topic each
+            board.to_board.put(bytes((0x90, 2 + len(granted))) + data[at : at + 2] + granted)
+        elif kind == PUBLISH and b"/outgoing/estop/mcu" in data[at : at + length]:
+            payload = data[data.find(b"{", at) : at + length]
+            state[: len(payload)] = payload
+            for index in range(len(payload), len(state)):
+                state[index] = 32
         elif kind == PINGREQ:
             board.to_board.put(b"\xd0\0")
         assert first
@@ -144,7 +151,7 @@ def packets(data):
 
 
 def publish(topic, payload, flags=0):
-    """From the broker; QoS 1 if flags say so (2), kept if (1)."""
+    """A PUBLISH of the broker; flags: QoS 1 (2), retained (1)."""
     ident = b"\x12\x34" if flags & 2 else b""
     rest = len(topic).to_bytes(2, "big") + topic + ident + payload
     size = bytes((len(rest),)) if len(rest) < 128 else bytes((len(rest) & 127 | 128, len(rest) >> 7))

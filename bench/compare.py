@@ -1,0 +1,208 @@
+"""Compares two runs of a comparison: did any metric get worse beyond random variation? Pure.
+
+Many metrics mean many chances of a false alarm: the confidence level of each grows with their number, so that two runs
+of the same program have a chance of about :data:`CHANCE` to show any change at all.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+from pebble.bench.percentiles import percentile
+from pebble.bench.ratios import LEAST_ROUNDS, Interval, student, unpaired
+from pebble.bench.results import OVER_TIME, Cell, Results
+
+CHANCE = 0.01
+#: Memory layout and core placement of new processes shift medians by this factor between runs, which no number of
+#: rounds within one run shows.
+THRESHOLD = 1.05
+_PERCENTS = (50, 99)
+_SAME_EVERY_TIME = ("kB/s", "kbit/s")  # encoder output is deterministic: one value is exact
+_MORE_IS_BETTER = ("1/s",)
+_LEAST_SAMPLES = 100  # of a round: with fewer, p99 is the maximum
+_LOSS = 0.005  # share of what was sent: smaller changes are ignored
+
+
+class Kind(StrEnum):
+    """The outcome for one metric, in the order of the table."""
+
+    NO_SAMPLES = "nothing in B"  # measured, but without samples, or at a rate of 0
+    WORSE = "worse"
+    ONLY_A = "only in A"
+    ONLY_B = "only in B"
+    BETTER = "better"
+    UNKNOWN = "unknown"
+    EQUAL = "no difference"  # beyond noise
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One percentile of one cell in both runs, as the median over its rounds; or the lost share. NaN: not measured."""
+
+    cell: Cell
+    percent: int | None  # None: the share that was lost, in %
+    a: float
+    b: float
+    ratio: Interval  # b / a
+    kind: Kind
+
+    @property
+    def what(self) -> str:
+        return "lost %" if self.percent is None else f"p{self.percent} {self.cell.unit}".strip()
+
+    @property
+    def worse(self) -> bool:
+        return self.kind in (Kind.WORSE, Kind.NO_SAMPLES)
+
+    @property
+    def changed(self) -> bool:
+        return self.kind not in (Kind.EQUAL, Kind.UNKNOWN)
+
+
+def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Finding]:
+    """All findings, the worst first. Each metric that both runs have is judged at the level of :func:`certainty`."""
+    before, after = _by_key(a.cells), _by_key(b.cells)
+    silent = {_key(cell) for cell in b.cells if not cell.samples}
+    both = [(before[key], after[key]) for key in before if key in after]
+    asked = [(one, other, percent) for one, other in both for percent in _percents(one, other)]
+    losing = [(one, other) for one, other in both if _counts(one) and _counts(other) and (one.lost or other.lost)]
+    level = certainty(len(asked) + len(losing))
+    findings = [_judged(one, other, percent, level, threshold) for one, other, percent in asked]
+    findings += [_lost(one, other, level) for one, other in losing]
+    findings += [
+        _alone(before[key], Kind.NO_SAMPLES if key in silent else Kind.ONLY_A) for key in before if key not in after
+    ]
+    findings += [_alone(after[key], Kind.ONLY_B) for key in after if key not in before]
+    return sorted(findings, key=_order)
+
+
+def certainty(figures: int) -> float:
+    """The confidence level of each of ``figures`` intervals."""
+    return 1 - CHANCE / max(1, figures)
+
+
+def differences(a: Results, b: Results) -> list[str]:
+    """Other differences between two runs, one line each: the program may then not be the only cause."""
+    return [
+        *_differing("machine", a.machine, b.machine),
+        *_differing("option", a.options, b.options),
+        *_differing("", {"pebble": a.pebble, "quick": a.quick}, {"pebble": b.pebble, "quick": b.quick}),
+    ]
+
+
+def _differing(what: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{what} {name}: {one.get(name)} in A, {other.get(name)} in B".strip()
+        for name in {**one, **other}
+        if one.get(name) != other.get(name)
+    ]
+
+
+def _by_key(cells: Sequence[Cell]) -> dict[Hashable, Cell]:
+    """The cells that have samples, by key."""
+    return {_key(cell): cell for cell in cells if cell.samples and not cell.measure.endswith(OVER_TIME)}
+
+
+def _key(cell: Cell) -> Hashable:
+    return cell.variant, frozenset(cell.params.items()), cell.measure
+
+
+def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
+    """The percentiles for which most rounds have enough samples."""
+    fewest = min(statistics.median(len(samples) for samples in cell.rounds if samples) for cell in (one, other))
+    return _PERCENTS if fewest >= _LEAST_SAMPLES else _PERCENTS[:1]
+
+
+def _alone(cell: Cell, kind: Kind) -> Finding:
+    figure = _figure(cell, _PERCENTS[0])
+    a, b = (math.nan, figure) if kind is Kind.ONLY_B else (figure, math.nan)
+    return Finding(cell, _PERCENTS[0], a, b, Interval(math.nan, math.nan, math.nan), kind)
+
+
+def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float) -> Finding:
+    ratio = unpaired(other.rounds, one.rounds, percent, level)
+    if other.unit in _SAME_EVERY_TIME:
+        ratio = replace(ratio, low=ratio.ratio, high=ratio.ratio)
+    a, b = _figure(one, percent), _figure(other, percent)
+    if other.unit in _MORE_IS_BETTER and a > 0 and not b:
+        return Finding(other, percent, a, b, ratio, Kind.NO_SAMPLES)
+    judged = not ratio.few or other.unit in _SAME_EVERY_TIME
+    kind = _kind(ratio, threshold, other.unit) if judged else Kind.UNKNOWN
+    return Finding(other, percent, a, b, ratio, kind)
+
+
+def _lost(one: Cell, other: Cell, level: float) -> Finding:
+    """Compares lost shares by the variance between rounds: losses come in bursts. Each round sends equally many."""
+    a, b = _lost_shares(one), _lost_shares(other)
+    rounds = min(len(a), len(b))
+    grown, kind = statistics.fmean(b) - statistics.fmean(a), Kind.UNKNOWN
+    if rounds >= LEAST_ROUNDS:
+        error = math.sqrt(sum(statistics.variance(shares) / len(shares) for shares in (a, b)))
+        changed = abs(grown) > max(_LOSS, student(level, rounds) * error)
+        kind = Kind.EQUAL if not changed else Kind.WORSE if grown > 0 else Kind.BETTER
+    unknown = Interval(math.nan, math.nan, math.nan, level, rounds)
+    return Finding(other, None, 100 * statistics.fmean(a), 100 * statistics.fmean(b), unknown, kind)
+
+
+def _counts(cell: Cell) -> bool:
+    """Whether the number of sent messages is known."""
+    return cell.lost is not None and cell.lost >= 0
+
+
+def _lost_shares(cell: Cell) -> list[float]:
+    arrived = [len(samples) for samples in cell.rounds if samples]
+    each = int(cell.figures["sent"] or 0) / len(arrived)
+    return [1 - count / each for count in arrived]
+
+
+def _figure(cell: Cell, percent: int) -> float:
+    """The percentile as the median over the rounds, as in the ratio."""
+    return statistics.median(percentile(samples, percent) for samples in cell.rounds if samples)
+
+
+def _kind(ratio: Interval, threshold: float, unit: str) -> Kind:
+    if math.isnan(ratio.ratio):  # of values that are 0
+        return Kind.UNKNOWN
+    if ratio.equal or 1 / threshold < ratio.ratio < threshold:
+        return Kind.EQUAL
+    return Kind.WORSE if (ratio.ratio > 1) != (unit in _MORE_IS_BETTER) else Kind.BETTER
+
+
+def _order(finding: Finding) -> tuple[int, float]:
+    size = finding.ratio.ratio
+    return list(Kind).index(finding.kind), 0.0 if math.isnan(size) else -size
+
+
+def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
+    """Counts of the outcomes and the sensitivity of the comparison, as sentences."""
+    count = {kind: sum(finding.kind is kind for finding in findings) for kind in Kind}
+    judged = [finding for finding in findings if finding.kind in (Kind.WORSE, Kind.BETTER, Kind.EQUAL)]
+    lines = [
+        f"{len(judged)} metrics compared: {count[Kind.WORSE]} worse, {count[Kind.BETTER]} better,"
+        f" {count[Kind.EQUAL]} without a difference beyond noise"
+    ]
+    if judged:
+        lines.append(
+            f"A change is a factor beyond {threshold:g} whose {100 * judged[0].ratio.level:.4g} % interval excludes"
+            f" 1.00; random variation within the runs shows any change with a chance of about {100 * CHANCE:g} %, and"
+            " variation between runs adds to that"
+        )
+    if widths := [_width(finding.ratio) for finding in judged if finding.percent == _PERCENTS[0]]:
+        seen = max(threshold, statistics.median(widths))
+        lines.append(f"Half of the medians would have shown a change by a factor of {seen:.2f}")
+    notes = {
+        Kind.NO_SAMPLES: "without samples in B: counted as worse",
+        Kind.UNKNOWN: f"unknown: fewer than {LEAST_ROUNDS} rounds, or zero",
+        Kind.ONLY_A: "only in A: not measured in B",
+        Kind.ONLY_B: "only in B",
+    }
+    return [*lines, *(f"{count[kind]} {note}" for kind, note in notes.items() if count[kind])]
+
+
+def _width(ratio: Interval) -> float:
+    return max(ratio.high / ratio.ratio, ratio.ratio / ratio.low)

@@ -1,0 +1,223 @@
+"""The two ends of the control comparison, a periodic sender and an echo, which use a transport as services do.
+
+A service's handlers run on its one thread, fed by an inbox to which the transport's thread posts; these do the same.
+Only stock paho calls its handler on its network thread, as programs written for it expect.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import msgspec
+
+from pebble.bench.control_wire import Exchange, parse, request, stamped
+from pebble.bench.null import spin
+from pebble.contract import DRIVE
+from pebble.errors import PebbleError
+from pebble.runtime.inbox import Inbox
+from pebble.transports import Message, QoS, State, Transport
+
+REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"  # followed by the sender's name
+QOS = QoS(DRIVE.default_qos)
+_LEAD_S = 0.1  # messages at the start of a slice do not count: caches are cold after a pause
+_LAST_S = 1.0  # how long to wait for the last replies of a slice
+_POLL_S = 0.01
+_CONNECT_S = 10.0
+
+Handler = Callable[[str, bytes], None]
+Clock = Callable[[], int]  # ns
+
+
+class SliceSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """One slice: messages of this size at this rate."""
+
+    size: int
+    rate: float
+    seconds: float
+    work_us: float = 0.0  # of busy work at each message: before its time stamp,
+    slowed: bool = False  # or, if slowed, between time stamp and publish call
+
+
+class Connection(Protocol):
+    """The connection of one end."""
+
+    received_ns: int  # CLOCK_MONOTONIC: when the transport received the message being handled
+
+    def subscribe(self, filter_: str, handler: Handler) -> None: ...
+
+    def publish(self, topic: str, payload: bytes) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class TransportConnection:
+    """Any of Pebble's transports, used through the same calls as in pebble.service.Service."""
+
+    def __init__(self, transport: Transport, inbox: Inbox) -> None:
+        self.received_ns = 0
+        self._transport, self._inbox = transport, inbox
+        transport.open(_CONNECT_S)
+        if transport.state is not State.CONNECTED:
+            problem = transport.problem
+            transport.close()
+            raise PebbleError(f"no connection: {problem or 'no answer'}")
+
+    def subscribe(self, filter_: str, handler: Handler) -> None:
+        def on_message(message: Message) -> None:
+            received_ns = time.monotonic_ns()
+            self._inbox.post(lambda: handle(message, received_ns))
+
+        def handle(message: Message, received_ns: int) -> None:
+            self.received_ns = received_ns
+            handler(message.topic, message.payload)
+
+        self._transport.subscribe(filter_, on_message, qos=QOS, direct=True)
+
+    def publish(self, topic: str, payload: bytes) -> None:
+        self._transport.publish(topic, payload, qos=QOS)
+
+    def close(self) -> None:
+        self._transport.close()
+
+
+class PahoConnection:
+    """Stock paho with its own network thread and no socket options, as in the original program."""
+
+    def __init__(self, port: int) -> None:
+        from paho.mqtt.client import Client
+        from paho.mqtt.enums import CallbackAPIVersion
+
+        connected, subscribed = threading.Event(), threading.Event()
+        self.received_ns = 0
+        self._subscribed = subscribed
+        self._client = Client(CallbackAPIVersion.VERSION2)
+        self._client.on_connect = lambda *_: connected.set()
+        self._client.on_subscribe = lambda *_: subscribed.set()
+        self._client.connect("127.0.0.1", port)
+        self._client.loop_start()
+        if not connected.wait(_CONNECT_S):
+            raise PebbleError(f"the broker on port {port} does not answer")
+
+    def subscribe(self, filter_: str, handler: Handler) -> None:
+        def on_message(_client: Any, _data: Any, message: Any) -> None:
+            self.received_ns = time.monotonic_ns()
+            handler(message.topic, message.payload)
+
+        self._client.on_message = on_message
+        self._client.subscribe(filter_, qos=QOS)
+        if not self._subscribed.wait(_CONNECT_S):
+            raise PebbleError(f"the broker does not answer to a subscription of {filter_}")
+
+    def publish(self, topic: str, payload: bytes) -> None:
+        self._client.publish(topic, payload, qos=QOS)
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+
+class Echo:
+    """Returns every message for ``who`` (``+`` for all) at once, with its own time stamps."""
+
+    def __init__(self, connection: Connection, who: str, clock: Clock) -> None:
+        self.count = 0
+        self._connection, self._clock = connection, clock
+        connection.subscribe(f"{REQUESTS}/{who}", self._on_message)
+
+    def _on_message(self, topic: str, payload: bytes) -> None:
+        received = self._clock()
+        try:
+            reply = stamped(payload, received, self._clock())
+        except struct.error:  # a foreign message on a shared broker
+            return
+        self._connection.publish(REPLIES + topic.removeprefix(REQUESTS), reply)
+        self.count += 1
+
+
+class Sender:
+    """Sends slices and collects the replies, on the thread that processes ``inbox``.
+
+    Stock paho collects on a thread of its own: it only fills entries that the slice has already made.
+    """
+
+    def __init__(self, connection: Connection, who: str, clock: Clock, inbox: Inbox) -> None:
+        self._connection, self._clock, self._inbox = connection, clock, inbox
+        self._topic = f"{REQUESTS}/{who}"
+        self._next = self._first = self._missing = 0
+        self._received: list[Exchange | None] = []
+        self._calls: list[int] = []
+        self.trips = 0  # in the last slice
+        self.calls_ns: list[int] = []  # durations of its publish calls
+        self.ended = False
+        connection.subscribe(f"{REPLIES}/{who}", self._on_message)
+
+    def warm_up(self, count: int, timeout: float) -> bool:
+        """Exchanges ``count`` messages, so that both ends are connected and their code has run; False if that fails."""
+        end, returned = time.monotonic() + timeout, 0
+        while returned < count and time.monotonic() < end and not self.ended:
+            self._expect(1)
+            self._send(self._first, SliceSpec(size=40, rate=1, seconds=1))
+            self._collect(0.1)
+            returned += not self._missing
+        return returned >= count
+
+    def run(self, spec: SliceSpec) -> tuple[int, int, list[Exchange]]:
+        """Runs one slice; returns the number of counted messages, how many of them were late, and the exchanges.
+
+        Late means by more than half of the period.
+        """
+        lead, period = max(1, math.ceil(_LEAD_S * spec.rate)), 1 / spec.rate
+        counting = max(1, round(spec.seconds * spec.rate))
+        self._expect(lead + counting)
+        sent = late = 0
+        due = time.monotonic() + period
+        while sent < lead + counting and not self.ended:
+            self._work(max(0.0, due - time.monotonic()))
+            behind = time.monotonic() - due
+            if behind >= 0:
+                late += sent >= lead and behind > period / 2
+                self._send(self._first + sent, spec)
+                sent, due = sent + 1, due + period
+        self._collect(_LAST_S)
+        self.trips, self.calls_ns = sent, self._calls[lead:]
+        return counting, late, [exchange for exchange in self._received[lead:] if exchange is not None]
+
+    def _expect(self, count: int) -> None:
+        self._first, self._next = self._next, self._next + count
+        self._received, self._missing, self._calls = [None] * count, count, []
+
+    def _send(self, number: int, spec: SliceSpec) -> None:
+        if not spec.slowed:
+            spin(spec.work_us)
+        message = request(number, self._clock(), spec.size)
+        if spec.slowed:
+            spin(spec.work_us)
+        called = time.monotonic_ns()
+        self._connection.publish(self._topic, message)
+        self._calls.append(time.monotonic_ns() - called)
+
+    def _collect(self, timeout: float) -> None:
+        end = time.monotonic() + timeout
+        while self._missing and time.monotonic() < end and not self.ended:
+            self._work(_POLL_S)
+
+    def _work(self, timeout: float) -> None:
+        job = self._inbox.take(timeout)
+        if job is not None:
+            job()
+
+    def _on_message(self, _topic: str, payload: bytes) -> None:
+        received = self._clock()
+        try:
+            number, t1, t2, t3 = parse(payload)
+        except struct.error:
+            return
+        index = number - self._first
+        if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
+            self._received[index] = Exchange(t1, t2, t3, received, self._connection.received_ns)
+            self._missing -= 1

@@ -1,0 +1,122 @@
+"""A load during the measurement of commands, as a process that standard input switches on and off.
+
+``python -m pebble.bench.control_load hog|writer|reader [mqtt|zenoh WHERE]``: a busy loop, or one end of a stream of raw
+640x480 pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing; each
+is answered with the number of pictures so far. The process ends when its standard input closes.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from pebble.bench.frames_loop import RATE_HZ, Reader, Writer
+from pebble.bench.frames_worker import MqttReader, MqttWriter, ZenohReader, ZenohWriter
+
+SIZE = 640 * 480 * 3
+_READ_S = 0.2
+_ALIVE_S = 0.01  # of reading while off: the client's network loop must run to stay connected
+_EVERY = 64  # bytes: one in each cache line is read
+_REST_S = 1.0  # between two runs of the network loop while off
+
+
+class Switch:
+    """Switches the load as standard input requests, and answers with the number of pictures."""
+
+    def __init__(self) -> None:
+        self.pictures = 0
+        self.on = False
+        self.ended = False
+        self._changed = threading.Condition()
+        threading.Thread(target=self._listen, name="switch", daemon=True).start()
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Waits until it is on, or standard input closes."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.on or self.ended, timeout)
+
+    def write_count(self) -> None:
+        sys.stdout.write(json.dumps({"pictures": self.pictures}) + "\n")
+        sys.stdout.flush()
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            if line.strip() in ("0", "1"):
+                self._set(on=line.strip() == "1")
+            self.write_count()
+        self._set(on=False, ended=True)
+
+    def _set(self, *, on: bool, ended: bool = False) -> None:
+        with self._changed:
+            self.on, self.ended = on, ended
+            self._changed.notify_all()
+
+
+def main(arguments: list[str]) -> int:
+    role, *where = arguments
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if role == "hog":
+        _hog(Switch())
+    elif role == "writer":
+        _write(_writer(*where), Switch())
+    else:
+        _read(_reader(*where), Switch())
+    return 0
+
+
+def _hog(switch: Switch) -> None:
+    switch.write_count()
+    while not switch.ended:
+        switch.wait()
+        while switch.on:
+            pass
+
+
+def _write(writer: Writer, switch: Switch) -> None:
+    picture = np.random.default_rng(1).integers(0, 256, SIZE, dtype=np.uint8)
+    switch.write_count()
+    while not switch.ended:
+        switch.wait()
+        due = time.monotonic()
+        while switch.on:
+            frame = writer.begin()
+            if frame is not None:
+                np.copyto(frame, picture)
+                writer.send()
+                switch.pictures += 1
+            del frame
+            due += 1 / RATE_HZ
+            time.sleep(max(0.0, due - time.monotonic()))
+    writer.close()
+
+
+def _read(reader: Reader, switch: Switch) -> None:
+    switch.write_count()
+    while not switch.ended:
+        switch.wait(_REST_S)
+        frame = reader.read(_READ_S if switch.on else _ALIVE_S)
+        if frame is not None:
+            switch.pictures += bool(frame[::_EVERY].any())
+            del frame
+            reader.done()
+    reader.close()
+
+
+def _writer(kind: str, where: str) -> Writer:
+    return (
+        MqttWriter(int(where), SIZE) if kind == "mqtt" else ZenohWriter(Path(where), SIZE, in_segment=True, shared=True)
+    )
+
+
+def _reader(kind: str, where: str) -> Reader:
+    return MqttReader(int(where)) if kind == "mqtt" else ZenohReader(Path(where), views=True, shared=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

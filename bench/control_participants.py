@@ -1,0 +1,249 @@
+"""The processes of the control comparison: brokers and hubs, two ends for each role, and the loads."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from pebble.bench.control_ends import SliceSpec
+from pebble.bench.control_plan import HOG, MEDIA, NONE
+from pebble.bench.control_variants import VARIANTS, Variant
+from pebble.bench.control_worker import Answer, Endpoint
+from pebble.bench.null import variant_of
+from pebble.bench.usage import cpu_s, wake_ups
+from pebble.bench.worker import Worker, end_workers
+from pebble.demo.broker import Broker, BrokerKind
+from pebble.demo.programs import Program, end_all
+from pebble.errors import PebbleError
+from pebble.transports.settings import ZenohSettings
+
+_READY_S = 40.0
+_ANSWER_S = 30.0  # in addition to the slice itself
+_END_S = 4.0
+_FLOWING = 3  # pictures received until the stream counts as flowing
+_FLOW_S = 10.0
+_POLL_S = 0.02
+_PYTHON = [sys.executable, "-m"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Slice:
+    """Results of one role under one condition in one round; CPU in % of one core, wake-ups per round trip."""
+
+    answer: Answer
+    cpu: float
+    backbone_cpu: float
+    wake_ups: float
+    backbone_wake_ups: float
+    pictures_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessUsage:
+    """Resource usage of some processes, in total or between two moments."""
+
+    cpu_s: float
+    wake_ups: int
+
+    def __sub__(self, earlier: ProcessUsage) -> ProcessUsage:
+        return ProcessUsage(self.cpu_s - earlier.cpu_s, self.wake_ups - earlier.wake_ups)
+
+
+def _used(pids: Sequence[int]) -> ProcessUsage:
+    return ProcessUsage(cpu_s(pids), wake_ups(pids))
+
+
+def joined(slices: Sequence[Slice]) -> Slice:
+    """Merges slices of the same role and condition; at least one."""
+    answers = [one.answer for one in slices]
+    rates = [one.pictures_hz for one in slices if one.pictures_hz is not None]
+    return Slice(
+        answer=Answer(
+            trips=sum(answer.trips for answer in answers),
+            sent=sum(answer.sent for answer in answers),
+            late=sum(answer.late for answer in answers),
+            one_way=[sample for answer in answers for sample in answer.one_way],
+            round_trip=[sample for answer in answers for sample in answer.round_trip],
+            call=[sample for answer in answers for sample in answer.call],
+            transport_times=[sample for answer in answers for sample in answer.transport_times],
+            inbox=[sample for answer in answers for sample in answer.inbox],
+        ),
+        cpu=fmean(one.cpu for one in slices),
+        backbone_cpu=fmean(one.backbone_cpu for one in slices),
+        wake_ups=fmean(one.wake_ups for one in slices),
+        backbone_wake_ups=fmean(one.backbone_wake_ups for one in slices),
+        pictures_hz=fmean(rates) if rates else None,
+    )
+
+
+class Backbone:
+    """The broker of an MQTT variant or the hub of a Zenoh one."""
+
+    def __init__(self, variant: Variant, folder: Path) -> None:
+        self._variant, self._run_dir = variant, folder / "z"
+        self._broker: Broker | None = None
+        if variant.on_zenoh:
+            settings = msgspec.json.encode(ZenohSettings(run_dir=self._run_dir), enc_hook=str).decode()
+            self.program = Program("hub", [*_PYTHON, "pebble.runtime.hub", settings], folder / "hub.log")
+        else:
+            self._broker = Broker("broker", BrokerKind.MOSQUITTO, folder, variant.broker)
+            self.program = self._broker.program
+
+    def wait(self) -> None:
+        if self._broker is not None:
+            self._broker.wait(threading.Event())
+        else:
+            self.program.wait_until((self._run_dir / "hub.sock").exists, _READY_S, threading.Event())
+
+    @property
+    def endpoint(self) -> Endpoint:
+        variant = self._variant
+        if self._broker is None:
+            return Endpoint(kind=variant.kind, run_dir=str(self._run_dir), client=variant.client)
+        return Endpoint(kind=variant.kind, port=self._broker.port, protocol=variant.protocol)
+
+    @property
+    def stream(self) -> list[str]:
+        """Arguments that let pictures flow through the same broker or hub."""
+        return ["zenoh", str(self._run_dir)] if self._broker is None else ["mqtt", str(self._broker.port)]
+
+
+class Participant:
+    """The processes of one role."""
+
+    def __init__(self, role: str, folder: Path) -> None:
+        self.role, self._folder = role, folder
+        self.backbone = Backbone(VARIANTS[variant_of(role)], folder)
+        self.ends: list[Worker] = []  # echo, sender
+        self.media: list[Worker] = []  # reader, writer
+
+    def start(self, *, media: bool) -> None:
+        """Starts the processes; the backbone must be ready."""
+        endpoint = msgspec.json.encode(self.backbone.endpoint).decode()
+        for end in ("echo", "sender"):
+            self.ends.append(self._worker(end, ["pebble.bench.control_worker", end, endpoint]))
+        if media:
+            for end in ("reader", "writer"):
+                self.media.append(self._worker(end, ["pebble.bench.control_load", end, *self.backbone.stream]))
+
+    def run(self, spec: SliceSpec) -> Slice:
+        """Runs one slice; returns the sender's answer and the resource usage of the ends and the backbone."""
+        every = ([worker.pid for worker in self.ends], [self.backbone.program.pid])
+        began, before = time.monotonic(), [_used(pids) for pids in every]
+        line = msgspec.json.encode(spec).decode()
+        answer = msgspec.convert(_ask(self.ends[1], line, spec.seconds + _ANSWER_S), Answer)
+        took = time.monotonic() - began
+        ends, backbone = (_used(pids) - used for pids, used in zip(every, before, strict=True))
+        return Slice(
+            answer=answer,
+            cpu=100 * ends.cpu_s / took,
+            backbone_cpu=100 * backbone.cpu_s / took,
+            wake_ups=ends.wake_ups / answer.trips,
+            backbone_wake_ups=backbone.wake_ups / answer.trips,
+        )
+
+    def _worker(self, end: str, arguments: Sequence[str]) -> Worker:
+        return Worker(f"{self.role}: {end}", [*_PYTHON, *arguments], self._folder / f"{end}.log")
+
+
+class Participants:
+    """All participants of some rounds; they are ready when the ``with`` block begins."""
+
+    def __init__(self, roles: Sequence[str], loads: Sequence[str]) -> None:
+        self._roles, self._loads = roles, loads
+        self._participants: dict[str, Participant] = {}
+        self._hog: Worker | None = None
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
+            stack.callback(self._end)
+            self._start(folder)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._stack.close()
+
+    def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
+        """Runs one slice. Raises PebbleError if a process ended, or pictures do not flow."""
+        participant = self._participants[role]
+        with self._loaded(participant, load):
+            before, began = self._pictures(participant, load), time.monotonic()
+            slice_ = participant.run(spec)
+            pictures, took = self._pictures(participant, load) - before, time.monotonic() - began
+        return replace(slice_, pictures_hz=pictures / took) if load == MEDIA else slice_
+
+    def _start(self, folder: Path) -> None:
+        for number, role in enumerate(self._roles):
+            endpoint = folder / str(number)  # short: paths of Unix sockets begin with it
+            endpoint.mkdir()
+            self._participants[role] = Participant(role, endpoint)
+        for participant in self._participants.values():
+            participant.backbone.wait()
+            participant.start(media=MEDIA in self._loads)
+        if HOG in self._loads:
+            self._hog = Worker("hog", [*_PYTHON, "pebble.bench.control_load", "hog"], folder / "hog.log")
+        for worker in self._workers():
+            worker.answer(_READY_S)
+
+    def _end(self) -> None:
+        end_workers(self._workers())
+        end_all([participant.backbone.program for participant in self._participants.values()], _END_S)
+
+    def _workers(self) -> list[Worker]:
+        hog = [] if self._hog is None else [self._hog]
+        return hog + [
+            worker for participant in self._participants.values() for worker in (*participant.ends, *participant.media)
+        ]
+
+    @contextmanager
+    def _loaded(self, participant: Participant, load: str) -> Iterator[None]:
+        if load == NONE:
+            yield
+            return
+        busy = participant.media if load == MEDIA else [self._hog] if self._hog is not None else []
+        try:
+            for worker in busy:
+                _switch_load(worker, "1")
+            if load == MEDIA:
+                _wait_for_pictures(participant)
+            yield
+        finally:
+            for worker in reversed(busy):  # first the writer, then the reader
+                _switch_load(worker, "0")
+
+    def _pictures(self, participant: Participant, load: str) -> int:
+        return _switch_load(participant.media[0], "?") if load == MEDIA else 0
+
+
+def _ask(worker: Worker, line: str, timeout: float) -> Any:
+    """Sends a line and returns the answer. Raises PebbleError if the worker ended or does not answer."""
+    worker.send(line)
+    return worker.answer(timeout)
+
+
+def _switch_load(worker: Worker, line: str) -> int:
+    """Sends a command to a load process; returns its count of pictures so far."""
+    return int(_ask(worker, line, _FLOW_S)["pictures"])
+
+
+def _wait_for_pictures(participant: Participant) -> None:
+    reader = participant.media[0]
+    enough, end = _switch_load(reader, "?") + _FLOWING, time.monotonic() + _FLOW_S
+    while _switch_load(reader, "?") < enough:
+        if time.monotonic() > end:
+            raise PebbleError(f"{participant.role}: no pictures flow after {_FLOW_S:.0f} s")
+        time.sleep(_POLL_S)

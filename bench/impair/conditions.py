@@ -1,0 +1,139 @@
+"""The network's impairment in each trial: the paper's conditions (chapter 4.2) and two profiles of real networks.
+
+The paper limits the rate of, or drops packets on, the robot's uplink only. Its list has 14 trials; with the profiles
+there are 16:
+
+``starlink``
+    A median round trip of 50 ms, 40 to 60 ms between the quartiles (APNIC blog, 28 Nov 2022, measured in Belgium). The
+    satellite changes every 15 s; round trips differ by 6.7 ms from one to the next, and by another 30 ms and more after
+    a handover, 30 to 80 ms at worst (Huston, APNIC blog, 17 May 2024, as quoted by The Register). Handovers lose up to
+    half of the packets (Kassem et al., "A browser-side view of Starlink connectivity", IMC 2022, abstract). Hence per
+    direction 25 ms ± 5 ms, and every 15 s a gap, after which additional delay decays. Our choices: a gap of 100 ms,
+    25 ms that decay within a second, the first gap after 5 s, and no rate limit, which does not constrain a robot.
+``wifi-power-save``
+    A Raspberry Pi with default settings: the access point holds packets for the robot until a beacon, every 102.4 ms
+    (100 time units of 1.024 ms), while the robot may send at any time. With power save on, pings had a p50 of 49 to
+    127 ms, off 6 ms (raspberrypi/linux, issue 7533). Hence 2 ms ± 1 ms per direction, and holding downlink packets. The
+    profile never stays awake; many radios do for a while after traffic, so it is a pessimistic case.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from random import Random
+
+from pebble.errors import PebbleError
+
+_JITTER_STEP_S = 0.01  # the jitter is constant for this long: packets sent together arrive together
+
+
+@dataclass(frozen=True)
+class Handover:
+    """A periodic gap in which no packet passes; after it the delay is longer for a while."""
+
+    every_s: float
+    first_s: float
+    gap_ms: float
+    extra_ms: float  # added right after the gap; decays linearly
+    recovery_s: float
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One direction of a network. Times are one way."""
+
+    kbit: float | None = None  # per second; None: no limit
+    loss: float = 0.0  # share of the packets
+    delay_ms: float = 0.0
+    jitter_ms: float = 0.0  # delay ± so much, never out of order
+    handover: Handover | None = None
+    beacon_ms: float = 0.0  # packets are held until the next beacon; 0: they are not
+
+    def __post_init__(self) -> None:
+        """Raises PebbleError for an impossible shape."""
+        if self.kbit is not None and not self.kbit > 0:
+            raise PebbleError(f"a network of {self.kbit} kbit/s carries nothing: give a rate above 0, or none")
+        if not 0 <= self.loss < 1:
+            raise PebbleError(f"loss is a share from 0 to below 1, not {self.loss}")
+        if min(self.delay_ms, self.jitter_ms, self.beacon_ms) < 0:
+            raise PebbleError("delay, jitter and beacon interval cannot be negative")
+
+    @property
+    def timed(self) -> bool:
+        """Whether it delays packets, or has gaps."""
+        return bool(self.delay_ms or self.jitter_ms or self.handover or self.beacon_ms)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Both directions; up is from the robot to the broker."""
+
+    name: str
+    up: Shape = Shape()
+    down: Shape = Shape()
+
+
+_SATELLITE = Shape(delay_ms=25, jitter_ms=5, handover=Handover(15, first_s=5, gap_ms=100, extra_ms=25, recovery_s=1))
+_AIR = Shape(delay_ms=2, jitter_ms=1)
+
+_PAPER = {
+    "base-start": Shape(),
+    **{f"{kbit}k": Shape(kbit=kbit) for kbit in (1024, 512, 256, 128, 64)},
+    **{f"{percent}%": Shape(loss=percent / 100) for percent in (1, 2, 5, 10)},
+    **{f"{kbit}k+{percent}%": Shape(kbit=kbit, loss=percent / 100) for kbit, percent in ((256, 1), (128, 2), (64, 5))},
+    "base-end": Shape(),
+}
+_PROFILES = (
+    Condition("starlink", _SATELLITE, _SATELLITE),
+    Condition("wifi-power-save", _AIR, replace(_AIR, beacon_ms=102.4)),
+)
+
+
+def trials(both_ways: bool = False) -> list[Condition]:
+    """All conditions in order. ``both_ways`` shapes the downlink like the uplink; the profiles have their own."""
+    shaped = [Condition(name, shape, shape if both_ways else Shape()) for name, shape in _PAPER.items()]
+    return [*shaped, *_PROFILES]
+
+
+def chosen(names: Sequence[str], both_ways: bool = False) -> list[Condition]:
+    """The trials of these names, in the order of `trials`. Raises PebbleError for an unknown name."""
+    known = trials(both_ways)
+    unknown = set(names) - {condition.name for condition in known}
+    if unknown:
+        raise PebbleError(f"no trial {min(unknown)!r}: choose from {', '.join(each.name for each in known)}")
+    return [condition for condition in known if condition.name in names]
+
+
+class Schedule:
+    """Computes when a packet sent now arrives; depends only on shape, seed and time, not on traffic."""
+
+    def __init__(self, shape: Shape, seed: str) -> None:
+        self._shape, self._seed = shape, seed
+        self._step, self._jitter_s = -1, 0.0
+
+    def arrival(self, sent: float) -> float | None:
+        """Takes and returns seconds since the condition began; None: lost in a gap. The caller preserves the order."""
+        shape = self._shape
+        extra = 0.0
+        if shape.handover:
+            since = (sent - shape.handover.first_s) % shape.handover.every_s - shape.handover.gap_ms / 1000
+            if sent >= shape.handover.first_s:
+                if since < 0:
+                    return None
+                extra = max(0.0, 1 - since / shape.handover.recovery_s) * shape.handover.extra_ms / 1000
+        arrival = sent + max(0.0, shape.delay_ms / 1000 + extra + self._jitter(sent))
+        if not shape.beacon_ms:
+            return arrival
+        beacon_s = shape.beacon_ms / 1000
+        return math.ceil(arrival / beacon_s) * beacon_s
+
+    def _jitter(self, sent: float) -> float:
+        if not self._shape.jitter_ms:
+            return 0.0
+        step = int(sent / _JITTER_STEP_S)
+        if step != self._step:
+            self._step = step
+            self._jitter_s = Random(f"{self._seed} {step}").uniform(-1, 1) * self._shape.jitter_ms / 1000  # noqa: S311
+        return self._jitter_s

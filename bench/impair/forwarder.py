@@ -1,0 +1,197 @@
+"""The process that holds an impaired network's two namespaces, and delays packets between them without netem.
+
+Each namespace has a TUN device whose descriptor is held here: a packet sent into one device leaves the other one when
+its schedule allows. When the process ends, the devices disappear, and so do the namespaces once they are empty.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import select
+import signal
+import stat
+import struct
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from pebble.bench.impair.conditions import Condition, Schedule, Shape
+from pebble.bench.impair.network_process import UnavailableError
+from pebble.errors import PebbleError
+
+TIMED = "timed"  # the device whose packets pass through this process
+_TUN = Path("/dev/net/tun")
+_CLONE_NEWNET = 0x40000000
+_TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
+_PACKET = 65536  # bytes at most
+_ROOM = 1000  # packets in flight per direction; 100 ms at 100 Mbit/s are 800
+_AT_ONCE = 64  # packets read before others are written
+_NICE = -10  # must not wait while the robot encodes pictures
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class Direction:
+    """Packets in flight from one device to the other, in order."""
+
+    def __init__(self, source: int, sink: int, seed: str) -> None:
+        self._source, self._sink, self._seed = source, sink, seed
+        self._in_flight: deque[tuple[float, bytes]] = deque()
+        self.lost = 0
+        self.apply(Shape())
+
+    def apply(self, shape: Shape) -> None:
+        self._began, self._schedule = time.monotonic(), Schedule(shape, self._seed)
+
+    @property
+    def due(self) -> float | None:
+        return self._in_flight[0][0] if self._in_flight else None
+
+    def take(self) -> None:
+        """Reads the packets available at the source."""
+        for _ in range(_AT_ONCE):
+            try:
+                packet = os.read(self._source, _PACKET)
+            except BlockingIOError:
+                return
+            self._send(packet)
+
+    def deliver(self) -> None:
+        """Writes the packets that are due."""
+        now = time.monotonic()
+        while self._in_flight and self._in_flight[0][0] <= now:
+            try:
+                os.write(self._sink, self._in_flight.popleft()[1])
+            except OSError:  # the kernel's queue is full: the packet is lost
+                self.lost += 1
+
+    def _send(self, packet: bytes) -> None:
+        arrival = self._schedule.arrival(time.monotonic() - self._began)
+        if arrival is None or len(self._in_flight) >= _ROOM:
+            self.lost += 1
+            return
+        last = self._in_flight[-1][0] if self._in_flight else 0.0
+        self._in_flight.append((max(last, self._began + arrival), packet))
+
+
+class NamespaceForwarder:
+    """Two namespaces with a TUN device each, and the forwarding between them."""
+
+    def __init__(self) -> None:
+        self.robot, robot_tun = _namespace()
+        self.remote, remote_tun = _namespace()
+        self.up = Direction(robot_tun, remote_tun, "up")
+        self.down = Direction(remote_tun, robot_tun, "down")
+        self._sources = {robot_tun: self.up, remote_tun: self.down}
+
+    def serve(self, requests: int) -> None:
+        """Forwards and answers requests until ``orders`` closes."""
+        asked = b""
+        while True:
+            ready, _, _ = select.select([requests, *self._sources], [], [], self._idle_s())
+            for source in ready:
+                if source != requests:
+                    self._sources[source].take()
+            self.up.deliver()
+            self.down.deliver()
+            if requests in ready:
+                received = os.read(requests, 4096)
+                if not received:
+                    return
+                *lines, asked = (asked + received).split(b"\n")
+                for line in lines:
+                    _write_line(self._answer(line))
+
+    def _answer(self, line: bytes) -> dict[str, Any]:
+        if line == b"count":
+            counts = {side: _transmitted(space) for side, space in (("up", self.robot), ("down", self.remote))}
+            return {**counts, "lost_up": self.up.lost, "lost_down": self.down.lost}
+        condition = msgspec.json.decode(line, type=Condition)
+        self.up.apply(condition.up)
+        self.down.apply(condition.down)
+        return {"applied": condition.name}
+
+    def _idle_s(self) -> float | None:
+        dues = [due for due in (self.up.due, self.down.due) if due is not None]
+        return max(0.0, min(dues) - time.monotonic()) if dues else None
+
+
+def _namespace() -> tuple[int, int]:
+    """Enters a new network namespace with a TUN device in it; returns the descriptors of both."""
+    _checked(_libc.unshare, _CLONE_NEWNET)
+    space = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+    tun = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK)  # of the namespace it is opened in
+    fcntl.ioctl(tun, _TUNSETIFF, struct.pack("16sH22x", TIMED.encode(), _IFF_TUN | _IFF_NO_PI))
+    return space, tun
+
+
+def _transmitted(space: int) -> dict[str, tuple[int, int]]:
+    """Bytes and packets sent by each device of a namespace."""
+    _checked(_libc.setns, space, _CLONE_NEWNET)
+    return dict(_devices(Path("/proc/thread-self/net/dev").read_text()))
+
+
+def _devices(text: str) -> Iterator[tuple[str, tuple[int, int]]]:
+    for line in text.splitlines()[2:]:
+        name, _, figures = line.partition(":")
+        columns = figures.split()
+        yield name.strip(), (int(columns[8]), int(columns[9]))
+
+
+def _checked(call: Callable[..., int], *arguments: int) -> None:
+    if call(*arguments) < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def _make_tun_node() -> None:
+    """Creates /dev/net/tun, which containers often lack."""
+    if not _TUN.exists():
+        with suppress(PermissionError):
+            _TUN.parent.mkdir(exist_ok=True)
+            os.mknod(_TUN, stat.S_IFCHR | 0o600, os.makedev(10, 200))
+
+
+def _hold() -> NamespaceForwarder:
+    """Raises UnavailableError without permission for namespaces or without TUN, PebbleError for other errors."""
+    _make_tun_node()
+    try:
+        return NamespaceForwarder()
+    except PermissionError as error:
+        what = error.filename or "new namespaces"
+        raise UnavailableError(f"{what}: not permitted: run it as root, or in `unshare --map-root-user`") from None
+    except OSError as error:
+        if error.filename == str(_TUN):
+            raise UnavailableError(f"{_TUN}: {error.strerror}: the kernel has no TUN") from None
+        raise PebbleError(f"new namespaces: {error.strerror}") from None
+
+
+def _write_line(answer: dict[str, Any]) -> None:
+    sys.stdout.buffer.write(msgspec.json.encode(answer) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def main() -> int:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+    try:
+        forwarder = _hold()
+    except PebbleError as error:
+        _write_line({"unavailable" if isinstance(error, UnavailableError) else "error": str(error)})
+        return 1
+    _write_line({"robot": forwarder.robot, "remote": forwarder.remote})
+    forwarder.serve(sys.stdin.fileno())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,277 @@
+"""The operator of one robot, on the broker's side of the network: drives all the time, and receives video, then audio.
+
+As a process: ``python -m pebble.bench.impair.operator HOST PORT BASE``. It reports when the robot is ready, then serves
+each request on its standard input (pebble.bench.impair.messages), and ends when its standard input closes.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import msgspec
+
+from pebble.bench.bridge_operator import wheels
+from pebble.bench.impair.messages import (
+    Command,
+    Heartbeat,
+    OperatorReport,
+    Picture,
+    Record,
+    RecoveryRequest,
+    Sound,
+    TrialRequest,
+    Window,
+)
+from pebble.client.media_receiver import MediaReceiver
+from pebble.client.viewer import Medium
+from pebble.contract import DRIVE, ONLINE, STATUS, codec
+from pebble.contract.payloads import Drive
+from pebble.errors import PayloadError, PebbleError
+from pebble.media.decode import Decoded
+from pebble.media.sound import ReceivedSound
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+
+_PERIOD_S = 0.1  # between two drive commands
+_UP_S, _CONNECT_S, _KNOWN_S = 60.0, 10.0, 5.0
+_FIRST_S = 5.0  # the longest wait for a first picture or sound before the window begins
+_POLL_S = 0.05
+_HEARTBEATS_BEFORE = 12  # heartbeats by which an operator's page judges when a trial begins
+_FRESH_MS, _FRESH_HEARTBEATS, _STARTUP_S = 500, 3, 20.0
+
+
+class MediaSubscriber(MediaReceiver):
+    """Records when each picture and each sound packet arrived."""
+
+    def __init__(self, transport: Transport, base: str) -> None:
+        self.pictures_seen: list[Picture] = []
+        self.received: list[Sound] = []
+        super().__init__(transport, base)
+
+    def has_received(self, medium: Medium) -> bool:
+        return bool(self.pictures_seen if medium == "video" else self.received)
+
+    def on_picture(self, seen: Decoded) -> None:
+        now = time.monotonic_ns()
+        self.pictures_seen.append(Picture(None if seen.captured_ms is None else _monotonic_ns(seen.captured_ms), now))
+
+    def on_sound(self, received: ReceivedSound) -> None:
+        now = time.monotonic_ns()
+        seconds = len(received.samples) / received.rate
+        self.received.append(Sound(_monotonic_ns(received.captured_ms), now, seconds, received.sequence))
+
+
+class TrialOperator:
+    """Drives over one connection and receives media over another; ``ended`` stops whatever it does."""
+
+    def __init__(self, host: str, port: int, base: str, ended: threading.Event) -> None:
+        self._base, self._ended = base, ended
+        settings = MqttSettings(host=host, port=port)
+        self._controls = create("mqtt", "pebble-impair-controls", settings)
+        self._media = create("mqtt", "pebble-impair-media", settings)
+        self._number = 0
+        self._commands: list[Command] = []
+        self._heartbeats: list[Heartbeat] = []
+        self._services: dict[str, str] = {}  # their states
+        self._over_at = time.monotonic()
+
+    def open(self) -> None:
+        """Connects and waits until the robot is ready. Raises PebbleError without a broker or a robot."""
+        connections = (self._controls, self._media)
+        for connection in connections:
+            connection.open(timeout=0.0)
+        if not self._wait(lambda: all(connection.state is State.CONNECTED for connection in connections), _CONNECT_S):
+            raise PebbleError(
+                f"the operator cannot connect to the broker: {connections[0].problem or connections[1].problem}"
+            )
+        self._controls.subscribe(ONLINE.topic(self._base), self._on_heartbeat)
+        self._controls.subscribe(STATUS.topic(self._base), self._on_status)
+        if not self._wait(self._is_ready, _UP_S):
+            raise PebbleError(f"the robot is not ready after {_UP_S:.0f} s: {self._services or 'no status received'}")
+
+    def close(self) -> None:
+        self._controls.close()
+        self._media.close()
+
+    def recover(self, quiet_s: float) -> None:
+        """Waits until the network delivers no old messages. Raises PebbleError if the robot does not recover."""
+        self._wait(lambda: time.monotonic() - self._over_at >= quiet_s, quiet_s)
+        if not self._wait(self._is_fresh, _STARTUP_S):
+            raise PebbleError(f"no fresh heartbeat {_STARTUP_S:.0f} s after the network was restored")
+
+    def run_trial(self, request: TrialRequest) -> Record:
+        """Runs one trial."""
+        first_heartbeat = max(0, len(self._heartbeats) - _HEARTBEATS_BEFORE)
+        self._commands.clear()
+        enough = threading.Event()
+        driver = threading.Thread(target=self._drive, args=(enough,), name="driver", daemon=True)
+        driver.start()
+        try:
+            alone = self._measure_phase("alone", request.alone_s)
+            seen, video = self._watch("video", request.video, request.window_s)
+            received, audio = self._watch("audio", request.audio, request.window_s, enough, request.grace_s)
+        finally:
+            enough.set()
+            driver.join()
+        self._over_at = time.monotonic()
+        return Record(
+            commands=list(self._commands),
+            heartbeats=self._heartbeats[first_heartbeat:],
+            pictures=seen.pictures_seen,
+            sounds=received.received,
+            alone=alone,
+            video=video,
+            audio=audio,
+            payloads=seen.pictures.count,
+        )
+
+    # -- phases
+
+    def _watch(
+        self,
+        medium: Medium,
+        encoding: str | None,
+        window_s: float,
+        over: threading.Event | None = None,
+        grace_s: float = 0.0,
+    ) -> tuple[MediaSubscriber, Window]:
+        """Requests a medium, waits for its first message, records a window; then sets ``over``, waits ``grace_s``."""
+        subscriber = MediaSubscriber(self._media, self._base)
+        try:
+            subscriber.wait_for_capabilities(_KNOWN_S)
+            asked = time.monotonic()
+            subscriber.viewer.request(medium, encoding)
+            started = self._wait(lambda: subscriber.has_received(medium), _FIRST_S, subscriber)
+            first_s = time.monotonic() - asked if started else None
+            window = self._measure_phase(medium, window_s, subscriber)
+            if over is not None:
+                over.set()
+            self._wait(lambda: False, grace_s, subscriber)
+        finally:
+            subscriber.close()
+        return subscriber, Window(window.began_ns, window.ended_ns, first_s)
+
+    def _measure_phase(self, phase: str, seconds: float, subscriber: MediaSubscriber | None = None) -> Window:
+        write_report(OperatorReport(phase=phase))
+        began = time.monotonic_ns()
+        self._wait(lambda: False, seconds, subscriber)
+        ended = time.monotonic_ns()
+        write_report(OperatorReport(phase=""))
+        return Window(began, ended)
+
+    def _wait(self, condition: _Condition, seconds: float, subscriber: MediaSubscriber | None = None) -> bool:
+        """Waits for ``condition``; with a subscriber, keeps requesting its media meanwhile."""
+        end = time.monotonic() + seconds
+        while not (met := condition()) and (left := end - time.monotonic()) > 0:
+            if self._ended.wait(min(left, _POLL_S)):
+                raise _EndedError
+            if subscriber is not None:
+                subscriber.poll()
+        return met
+
+    def _is_ready(self) -> bool:
+        states = set(self._services.values())
+        return bool(states) and states <= {"ready", "stopped"} and len(self._heartbeats) > 1
+
+    def _is_fresh(self) -> bool:
+        newest = self._heartbeats[-_FRESH_HEARTBEATS:]
+        limit_ns, now = _FRESH_MS * 1_000_000, time.monotonic_ns()
+        return len(newest) == _FRESH_HEARTBEATS and all(
+            heartbeat.online
+            and heartbeat.arrived_ns - heartbeat.sent_ns < limit_ns
+            and now - heartbeat.arrived_ns < 2 * limit_ns
+            for heartbeat in newest
+        )
+
+    # -- the driver's thread
+
+    def _drive(self, enough: threading.Event) -> None:
+        topic, due = DRIVE.topic(self._base), time.monotonic()
+        while not enough.is_set():
+            self._number += 1
+            left, right = wheels(self._number)
+            payload = codec.encode(DRIVE, Drive(x=(left - right) / 2, z=(left + right) / 2))
+            self._commands.append(Command(left, right, time.monotonic_ns()))
+            self._controls.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
+            due += _PERIOD_S
+            enough.wait(max(0.0, due - time.monotonic()))
+
+    # -- the transports' threads
+
+    def _on_heartbeat(self, message: Message) -> None:
+        now = time.monotonic_ns()
+        if message.retain:
+            return  # a retained heartbeat is not current
+        try:
+            heartbeat = codec.decode(ONLINE, message.payload)
+        except PayloadError:
+            return
+        self._heartbeats.append(Heartbeat(_monotonic_ns(heartbeat.t), now, heartbeat.online is not False))
+
+    def _on_status(self, message: Message) -> None:
+        try:
+            services = codec.decode(STATUS, message.payload).value.get("services", {})
+        except PayloadError:
+            return
+        self._services = {name: service.get("state", "") for name, service in services.items()}
+
+
+_Condition = Callable[[], bool]
+
+
+class _EndedError(Exception):
+    """Standard input has closed."""
+
+
+def _monotonic_ns(epoch_ms: int) -> int:
+    """Converts a wall-clock time of the robot, which runs on this machine, to the monotonic clock."""
+    return time.monotonic_ns() - (time.time_ns() - epoch_ms * 1_000_000)
+
+
+def write_report(report: OperatorReport) -> None:
+    sys.stdout.buffer.write(msgspec.json.encode(report) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def main(arguments: list[str]) -> int:
+    host, port, base = arguments
+    ended = threading.Event()
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(lines, ended), name="orders", daemon=True).start()
+    operator = TrialOperator(host, int(port), base, ended)
+    try:
+        operator.open()
+        write_report(OperatorReport(ready=True))
+        while line := lines.get():
+            _serve(operator, line)
+    except _EndedError:
+        return 0
+    except PebbleError as error:
+        write_report(OperatorReport(problem=str(error)))
+        return 1
+    finally:
+        operator.close()
+    return 0
+
+
+def _serve(operator: TrialOperator, line: bytes) -> None:
+    request = msgspec.json.decode(line, type=TrialRequest | RecoveryRequest)
+    if isinstance(request, RecoveryRequest):
+        operator.recover(request.quiet_s)
+        write_report(OperatorReport(ready=True))
+    else:
+        write_report(OperatorReport(record=operator.run_trial(request)))
+
+
+def _read(lines: queue.SimpleQueue[bytes], ended: threading.Event) -> None:
+    for line in sys.stdin.buffer:
+        lines.put(line)
+    ended.set()
+    lines.put(b"")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,78 @@
+"""The null test: does a comparison find a planted difference, and none where there is none? One variant in three roles.
+
+The variant is compared with itself, and with itself slowed by a fifth: the sender takes its time stamp, works for a
+fifth of the usual latency, and only then sends.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from pebble.bench.ratios import Interval, paired
+from pebble.bench.results import Cell
+
+AGAIN, SLOWED = " again", " +20 %"
+SLOWDOWN = 0.2
+
+
+def roles(variant: str) -> tuple[str, str, str]:
+    """Names of the plain, the repeated and the slowed role."""
+    return variant, variant + AGAIN, variant + SLOWED
+
+
+def variant_of(role: str) -> str:
+    """The variant of a role."""
+    return role.removesuffix(AGAIN).removesuffix(SLOWED)
+
+
+def is_slowed(role: str) -> bool:
+    return role.endswith(SLOWED)
+
+
+def spin(us: float) -> None:
+    """Computes for that many microseconds: sleeping is less exact."""
+    end = time.perf_counter_ns() + int(1000 * us)
+    while time.perf_counter_ns() < end:
+        pass
+
+
+def intervals(cells: Sequence[Cell]) -> list[tuple[Cell, Interval]]:
+    """Each cell of a repeated or slowed role, with the ratio of its median latency to the plain one's."""
+    plain = [cell for cell in cells if variant_of(cell.variant) == cell.variant]
+    return [
+        (cell, paired(cell.rounds, base.rounds))
+        for base in plain
+        for cell in cells
+        if cell is not base and variant_of(cell.variant) == base.variant
+        if cell.params == base.params and cell.measure == base.measure
+    ]
+
+
+def assessment(cells: Sequence[Cell]) -> list[str]:
+    """One line for each role, ``MISSED`` where the comparison was wrong, and the aim. Few rounds are not judged."""
+    found = intervals(cells)
+    few = any(interval.few for _, interval in found)
+    outcome = "not judged" if few else "met" if passed(cells) else "missed"
+    shown = ", ".join(f"{cell.variant} {interval}" for cell, interval in found)
+    lines = [_ratio(cell, interval) if few else _line(cell, interval) for cell, interval in found]
+    return [*lines, f"aim: no difference found where there is none, and the planted 20 % found: {outcome} ({shown})"]
+
+
+def passed(cells: Sequence[Cell]) -> bool:
+    """Whether the repeated role was equal and the slowed one slower; False without cells."""
+    found = intervals(cells)
+    return bool(found) and all(_as_expected(cell, interval) for cell, interval in found)
+
+
+def _as_expected(cell: Cell, interval: Interval) -> bool:
+    return interval.low > 1.0 if is_slowed(cell.variant) else interval.equal
+
+
+def _line(cell: Cell, interval: Interval) -> str:
+    expected = "the planted 20 % were found" if is_slowed(cell.variant) else "equal, as expected"
+    return f"{_ratio(cell, interval)}: {expected if _as_expected(cell, interval) else 'MISSED'}"
+
+
+def _ratio(cell: Cell, interval: Interval) -> str:
+    return f"{cell.measure}, {cell.conditions()}: {cell.variant} / {variant_of(cell.variant)} = {interval}"

@@ -1,0 +1,53 @@
+"""References for robots on an impaired network: the paper, one measurement of the original program, our aims. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+#: % of the audio delivered, "saturated near" (paper, section 4.2).
+PAPER_BEST_PERCENT: Final = 80.0
+PAPER_WORDS: Final = {"512k": "degraded", "256k": "broken"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Original:
+    """Results of the original program in one trial; None: not recorded."""
+
+    delivered_percent: float  # of the audio
+    on_time_percent: float | None = None  # within a second
+    p95_s: float | None = None  # of the audio
+    fps: float | None = None
+
+
+#: Measured once, elsewhere, through such a network.
+ORIGINAL: Final = {
+    "256k": Original(delivered_percent=40.0, on_time_percent=3.5, p95_s=6.9, fps=2.2),
+    "64k": Original(delivered_percent=5.7),
+}
+
+#: The trials that have aims, and the aims.
+NARROW: Final = "256k"
+NARROW_SOUND_PERCENT: Final = 99.0  # delivered, at least
+NARROW_SOUND_P95_MS: Final = 400.0
+NARROW_PICTURE_GAP_S: Final = 1.0
+WORST: Final = "64k+5%"
+WORST_SOUND_PERCENT: Final = 95.0  # delivered, at least
+WORST_DRIVE_P95_MS: Final = 500.0
+WORST_OFFLINE_S: Final = 2.0
+
+
+def _quoted() -> tuple[str, ...]:
+    narrow, thin = ORIGINAL["256k"], ORIGINAL["64k"]
+    words = ", ".join(f"{word} {'at' if word == 'degraded' else 'by'} {trial}" for trial, word in PAPER_WORDS.items())
+    return (
+        "Quoted, not measured here:",
+        f"  the original program, once through such a network: at 256k {narrow.delivered_percent:g} % of its audio "
+        f"arrived ({narrow.on_time_percent:g} % within 1 s, p95 {narrow.p95_s:g} s) and {narrow.fps:g} pictures a "
+        f"second; at 64k {thin.delivered_percent:g} % of its audio.",
+        f"  the paper (4.2): audio delivery about {PAPER_BEST_PERCENT:g} % at best, {words}.",
+    )
+
+
+#: Both references as lines of text.
+QUOTED: Final = _quoted()

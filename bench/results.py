@@ -1,0 +1,178 @@
+"""The results of a comparison: every sample, and all that is needed to repeat the run."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import msgspec
+
+from pebble.bench.percentiles import percentile
+from pebble.errors import PebbleError
+from pebble.version import __version__
+
+FORMAT = 1
+OVER_TIME = " over time"  # suffix of the measure of a cell that holds a curve: times, then values
+_PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
+_MOSQUITTO = "/usr/sbin:/usr/local/sbin"
+_DIGITS = 3  # decimal places of a sample
+
+Value = str | int | float | bool | None
+
+
+class Cell(msgspec.Struct, kw_only=True):
+    """One variant under one set of conditions.
+
+    Cells with equal ``params`` and ``measure`` ran in turn: their rounds with the same number form pairs.
+    """
+
+    variant: str
+    params: dict[str, Value] = {}
+    measure: str  # "one-way", "round trip", …
+    unit: str  # of the samples: "us", "ms", "s", "MB", "%"
+    rounds: list[list[float]] = []  # the samples of each round, in the order they were taken
+    figures: dict[str, Value] = {}  # single values: sent, cpu, …
+
+    @property
+    def samples(self) -> list[float]:
+        return [sample for one in self.rounds for sample in one]
+
+    @property
+    def lost(self) -> int | None:
+        """Messages that were sent and never arrived; None if they were not counted."""
+        sent = self.figures.get("sent")
+        return int(sent) - len(self.samples) if isinstance(sent, int) else None
+
+    def percentile(self, percent: float) -> float:
+        """A percentile of all samples; NaN without samples."""
+        return percentile(self.samples, percent)
+
+    def conditions(self) -> str:
+        """The conditions as text: ``40 B, 200 Hz``."""
+        return ", ".join(str(value) for value in self.params.values())
+
+
+class Results(msgspec.Struct, kw_only=True):
+    """One run of one comparison."""
+
+    bench: str
+    format: int = FORMAT
+    pebble: str = __version__
+    command: list[str] = []  # repeats the run
+    options: dict[str, Value | list[Value]] = {}
+    machine: dict[str, Value] = {}
+    began: str = ""  # UTC, ISO 8601
+    took_s: float = 0.0
+    quick: bool = False
+    cells: list[Cell] = []
+    assessment: list[str] = msgspec.field(name="verdict", default_factory=list)  # sentences
+
+    def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
+        """The first cell that matches."""
+        return next(
+            (
+                cell
+                for cell in self.cells
+                if cell.variant == variant
+                and measure in (None, cell.measure)
+                and all(cell.params.get(name) == value for name, value in params.items())
+            ),
+            None,
+        )
+
+    def save(self, path: Path) -> None:
+        """Raises PebbleError if the file cannot be written."""
+        for cell in self.cells:
+            cell.rounds = [[round(sample, _DIGITS) for sample in one] for one in cell.rounds]
+        try:
+            path.write_bytes(msgspec.json.encode(self) + b"\n")
+        except OSError as error:
+            raise PebbleError(f"{path}: {error.strerror}") from None
+
+
+def load(path: Path) -> Results:
+    """Raises PebbleError if the file holds no results."""
+    try:
+        results = msgspec.json.decode(path.read_bytes(), type=Results)
+    except OSError as error:
+        raise PebbleError(f"{path}: {error.strerror}") from None
+    except msgspec.DecodeError as error:
+        raise PebbleError(f"{path} holds no results of pebble bench: {error}") from None
+    if results.format != FORMAT:
+        raise PebbleError(f"{path} has format {results.format}, this pebble reads {FORMAT}: measure again")
+    return results
+
+
+class Stopwatch:
+    """Records machine, options and start time of a run; :meth:`results` adds the cells and the duration."""
+
+    def __init__(self, bench: str, command: Sequence[str], options: Mapping[str, Value | list[Value]]) -> None:
+        self._bench, self._command, self._options = bench, list(command), dict(options)
+        self._machine = machine()
+        self._began, self._since = time.gmtime(), time.monotonic()
+
+    def results(self, cells: Sequence[Cell], assessment: Sequence[str] = (), *, quick: bool = False) -> Results:
+        return Results(
+            bench=self._bench,
+            command=self._command,
+            options=self._options,
+            machine=self._machine,
+            began=time.strftime("%Y-%m-%dT%H:%M:%SZ", self._began),
+            took_s=round(time.monotonic() - self._since, 1),
+            quick=quick,
+            cells=list(cells),
+            assessment=list(assessment),
+        )
+
+
+def machine() -> dict[str, Value]:
+    """The machine and the versions the results depend on; no names of hosts or users."""
+    return {
+        "cpu": _cpu(),
+        "cores": len(os.sched_getaffinity(0)),
+        "kernel": platform.release(),
+        "system": _system(),
+        "python": platform.python_version(),
+        "mosquitto": _mosquitto(),
+        **{name: _version(name) for name in _PACKAGES},
+    }
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model")))
+    return next(named, platform.machine())
+
+
+def _system() -> str:
+    try:
+        return platform.freedesktop_os_release().get("PRETTY_NAME", "")
+    except OSError:
+        return platform.system()
+
+
+def _mosquitto() -> str | None:
+    program = shutil.which("mosquitto") or shutil.which("mosquitto", path=_MOSQUITTO)
+    if program is None:
+        return None
+    try:
+        answer = subprocess.run([program, "-h"], capture_output=True, text=True, check=False, timeout=5).stdout
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,93 @@
+"""Who moves the motors: nobody while latched, people before scripts. Pure; boards and Linux robots share it.
+
+A drive command with all axes 0 is a zero. A person's zero is always judged. Commands of a script carry the number of
+its run, which grows with each start; a run that is barred never moves anything again.
+"""
+
+HOLD_MS = 2000  # so long after a person's last command scripts are refused
+_START_MS = 2000  # so long after the start scripts are refused: their manager first sees that their owner restarted
+
+PERSON = 0  # in place of the number of a run
+UNKNOWN_RUN = -1  # a script's zero without a valid number
+REFUSED = -1
+
+
+class Arbiter:
+    """``judge`` every drive command; ``stop`` at every emergency stop; ``tick`` regularly."""
+
+    def __init__(self, latch, now: int, diff, watchdog_ms: int) -> None:
+        """``watchdog_ms`` is how long a command moves anything, at most; see latch.py for ``diff``."""
+        self.latch = latch
+        self.barred = 0  # runs up to this number
+        self._diff = diff
+        self._watchdog_ms = watchdog_ms
+        self._newest = 0  # the highest run received
+        self._starting = True
+        self._started = now
+        self._held = False  # by a person
+        self._held_from = now
+        self._resumes = True  # at the end of the hold: the person's last command was a zero that is not final
+        self._scripted = False  # a script is in effect: the newest admitted command is its, and within its deadline
+        self._script_from = now
+        self._script_ms = 0
+
+    def judge(self, moves: bool, run: int, valid_ms: float, now: int) -> int:
+        """Return for how many milliseconds it moves, 0: it stops the motors, REFUSED: it has no effect.
+
+        ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN of a zero. ``valid_ms`` < 0: not given.
+        """
+        self.tick(now)
+        if run > self._newest:  # a later run has begun, even if this command is refused
+            self._newest = run
+            self._bar(run - 1)
+        if self.latch.latched:
+            self._bar(run)
+        if self.latch.refuses(moves, run != PERSON, now):
+            return REFUSED
+        limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
+        if run == PERSON:
+            self._take(moves, valid_ms == 0, now)
+        elif self._held or self._starting or 0 < run <= self.barred:
+            return REFUSED
+        else:
+            self._scripted = True
+            self._script_from = now
+            self._script_ms = limit
+        return limit if moves else 0
+
+    def stop(self, name: str, by: str, why: str, since: int) -> bool:
+        """Latch, and bar all runs so far; False: this stop is known already."""
+        if not self.latch.stop(name, by, why, since):
+            return False
+        self._bar(self._newest)
+        self._scripted = False
+        return True
+
+    def tick(self, now: int) -> None:
+        """Let what is over end; at least every few minutes, because clocks of boards wrap."""
+        diff = self._diff
+        self.latch.tick(now)
+        if self._starting and diff(now, self._started) >= _START_MS:
+            self._starting = False
+        if self._scripted and diff(now, self._script_from) >= self._script_ms:
+            self._scripted = False
+        if self._held and diff(now, self._held_from) >= HOLD_MS:
+            self._held = False
+            if not self._resumes:  # the person has not let go: the connection was lost
+                self._bar(self._newest)
+
+    def _take(self, moves: bool, final: bool, now: int) -> None:
+        """A person's command: scripts wait, or end.
+
+        After the first command of a person no script is in effect: a zero then is the end of the person's own driving.
+        """
+        if not moves and (final or self._scripted):
+            self._bar(self._newest)
+        self._resumes = not moves and not final
+        self._scripted = False
+        self._held = True
+        self._held_from = now
+
+    def _bar(self, run: int) -> None:
+        if run > self.barred:
+            self.barred = run

@@ -1,0 +1,19 @@
+"""What a robot on Wi-Fi announces about itself (paper A.8.6). Pure."""
+
+# It also lists what the robot does not offer, because readers assume the presence of what is missing.
+_CAPABILITIES = (
+    b'{"schema":"pebble-capabilities/v1","t":%d,"value":{"identity":{"system":"%s","type":"%s","id":"%s"},'
+    b'"transport":{"kind":"mqtt"},"drive":{"available":true,"controls":true,"arbitrates":true,'
+    b'"topic":"%s/incoming/drive-values"},"estop":{"available":%s,"topic":"%s/incoming/estop",'
+    b'"reset_topic":"%s/incoming/estop-reset","owners":["mcu"],"status_topics":["%s/outgoing/estop/mcu"]},'
+    b'"telemetry":{"touch_sensors":false,"charging_status":%s,"charging_topic":"%s/outgoing/charging-status",'
+    b'"charging_level_topic":"%s/outgoing/charging-level"},"lights":{"solid":false,"flash":false},"video":%s,"audio":%s,'
+    b'"soundboard":%s,"autonomy":%s,"system":{"reboot":%s,"service_restart":%s,"git_pull":%s}}}'
+)
+
+
+def describe(epoch_ms: int, root: bytes, stoppable: bool, charging: bytes) -> bytes:
+    """Make the payload; ``root`` is the base of the topics, ``charging``: whether it reports that status, in JSON."""
+    values = [epoch_ms] + root.split(b"/") + [root, b"true" if stoppable else b"false"]
+    values += [root, root, root, charging, root, root]
+    return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

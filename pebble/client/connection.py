@@ -1,0 +1,119 @@
+"""A command's own short-lived connection to a robot's local transport or to a broker."""
+
+from __future__ import annotations
+
+import os
+import queue
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pebble.client.names import ANY_ROBOT, Names, base_of
+from pebble.client.url import settings_of
+from pebble.config import Config, load
+from pebble.errors import ConfigError, PebbleError, TransportError
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
+from pebble.transports import Message, QoS, State, Transport, create
+
+PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
+_OPEN_TIMEOUT_S = 3.0
+_WAITING = 10_000  # messages that wait to be printed before new ones are dropped
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """The options of a ``pebble topic`` command that select where to connect."""
+
+    config: Path | None = None
+    url: str | None = None
+    robot: str | None = None
+    remote: bool = False
+    password_file: Path | None = None
+    ca_cert: Path | None = None
+
+
+@contextmanager
+def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
+    """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
+    kind, settings, names, where = _resolve(target)
+    transport = create(kind, f"pebble-tool-{os.getpid()}", settings)
+    with closing(transport.open(_OPEN_TIMEOUT_S)):
+        if transport.state is not State.CONNECTED:
+            why = transport.problem or f"no answer within {_OPEN_TIMEOUT_S:g} s"
+            raise TransportError(f"cannot connect to {where}: {why}")
+        yield transport, names
+
+
+def _resolve(target: Target) -> tuple[str, Any, Names, str]:
+    if (target.config is None) == (target.url is None):
+        raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
+    if target.config is not None:
+        return _of_config(load(target.config), target)
+    url = str(target.url)
+    if target.remote:
+        raise PebbleError("--remote needs --config; with --url name the remote broker itself")
+    kind, settings = settings_of(url, password=password(target.password_file), ca_cert=target.ca_cert)
+    return kind, settings, Names(ANY_ROBOT if target.robot is None else base_of(target.robot)), url
+
+
+def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
+    base = config.base if target.robot is None else base_of(target.robot)
+    names = Names(base, Addresses(config) if base == config.base else None)
+    if target.remote:
+        return *_remote(config), names, f"the remote side of {config.base}"
+    if config.transport.kind == "zenoh":
+        where = f"the hub of {config.base} in {config.run_dir()} (is the robot up?)"
+        return "zenoh", zenoh_settings(config, client=True), names, where
+    where = f"{config.base} by {config.transport.kind}"
+    if config.transport.kind == "mqtt":
+        where = f"the broker of {config.base} at {config.local_mqtt.host}:{config.local_mqtt.port}"
+    return config.transport.kind, local_settings(config), names, where
+
+
+def _remote(config: Config) -> tuple[str, Any]:
+    bridge = config.services.mqtt_bridge
+    if bridge.remote is not None and bridge.remote.kind != "mqtt":
+        raise ConfigError("services.mqtt_bridge.remote: --remote uses MQTT only, and this robot's uplink does not")
+    if not bridge.remote_mqtt.host:
+        raise ConfigError("services.mqtt_bridge.remote_mqtt.host: is not set, so there is no remote side")
+    return "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+
+
+def password(file: Path | None) -> str | None:
+    """The password in the file, else in the environment. Raises PebbleError."""
+    if file is None:
+        return os.environ.get(PASSWORD)
+    try:
+        return file.read_text().rstrip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise PebbleError(f"--password-file {file}: {getattr(error, 'strerror', 'is not text')}") from None
+
+
+class Listener:
+    """Queues messages from the transport's threads for the thread that prints them."""
+
+    def __init__(self, transport: Transport, filters: Iterable[str]) -> None:
+        self._waiting: queue.Queue[Message] = queue.Queue(_WAITING)
+        self.dropped = 0  # messages that arrived faster than they were printed
+        self.subscribe(transport, filters)
+
+    def subscribe(self, transport: Transport, filters: Iterable[str]) -> None:
+        """Queue further messages; on a slow network this takes seconds."""
+        for filter_ in filters:
+            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED)
+
+    def next(self, timeout: float) -> Message | None:
+        """The next message, waiting up to ``timeout`` seconds for one."""
+        try:
+            return self._waiting.get(timeout=max(timeout, 0.0))
+        except queue.Empty:
+            return None
+
+    def _take(self, message: Message) -> None:
+        try:
+            self._waiting.put_nowait(message)
+        except queue.Full:
+            self.dropped += 1

@@ -1,0 +1,104 @@
+"""Resolves what a user types (``drive-values``, ``outgoing/online``, a whole topic) to topics and channels."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, channel_of
+from pebble.contract.identity import Identity, parse_topic
+from pebble.errors import PebbleError
+from pebble.runtime.addresses import Addresses
+from pebble.transports.topics import is_pattern
+
+ANY_ROBOT = "+/+/+"
+_USUAL = "pebble/robots/"  # before the id alone
+
+
+class NamingError(PebbleError):
+    """A name without a topic. Example: ``there is no topic "drive-value": did you mean "drive-values"?``."""
+
+
+class Names:
+    """Resolves names to the topics of one robot, including those its config renames, or of every robot."""
+
+    def __init__(self, base: str = ANY_ROBOT, addresses: Addresses | None = None) -> None:
+        self.base = base
+        self._addresses = addresses
+
+    def filters(self, name: str) -> list[str]:
+        """The filters to subscribe to for ``name``: its topic and those of its synonyms (paper Table A.5)."""
+        channel = self._find(name, (OUTGOING, INCOMING))
+        if channel is None:
+            return [name]
+        return [self._place(one, name) for one in _with_synonyms(channel)]
+
+    def topic(self, name: str) -> str:
+        """The topic to publish to for ``name``. Raises PebbleError if it is not exactly one."""
+        channel = self._find(name, (INCOMING, OUTGOING))
+        topic = name if channel is None else self._place(channel, name)
+        if is_pattern(topic):
+            raise NamingError(
+                f"{name} is not one topic: select the robot by --config or --robot, or give a whole topic"
+            )
+        return topic
+
+    def channel(self, topic: str) -> Channel | None:
+        """The channel of ``topic``, of any robot."""
+        known = None if self._addresses is None else self._addresses.channel(topic)
+        if known is not None:
+            return known
+        address = parse_topic(topic)
+        return None if address is None else channel_of(f"{address.direction}/{address.metric}")
+
+    def _find(self, name: str, directions: tuple[str, str]) -> Channel | None:
+        """The channel of a short name; None for a whole topic. The first direction that has the name wins."""
+        if name.startswith((f"{INCOMING}/", f"{OUTGOING}/")):
+            found = channel_of(name)
+        elif parse_topic(name) is not None or is_pattern(name):
+            return None
+        else:
+            found = next((one for way in directions if (one := channel_of(f"{way}/{name}")) is not None), None)
+        if found is None:
+            _refuse_misspelt(name)
+        return found
+
+    def _place(self, channel: Channel, name: str) -> str:
+        if channel.is_pattern:
+            return f"{self.base}/{channel.direction}/{name.removeprefix(f'{channel.direction}/')}"
+        if self._addresses is not None:
+            return self._addresses[channel].topic
+        return channel.filter(self.base)
+
+
+def base_of(robot: str) -> str:
+    """The base topic of ``goob`` or ``pebble/robots/goob``. Raises ConfigError for names that no topic can hold."""
+    levels = robot.split("/")
+    if len(levels) == 1:
+        levels = [*_USUAL.split("/")[:2], robot]
+    if len(levels) != 3:
+        raise NamingError(f'--robot {robot}: give its id, or "system/type/id"')
+    return Identity(*levels).base
+
+
+def id_of(base: str) -> str:
+    """The shortest name that :func:`base_of` takes for this robot."""
+    name = base.removeprefix(_USUAL)
+    return base if "/" in name else name
+
+
+def _with_synonyms(channel: Channel) -> Iterator[Channel]:
+    yield channel
+    for other in CHANNELS:
+        if other.direction == channel.direction and other.synonym_of == channel.metric:
+            yield other
+
+
+def _refuse_misspelt(name: str) -> None:
+    """Raise NamingError for a single word or a near match: other topics may exist on a broker outside the contract."""
+    known = {spelling for channel in CHANNELS for spelling in (channel.metric, channel.suffix)}
+    near = difflib.get_close_matches(name, sorted(known), n=1)
+    if near:
+        raise NamingError(f'there is no topic "{name}": did you mean "{near[0]}"?')
+    if "/" not in name:
+        raise NamingError(f'there is no topic "{name}"; `pebble topics` lists all topics')

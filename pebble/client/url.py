@@ -1,0 +1,64 @@
+"""Parses the address of a connection: ``mqtt://host:port``, ``mqtts://host:port`` or ``zenoh:<run_dir>``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from pebble.errors import PebbleError
+from pebble.transports import MqttSettings, TlsSettings, ZenohSettings
+
+FORMS = "mqtt://HOST[:PORT], mqtts://HOST[:PORT] or zenoh:RUN_DIR"
+_PORTS = {"mqtt": 1883, "mqtts": 8883}
+
+
+class UrlError(PebbleError):
+    """A URL without a usable address. Example: ``--url http://x: use mqtt://HOST[:PORT], …``."""
+
+
+def settings_of(
+    url: str, *, password: str | None = None, ca_cert: Path | None = None
+) -> tuple[str, MqttSettings | ZenohSettings]:
+    """The kind of transport and its settings. Raises UrlError, whose text never contains the password."""
+    scheme, _, rest = url.partition(":")
+    if scheme == "zenoh":
+        return "zenoh", _zenoh(rest)
+    if scheme in _PORTS and rest.startswith("//"):
+        return "mqtt", _mqtt(url, password, ca_cert)
+    raise UrlError(f"--url must be {FORMS}")
+
+
+def _zenoh(path: str) -> ZenohSettings:
+    if not path:
+        raise UrlError("--url zenoh: names no run directory; `pebble check CONFIG` shows a robot's")
+    run_dir = Path(path).expanduser().absolute()
+    if not run_dir.is_dir():
+        raise UrlError(f"--url zenoh:{path}: there is no such directory, is the robot up?")
+    return ZenohSettings(run_dir=run_dir, client=True)
+
+
+def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError as error:
+        raise UrlError(f"--url: {error}, use {FORMS}") from None
+    if parts.password is not None:
+        raise UrlError(
+            "--url holds a password, which every user of this machine can read: put it into a file "
+            "(--password-file FILE) or into the environment (PEBBLE_PASSWORD)"
+        )
+    if not parts.hostname:
+        raise UrlError(f"--url names no host, use {FORMS}")
+    if parts.path.strip("/") or parts.query or parts.fragment:
+        raise UrlError(f"--url must end after the port; topics are named separately: {FORMS}")
+    encrypted = parts.scheme == "mqtts"
+    if ca_cert is not None and not encrypted:
+        raise UrlError("--ca-cert has no use with mqtt://: use mqtts://")
+    return MqttSettings(
+        host=parts.hostname,
+        port=_PORTS[parts.scheme] if port is None else port,
+        username=None if parts.username is None else unquote(parts.username),
+        password=password,
+        tls=TlsSettings(ca_cert=ca_cert) if encrypted else None,
+    )

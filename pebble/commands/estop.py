@@ -1,0 +1,327 @@
+"""``pebble estop``: stops robots until each has confirmed it, ends stops, and shows them."""
+
+from __future__ import annotations
+
+import difflib
+import getpass
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pebble.client.connection import Listener, Target, connected
+from pebble.client.discovery import ALL_OUTGOING, Discovery
+from pebble.client.estop import Progress, RobotStop, StopSender, new_name
+from pebble.client.estop_states import Reset, RobotEstop
+from pebble.client.names import id_of
+from pebble.commands import show
+from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE
+from pebble.errors import PebbleError, TransportError
+from pebble.runtime.signals import interrupted_by_signals
+from pebble.transports import State, Transport
+
+_VERBS = ("reset", "status")
+_TICK_S = 0.25
+_REPORT_PERIOD_S = 0.05
+_QUICK_S = 1.0  # an answer within this time needs no line before it
+_ANSWER_S = 2.0  # longest wait for the states of a robot, and for its answer to a reset
+_HEARTBEAT_S = 0.6  # more than two periods of a heartbeat
+_BATCH = 1000  # messages that are handled before the next stop is due
+
+
+def estop(
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="A robot's config file, or with --url or --config its id.",
+            metavar="[reset|status] ROBOT",
+            show_default=False,
+        ),
+    ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Stop all robots there.")] = False,
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Until Ctrl-C: also stop robots that come online meanwhile.")
+    ] = False,
+    why: Annotated[str, typer.Option(help="Shown to others; at most 40 characters.", metavar="TEXT")] = "",
+    config: ConfigOption = None,
+    url: UrlOption = None,
+    remote: RemoteOption = False,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Stop robots until they are reset.
+
+    This is software over a network, not a safety-rated stop: where people can be hurt, cut the power of the motors.
+
+    A stopped robot moves nothing, also after a restart, until `pebble estop reset`. The stop is repeated until every
+    motor owner of the robot has confirmed it, for at most a minute. Exit code 0: confirmed; 1: not confirmed.
+
+    \b
+        pebble estop goob.json
+        pebble estop goob.json --remote
+        pebble estop goob --url mqtt://127.0.0.1 --why "dog on the lane"
+        pebble estop --all --url mqtt://127.0.0.1
+        pebble estop --all --hold --url mqtt://127.0.0.1
+        pebble estop status --url mqtt://127.0.0.1
+        pebble estop reset goob.json
+    """
+    verb, robot = _parse(words or [])
+    if verb and (all_ or hold or why):
+        raise typer.BadParameter(f"--all, --hold and --why are not for {verb}")
+    if all_ and robot is not None:
+        raise typer.BadParameter(f"give either --all or {robot}")
+    if robot is None and not all_ and verb != "status":
+        raise typer.BadParameter("name the robot" if verb else "nothing was stopped: name the robot, or add --all")
+    target = _target(robot, Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert))
+    if verb == "reset":
+        return _reset(target)
+    if verb == "status":
+        return _status(target, every=robot is None)
+    return _stop(target, why, every=all_, hold=hold)
+
+
+def register(app: typer.Typer) -> None:
+    app.command("estop")(estop)
+
+
+def _parse(words: list[str]) -> tuple[str, str | None]:
+    """``("reset", "goob.json")``; the verb is empty for a stop. A robot called reset is given as system/type/id."""
+    verb = words[0] if words and words[0] in _VERBS else ""
+    robots = words[1:] if verb else words
+    near = difflib.get_close_matches(words[0], _VERBS, n=1) if len(words) > 1 and not verb else []
+    if near:
+        raise typer.BadParameter(f'did you mean "pebble estop {near[0]} {words[1]}"?')
+    if len(robots) > 1:
+        raise typer.BadParameter(f"one robot at a time{'' if verb else ', or --all'}: not {' '.join(robots)}")
+    if robots and robots[0] in _VERBS:
+        raise typer.BadParameter(f"a robot called {robots[0]} is given as system/type/id")
+    return verb, robots[0] if robots else None
+
+
+def _target(robot: str | None, options: Target) -> Target:
+    """Where to connect: with --url or --config ``robot`` is an id, else a config file."""
+    if options.config is None and options.url is None:
+        if robot is None:
+            raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
+        if not Path(robot).is_file():
+            raise PebbleError(f"{robot} is not a config file: name one, or add --url or --config for the robot {robot}")
+        return replace(options, config=Path(robot))
+    if robot is not None and robot.endswith(".json") and Path(robot).is_file():
+        raise PebbleError(f"{robot} is a config file: leave out --url and --config, or give the robot's id instead")
+    return replace(options, robot=robot)
+
+
+def _me() -> str:
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # no name for this user id
+        user = "unknown"
+    return f"{user}@{socket.gethostname()}"
+
+
+# -- stop
+
+
+def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
+    with interrupted_by_signals(), connected(target) as (transport, names):
+        robots = None if every else [names.base]
+        sender = StopSender(new_name(), by=_me(), why=why, now=time.monotonic(), robots=robots, hold=hold)
+        report = _Report(sender)
+        try:
+            _publish(transport, sender)
+            listener = _listen(transport, [ALL_OUTGOING] if every else _filters(names.base))
+            while not sender.finished:
+                _receive(listener, sender)
+                _publish(transport, sender)
+                report.connection("" if transport.state is State.CONNECTED else transport.problem or "no connection")
+                report.update(time.monotonic())
+        except KeyboardInterrupt:
+            sender.end()
+        report.end()
+    return 0 if sender.confirmed else 1
+
+
+def _listen(transport: Transport, filters: list[str]) -> Listener:
+    """Subscribe on a thread of its own: what the network takes for it must not delay a stop."""
+    listener = Listener(transport, ())
+
+    def subscribe() -> None:
+        with suppress(TransportError):  # closed meanwhile
+            listener.subscribe(transport, filters)
+
+    threading.Thread(target=subscribe, name="pebble-estop-subscribe", daemon=True).start()
+    return listener
+
+
+def _filters(base: str) -> list[str]:
+    return [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, ONLINE)]
+
+
+def _receive(listener: Listener, sender: StopSender) -> None:
+    """Handle what has arrived; wait for something if nothing has, until something is due."""
+    due = sender.due
+    left = _TICK_S if due is None else min(_TICK_S, due - time.monotonic())
+    for _ in range(_BATCH):
+        message = listener.next(left)
+        if message is None:
+            return
+        sender.receive(message, time.monotonic())
+        left = 0.0
+
+
+def _publish(transport: Transport, sender: StopSender) -> None:
+    for message in sender.tick(time.monotonic()):  # the transport waits for no acknowledgement
+        transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
+
+
+class _Report:
+    """Prints a line whenever the stop of a robot has got further."""
+
+    def __init__(self, sender: StopSender) -> None:
+        self._sender = sender
+        self._lines: dict[str, str] = {}  # the last one of each robot
+        self._problem = ""
+        self._began = self._updated = time.monotonic()
+        if sender.hold:
+            _echo(f"stop {sender.name} is held until Ctrl-C; robots stay stopped after it")
+
+    def connection(self, problem: str) -> None:
+        """Warn once of each outage."""
+        if problem and not self._problem:
+            _echo(f"pebble: warning: nothing is sent until there is a connection again: {problem}", err=True)
+        self._problem = problem
+
+    def update(self, now: float) -> None:
+        if now - self._updated >= _REPORT_PERIOD_S:
+            self._updated = now
+            self._print(patient=now - self._began < _QUICK_S)
+
+    def end(self) -> None:
+        sender = self._sender
+        self._print(patient=False)
+        if not sender.robots:
+            _echo("no robot was found: NOTHING IS STOPPED")
+        if sender.omitted:
+            _echo(f"there are more than {len(sender.robots)} robots: the others are NOT STOPPED")
+
+    def _print(self, *, patient: bool) -> None:
+        for base, robot in list(self._sender.robots.items()):
+            line = _line(robot, patient=patient)
+            if self._lines.get(base) != line:
+                self._lines[base] = line
+                _echo(show.printable(f"{id_of(base)}: {line}"))
+
+
+def _echo(line: str, *, err: bool = False) -> None:
+    """Print ``line``; a stop is sent on if that fails, because the reader has ended or a disk is full."""
+    try:
+        typer.echo(line, err=err)
+    except OSError:
+        show.discard_output(sys.stderr if err else sys.stdout)
+
+
+def _line(robot: RobotStop, *, patient: bool) -> str:
+    match robot.progress:
+        case Progress.CONFIRMED if not robot.estop.latched:
+            return "was stopped, and reset since"
+        case Progress.CONFIRMED:
+            took = f"after {robot.confirmed_s:.2f} s"
+            return f"stopped and confirmed {took}" if robot.saved else f"stopped {took}, NOT SAVED: a restart frees it"
+        case Progress.OLD if robot.sending:
+            return "old firmware: zeros are sent, it cannot be latched"
+        case Progress.OLD:
+            return "old firmware: NOT LATCHED, zeros are no longer sent"
+        case Progress.SPARED:
+            return "does not drive"
+        case Progress.NOT_CONFIRMED:
+            return f"NOT CONFIRMED, no longer sent: {robot.why}"
+    return "stop sent" if patient else f"stop sent, not confirmed yet: {robot.why}"
+
+
+# -- reset and status
+
+
+def _reset(target: Target) -> int:
+    with connected(target) as (transport, names):
+        robot, name = RobotEstop(names.base), show.printable(id_of(names.base))
+        robot.subscribe(transport)
+        _wait(lambda: robot.has_capabilities and len(robot.states) >= len(robot.owners))
+        if not robot.states:
+            raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
+        reset = Reset(robot, _me())
+        _print_states(robot)
+        if not reset.shown:
+            return 0
+        if sys.stdin.isatty() and not typer.confirm(f"Let {name} move again?"):
+            return 1
+        for message in reset.messages():
+            if not transport.publish(message.topic, message.payload, qos=message.qos, urgent=True):
+                raise TransportError(f"the reset was not sent: {transport.problem or 'the connection was lost'}")
+        _wait(lambda: not reset.waiting)
+        for owner, why in reset.refusals().items():
+            raise PebbleError(show.printable(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
+    typer.echo(f"{name}: free; it moves again once drive commands have paused for half a second")
+    return 0
+
+
+def _status(target: Target, *, every: bool) -> int:
+    with connected(target) as (transport, names):
+        discovery = Discovery()
+        is_remote = target.remote or str(target.url).startswith("mqtt")  # within a robot there is no heartbeat
+        for channel in (ESTOP_STATE, CAPABILITIES, *((ONLINE,) if is_remote else ())):
+            transport.subscribe(
+                channel.filter(names.base),
+                lambda message: discovery.receive(message, time.monotonic(), time.time()),
+                direct=True,
+            )
+        if not every:
+            _wait(lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities)
+        if is_remote:
+            _wait(lambda: all(robot.liveness.received_at for robot in discovery.all_robots()), _HEARTBEAT_S)
+        robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
+    for robot in robots:
+        _print_states(robot.estop, silent=is_remote and robot.liveness.received_at is None)
+    if not robots:
+        typer.echo("no robot has published an emergency stop or capabilities")
+    return 0 if robots else 1
+
+
+def _print_states(robot: RobotEstop, *, silent: bool = False) -> None:
+    """One line for a robot that is free or has no emergency stop, else one for each stopped owner.
+
+    ``silent``: it sends no heartbeat now.
+    """
+    name, now = f"{id_of(robot.base)}{': no heartbeat; its last state' if silent else ''}", time.time()
+    lines = [
+        f"{name}: {show.stopped(state, now)} ({owner}{'' if state.persisted else ', NOT SAVED'})"
+        for owner, state in robot.latched.items()
+    ]
+    missing = [owner for owner in robot.owners if owner not in robot.states]
+    if robot.has_capabilities and not robot.available:
+        lines.append(f"{name}: {_absent(robot)}")
+    elif missing or not robot.states:
+        lines.append(f"{name}: unknown, no state of {', '.join(missing) or 'any motor owner'}")
+    for line in lines or [f"{name}: free"]:
+        typer.echo(show.printable(line))
+
+
+def _absent(robot: RobotEstop) -> str:
+    if robot.old:
+        return "its firmware has none"
+    if robot.has_capabilities and not robot.available:
+        return "its broker refuses it" if robot.drives else "it does not drive"
+    return "is it on, and is this its broker?"
+
+
+def _wait(condition: Callable[[], bool], seconds: float = _ANSWER_S) -> None:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)

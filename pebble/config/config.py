@@ -1,0 +1,186 @@
+"""A whole config: read from its JSON file, checked, completed, and from then on typed and unchangeable."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import asdict, fields
+
+from pebble.config.checks import CHECKS
+from pebble.config.raw import decode, inherit, plain, read_text
+from pebble.config.reader import Reader
+from pebble.config.tree import Root, SerialBridge, SerialBridges
+from pebble.config.types import Secret, Section
+from pebble.contract.identity import Identity
+from pebble.errors import ConfigError
+
+_LOGIN = re.compile(r"(?<=://)[^/@\s]*(?=@)")  # user:password of a URL
+_LONGEST_NAME = 150  # bytes; file systems allow 255
+_SECRET_KEY = re.compile("password|secret|token", re.IGNORECASE)
+_HARMLESS = ("password_file", "password_env")
+
+
+class Config(Root, frozen=True, kw_only=True):
+    """A complete, valid config: the keys of the file as attributes of the same names, and values derived from them."""
+
+    identity: Identity
+    path: Path | None  # None: not from a file
+    folder: Path  # where relative paths start
+    warnings: tuple[str, ...]  # one line each
+    run_folder: Path
+    state_folder: Path
+
+    @property
+    def base(self) -> str:
+        """What all topics of this robot begin with, without a final slash."""
+        return self.identity.base
+
+    def run_dir(self) -> Path:
+        """The folder of this robot's sockets and locks, absolute; not created here."""
+        return self.run_folder
+
+    def state_dir(self) -> Path:
+        """The folder of what must survive a power cut, absolute; not created here."""
+        return self.state_folder
+
+    def state_file(self, name: str) -> Path:
+        """A file in the state directory, which several robots may share."""
+        return self.state_folder / f"{name}-{_file_name(self.base)}.json"
+
+    @staticmethod
+    def motor_owner(instance: str) -> str:
+        """What the motor owner of a serial line is called in ``outgoing/estop/{owner}``."""
+        return instance or "serial"
+
+    def log_level_of(self, service: str) -> str:
+        """The log level of a process: ``mqtt_bridge``, ``serial_mcu_bridge:imu``, or any other name for the root's."""
+        name, _, instance = service.partition(":")
+        section = getattr(self.services, name, None)
+        if instance and isinstance(section, SerialBridges):
+            section = section.instances.get(instance, section)
+        return str(getattr(section, "log_level", self.log_level))
+
+    def serial_instances(self) -> dict[str, SerialBridge]:
+        """The enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
+        own = self.services.serial_mcu_bridge
+        lines: dict[str, SerialBridge] = {"": own, **own.instances}
+        return {name: line for name, line in lines.items() if line.enabled and line.serial.port is not None}
+
+    def media_programs(self) -> tuple[str, ...]:
+        """The on-demand programs for pictures and sound, by the services' names."""
+        devices = self.services.av_daemon
+        if not (self.services.mqtt_bridge.enabled and devices.enabled):
+            return ()
+        video = ("camera_publisher",) if devices.video.enabled else ()
+        return (*video, *(("audio_publisher", "audio_receiver") if devices.audio.enabled else ()))
+
+    def on_demand_programs(self) -> tuple[str, ...]:
+        """All programs that the bridge may request: the media programs, and a third party's streaming program."""
+        own = self.services.video_stream
+        stream = ("video_stream",) if own.enabled and own.command and self.services.mqtt_bridge.enabled else ()
+        return (*self.media_programs(), *stream)
+
+
+def load(path: Path | str, env: Mapping[str, str] = os.environ) -> Config:
+    """Read a config file. Raises ConfigError with every problem in it."""
+    path = Path(path).absolute()
+    return _config(decode(read_text(path), path.name), path, path.parent, env)
+
+
+def parse(raw: dict[str, Any], *, folder: Path, env: Mapping[str, str]) -> Config:
+    """The same from plain data. ``folder`` is where relative paths start, ``env`` the environment for passwords."""
+    return _config(raw, None, folder.absolute(), env)
+
+
+def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -> Config:
+    reader = Reader(folder, env, CHECKS)
+    own = plain(raw, reader.notes)
+    merged = inherit(own)
+    root = reader.section(Root, merged)
+    reader.notes.forget_inherited(own, merged)
+    if reader.notes.problems:
+        raise ConfigError(list(dict.fromkeys(map(str, reader.notes.problems))))
+    identity = Identity(root.robot.system, root.robot.type, root.robot.id)
+    return Config(
+        **asdict(root),
+        identity=identity,
+        path=path,
+        folder=folder,
+        warnings=reader.notes.warning_lines(),
+        run_folder=_run_folder(root, identity.base, env),
+        state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
+    )
+
+
+def _run_folder(root: Root, base: str, env: Mapping[str, str]) -> Path:
+    return root.transport.run_dir or default_run_folder(base, env)
+
+
+def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
+    """The run directory of the robot with this base topic, if its config names none.
+
+    Short, because a unix socket's path ends at 108 bytes; one per robot, because a host may run two.
+    """
+    if by_systemd := env.get("RUNTIME_DIRECTORY"):
+        return Path(by_systemd.split(":")[0])  # one per RuntimeDirectory= of the unit
+    robot = f"{zlib.crc32(base.encode()):08x}"
+    if by_login := env.get("XDG_RUNTIME_DIR"):
+        return Path(by_login, "pebble", robot)
+    return Path(env.get("TMPDIR", "/tmp"), f"pebble-{os.getuid()}", robot)  # noqa: S108 - 0700 and checked when made
+
+
+def default_state_folder(base: str, env: Mapping[str, str]) -> Path:
+    """The state directory of the robot with this base topic, if its config names none; one per robot."""
+    robot = _file_name(base)
+    if by_systemd := env.get("STATE_DIRECTORY"):
+        return Path(by_systemd.split(":")[0], robot)
+    return Path(env.get("XDG_STATE_HOME") or Path.home() / ".local/state", "pebble", robot)
+
+
+def _file_name(base: str) -> str:
+    """A name for one robot's files: its base, or a digest of it where a file system would refuse the name."""
+    name = base.replace("/", "+")  # which no level of a topic contains
+    return name if len(name.encode()) <= _LONGEST_NAME else hashlib.sha256(base.encode()).hexdigest()
+
+
+def resolved(config: Config) -> dict[str, Any]:
+    """The keys of the file with every default and inherited value, and under ``derived`` what is computed from them.
+
+    JSON can write all of it. Keys that are not set and have no default are left out; secrets read ``***``.
+    """
+    own = {
+        name: _view(getattr(config, name), name)
+        for name in ("log_level", "robot", "local_mqtt", "transport", "services", "web_interface")
+    }
+    return own | {
+        "derived": {
+            "base": config.base,
+            "run_dir": str(config.run_dir()),
+            "state_dir": str(config.state_dir()),
+            "serial_instances": list(config.serial_instances()),
+        }
+    }
+
+
+def _view(value: Any, key: str) -> Any:
+    if isinstance(value, Secret) or (_SECRET_KEY.search(key) and key not in _HARMLESS and value is not None):
+        return "***"
+    if isinstance(value, Section):
+        return _object({field.encode_name: getattr(value, field.name) for field in fields(value)})
+    if isinstance(value, dict):
+        return _object(value)
+    if isinstance(value, tuple | list):
+        return [_view(item, key) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    return _LOGIN.sub("***", value) if isinstance(value, str) else value
+
+
+def _object(items: dict[str, Any]) -> dict[str, Any]:
+    return {key: _view(value, key) for key, value in items.items() if value is not None}

@@ -1,0 +1,155 @@
+"""The config sections of camera, microphone and video, on the robot and towards operators."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from msgspec import Meta, field
+
+from pebble.config.types import (
+    EMPTY,
+    AudioChannels,
+    BitsPerSecond,
+    Command,
+    Count,
+    File,
+    FramesPerSecond,
+    Pixels,
+    Qos,
+    Rotation,
+    SampleRate,
+    Seconds,
+    Section,
+    ServiceSection,
+    Topic,
+    doc,
+)
+from pebble.contract.encodings import SoundEncoding, VideoEncoding
+
+_FRAMES = "pictures and sound use the robot's own shared memory, found by transport.run_dir"
+_SOURCE = "every frame has its own size and format"
+_SHARED_MEMORY = {"socket_path": _FRAMES, "shm_size": _FRAMES, "wait_for_connection": _FRAMES}
+_INPUT = {"input_shm": _FRAMES, "input_retry_seconds": _FRAMES}
+
+
+class CameraCapture(Section, frozen=True, kw_only=True):
+    """The camera."""
+
+    retired: ClassVar = _SHARED_MEMORY
+
+    enabled: Annotated[bool, doc("Open the camera.")] = True
+    backend: Annotated[
+        Literal["v4l2", "libcamera", "arducam", "picamera2", "synthetic"],
+        doc("How the camera is reached; `synthetic` needs none."),
+    ] = "v4l2"
+    device: Annotated[str, doc("Device of a v4l2 camera; or a file or URL instead of a camera.")] = "/dev/video0"
+    capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
+    io_mode: Annotated[str | int, doc("Not used: OpenCV chooses by itself.")] = "auto"
+    camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None
+    camera_controls: Annotated[dict[str, Any], doc("Settings passed to the camera unchanged.")] = field(
+        default_factory=dict
+    )
+    width: Annotated[Pixels, doc("Pixels.")] = 640
+    height: Annotated[Pixels, doc("Pixels.")] = 480
+    fps: Annotated[FramesPerSecond, doc("Frames per second.")] = 15
+    rotate_degrees: Annotated[Rotation, doc("Clockwise.")] = 0
+
+
+class Microphone(Section, frozen=True, kw_only=True):
+    """The microphone."""
+
+    retired: ClassVar = _SHARED_MEMORY
+
+    enabled: Annotated[bool, doc("Open the microphone.")] = True
+    source: Annotated[
+        Literal["alsa", "auto", "synthetic"], doc("How the microphone is reached; `synthetic` needs none.")
+    ] = "alsa"
+    device: Annotated[str | None, doc("ALSA device; unset: the default.")] = None
+    rate: Annotated[SampleRate, doc("Samples per second.")] = 16000
+    channels: Annotated[AudioChannels, doc("1 is mono, 2 stereo.")] = 1
+
+
+class AvDaemon(ServiceSection, frozen=True, kw_only=True):
+    """Owns the camera and the microphone."""
+
+    restart_delay_seconds: Annotated[Seconds, doc("Wait before a failed device is opened again.")] = 2.0
+    stop_timeout_seconds: Annotated[Seconds, doc("How long a device may take to close.")] = 5.0
+    cwd: Annotated[File | None, doc("Folder to run in.")] = None
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    video: Annotated[CameraCapture, doc("Camera.")] = CameraCapture()
+    audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
+
+
+class VideoStream(ServiceSection, frozen=True, kw_only=True):
+    """Runs a third party's streaming program while operators request video."""
+
+    command: Annotated[Command, doc("The program and its arguments, without a shell; required where enabled.")] = ()
+    cwd: Annotated[File | None, doc("Folder to run in; unset: the launcher's.")] = None
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    webrtc_url: Annotated[str | None, doc("Where its pictures are shown; operator pages find it in the status.")] = None
+
+
+class VideoPublisher(Section, frozen=True, kw_only=True):
+    """Pictures for operators."""
+
+    retired: ClassVar = {**_INPUT, "source_*": _SOURCE}
+
+    encoding: Annotated[VideoEncoding, doc("How pictures are sent unless a request names another encoding.")] = "json"
+    profile: Annotated[str, doc("Name of this set of values.")] = "default"
+    topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/front-camera`.")] = None
+    overlays_topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/video-overlays`.")] = None
+    width: Annotated[Pixels | None, doc("Pixels, where publish_width is not set; unset: as captured.")] = None
+    height: Annotated[Pixels | None, doc("Pixels, where publish_height is not set; unset: as captured.")] = None
+    fps: Annotated[FramesPerSecond | None, doc("Where neither publish_fps nor target_fps is set.")] = None
+    publish_width: Annotated[Pixels | None, doc("Pixels of what is sent.")] = None
+    publish_height: Annotated[Pixels | None, doc("Pixels of what is sent.")] = None
+    publish_fps: Annotated[FramesPerSecond | None, doc("Frames per second of what is sent.")] = None
+    target_fps: Annotated[FramesPerSecond | None, doc("Where publish_fps is not set.")] = None
+    keyframe_interval: Annotated[Count | None, doc("Frames from one full picture to the next; unset: fps / 3.")] = None
+    jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="1 is worst and smallest.")] = 10
+    bitrate: Annotated[BitsPerSecond | None, doc("Of h264, at most; unset: quality as jpeg_quality.")] = None
+    rotate_degrees: Annotated[Rotation, doc("Clockwise, in addition to the camera's section.")] = 0
+    reconnect_seconds: Annotated[Seconds, doc("Wait between attempts to reach the broker.")] = 10.0
+
+
+class AudioPublisher(Section, frozen=True, kw_only=True):
+    """Sound for operators."""
+
+    retired: ClassVar = _INPUT
+
+    encoding: Annotated[SoundEncoding, doc("How sound is sent unless a request names another encoding.")] = "pcm"
+    topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/audio`.")] = None
+    rate: Annotated[SampleRate | None, doc("Samples per second; unset: as captured.")] = None
+    channels: Annotated[AudioChannels | None, doc("1 is mono, 2 stereo; unset: as captured.")] = None
+    chunk_ms: Annotated[
+        int,
+        Meta(ge=1, le=1000, description="Milliseconds of sound in one packet; of opus 20, 40 or 60, and each part."),
+    ] = 20
+    bitrate: Annotated[int, Meta(ge=6_000, le=256_000, description="Of opus, bits per second.")] = 24_000
+    bundle: Annotated[int, Meta(ge=1, le=3, description="How many parts a packet of opus has.")] = 2
+    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
+
+
+class AudioReceiver(Section, frozen=True, kw_only=True):
+    """Sound from operators."""
+
+    topic: Annotated[Topic | None, doc("Instead of `{base}/incoming/audio-stream`.")] = None
+    device: Annotated[str, doc("ALSA device to play on.")] = "default"
+    rate: Annotated[SampleRate, doc("Samples per second before the first packet.")] = 16000
+    channels: Annotated[AudioChannels, doc("Channels before the first packet.")] = 1
+    command: Annotated[
+        Command,
+        doc("Plays sound from its standard input; `{rate}`, `{channels}` and `{device}` are filled in."),
+    ] = ("aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-D", "{device}", "-")
+    latency_ms: Annotated[
+        int, Meta(ge=0, le=1000, description="Sound buffered against uneven arrival; increased when necessary.")
+    ] = 60
+    queue_limit: Annotated[Count, doc("Packets that wait to be played; beyond it the oldest is dropped.")] = 48
+    concealment_ms: Annotated[int, Meta(ge=0, le=10_000, description="Longest gap filled with the last packet.")] = 100
+    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
+
+
+class Media(Section, frozen=True, kw_only=True):
+    """Pictures and sound, to and from operators."""
+
+    video_publisher: Annotated[VideoPublisher, doc("Pictures out.")] = VideoPublisher()
+    audio_publisher: Annotated[AudioPublisher, doc("Sound out.")] = AudioPublisher()
+    audio_receiver: Annotated[AudioReceiver, doc("Sound in.")] = AudioReceiver()

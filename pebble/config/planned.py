@@ -1,0 +1,233 @@
+"""The config sections of services that later releases bring: typed and checked now, so that files stay valid."""
+
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, field
+
+from pebble.config.transport import Mqtt
+from pebble.config.types import (
+    EMPTY,
+    Command,
+    Count,
+    File,
+    Interval,
+    LogLevel,
+    Port,
+    Qos,
+    Seconds,
+    Section,
+    ServiceSection,
+    Topic,
+    doc,
+)
+
+
+class HandlerTopics(Section, frozen=True, kw_only=True):
+    """Other names for a handler's three topics."""
+
+    command: Annotated[Topic | None, doc("Instead of the contract's incoming command topic.")] = None
+    files: Annotated[Topic | None, doc("Instead of the contract's list of files.")] = None
+    status: Annotated[Topic | None, doc("Instead of the contract's status.")] = None
+
+
+class Playback(Section, frozen=True, kw_only=True):
+    """Where sounds are and what plays them."""
+
+    directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
+    player_command: Annotated[Command, doc("Player; `{file}` stands for the sound, else it comes last.")] = ("aplay",)
+    stop_timeout: Annotated[Seconds, doc("How long the player may take to stop before it is killed.")] = 5.0
+    scan_interval: Annotated[float, Meta(ge=1, le=86_400, description="Seconds between scans of the folder.")] = 10.0
+    cwd: Annotated[File | None, doc("Folder to run the player in.")] = None
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+
+
+class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):
+    """Plays sounds on the robot."""
+
+    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
+    playback: Annotated[Playback, doc("Sounds and player.")] = Playback()
+
+
+class ScriptArgument(Section, frozen=True, kw_only=True):
+    """One setting of a script that operators may change."""
+
+    key: Annotated[str, doc("Its name in commands.")]
+    label: Annotated[str | None, doc("Its name for operators; unset: the key.")] = None
+    type: Annotated[Literal["string", "int", "float", "bool", "enum"], doc("What it holds.")] = "string"
+    default: Annotated[str | int | float | bool | None, doc("Its value unless a command sets it.")] = None
+    arg: Annotated[str | None, doc("The option of the script's command line.")] = None
+    arg_false: Annotated[str | None, doc("The option for false.")] = None
+    mode: Annotated[Literal["flag", "value"] | None, doc("Whether the option has a value.")] = None
+    required: Annotated[bool, doc("A command must give it.")] = False
+    min: Annotated[float | None, doc("Smallest value.")] = None
+    max: Annotated[float | None, doc("Largest value.")] = None
+    step: Annotated[float | None, doc("Step of an operator's control.")] = None
+    options: Annotated[tuple[Any, ...], doc("The values of an enum.")] = ()
+
+
+class ScriptDependency(Section, frozen=True, kw_only=True):
+    """Another script that a script needs."""
+
+    file: Annotated[str, doc("Folder of the other script.")]
+    enabled: Annotated[bool, doc("Start it.")] = True
+    config: Annotated[dict[str, Any], doc("Its settings.")] = EMPTY
+
+
+class Script(Section, frozen=True, kw_only=True):
+    """One autonomy script: a folder with an entry point."""
+
+    enabled: Annotated[bool, doc("Offer it.")] = True
+    display_name: Annotated[str | None, doc("Its name for operators; unset: the folder's.")] = None
+    entrypoint: Annotated[str, doc("File to run.")] = "run.py"
+    cwd: Annotated[File | None, doc("Folder to run it in; unset: its own.")] = None
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    args: Annotated[tuple[ScriptArgument, ...], doc("Its settings.")] = ()
+    dependencies: Annotated[tuple[ScriptDependency, ...], doc("Scripts that must run too.")] = ()
+
+
+class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
+    """Runs one autonomy script at a time."""
+
+    autonomy_root: Annotated[str, doc("Folder of the scripts.")] = "autonomy"
+    scan_interval_seconds: Annotated[Interval, doc("Seconds between scans of the folder.")] = 5.0
+    stop_timeout_seconds: Annotated[Seconds, doc("How long a script may take to stop before it is killed.")] = 8.0
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
+    scripts: Annotated[dict[str, Script], doc("Scripts by folder.")] = EMPTY
+
+
+class RosSwitch(Section, frozen=True, kw_only=True):
+    """Whether ROS drives the robot."""
+
+    enabled: Annotated[bool, doc("Send drive commands to ROS.")] = True
+
+
+class RosTopics(Section, frozen=True, kw_only=True):
+    """Other topics for what the ROS bridge publishes and subscribes to; unset: the contract's."""
+
+    drive_values: Annotated[Topic | None, doc("Instead of `{base}/incoming/drive-values`.")] = None
+    wheel_odometry: Annotated[Topic | None, doc("Instead of `{base}/outgoing/wheel-odometry`.")] = None
+    charging_status: Annotated[Topic | None, doc("Instead of `{base}/outgoing/charging-status`.")] = None
+    charging_level: Annotated[Topic | None, doc("Instead of `{base}/outgoing/charging-level`.")] = None
+    localization_pose: Annotated[Topic | None, doc("Instead of `{base}/outgoing/localization-pose`.")] = None
+    navigation_status: Annotated[Topic | None, doc("Instead of `{base}/outgoing/navigation-status`.")] = None
+    navigation_goal: Annotated[Topic | None, doc("Instead of `{base}/outgoing/navigation-goal`.")] = None
+    navigation_local_plan: Annotated[Topic | None, doc("Instead of `{base}/outgoing/navigation/local-plan`.")] = None
+    navigation_global_plan: Annotated[Topic | None, doc("Instead of `{base}/outgoing/navigation/global-plan`.")] = None
+    diagnostics: Annotated[Topic | None, doc("Instead of `{base}/outgoing/diagnostics`.")] = None
+
+
+class RosHeartbeat(Section, frozen=True, kw_only=True):
+    """Sign of life of the ROS side."""
+
+    enabled: Annotated[bool, doc("Send it.")] = True
+    topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/online`.")] = None
+    interval_seconds: Annotated[float, Meta(ge=0.05, le=3600, description="Seconds between two of them.")] = 0.25
+    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
+    retain: Annotated[bool | None, doc("Instead of the contract's retain flag.")] = None
+
+
+class RosNames(Section, frozen=True, kw_only=True):
+    """Names on the ROS side."""
+
+    node_name: Annotated[str, doc("ROS node.")] = "pebble_ros1_bridge"
+    cmd_vel_topic: Annotated[str, doc("ROS topic of drive commands.")] = "/cmd_vel"
+    cmd_vel_publish_interval_seconds: Annotated[Interval, doc("How often a drive command is repeated.")] = 0.05
+    odometry_topic: Annotated[str, doc("ROS topic.")] = "/odometry/filtered"
+    navigation_status_topic: Annotated[str, doc("ROS topic.")] = "/move_base/status"
+    navigation_goal_topic: Annotated[str, doc("ROS topic.")] = "/move_base/current_goal"
+    navigation_local_plan_topic: Annotated[str, doc("ROS topic.")] = "/move_base/TrajectoryPlannerROS/local_plan"
+    navigation_global_plan_topic: Annotated[str, doc("ROS topic.")] = "/move_base/NavfnROS/plan"
+    diagnostics_topic: Annotated[str, doc("ROS topic.")] = "/diagnostics_agg"
+
+
+class RosMotion(Section, frozen=True, kw_only=True):
+    """The speeds of a drive value of 1."""
+
+    max_linear_speed_mps: Annotated[float, Meta(gt=0, le=100, description="Metres per second.")] = 0.6
+    max_angular_speed_radps: Annotated[float, Meta(gt=0, le=100, description="Radians per second.")] = 1.2
+
+
+class RosItem(Section, frozen=True, kw_only=True):
+    """One report from ROS; QoS, retain and limits unset: the bridge's defaults."""
+
+    enabled: Annotated[bool | None, doc("Publish it; unset: all but the two plans and charging_status.")] = None
+    interval_seconds: Annotated[Interval | None, doc("Seconds between two of them.")] = None
+    qos: Annotated[Qos | None, doc("QoS.")] = None
+    retain: Annotated[bool | None, doc("Retain flag.")] = None
+    max_points: Annotated[Count | None, doc("Points of a plan that are sent.")] = None
+    max_items: Annotated[Count | None, doc("Lines of diagnostics that are sent.")] = None
+    status_name: Annotated[str | None, doc("Entry of the diagnostics to read.")] = None
+    key: Annotated[str | None, doc("Key of that entry to read.")] = None
+    truthy_values: Annotated[tuple[str, ...], doc("Texts that mean yes.")] = ()
+    falsey_values: Annotated[tuple[str, ...], doc("Texts that mean no.")] = ()
+
+
+class RosTelemetry(Section, frozen=True, kw_only=True):
+    """What the ROS bridge reports."""
+
+    wheel_odometry: Annotated[RosItem, doc("Wheel odometry.")] = RosItem()
+    localization_pose: Annotated[RosItem, doc("Pose.")] = RosItem()
+    navigation_status: Annotated[RosItem, doc("Navigation.")] = RosItem()
+    navigation_goal: Annotated[RosItem, doc("Goal.")] = RosItem()
+    navigation_local_plan: Annotated[RosItem, doc("Local plan.")] = RosItem()
+    navigation_global_plan: Annotated[RosItem, doc("Global plan.")] = RosItem()
+    diagnostics: Annotated[RosItem, doc("Diagnostics.")] = RosItem()
+    charging_level: Annotated[RosItem, doc("Battery.")] = RosItem()
+    charging_status: Annotated[RosItem, doc("Charging.")] = RosItem()
+
+
+class RosSafety(Section, frozen=True, kw_only=True):
+    """When ROS is stopped."""
+
+    drive_timeout_seconds: Annotated[float, Meta(gt=0, le=5, description="No drive command for this long: stop.")] = (
+        0.75
+    )
+    ignore_retained_drive: Annotated[bool, doc("Refuse a retained drive command, because it is stale.")] = True
+    stop_on_shutdown: Annotated[bool, doc("Send a stop at the end.")] = True
+
+
+class Ros1Bridge(ServiceSection, frozen=True, kw_only=True):
+    """The connection to a ROS 1 robot."""
+
+    drive: Annotated[RosSwitch, doc("Driving.")] = RosSwitch()
+    topics: Annotated[RosTopics, doc("Other names for topics.")] = RosTopics()
+    heartbeat: Annotated[RosHeartbeat, doc("Sign of life.")] = RosHeartbeat()
+    ros: Annotated[RosNames, doc("Names on the ROS side.")] = RosNames()
+    motion: Annotated[RosMotion, doc("Speeds.")] = RosMotion()
+    telemetry: Annotated[RosTelemetry, doc("Reports.")] = RosTelemetry()
+    safety: Annotated[RosSafety, doc("When to stop.")] = RosSafety()
+
+
+class WebHandler(ServiceSection, frozen=True, kw_only=True):
+    """Runs the web page on the robot."""
+
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+
+
+class MqttHistory(Section, frozen=True, kw_only=True):
+    """A record of all messages."""
+
+    enabled: Annotated[bool, doc("Keep one.")] = False
+    uri: Annotated[str, doc("MongoDB to keep it in.")] = "mongodb://127.0.0.1:27017"
+    database: Annotated[str, doc("Its database.")] = "pebble"
+    collection: Annotated[str, doc("Its collection.")] = "mqtt_history"
+    max_bytes: Annotated[int, Meta(ge=1, description="How large it may become.")] = 500 * 1024**3
+    subscribe_all_topics: Annotated[bool, doc("Record other systems' topics too.")] = True
+    prune_check_every_messages: Annotated[Count, doc("How often its size is checked.")] = 2000
+    prune_chunk_documents: Annotated[Count, doc("How many messages are deleted at once.")] = 50000
+    prune_target_ratio: Annotated[float, Meta(gt=0, le=1, description="How full it is after deleting.")] = 0.9
+
+
+class WebInterface(Section, frozen=True, kw_only=True):
+    """The operators' web page."""
+
+    log_level: Annotated[LogLevel, doc("Log level; the root's log_level unless set.")] = "INFO"
+    host: Annotated[str, doc("Address to listen on.")] = "0.0.0.0"  # noqa: S104 - the operators' page is for others
+    port: Annotated[Port, doc("TCP port to listen on.")] = 8080
+    mqtt: Annotated[Mqtt, doc("The broker that robots connect to.")] = Mqtt()
+    robots: Annotated[tuple[dict[str, Any], ...], doc("Hints about robots, in the original's format.")] = ()
+    robot_discovery: Annotated[dict[str, Any], doc("Read and ignored: robots are found by their messages.")] = field(
+        default_factory=dict
+    )
+    mqtt_history: Annotated[MqttHistory, doc("A record of all messages.")] = MqttHistory()

@@ -1,0 +1,130 @@
+"""From a config file to plain data: JSON with `//` keys as comments, and shared values copied to where they count."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from pebble.config import problems
+from pebble.config.tree import Services
+from pebble.config.types import ServiceSection
+from pebble.errors import ConfigError
+
+_SERVICES = tuple(name for name in Services.__struct_fields__ if isinstance(getattr(Services(), name), ServiceSection))
+_INTERVAL = "retained_publish_interval_seconds"
+
+
+class Pairs(list[tuple[str, Any]]):
+    """A JSON object as written: in order, and with repeated keys."""
+
+
+def read_text(path: Path) -> str:
+    """The file's text. Raises ConfigError, naming the file, when it cannot be read."""
+    try:
+        if path.is_dir():
+            raise ConfigError(f"{path}: is a folder, name the JSON file in it")
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not UTF-8 text, see its byte {error.start}") from None
+
+
+def decode(text: str, name: str) -> Any:
+    """Parse JSON, objects as Pairs. Raises ConfigError with line and column in the file ``name``."""
+    try:
+        return json.loads(text, object_pairs_hook=Pairs)
+    except json.JSONDecodeError as error:
+        place = f"{name}: line {error.lineno}, column {error.colno}"
+        raise ConfigError(f"{place}: not JSON: {error.msg}{_hint(text, error.pos)}") from None
+    except RecursionError:
+        raise ConfigError(f"{name}: nested too deeply") from None
+    except ValueError as error:  # a number of thousands of digits
+        raise ConfigError(f"{name}: not JSON: {error}") from None
+
+
+def _hint(text: str, position: int) -> str:
+    rest, before = text[position:].lstrip(), text[:position].rstrip()
+    if rest[:1] in ("}", "]") and before.endswith(","):
+        return "; leave out the comma before it"
+    if rest.startswith(("//", "/*", "#")):
+        return '; a comment is a key that starts with //, such as {"// why": "because"}'
+    return ""
+
+
+def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
+    """Make ``raw`` plain data: without comments; repeated keys and invalid values are problems."""
+    if isinstance(raw, dict):
+        raw = Pairs(raw.items())
+    if isinstance(raw, Pairs):
+        return _object(raw, notes, path)
+    if isinstance(raw, list):
+        return [plain(item, notes, (*path, index)) for index, item in enumerate(raw)]
+    if isinstance(raw, float) and not math.isfinite(raw):
+        notes.problem(path, f"must be a number, not {raw}")
+        return None
+    if isinstance(raw, str) and not _encodable(raw):
+        notes.problem(path, "holds half a character (a lone surrogate)")
+        return None
+    return raw
+
+
+def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[str, Any]:
+    data: dict[str, Any] = {}
+    for key, value in pairs:
+        if key.startswith("//"):
+            continue
+        if key in data:
+            notes.problem((*path, key), "occurs twice in one object, leave one of them")
+        data[key] = plain(value, notes, (*path, key))
+    return data
+
+
+def _encodable(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def inherit(raw: Any) -> Any:
+    """``raw`` with the root's log level and the common republish interval in every service, and merged instances."""
+    return _with_instances(deep_merge(_shared(raw), raw))
+
+
+def deep_merge(under: Any, over: Any) -> Any:
+    """``under`` updated by ``over``: objects key by key, all else whole. An empty string or null changes nothing."""
+    if over is None or over == "":
+        return under
+    if not isinstance(under, dict) or not isinstance(over, dict):
+        return over
+    merged = {key: deep_merge(under.get(key), value) for key, value in over.items()}
+    return merged | {key: value for key, value in under.items() if key not in over}  # problems follow the file's order
+
+
+def _shared(raw: Any) -> dict[str, Any]:
+    level = _at(raw, "log_level")
+    interval = _at(raw, "services", "defaults", _INTERVAL)
+    services = {name: {"log_level": level, _INTERVAL: interval} for name in _SERVICES}
+    services["launcher"]["capabilities"] = {"publish_interval_seconds": interval}
+    return {"services": services, "web_interface": {"log_level": level}}
+
+
+def _with_instances(raw: Any) -> Any:
+    serial = _at(raw, "services", "serial_mcu_bridge")
+    instances = _at(serial, "instances")
+    if not isinstance(instances, dict):
+        return raw
+    shared = {key: value for key, value in serial.items() if key != "instances"}
+    merged = {name: deep_merge(shared, own) for name, own in instances.items()}
+    return raw | {"services": raw["services"] | {"serial_mcu_bridge": shared | {"instances": merged}}}
+
+
+def _at(raw: Any, *keys: str) -> Any:
+    """The value at a path of keys; None where there is none, as for a key that is not set."""
+    for key in keys:
+        raw = raw.get(key) if isinstance(raw, dict) else None
+    return raw

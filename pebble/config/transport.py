@@ -1,0 +1,77 @@
+"""The config sections of connections: brokers, Zenoh endpoints, encryption."""
+
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, field
+
+from pebble.config.types import Endpoint, File, Password, Port, Section, Silence, doc
+
+
+class Tls(Section, frozen=True, kw_only=True):
+    """Encryption of one connection."""
+
+    enabled: Annotated[bool, doc("Encrypt the connection; otherwise the other keys have no effect.")] = False
+    ca_cert: Annotated[File | None, doc("Authority to trust; unset: those of the system.")] = None
+    client_cert: Annotated[File | None, doc("Certificate to show; needs client_key.")] = None
+    client_key: Annotated[File | None, doc("Private key of client_cert.")] = None
+    insecure: Annotated[bool, doc("Do not check that the certificate names the host.")] = False
+    ciphers: Annotated[str | None, doc("OpenSSL cipher list; unset: OpenSSL's own.")] = None
+
+
+class Mqtt(Section, frozen=True, kw_only=True):
+    """One MQTT broker."""
+
+    host: Annotated[str, doc("Name or address of the broker.")] = "127.0.0.1"
+    port: Annotated[Port, doc("TCP port of the broker.")] = 1883
+    keepalive: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=65535,
+            description="The broker closes a connection after 1.5 times as many seconds without a message; 0: never.",
+        ),
+    ] = 15
+    username: Annotated[str | None, doc("Login; unset: anonymous.")] = None
+    password: Annotated[Password | None, doc("The password itself; better one of the next two.")] = None
+    password_file: Annotated[File | None, doc("File that holds the password; a final newline is removed.")] = None
+    password_env: Annotated[str | None, doc("Environment variable that holds the password.")] = None
+    tls: Annotated[Tls, doc("Encryption.")] = Tls()
+    protocol: Annotated[Literal["3.1.1", "5"], doc("Version of MQTT to use.")] = "3.1.1"
+    silence_seconds: Annotated[
+        Silence, doc("A connection that does not answer for this many seconds is closed and opened again.")
+    ] = 2.0
+
+
+class RemoteMqtt(Mqtt, frozen=True, kw_only=True):
+    """The remote broker, which operators connect to."""
+
+    host: Annotated[str, doc("Name or address of the broker; required when the bridge is enabled.")] = ""
+
+
+class ZenohSection(Section, frozen=True, kw_only=True):
+    """Where a Zenoh session listens and connects, beyond the robot's own processes."""
+
+    listen: Annotated[tuple[Endpoint, ...], doc("Zenoh endpoints to listen on, for other machines.")] = ()
+    connect: Annotated[tuple[Endpoint, ...], doc("Zenoh endpoints to connect to.")] = ()
+    tls: Annotated[Tls, doc("Certificates for `tls/` and `quic/` endpoints.")] = Tls()
+    lease_ms: Annotated[
+        # Messages that a silent connection delays for less are delivered: at most 5 s, as types.Silence.
+        int, Meta(ge=100, le=5000, description="A Zenoh peer that is silent for this many milliseconds is gone.")
+    ] = 2000
+    settings: Annotated[dict[str, Any], doc("Settings of a third party's transport.")] = field(default_factory=dict)
+
+
+class TransportSection(ZenohSection, frozen=True, kw_only=True):
+    """The transport inside the robot."""
+
+    kind: Annotated[str, doc('"mqtt", "zenoh", or the name of a transport that another package offers.')]
+    run_dir: Annotated[File | None, doc("Folder of sockets and locks; unset: see above.")] = None
+    state_dir: Annotated[File | None, doc("Folder of what survives a power cut; unset: see above.")] = None
+    journal: Annotated[File | None, doc("File for a Zenoh robot's retained messages; unset: memory only.")] = None
+    mqtt_mirror: Annotated[Mqtt | None, doc("Zenoh robots only: offer all topics on this MQTT broker, too.")] = None
+
+
+class RemoteConnection(ZenohSection, frozen=True, kw_only=True):
+    """A connection to operators by another transport than MQTT."""
+
+    kind: Annotated[str, doc('"zenoh", or the name of a transport that another package offers.')]

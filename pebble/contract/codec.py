@@ -1,0 +1,223 @@
+"""Encodes and decodes payloads: JSON within limits, and the wrappers the contract accepts (paper A.4.5, A.8.2)."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+from msgspec import UNSET
+
+from pebble.contract import INCOMING, Channel
+from pebble.contract.payloads import (
+    LAST_RUN,
+    SCRIPT,
+    AutonomyCommand,
+    Drive,
+    EstopCommand,
+    MediaRequest,
+    SoundboardCommand,
+)
+from pebble.errors import PayloadError
+from pebble.motion.latch import stop_of
+
+MAX_COMMAND_BYTES = 64 * 1024
+MAX_DEPTH = 32
+
+_LONGEST_MS = 1e12  # of a command's validity; far beyond every watchdog
+_LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are invalid
+
+# Narrower than float(): that also takes "1_0", digits of other scripts and the names of NaN and infinity.
+_numeric = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII).fullmatch
+_encoder = msgspec.json.Encoder()
+_decoder = msgspec.json.Decoder()
+
+
+def encode(channel: Channel, value: Any) -> bytes:
+    """The wire form of ``value``: JSON, or the bytes themselves on binary channels."""
+    if channel.payload is bytes:
+        return bytes(value)
+    if channel.payload is bool:
+        return _encoder.encode({"value": value})
+    return _encoder.encode(value)
+
+
+def decode(channel: Channel, raw: bytes) -> Any:
+    """The payload struct (or bool, or bytes) in ``raw``. Raises PayloadError that describes the problem.
+
+    Commands may be bare or wrapped in ``{"value": …}``; boolean controls are ``true``, ``{"value": true}`` or
+    ``{"enabled": true}`` and nothing else.
+    """
+    if channel.payload is bytes:
+        return raw
+    if channel.payload is EstopCommand:
+        return _stop(channel, raw)
+    decoded = plain(channel, raw)
+    if channel.payload is bool:
+        return _boolean(channel, decoded)
+    if channel.direction == INCOMING:
+        decoded = _unwrap(channel, decoded)
+    try:
+        return msgspec.convert(decoded, channel.payload)
+    except (msgspec.ValidationError, ValueError, OverflowError) as error:
+        raise PayloadError(f"{channel.metric}: {error}") from None
+
+
+def plain(channel: Channel, raw: bytes) -> Any:
+    """The JSON value in ``raw``, of any shape. Raises PayloadError if it is invalid or beyond the limits."""
+    if channel.direction == INCOMING and len(raw) > MAX_COMMAND_BYTES:
+        raise PayloadError(f"{channel.metric}: {len(raw)} bytes, more than {MAX_COMMAND_BYTES}")
+    if too_deep(raw):
+        raise PayloadError(f"{channel.metric}: nested deeper than {MAX_DEPTH}")
+    try:
+        raw.decode()  # msgspec checks only the strings it keeps
+        return _decoder.decode(raw)
+    except UnicodeDecodeError:
+        raise PayloadError(f"{channel.metric}: not UTF-8") from None
+    except msgspec.DecodeError as error:
+        raise PayloadError(f"{channel.metric}: not JSON: {error}") from None
+
+
+def _stop(channel: Channel, raw: bytes) -> EstopCommand:
+    """What cannot be read is a stop without a name; only an empty payload, of a removed retained one, is none."""
+    if not raw:
+        raise PayloadError(f"{channel.metric}: empty")
+    try:
+        name, by, why = stop_of(plain(channel, raw))
+    except PayloadError:
+        return EstopCommand()
+    return EstopCommand(stop=name or UNSET, by=by, why=why)
+
+
+def too_deep(raw: bytes) -> bool:
+    """True if this JSON is nested deeper than MAX_DEPTH. Counts brackets outside strings, without parsing."""
+    if raw.count(b"[") + raw.count(b"{") <= MAX_DEPTH:
+        return False
+    depth = 0
+    in_string = escaped = False
+    for byte in raw:
+        if in_string:
+            if escaped:
+                escaped = False
+            elif byte == 0x5C:  # backslash
+                escaped = True
+            elif byte == 0x22:  # quote
+                in_string = False
+        elif byte == 0x22:
+            in_string = True
+        elif byte in b"[{":
+            depth += 1
+            if depth > MAX_DEPTH:
+                return True
+        elif byte in b"]}":
+            depth -= 1
+    return False
+
+
+def _boolean(channel: Channel, plain: Any) -> bool:
+    if isinstance(plain, bool):
+        return plain
+    if isinstance(plain, dict):
+        for key in ("value", "enabled"):
+            if isinstance(plain.get(key), bool):
+                return bool(plain[key])
+    raise PayloadError(f'{channel.metric}: only true, false, {{"value": bool}} or {{"enabled": bool}} switch it')
+
+
+def _unwrap(channel: Channel, plain: Any) -> Any:
+    """Commands: the object under ``value`` if there is one, else the root (paper A.4.5)."""
+    if channel.payload in (SoundboardCommand, AutonomyCommand):
+        return _switch(plain)
+    if channel.payload is MediaRequest:
+        return _request(channel, plain)
+    if not isinstance(plain, dict):
+        raise PayloadError(f"{channel.metric}: an object is needed, not {_name_of(plain)}")
+    inner = plain["value"] if isinstance(plain.get("value"), dict) else plain
+    return _drive(channel, inner) if channel.payload is Drive else inner
+
+
+def _switch(plain: Any) -> Any:
+    """Bare or wrapped, a boolean or an object; ``file`` may stay outside the wrapper (paper A.8.10)."""
+    if isinstance(plain, bool):
+        return {"enabled": plain}
+    if isinstance(plain, dict):
+        value = plain.get("value")
+        if isinstance(value, bool):
+            return {**plain, "enabled": value}
+        if isinstance(value, dict):
+            outer = {key: plain[key] for key in ("file",) if key in plain}
+            return {**outer, **value}
+    return plain
+
+
+def _request(channel: Channel, plain: Any) -> Any:
+    """A boolean control in any of its forms, with optional further fields."""
+    inner = plain["value"] if isinstance(plain, dict) and isinstance(plain.get("value"), dict) else plain
+    return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
+
+
+def _drive(channel: Channel, plain: dict[str, Any]) -> dict[str, Any]:
+    """Axes may be numeric strings; anything else that is no finite number is refused.
+
+    A wrong ``source``, ``run`` or ``valid_ms`` refuses a command that moves anything, but never a stop.
+    """
+    axes = {axis: _number(channel, axis, plain[axis]) for axis in ("x", "z", "y") if axis in plain}
+    moves = any(axes.values())
+    more = {key: plain[key] for key in _DRIVE_CHECKS if plain.get(key) is not None}
+    wrong = [key for key, value in more.items() if not _DRIVE_CHECKS[key][0](value)]
+    if moves and wrong:
+        raise PayloadError(f"{channel.metric}: {wrong[0]} is not {_DRIVE_CHECKS[wrong[0]][1]}")
+    if moves and more.get("source") == SCRIPT and "run" not in more:
+        raise PayloadError(f"{channel.metric}: run is missing, which a script's command needs")
+    if moves and "valid_ms" in more and more["valid_ms"] < 1:
+        raise PayloadError(f"{channel.metric}: valid_ms is less than 1, so it moves nothing")
+    more = {key: value for key, value in more.items() if key not in wrong}
+    if "valid_ms" in more:
+        more["valid_ms"] = int(more["valid_ms"])
+    return axes | more
+
+
+#: What a drive command may have besides its axes; null is the same as absent.
+_DRIVE_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "source": (lambda value: isinstance(value, str), "a string"),
+    "run": (lambda value: type(value) is int and 1 <= value <= LAST_RUN, f"an integer from 1 to {LAST_RUN}"),
+    "valid_ms": (lambda value: type(value) in (int, float) and 0 <= value < _LONGEST_MS, "a number of milliseconds"),
+}
+
+
+def _number(channel: Channel, name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise PayloadError(f"{channel.metric}: {name} is {_name_of(value)}, not a number")
+    if isinstance(value, str) and not _numeric(value):
+        raise PayloadError(f"{channel.metric}: {name} is not a number")
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        raise PayloadError(f"{channel.metric}: {name} is not a number") from None
+    if not math.isfinite(number):
+        raise PayloadError(f"{channel.metric}: {name} is not a finite number")
+    return number
+
+
+def _name_of(value: Any) -> str:
+    names = {dict: "an object", list: "an array", str: "a string", bool: "a boolean", type(None): "null"}
+    return names.get(type(value), "a number")
+
+
+def stamp_of(plain: Any) -> float | None:
+    """The time stamp of a JSON payload in epoch seconds: ``t`` in ms or ``timestamp`` in s, distinguished by size.
+
+    Readings of 1e11 and more are milliseconds, 1e9 and more are seconds (the readers' rule, paper A.4.2); else None.
+    """
+    if not isinstance(plain, dict):
+        return None
+    for key in ("t", "timestamp"):
+        value = plain.get(key)
+        if isinstance(value, int | float) and not isinstance(value, bool) and value < _LATEST_STAMP:
+            if value >= 1e11:
+                return value / 1000.0
+            if value >= 1e9:
+                return float(value)
+    return None

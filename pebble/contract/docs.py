@@ -1,0 +1,216 @@
+"""Writes docs/topics.md and docs/payloads.schema.json: ``python -m pebble.contract.docs [FOLDER]``."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from msgspec import NODEFAULT, UNSET, UnsetType
+from msgspec.structs import FieldInfo, fields
+
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind
+from pebble.contract.payloads import Payload
+from pebble.contract.schemas import schemas
+
+TOPICS, SCHEMAS = "topics.md", "payloads.schema.json"
+
+_INTRO = """\
+# Topics
+
+Generated from `pebble/contract/channels.py` by `python -m pebble.contract.docs`; edit the contract, not this file.
+
+A topic is `{system}/{type}/{id}/{direction}/{metric}`, for example `pebble/robots/goob/incoming/drive-values`.
+Direction is seen from the robot: it subscribes to `incoming` and publishes `outgoing`. Payloads are UTF-8 JSON
+unless they are called binary. Stamps are `t` in epoch milliseconds or `timestamp` in epoch seconds.
+The same as JSON Schema, for programs in other languages: `payloads.schema.json`.
+"""
+
+_ACCEPTED = """\
+## What is accepted
+
+* A command may be bare or wrapped: `{"x": 0.2, "z": 0.5}` and `{"value": {"x": 0.2, "z": 0.5}}` mean the same.
+* A boolean is `true`, `{"value": true}` or `{"enabled": true}`; numbers, strings and null switch nothing.
+* Drive values may be numeric strings; a missing axis is 0; everything is clamped to -1..1.
+* Refused, counted and logged: NaN and infinities in any spelling, wrong types, bytes that are not UTF-8, JSON nested
+  deeper than 32 levels, commands larger than 64 KB.
+* Unknown fields are ignored. A retained command or action is stale: it is neither executed nor forwarded.
+"""
+
+_JSON_TYPES = {Any: "any", NoneType: "null", bool: "boolean", int: "integer", float: "number", str: "string"}
+
+
+def topics_document() -> str:
+    """The whole of docs/topics.md."""
+    return "\n".join(
+        [
+            _INTRO,
+            "## Kinds\n",
+            _table(("kind", "direction", "QoS", "retained", "meaning"), map(_kind_row, Kind)),
+            *(section for direction in (INCOMING, OUTGOING) for section in _direction(direction)),
+            _ACCEPTED,
+            "## Payloads\n",
+            *map(_payload, _structs()),
+        ]
+    )
+
+
+def travels(channel: Channel) -> str:
+    """The direction in which the bridge forwards a channel (paper Table A.1)."""
+    if not channel.remote:
+        return "stays on the robot"
+    if not channel.bridged:
+        return "directly between its process and the remote broker"
+    if channel.direction == OUTGOING:
+        return "robot to remote"
+    if channel.kind in (Kind.FLAG, Kind.ACTION):
+        return "both ways"
+    return "remote to robot; back only with remote-mirror"
+
+
+def authority(channel: Channel) -> str:
+    """Which side is right when the two sides of the bridge differ."""
+    if channel.direction == OUTGOING:
+        return "robot"
+    if channel.kind is Kind.FLAG:
+        return "last change; after an outage the robot's own change, else the remote retained value"
+    return "operator, live only"
+
+
+def _kind_row(kind: Kind) -> tuple[str, ...]:
+    return (kind.name, kind.direction, str(kind.qos), _yes(kind.retain), kind.meaning)
+
+
+def _direction(direction: str) -> tuple[str, ...]:
+    channels = [channel for channel in CHANNELS if channel.direction == direction]
+    return (
+        f"## {direction.capitalize()}\n",
+        _table(("topic", "kind", "payload", "QoS", "retained", "rate", "what it is"), map(_meaning_row, channels)),
+        f"### {direction.capitalize()}: authority and forwarding\n",
+        _table(("topic", "authoritative", "forwarded", "renamed at (config)"), map(_travel_row, channels)),
+    )
+
+
+def _meaning_row(channel: Channel) -> tuple[str, ...]:
+    doc = channel.doc if channel.synonym_of is None else f"{channel.doc} Understood like `{channel.synonym_of}`."
+    return (
+        f"`{channel.suffix}`", channel.kind.name, _payload_name(channel), str(channel.default_qos),
+        _yes(channel.default_retain), rate(channel), doc,
+    )  # fmt: skip
+
+
+def _travel_row(channel: Channel) -> tuple[str, ...]:
+    override = channel.override
+    paths = () if override is None else (override.topic, override.qos, override.retain)
+    return (
+        f"`{channel.suffix}`",
+        authority(channel),
+        travels(channel),
+        "<br>".join(f"`{path}`" for path in paths if path is not None),
+    )
+
+
+def rate(channel: Channel) -> str:
+    """Nominal rate in words."""
+    if channel.rate_hz:
+        return f"{channel.rate_hz:g} Hz"
+    return {Kind.STATE: "on change", Kind.STREAM: "varies", Kind.FEED: "varies"}.get(channel.kind, "on demand")
+
+
+def payload_name(channel: Channel) -> str:
+    """``boolean``, ``binary``, or the name of the struct."""
+    return {bool: "boolean", bytes: "binary"}.get(channel.payload) or str(channel.payload.__name__)
+
+
+def _payload_name(channel: Channel) -> str:
+    name = payload_name(channel)
+    return name if channel.payload in (bool, bytes) else f"[{name}](#{name.lower()})"
+
+
+def _structs() -> list[type[Payload]]:
+    """The payload structs in the order of their channels, each followed by the structs inside it."""
+    found: dict[type[Payload], None] = {}
+    for channel in CHANNELS:
+        _collect(channel.payload, found)
+    return list(found)
+
+
+def _collect(kind: Any, found: dict[type[Payload], None]) -> None:
+    if isinstance(kind, type) and issubclass(kind, Payload) and kind not in found:
+        found[kind] = None
+        for member in get_type_hints(kind).values():
+            _collect(member, found)
+    for inner in get_args(kind):
+        _collect(inner, found)
+
+
+def _payload(struct: type[Payload]) -> str:
+    remarks = _remarks(struct)
+    kinds = get_type_hints(struct)
+    rows = [
+        (f"`{member.encode_name}`", _type_name(kinds[member.name]), _default(member), remarks.get(member.name, ""))
+        for member in fields(struct)
+    ]
+    doc = inspect.cleandoc(struct.__doc__).replace("``", "`") + "\n\n" if struct.__doc__ else ""
+    return f"### {struct.__name__}\n\n{doc}" + _table(("field", "type", "default", "remark"), rows)
+
+
+def _type_name(kind: Any) -> str:
+    """A field's type as a reader of JSON calls it; a field that may be absent shows it in its default."""
+    origin, inner = get_origin(kind), [one for one in get_args(kind) if one is not UnsetType]
+    if origin in (Union, UnionType):
+        return " or ".join(map(_type_name, inner))
+    if origin is Literal:
+        return " or ".join(f"`{json.dumps(value)}`" for value in inner)
+    if origin is list:
+        return f"array of {_type_name(inner[0])}"
+    if origin is tuple:
+        return f"[{', '.join(map(_type_name, inner))}]"
+    if origin is dict:
+        return "object"
+    return _JSON_TYPES.get(kind) or f"[{kind.__name__}](#{kind.__name__.lower()})"
+
+
+def _default(member: FieldInfo) -> str:
+    if member.required:
+        return "required"
+    value = member.default if member.default_factory is NODEFAULT else member.default_factory()
+    return "absent" if value is UNSET else f"`{json.dumps(value)}`"
+
+
+def _remarks(struct: type[Payload]) -> dict[str, str]:
+    """The comments behind the fields of payloads.py: units and meanings."""
+    sources = [inspect.getsource(base) for base in reversed(struct.__mro__) if issubclass(base, Payload)]
+    lines = [line for source in sources for line in source.splitlines()]
+    found = (re.match(r"    (\w+): [^#]*#\s*(.+)$", line) for line in lines)
+    return {match[1]: match[2] for match in found if match is not None}
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def documents() -> dict[str, str]:
+    """The generated files by name."""
+    return {TOPICS: topics_document(), SCHEMAS: json.dumps(schemas(), indent=2) + "\n"}
+
+
+def main(arguments: list[str]) -> None:
+    """Write both files into the given folder, or into docs/ of this checkout."""
+    folder = Path(arguments[0]) if arguments else Path(__file__).resolve().parents[2] / "docs"
+    for name, text in documents().items():
+        (folder / name).write_text(text)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,83 @@
+"""The identity of a component, three levels of a topic, and how topics are built and parsed."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+
+from msgspec import Struct
+
+from pebble.errors import ConfigError
+
+# ``/ + # $`` belong to MQTT; brokers close the connection on control characters and Unicode non-characters.
+_RESERVED = r"/+#$\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
+#: One level of a topic. The last group keeps Python's ``$`` from accepting a final newline; other dialects ignore it.
+LEVEL = rf"^[^{_RESERVED}]{{1,64}}$(?!\n)"
+LEVEL_RULE = "a topic level: 1 to 64 characters, without / + # $ and control characters"
+
+_valid_level = re.compile(LEVEL).search
+
+
+class Direction(StrEnum):
+    """Seen from the component: topics it subscribes to, and topics it publishes."""
+
+    INCOMING = "incoming"
+    OUTGOING = "outgoing"
+
+
+class Identity(Struct, frozen=True):
+    """``{system}/{type}/{id}`` of one component. Raises ConfigError for levels that no topic can hold.
+
+    Example: ``Identity("pebble", "robots", "goob").outgoing("online")`` is ``pebble/robots/goob/outgoing/online``.
+    """
+
+    system: str
+    type: str
+    id: str
+
+    def __post_init__(self) -> None:
+        wrong = [
+            f"robot.{name}: must be {LEVEL_RULE}, not {level!r}"
+            for name, level in (("system", self.system), ("type", self.type), ("id", self.id))
+            if not _valid_level(level)
+        ]
+        if wrong:
+            raise ConfigError(wrong)
+
+    def __str__(self) -> str:
+        return self.base
+
+    @property
+    def base(self) -> str:
+        """What all topics of this component begin with, without a final slash."""
+        return f"{self.system}/{self.type}/{self.id}"
+
+    def incoming(self, metric: str) -> str:
+        """A topic that this component subscribes to; ``metric`` may have several levels."""
+        return f"{self.base}/{Direction.INCOMING}/{metric}"
+
+    def outgoing(self, metric: str) -> str:
+        """A topic that this component publishes; ``metric`` may have several levels."""
+        return f"{self.base}/{Direction.OUTGOING}/{metric}"
+
+
+class ParsedTopic(Struct, frozen=True):
+    """The parts of a topic of the contract: identity, direction and metric (one or more levels)."""
+
+    identity: Identity
+    direction: Direction
+    metric: str
+
+    @property
+    def topic(self) -> str:
+        return f"{self.identity.base}/{self.direction}/{self.metric}"
+
+
+def parse_topic(topic: str) -> ParsedTopic | None:
+    """Parse ``topic``; None for topics that are not of the form ``{system}/{type}/{id}/{direction}/{metric}``."""
+    levels = topic.split("/", 4)
+    if len(levels) < 5 or levels[3] not in tuple(Direction) or not levels[4]:
+        return None
+    if not all(_valid_level(level) for level in levels[:3]):
+        return None
+    return ParsedTopic(Identity(*levels[:3]), Direction(levels[3]), levels[4])

@@ -1,0 +1,429 @@
+"""One frozen struct per payload of the contract, with the field names of the wire. Source: paper Appendix A.8.
+
+Unknown fields are tolerated, wrong types are not. Numbers are finite: NaN and infinity are refused.
+Values that the contract clamps are clamped when the struct is made, so no value is out of range.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from msgspec import UNSET, Meta, Struct, UnsetType, field
+from msgspec.structs import force_setattr
+
+
+class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
+    """Base of every JSON payload: refuses NaN and infinities in every number field."""
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"{name} is not a finite number")
+
+
+def _clamp(payload: Payload, low: float, high: float, *names: str) -> None:
+    for name in names:
+        force_setattr(payload, name, min(max(getattr(payload, name), low), high))
+
+
+# -- incoming
+
+
+SCRIPT = "autonomy"  # the source of a script's drive command; any other source is a person
+LAST_RUN = (1 << 30) - 1  # the largest integer for which MicroPython allocates no memory on a 32-bit board
+
+
+class Drive(Payload, frozen=True, kw_only=True):
+    """Wanted motion. Missing axes are 0; everything is clamped to -1..1 (paper A.8.3).
+
+    A script signs its commands with ``source`` and ``run``; ``valid_ms`` limits how long this command moves anything.
+    Fields that say nothing are not written: old sketches have 256 bytes for the topic and the payload.
+    """
+
+    x: float = 0.0  # steering, positive turns right
+    z: float = 0.0  # throttle, positive is forward
+    y: float = 0.0  # auxiliary axis, for example MiniLAMP's grousers
+    source: str | UnsetType = UNSET  # "autonomy" of a script; anything else counts as a person
+    run: Annotated[int, Meta(ge=1, le=LAST_RUN)] | UnsetType = UNSET  # of a script: below 2^30, grows with each start
+    valid_ms: Annotated[int, Meta(ge=0)] | UnsetType = UNSET  # of a zero, 0: the script must not resume
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _clamp(self, -1.0, 1.0, "x", "z", "y")
+
+    @property
+    def moves(self) -> bool:
+        """Whether any axis is not 0; a command without is called a zero."""
+        return self.x != 0.0 or self.z != 0.0 or self.y != 0.0
+
+    @property
+    def signed(self) -> bool:
+        """Whether it is a script's."""
+        return self.source == SCRIPT
+
+
+class EstopCommand(Payload, frozen=True, kw_only=True):
+    """An emergency stop. ``stop`` is its name: 16 hex digits, new for every press, the same in its repetitions."""
+
+    stop: str | UnsetType = UNSET
+    by: str | UnsetType = UNSET  # who stops, at most 32 ASCII characters
+    why: str | UnsetType = UNSET  # at most 40
+
+
+class EstopReset(Payload, frozen=True, kw_only=True):
+    """Ends the emergency stop of one motor owner, if both are those of its state now."""
+
+    boot: str
+    count: int
+    by: str | UnsetType = UNSET
+
+
+class LightsSolid(Payload, frozen=True, kw_only=True):
+    """A steady colour, each channel 0..1 (paper A.8.4)."""
+
+    b: float = 0.0
+    g: float = 0.0
+    r: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _clamp(self, 0.0, 1.0, "b", "g", "r")
+
+
+class LightsFlash(LightsSolid, frozen=True, kw_only=True):
+    """A colour that fades in and out once every ``period`` seconds (≥ 0.05)."""
+
+    period: float = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _clamp(self, 0.05, math.inf, "period")
+
+
+class SoundboardCommand(Payload, frozen=True, kw_only=True):
+    """Play or stop a clip (paper A.8.10); ``action`` wins over ``enabled``."""
+
+    action: str | None = None
+    enabled: bool | None = None
+    file: str | None = None
+
+
+class AutonomyCommand(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Start or stop one script (paper A.8.11)."""
+
+    action: str | None = None
+    enabled: bool | None = None
+    file: str | None = None
+    config: dict[str, Any] | None = None
+
+
+class MediaRequest(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """Start or stop remote video or audio; ``encoding`` None or unknown: as configured."""
+
+    enabled: bool
+    encoding: str | None = None
+    keyframe: bool = False  # request a full picture
+
+
+class OutletCommand(Payload, frozen=True, kw_only=True):
+    """Switch an outlet; only a JSON boolean switches anything."""
+
+    on: bool
+
+
+# -- outgoing
+
+
+class Heartbeat(Payload, frozen=True, kw_only=True):
+    """Sign of life; as the will it holds ``online: false`` (paper A.8.5)."""
+
+    t: int  # epoch milliseconds
+    online: bool | UnsetType = UNSET
+
+
+class ChargingStatus(Payload, frozen=True, kw_only=True):
+    """Whether the robot is on its charger; null: unknown."""
+
+    value: bool | None
+
+
+class ChargingLevel(Payload, frozen=True, kw_only=True):
+    """Battery voltage; some robots send per cent, without a unit."""
+
+    value: float
+    unit: str | UnsetType = "v"
+
+
+class TouchValues(Payload, frozen=True, kw_only=True):
+    """Three raw readings of the MCU's converter (hall sensors on Goob)."""
+
+    a0: int
+    a1: int
+    a2: int
+
+
+class TouchSensors(Payload, frozen=True, kw_only=True):
+    """Raw touch or hall readings."""
+
+    value: TouchValues
+    unit: str = "adc"
+
+
+class Capabilities(Payload, frozen=True, kw_only=True):
+    """What a robot can do, with the effective topics (paper A.8.6)."""
+
+    t: int  # epoch milliseconds
+    value: dict[str, Any]
+    schema: str = "pebble-capabilities/v1"
+
+
+class EstopState(Payload, frozen=True, kw_only=True):
+    """The emergency stop of one motor owner, at most 400 bytes; of a board 300."""
+
+    latched: bool  # it moves nothing until it is reset
+    boot: str  # random at each start of the owner
+    count: int  # of the stops since then
+    recent: list[str]  # names of the newest stops, the last one first: 8, of a board 4
+    by: str
+    why: str
+    since: int  # epoch milliseconds of the newest stop; 0: none
+    reset_refused: Literal["count", "boot", "old"] | None = None  # why the last reset was refused
+    persisted: bool | None = None  # whether this survives a power cut; None: the owner cannot save it
+    barred: int | UnsetType = UNSET  # no script's run up to this one moves anything
+
+
+class LogRecord(Payload, frozen=True, kw_only=True):
+    """One log line (paper A.8.7); ``message`` at most 2048 characters by default."""
+
+    t: int  # epoch milliseconds
+    level: str
+    service: str
+    message: str
+    logger: str = "root"
+    pid: int = 0
+
+
+class ServiceState(Payload, frozen=True, kw_only=True):
+    """The state of one service process, inside ``Status``."""
+
+    state: Literal["init", "ready", "restarting", "failed", "stopped"]
+    restarts: int = 0
+    last_exit: str | None = None  # for example "exit code 1" or "signal 9"
+
+
+class Status(Payload, frozen=True, kw_only=True):
+    """A robot's general state; robots carry ``services``, other components may put anything into ``value``."""
+
+    t: int | UnsetType = UNSET  # epoch milliseconds
+    value: dict[str, Any] = field(default_factory=dict)
+
+
+class MediaReport(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """The state of one stream (``camera``, ``microphone``) or one media program; other fields are absent."""
+
+    running: bool
+    doing: str | None = None  # for people: "h264 640x480, 10 fps, 212 kbit/s"
+    encoding: str | None = None
+    width: int | None = None  # of what is sent, or captured
+    height: int | None = None
+    rate: float | None = None  # frames or sound packets per second, over the last seconds
+    bitrate: int | None = None  # bits per second sent, over the last seconds
+    readers: int | None = None
+    fallbacks: int | None = None  # frames that were not sent through shared memory
+    dropped: int | None = None  # frames or packets dropped because a reader or the connection was too slow
+    restarts: int | None = None  # how often the device was opened again
+    reduced: str | None = None  # how it is adapted to a slow connection: "quality 6", "size 1/2", "rate 1/2"
+    last_error: str | None = None
+
+
+class MediaStatus(Payload, frozen=True, kw_only=True):
+    """Everything about pictures and sound: by stream and by program."""
+
+    t: int  # epoch milliseconds
+    value: dict[str, MediaReport]
+
+
+class Vector(Payload, frozen=True, kw_only=True):
+    x: float
+    y: float
+    z: float
+
+
+class Orientation(Payload, frozen=True, kw_only=True):
+    """Degrees."""
+
+    roll: float
+    pitch: float
+
+
+class ImuFastValues(Payload, frozen=True, kw_only=True):
+    accel_mps2: Vector
+    gyro_dps: Vector
+    temp_c: float
+    orientation_deg: Orientation
+
+
+class ImuFast(Payload, frozen=True, kw_only=True):
+    """Every sample of the inertial sensor; stays on the robot."""
+
+    t: int
+    seq: int
+    mcu_ms: int
+    value: ImuFastValues
+
+
+class ImuHealth(Payload, frozen=True, kw_only=True):
+    device: str
+    protocol: str
+    instance: str
+    samples_ok: int
+    samples_error: int
+    calibration_samples: int
+
+
+class ImuValues(ImuFastValues, frozen=True, kw_only=True):
+    accel_norm_g: float
+    gyro_bias_dps: Vector
+    health: ImuHealth
+
+
+class Imu(Payload, frozen=True, kw_only=True):
+    """The inertial sensor's summary for operators."""
+
+    t: int
+    seq: int
+    mcu_ms: int
+    value: ImuValues
+
+
+class McuManifest(Payload, frozen=True, kw_only=True):
+    """The interfaces of a self-describing MCU, as it reports them."""
+
+    protocol: str
+    schema_version: int
+    interface_count: int
+    schema_hash: str
+    device_uid: str
+    firmware_version: str
+    model: str
+    interfaces: list[dict[str, Any]]
+
+
+class McuSample(Payload, frozen=True, kw_only=True):
+    """One reading of a self-describing MCU's interface."""
+
+    t: int
+    seq: int
+    mcu_ms: int
+    device_uid: str
+    interface: str
+    profile: str
+    value: dict[str, Any]
+
+
+class SoundboardFiles(Payload, frozen=True, kw_only=True):
+    files: list[str]
+    timestamp: float  # epoch seconds
+    controls: bool = True
+
+
+class SoundboardStatus(Payload, frozen=True, kw_only=True):
+    playing: bool
+    timestamp: float  # epoch seconds
+    file: str | None = None
+    error: str | None = None
+    controls: bool = True
+
+
+class AutonomyFiles(Payload, frozen=True, kw_only=True):
+    files: list[dict[str, Any]]
+    timestamp: float  # epoch seconds
+    controls: bool = True
+
+
+class AutonomyDependency(Payload, frozen=True, kw_only=True):
+    file: str
+    pid: int | None
+    running: bool
+
+
+class AutonomyStatus(Payload, frozen=True, kw_only=True):
+    running: bool
+    timestamp: float  # epoch seconds
+    file: str | None = None
+    pid: int | None = None
+    dependencies: list[AutonomyDependency] = field(default_factory=list)
+    error: str | None = None
+    config: dict[str, Any] | None = None
+    controls: bool = True
+
+
+class WheelOdometry(Payload, frozen=True, kw_only=True):
+    """Dead reckoning from the wheels; the fields of ``value`` vary by producer (paper A.8.12)."""
+
+    value: dict[str, Any]
+    timestamp: float  # epoch seconds
+    unit: str = "mm"
+    source: str | UnsetType = UNSET
+
+
+Corners = list[tuple[float, float]]  # normalised 0..1
+
+
+class TagDetection(Payload, frozen=True, kw_only=True):
+    marker_id: int
+    corners_norm: Corners
+    center_norm: tuple[float, float]
+
+
+class TagLocations(Payload, frozen=True, kw_only=True):
+    """All AprilTags in one camera picture."""
+
+    source: str
+    detections: list[TagDetection]
+    frame_width: int
+    frame_height: int
+    timestamp: float  # epoch seconds
+
+
+class TagData(Payload, frozen=True, kw_only=True):
+    """The tag being followed; ``angle_rad`` is positive to the right."""
+
+    detected: bool
+    timestamp: float  # epoch seconds
+    marker_id: int | None = None
+    corners_norm: Corners | None = None
+    distance_m: float | None = None
+    angle_rad: float | None = None
+
+
+class OverlayLabel(Payload, frozen=True, kw_only=True):
+    marker_id: int
+    center_norm: tuple[float, float]
+
+
+class VideoOverlays(Payload, frozen=True, kw_only=True):
+    """Polylines and labels to draw over the picture."""
+
+    source: str
+    shapes: list[Corners]
+    frame_width: int
+    frame_height: int
+    timestamp: float  # epoch seconds
+    labels: list[OverlayLabel] = field(default_factory=list)
+
+
+class OutletStatus(Payload, frozen=True, kw_only=True):
+    """An outlet as its station reports it: ``value`` holds ``bound``, ``reachable`` and ``on``."""
+
+    value: dict[str, Any]
+    label: str | UnsetType = UNSET
+
+
+class AnyObject(Payload, frozen=True, kw_only=True):
+    """A payload whose fields other components define (ROS extras); only the stamp is common."""
+
+    t: int | UnsetType = UNSET
+    timestamp: float | UnsetType = UNSET

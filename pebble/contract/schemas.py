@@ -1,0 +1,42 @@
+"""JSON Schemas of every payload, generated from the contract, for programs in other languages.
+
+They define what to *send*; Pebble reads more leniently (numeric strings in drive values, a bare boolean for sounds).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from pebble.contract import CHANNELS, INCOMING, Channel
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_REF = "#/$defs/{name}"
+_BOOLEAN = {"type": "boolean"}
+
+
+def schemas() -> dict[str, Any]:
+    """One document: ``topics`` maps ``incoming/drive-values`` to its schema, ``$defs`` holds the structs.
+
+    Binary topics are absent. Limits that a schema cannot express (64 KB, 32 levels, NaN) are in docs/topics.md.
+    """
+    json_channels = [channel for channel in CHANNELS if channel.payload is not bytes]
+    structs = list(dict.fromkeys(channel.payload for channel in json_channels if channel.payload is not bool))
+    roots, definitions = msgspec.json.schema_components(structs, ref_template=_REF)
+    root_of = dict(zip(structs, roots, strict=True))
+    topics = {channel.suffix: _accepted(channel, root_of.get(channel.payload, _BOOLEAN)) for channel in json_channels}
+    return {"$schema": DIALECT, "title": "Pebble payloads", "topics": topics, "$defs": definitions}
+
+
+def _accepted(channel: Channel, root: dict[str, Any]) -> dict[str, Any]:
+    """Every accepted form: bare, and for incoming channels also wrapped."""
+    if channel.payload is bool:
+        return {"description": channel.doc, "anyOf": [root, _wrapped("value", root), _wrapped("enabled", root)]}
+    if channel.direction == INCOMING:
+        return {"description": channel.doc, "anyOf": [root, _wrapped("value", root)]}
+    return {"description": channel.doc, **root}
+
+
+def _wrapped(key: str, inner: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "properties": {key: inner}, "required": [key]}

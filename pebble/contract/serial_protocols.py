@@ -1,0 +1,40 @@
+"""The protocols of serial lines to MCUs, one row each: all that other programs know of them.
+
+A new protocol is a row here and the service that the row names. The row is kept apart from that service, because every
+process reads the config, and must not import the serial port's library for the names that it may contain.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+
+from msgspec import Struct
+
+_IMU_INSTANCE = "imu"
+
+
+class SerialProtocol(Struct, frozen=True):
+    """``service`` is the ``module:class`` that runs such a line, a subclass of SerialService."""
+
+    service: str
+    drives: bool = False  # has motors and lights: takes drive commands, is stopped when they end
+    is_imu: bool = False  # every such device is an inertial sensor
+    describes_itself: bool = False  # only its manifest says what the device is
+
+    def has_imu(self, instance: str) -> bool:
+        """Return whether the line of this name is known to have an inertial sensor before the device is connected."""
+        return self.is_imu or (self.describes_itself and instance == _IMU_INSTANCE)
+
+
+_BRIDGE = "pebble.services.serial_mcu_bridge"
+
+#: By the config's ``protocol``.
+SERIAL_PROTOCOLS: Final = {
+    "goob_base_v1": SerialProtocol(f"{_BRIDGE}.text.motor_bridge:MotorBridge", drives=True),
+    "imu_mpu6050_v1": SerialProtocol(f"{_BRIDGE}.text.imu_bridge:ImuBridge", is_imu=True),
+    "pebble_serial_v1": SerialProtocol(f"{_BRIDGE}.devices.described_bridge:DescribedBridge", describes_itself=True),
+}
+if TYPE_CHECKING:
+    SerialProtocolName: TypeAlias = str
+else:
+    SerialProtocolName = Literal[tuple(SERIAL_PROTOCOLS)]

@@ -1,0 +1,209 @@
+"""The brokers and simulated robots of the demo, in a temporary folder, and the order in which they start and end."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from pebble.demo.broker import Broker, BrokerKind
+from pebble.demo.programs import Program, end_all
+from pebble.simulation.mcu import Snapshot
+from pebble.simulation.trace import Entry
+
+ROBOTS = ("goob", "fred", "minilamp", "benjr")
+CAMERA_FPS = 15
+_ROBOTS_END_S, _REST_END_S = 2.5, 1.0  # with the operator's disconnect: every process ends within five seconds
+_LONGEST_FOLDER = 40  # characters: unix sockets live below, and their paths end at 108 bytes
+_MCU_START_S = 10.0
+_REPORTS = 600  # a minute of reports
+_ENTRIES = 5_000  # minutes of commands
+
+
+class SimulatedRobot(ABC):
+    """A robot on this machine. ``mcu_reports`` and ``entries()`` are what its MCU measured, independent of telemetry.
+
+    ``stop_s``: how long its wheels may turn after the last command, its own watchdog included.
+    """
+
+    runs_on: str
+    stop_s: float
+    has_media = has_imu = False
+
+    def __init__(self, name: str, folder: Path) -> None:
+        self.name, self._folder = name, folder / name
+        self._folder.mkdir()
+        self.mcu_reports: deque[Snapshot] = deque(maxlen=_REPORTS)
+        self.mcu: Program | None = None
+        self.imu: Program | None = None
+        self.launcher: Program | None = None
+        self._trace = self._folder / "trace.jsonl"
+        self._trace_read = 0
+        self._entries: deque[Entry] = deque(maxlen=_ENTRIES)
+
+    @abstractmethod
+    def start(self, ending: threading.Event) -> None:
+        """Start its processes. Raises PebbleError if its MCU does not start; the operator detects any later failure."""
+
+    @property
+    def programs(self) -> list[Program]:
+        """All processes of it that were started."""
+        return [program for program in (self.launcher, *self.mcus) if program is not None]
+
+    @property
+    def mcus(self) -> list[Program]:
+        """Its MCUs, which end after the processes that are connected to them."""
+        return [program for program in (self.mcu, self.imu) if program is not None]
+
+    def entries(self) -> list[Entry]:
+        """The lines that the MCU received and the changes of its motors, oldest first."""
+        with self._trace.open("rb") as file:
+            file.seek(self._trace_read)
+            new = file.read()
+        complete = new[: new.rfind(b"\n") + 1]
+        self._trace_read += len(complete)
+        self._entries.extend(msgspec.json.decode(line, type=Entry) for line in complete.splitlines())
+        return list(self._entries)
+
+    def _start_mcu(self, module: str, *options: str) -> Program:
+        command = [sys.executable, "-m", module, "--kind", self.name, "--trace", str(self._trace), "--report", *options]
+        mcu = Program(f"{self.name}'s MCU", command, self._folder / "mcu.log", reports=True)
+        threading.Thread(target=self._watch, args=(mcu,), name=f"reports of {self.name}", daemon=True).start()
+        return mcu
+
+    def _watch(self, mcu: Program) -> None:
+        for line in mcu.reports:
+            self.mcu_reports.append(msgspec.json.decode(line, type=Snapshot))
+
+
+class LinuxRobot(SimulatedRobot):
+    """Goob or Fred: the real launcher and services; camera, microphone and motor MCU are simulated."""
+
+    runs_on = "Linux, SAMD21"
+    stop_s = 0.85  # 0.75 s watchdog, and its resolution
+    has_media = True
+
+    def __init__(self, name: str, folder: Path, local_port: int, remote_port: int, *, has_imu: bool = False) -> None:
+        super().__init__(name, folder)
+        self.has_imu = has_imu
+        self._port, self._imu_port = self._folder / "mcu", self._folder / "imu"
+        self._config = self._folder / f"{name}.json"
+        self._config.write_text(json.dumps(self._relocated(local_port, remote_port), indent=2))
+
+    def start(self, ending: threading.Event) -> None:
+        """Start the MCU first, so that its port exists, then the robot."""
+        self.mcu = self._start_mcu("pebble.simulation.mcu", "--link", str(self._port))
+        self.mcu.wait_until(self._port.exists, _MCU_START_S, ending)
+        if self.has_imu:
+            command = [
+                sys.executable,
+                "-m",
+                "pebble.simulation.mcu",
+                "--kind",
+                "goob_imu",
+                "--link",
+                str(self._imu_port),
+            ]
+            self.imu = Program(f"{self.name}'s IMU", command, self._folder / "imu.log")
+            self.imu.wait_until(self._imu_port.exists, _MCU_START_S, ending)
+        command = [sys.executable, "-m", "pebble.cli", "up", str(self._config)]
+        self.launcher = Program(self.name, command, self._folder / "robot.log")
+
+    def _relocated(self, local_port: int, remote_port: int) -> dict[str, Any]:
+        """The robot's own config file, with only addresses and paths changed."""
+        text = (files("pebble") / "configs" / f"{self.name}.json").read_text()
+        config: dict[str, Any] = json.loads(text)
+        folders = {"run_dir": str(self._folder / "run"), "state_dir": str(self._folder / "state")}
+        config.setdefault("transport", {}).update(folders)
+        config["local_mqtt"] = {"host": "127.0.0.1", "port": local_port}
+        services = config["services"]
+        services["mqtt_bridge"]["remote_mqtt"] = {"host": "127.0.0.1", "port": remote_port}
+        services["serial_mcu_bridge"]["serial"]["port"] = str(self._port)
+        if self.has_imu:
+            services["serial_mcu_bridge"]["instances"]["imu"]["serial"]["port"] = str(self._imu_port)
+        services["av_daemon"] = {
+            "enabled": True,
+            "video": {"backend": "synthetic", "width": 640, "height": 480, "fps": CAMERA_FPS},
+            "audio": {"source": "synthetic"},
+        }
+        return config
+
+
+class McuRobot(SimulatedRobot):
+    """MiniLAMP or BenJr: the firmware's own files against simulated pins, with its own connection to the broker."""
+
+    stop_s = 1.0
+
+    def __init__(self, name: str, folder: Path, runs_on: str, remote_port: int) -> None:
+        super().__init__(name, folder)
+        self.runs_on, self._broker = runs_on, f"127.0.0.1:{remote_port}"
+
+    def start(self, ending: threading.Event) -> None:
+        self.mcu = self._start_mcu("pebble.simulation.networked", "--broker", self._broker)
+        self.mcu.wait_until(lambda: bool(self.mcu_reports), _MCU_START_S, ending)
+
+
+class Testbed:
+    """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU.
+
+    ``keep``: the folder with the logs stays after the demo.
+    """
+
+    def __init__(self, ending: threading.Event) -> None:
+        self.keep = True
+        self.folder = Path(tempfile.mkdtemp(prefix="pebble-demo-", dir=_temporary_folder()))
+        self.robots: Sequence[SimulatedRobot] = ()
+        self.remote_port = 0
+        self._ending = ending
+        self._brokers: list[Program] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """End the robots first, while the brokers that they report offline to still run."""
+        end_all((robot.launcher for robot in self.robots if robot.launcher is not None), _ROBOTS_END_S)
+        end_all((mcu for robot in self.robots for mcu in robot.mcus), _REST_END_S)
+        end_all(self._brokers, _REST_END_S)
+        if not self.keep:
+            shutil.rmtree(self.folder)
+
+    def start_brokers(self, kind: BrokerKind) -> None:
+        """Start the operators' remote broker and Fred's local one. Raises PebbleError if one fails."""
+        remote, local = (Broker(name, kind, self.folder) for name in ("remote-broker", "freds-broker"))
+        self._brokers = [remote.program, local.program]
+        for broker in (remote, local):
+            broker.wait(self._ending)
+        self.remote_port = remote.port
+        self.robots = [
+            LinuxRobot("goob", self.folder, local.port, remote.port, has_imu=True),
+            LinuxRobot("fred", self.folder, local.port, remote.port),
+            McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
+            McuRobot("benjr", self.folder, "ESP8266", remote.port),
+        ]
+
+    def start_robots(self) -> None:
+        """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
+        for robot in self.robots:
+            robot.start(self._ending)
+
+    def unexpected_exits(self) -> list[str]:
+        """The processes that should still run and do not."""
+        programs = [*self._brokers, *(program for robot in self.robots for program in robot.programs)]
+        return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
+
+
+def _temporary_folder() -> str:
+    usual = tempfile.gettempdir()
+    return usual if len(usual) <= _LONGEST_FOLDER else "/tmp"  # noqa: S108 - mkdtemp makes a 0700 folder in it

@@ -1,0 +1,87 @@
+"""Buffers events (QoS 1, not retained) during an outage, a bounded number of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pebble.transports import Message, State, Transport
+from pebble.transports.counters import Counters
+
+LIMIT = 256
+#: A dead connection accepts messages until its silence is detected (2 s by default). Events published so shortly before
+#: the loss are sent again: QoS 1 allows duplicates, and no loss.
+RESEND_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    at: float
+    message: Message
+
+
+class EventBuffer:
+    """Sends events in order; during an outage they wait, and the oldest is dropped when the buffer is full."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        counters: Counters,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        limit: int = LIMIT,
+    ) -> None:
+        self._transport, self._counters, self._clock, self._limit = transport, counters, clock, limit
+        self._lock = threading.Lock()
+        self._waiting: deque[Message] = deque()
+        self._recent: deque[_Sent] = deque(maxlen=limit)
+        self._lost_at: float | None = None  # when the connection was lost, until flush()
+
+    def watch(self, state: State) -> None:
+        """Follow the transport's state."""
+        if state is not State.CONNECTED and self._lost_at is None:
+            self._lost_at = self._clock()
+
+    def send(self, message: Message) -> None:
+        with self._lock:
+            self._append(message)
+            if self._lost_at is None or self._transport.state is not State.CONNECTED:
+                self._drain()  # Zenoh accepts messages while the hub is away
+
+    def hold(self, message: Message) -> None:
+        """Store ``message`` until the next :meth:`flush`."""
+        with self._lock:
+            self._append(message)
+
+    def flush(self) -> None:
+        """The connection is up (again): send what may have been lost with the last one, then what waits."""
+        with self._lock:
+            if self._lost_at is not None:
+                recent = [sent.message for sent in self._recent if 0 <= self._lost_at - sent.at <= RESEND_S]
+                waiting = recent + list(self._waiting)
+                self._counters.add("events_dropped", max(0, len(waiting) - self._limit))
+                self._waiting = deque(waiting[-self._limit :])
+                self._lost_at = None
+            self._recent.clear()
+            self._drain()
+
+    def clear(self) -> None:
+        with self._lock:
+            self._waiting.clear()
+            self._recent.clear()
+
+    def _append(self, message: Message) -> None:
+        self._waiting.append(message)
+        if len(self._waiting) > self._limit:
+            self._waiting.popleft()
+            self._counters.add("events_dropped")
+
+    def _drain(self) -> None:
+        while self._waiting:
+            message = self._waiting[0]
+            if not self._transport.publish(message.topic, message.payload, qos=message.qos):
+                return
+            self._recent.append(_Sent(self._clock(), self._waiting.popleft()))

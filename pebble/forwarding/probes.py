@@ -1,0 +1,49 @@
+"""Detects that two of a robot's connections lead to one broker: a probe sent on one arrives on the other. Pure.
+
+The bridge publishes probes on its remote side. For the mirror it also announces each on the robot's own transport,
+where clients of the mirrored broker can neither read nor publish it. So a probe that the mirror receives from both is
+the bridge's, and anything else on that topic is not.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections import deque
+from typing import Final
+
+from pebble.contract import BRIDGE_PROBE, codec
+
+_REMEMBERED = 64  # probes that may still arrive
+_MAX_BYTES = 256  # of a probe
+
+#: Published by the mirror on the robot's own transport: the bridge answers with a new probe.
+PROBE_REQUEST: Final = codec.encode(BRIDGE_PROBE, {"question": True})
+
+
+def new_probe(now_ms: int) -> bytes:
+    """A payload that no other client can have published before."""
+    return codec.encode(BRIDGE_PROBE, {"t": now_ms, "nonce": secrets.token_hex(8)})
+
+
+class Probes:
+    """Compares the probes that the bridge announces with those received from a broker, in either order."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._announced: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._seen: deque[bytes] = deque(maxlen=_REMEMBERED)
+
+    def announce(self, payload: bytes) -> bool:
+        """The bridge has announced ``payload``; returns whether the broker has sent it already."""
+        with self._lock:
+            self._announced.append(payload)
+            return payload in self._seen
+
+    def see(self, payload: bytes) -> bool:
+        """The broker has sent ``payload``; returns whether the bridge has announced it."""
+        if len(payload) > _MAX_BYTES:
+            return False
+        with self._lock:
+            self._seen.append(payload)
+            return payload in self._announced

@@ -1,0 +1,132 @@
+"""Decides which value of a retained topic counts if both sides may publish it (a flag). Pure.
+
+The rules:
+
+1. A live message always counts, whichever side publishes it.
+2. A retained message that a subscription brings counts only where nothing else is known. At a reconnect the *winner*
+   side is right. Retained messages of the other side fill what the winner does not have; they are held back until the
+   winner's have arrived.
+3. A side that lost a value receives it again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from pebble.forwarding.routing import Side
+
+TOPICS = 4096  # remembered; beyond it the oldest is dropped
+
+
+class Resolution(Enum):
+    PASS = "publish it to the other side"  # noqa: S105  (no password)
+    KNOWN = "nothing new"
+    HOLD = "wait for the winner"
+    CORRECT = "publish the right value to the sender"
+    OVERTAKEN = "changed on the other side while this one was away"
+
+
+@dataclass(frozen=True, slots=True)
+class LastValue:
+    """The newest value of a topic, and the side that published it."""
+
+    payload: bytes
+    side: Side
+
+
+class Reconciliation:
+    """The state of all retained topics that both sides may publish."""
+
+    def __init__(self, winner: Side) -> None:
+        self._winner = winner
+        self._last: dict[str, LastValue] = {}
+        self._held: dict[str, bytes] = {}  # retained values of the other side, until the winner's have arrived
+        self._published: dict[Side, dict[str, bytes]] = {side: {} for side in Side}
+        self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
+        self._synchronized = dict.fromkeys(Side, False)
+        self._overtaken: set[str] = set()  # changed by the loser while the winner was away
+
+    @property
+    def synchronized(self) -> bool:
+        """Whether the retained messages of both sides have arrived."""
+        return all(self._synchronized.values())
+
+    def value(self, topic: str) -> bytes | None:
+        """The newest value; None if there is none."""
+        last = self._last.get(topic)
+        return None if last is None else last.payload
+
+    def begin(self, side: Side) -> None:
+        """The connection of ``side`` was lost, or is new: its retained messages will arrive again."""
+        self._received[side].clear()
+        self._synchronized[side] = False
+
+    def has_received(self, side: Side, topic: str) -> bool:
+        """Whether ``side`` has published on ``topic`` since its connection began."""
+        return topic in self._received[side]
+
+    def receive(
+        self, side: Side, topic: str, payload: bytes, *, retained: bool, other_away: bool = False
+    ) -> Resolution:
+        """``side`` published ``payload``; ``retained``: a subscription brought it, it may be old."""
+        if len(self._received[side]) < TOPICS:
+            self._received[side].add(topic)
+        resolution = self._resolve_retained(side, topic, payload) if retained else Resolution.PASS
+        if resolution is Resolution.HOLD:
+            if topic in self._held or len(self._held) < TOPICS:
+                self._held[topic] = payload
+        elif resolution is Resolution.PASS:
+            self._held.pop(topic, None)
+            if side is self._winner:
+                self._overtaken.discard(topic)
+            elif other_away and len(self._overtaken) < TOPICS:
+                self._overtaken.add(topic)
+            self._remember(topic, LastValue(payload, side))
+        return resolution
+
+    def note_published(self, side: Side, topic: str, payload: bytes) -> None:
+        """``payload`` was forwarded to ``side``."""
+        self._published[side][topic] = payload
+
+    def synchronize(self, side: Side) -> list[tuple[Side, str, bytes]]:
+        """The retained messages of ``side`` have arrived: returns what is to be published now, and to which side."""
+        self._synchronized[side] = True
+        due: list[tuple[Side, str, bytes]] = []
+        if side is self._winner:
+            self._overtaken.clear()
+            for topic, payload in self._held.items():
+                self._remember(topic, LastValue(payload, side.other))
+                due.append((side, topic, payload))
+            self._held.clear()
+        fresh = {topic for _, topic, _ in due}
+        due += [
+            (side, topic, last.payload)
+            for topic, last in self._last.items()
+            if topic not in fresh and self._is_missing(side, topic, last)
+        ]
+        return due
+
+    def _resolve_retained(self, side: Side, topic: str, payload: bytes) -> Resolution:
+        last = self._last.get(topic)
+        if side is self._winner:
+            if topic in self._overtaken:
+                return Resolution.OVERTAKEN
+            return Resolution.KNOWN if last is not None and last.payload == payload else Resolution.PASS
+        if last is None:
+            return Resolution.PASS if self._synchronized[self._winner] else Resolution.HOLD
+        if last.payload == payload:
+            return Resolution.KNOWN
+        return Resolution.CORRECT if last.side is self._winner else Resolution.PASS
+
+    def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
+        """Whether ``side`` lacks the newest value; it lacks no removal of what it never received."""
+        return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload
+
+    def _remember(self, topic: str, last: LastValue) -> None:
+        if topic not in self._last and len(self._last) >= TOPICS:
+            oldest = next(iter(self._last))
+            del self._last[oldest]
+            for published in self._published.values():
+                published.pop(oldest, None)
+        self._last[topic] = last

@@ -1,0 +1,102 @@
+"""Messages from the launcher to its announcer process, over a socket pair on which neither side waits."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Literal
+
+import msgspec
+
+from pebble.launcher.reactor import Reactor
+from pebble.runtime.timers import Timer
+from pebble.transports import Message
+
+ENVELOPE_LIMIT = 65_536  # bytes; longer ones are dropped
+_RETRY_S = 0.1  # until the next attempt, when the socket had no room for a state
+
+Kind = Literal["will", "state", "record"]
+
+
+class Envelope(msgspec.Struct, frozen=True, array_like=True):
+    """The will comes first; a state is published again on every new connection, a record only once."""
+
+    kind: Kind
+    message: Message
+
+
+class AnnouncerPipe:
+    """The launcher's end. Records that the socket has no room for are dropped and counted; states are sent later.
+
+    The kernel's buffer is the bound: some hundred log records that an announcer has not read yet.
+    """
+
+    def __init__(self, reactor: Reactor) -> None:
+        self.dropped = 0  # records
+        self._reactor = reactor
+        self._retry: Timer | None = None
+        self._states: dict[str, Message] = {}
+        self._unsent: dict[str, Message] = {}  # states that the present announcer has not received
+        self._socket: socket.socket | None = None
+
+    def connect(self, will: Message) -> int:
+        """Send the will and all states to a new announcer; returns its end of the socket, which the caller closes."""
+        self.close()
+        self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.setblocking(False)
+        self._send("will", will)
+        self._unsent = dict(self._states)
+        self._send_states()
+        return other.detach()
+
+    def state(self, message: Message) -> None:
+        """Send the newest value of its topic."""
+        self._states[message.topic] = self._unsent[message.topic] = message
+        self._send_states()
+
+    def record(self, message: Message) -> None:
+        """Send a message that only counts now. States go first."""
+        if not (self._send_states() and self._send("record", message)):
+            self.dropped += 1
+
+    def close(self) -> None:
+        """The announcer reads the end of the stream."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _send_states(self) -> bool:
+        """Send what is unsent; False, and another attempt later, if there is no room."""
+        for topic in list(self._unsent):
+            if not self._send("state", self._unsent[topic]):
+                self._retry_later()
+                return False
+            del self._unsent[topic]
+        return True
+
+    def _retry_later(self) -> None:
+        if self._socket is not None and self._retry is None:
+            self._retry = self._reactor.after(_RETRY_S, self._retry_now)
+
+    def _retry_now(self) -> None:
+        self._retry = None
+        self._send_states()
+
+    def _send(self, kind: Kind, message: Message) -> bool:
+        raw = msgspec.msgpack.encode(Envelope(kind, message))
+        if self._socket is None or len(raw) > ENVELOPE_LIMIT:
+            return False
+        try:
+            self._socket.send(raw)
+        except BlockingIOError:
+            return False
+        except OSError:  # the announcer has ended; there will be another
+            self.close()
+            return False
+        return True
+
+
+def next_envelope(descriptor: int) -> Envelope | None:
+    """The announcer's end: the next envelope, None at the end. Raises BlockingIOError, DecodeError."""
+    raw = os.read(descriptor, ENVELOPE_LIMIT)
+    return msgspec.msgpack.decode(raw, type=Envelope) if raw else None

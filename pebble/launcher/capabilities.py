@@ -1,0 +1,152 @@
+"""What a robot offers, with effective topics, from its config (paper A.8.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from pebble import contract as c
+from pebble.config import Config, SystemControl
+from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+from pebble.media import pyav
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.process import view_of
+
+#: Sounds and scripts: their topics are fixed, their services arrive in a later release.
+_LATER = {"available": False, "controls": False}
+
+
+def capabilities(config: Config, addresses: Addresses, lacking: Collection[str] = ()) -> dict[str, Any]:
+    """The ``value`` of a capabilities message: ``available`` is what exists, ``controls`` what takes commands.
+
+    ``lacking`` names what its processes cannot provide at present: ``estop``.
+    """
+    return {
+        "identity": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
+        "transport": {"kind": config.transport.kind},
+        "video": _video(config, addresses),
+        "audio": _audio(config, addresses),
+        "soundboard": _LATER | _topics(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
+        "autonomy": _LATER | _topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
+        "system": _system(config, addresses),
+        **_motor(config, addresses, lacking),
+    }
+
+
+def _video(config: Config, addresses: Addresses) -> dict[str, Any]:
+    sent, captured = config.services.mqtt_bridge.media.video_publisher, config.services.av_daemon.video
+    offered = _offered(config, captured.enabled)
+    if "video_stream" in config.on_demand_programs():
+        offered = {"available": True, "controls": True}
+    return {
+        **offered,
+        "topic": addresses[c.CAMERA].topic,
+        "command_topic": addresses[c.VIDEO_CONTROL].topic,
+        "flag_topic": addresses[c.MQTT_VIDEO].topic,
+        "overlays_topic": addresses[c.VIDEO_OVERLAYS].topic,
+        "width": _first(sent.publish_width, sent.width, captured.width),
+        "height": _first(sent.publish_height, sent.height, captured.height),
+        "fps": _first(sent.publish_fps, sent.target_fps, sent.fps, captured.fps),
+        "encoding": sent.encoding,
+        "encodings": list(pyav.available(ALL_VIDEO)),
+    }
+
+
+def _audio(config: Config, addresses: Addresses) -> dict[str, Any]:
+    sent, captured = config.services.mqtt_bridge.media.audio_publisher, config.services.av_daemon.audio
+    return {
+        **_offered(config, captured.enabled),
+        "topic": addresses[c.AUDIO].topic,
+        "uplink_topic": addresses[c.AUDIO_STREAM].topic,
+        "command_topic": addresses[c.AUDIO_CONTROL].topic,
+        "flag_topic": addresses[c.MQTT_AUDIO].topic,
+        "rate": _first(sent.rate, captured.rate),
+        "channels": _first(sent.channels, captured.channels),
+        "encoding": sent.encoding,
+        "encodings": list(pyav.available(ALL_SOUND)),
+    }
+
+
+def _offered(config: Config, captured: bool) -> dict[str, bool]:
+    """The bridge requests the programs that send it; without a bridge there are no requests."""
+    available = config.services.av_daemon.enabled and captured
+    return {"available": available, "controls": available and config.services.mqtt_bridge.enabled}
+
+
+def _topics(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> dict[str, Any]:
+    return {
+        "command_topic": addresses[command].topic,
+        "files_topic": addresses[files].topic,
+        "status_topic": addresses[status].topic,
+    }
+
+
+def _system(config: Config, addresses: Addresses) -> dict[str, Any]:
+    bridge = config.services.mqtt_bridge
+
+    def entry(control: SystemControl, channel: c.Channel) -> dict[str, Any]:
+        controls = bridge.enabled and bool(control.command)
+        return {"available": True, "controls": controls, "flag_topic": addresses[channel].topic}
+
+    return {
+        "reboot": entry(bridge.reboot_control, c.REBOOT),
+        "service_restart": entry(bridge.service_restart_control, c.SERVICE_RESTART),
+        "git_pull": entry(bridge.git_pull_control, c.GIT_PULL),
+    }
+
+
+def _motor(config: Config, addresses: Addresses, lacking: Collection[str]) -> dict[str, Any]:
+    """Drive, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
+    lines = {name: line for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].drives}
+    present = bool(lines)
+    name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
+    if name:
+        addresses = Addresses(view_of(config, name))
+    return {
+        "drive": {
+            "available": present,
+            "controls": present,
+            "topic": addresses[c.DRIVE].topic,
+            **({"arbitrates": True} if present else {}),
+        },
+        "estop": _estop(config, [] if "estop" in lacking else list(lines)),
+        "lights": {
+            "solid": present,
+            "flash": present,
+            "solid_topic": addresses[c.LIGHTS_SOLID].topic,
+            "flash_topic": addresses[c.LIGHTS_FLASH].topic,
+        },
+        "telemetry": {
+            "touch_sensors": present and line.telemetry.publish_touch_sensors,
+            "charging_status": present,
+            "touch_topic": addresses[c.TOUCH_SENSORS].topic,
+            "charging_topic": addresses[c.CHARGING_STATUS].topic,
+            "charging_level_topic": addresses[c.CHARGING_LEVEL].topic,
+            **_imu(config),
+        },
+    }
+
+
+def _estop(config: Config, instances: list[str]) -> dict[str, Any]:
+    """Where to stop the robot, and who then reports it as stopped. If one owner lacks the stop, the robot does."""
+    owners = [config.motor_owner(instance) for instance in instances]
+    return {
+        "available": bool(owners),
+        "topic": c.ESTOP.topic(config.base),
+        "reset_topic": c.ESTOP_RESET.topic(config.base),
+        "owners": owners,
+        "status_topics": [c.ESTOP_STATE.topic(config.base, owner=owner) for owner in owners],
+    }
+
+
+def _imu(config: Config) -> dict[str, Any]:
+    """An inertial sensor, known by its line's protocol or name; a self-describing MCU's manifest comes later."""
+    lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
+    addresses = Addresses(view_of(config, lines[0]) if lines else config)
+    return {"imu": bool(lines), "imu_topic": addresses[c.IMU].topic}
+
+
+def _first(*values: float | None) -> float | None:
+    """The first that was set: 0 is a value."""
+    return next((value for value in values if value is not None), None)

@@ -1,0 +1,258 @@
+"""Supervises one program of the robot: starts it, reads its pipes, restarts it and stops it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from enum import Enum, auto
+
+from pebble.launcher.child import Child, read_available
+from pebble.launcher.log_forwarding import LINE_LIMIT, text_of
+from pebble.launcher.programs import Program
+from pebble.launcher.reactor import Reactor
+from pebble.launcher.restart_policy import LOOP_EXITS, LOOP_WINDOW_S, RestartPolicy
+from pebble.runtime.lines import LineSplitter
+from pebble.runtime.timers import Timer
+
+_LAST_READS = 16  # 64 KiB each, of what a child left in its pipe when it died
+
+log = logging.getLogger(__name__)
+
+
+class State(Enum):
+    """What the program does, and with it what the supervisor's one timer is for."""
+
+    IDLE = auto()  # no child; started by request() or start()
+    WAITING = auto()  # no child; the timer starts one
+    RUNNING = auto()  # the timer checks for signs of life
+    STUCK = auto()  # killed because there was none; started again after its exit
+    RELEASED = auto()  # asked to end because it is not needed; the timer kills it; IDLE after its exit
+    REPLACED = auto()  # as RELEASED, and requested again since: started again after its exit
+    STOPPING = auto()  # asked to end for good
+    STOPPED = auto()  # no child, and never another
+
+
+_ACTIVE = (State.WAITING, State.RUNNING, State.STUCK, State.REPLACED)
+
+
+class ProcessSupervisor:
+    """One program, its restart policy and its present child. All methods belong to the reactor's thread.
+
+    An on-demand program is started by :meth:`request`, any other by :meth:`start`. ``on_line(pid, line)`` gets the
+    child's output, ``on_note(line)`` its notes other than READY and ALIVE; ``on_change()`` is called when the state
+    that is reported may have changed, ``on_end()`` whenever a child has ended.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        policy: RestartPolicy,
+        reactor: Reactor,
+        *,
+        spawn: Callable[[Program], Child],
+        on_line: Callable[[int, str], None],
+        on_note: Callable[[str], None],
+        on_change: Callable[[], None],
+        on_end: Callable[[], None],
+    ) -> None:
+        self.program, self.policy = program, policy
+        self.state = State.IDLE
+        self.shown = not program.on_demand  # in the robot's status: on-demand programs from their first request on
+        self._reactor, self._spawn = reactor, spawn
+        self._on_line, self._on_note, self._on_change, self._on_end = on_line, on_note, on_change, on_end
+        self._child: Child | None = None
+        self._lines, self._notes = _splitter(), _splitter()
+        self._timer: Timer | None = None
+
+    @property
+    def running(self) -> bool:
+        """True from the start of a child until its exit."""
+        return self._child is not None
+
+    @property
+    def requested(self) -> bool:
+        """True if an on-demand program is to run."""
+        return self.state in _ACTIVE
+
+    def request(self) -> None:
+        """Run an on-demand program: now, or as soon as its child that is being stopped has ended."""
+        if self.state not in (State.IDLE, State.RELEASED):
+            return
+        log.info("%s is requested", self.program.name)
+        self.shown = True
+        if self.state is State.RELEASED:
+            self.state = State.REPLACED
+        else:
+            self._start_after_request()
+
+    def release(self) -> None:
+        """Ask an on-demand program to end, and kill it if it does not; returns at once."""
+        if self.state not in _ACTIVE:
+            return
+        log.info("%s is released", self.program.name)
+        if self.state is State.REPLACED:
+            self.state = State.RELEASED
+            return
+        self._end_child(State.RELEASED, State.IDLE)
+        if self._child is not None:
+            self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
+
+    def start(self) -> None:
+        self._lines, self._notes = _splitter(), _splitter()
+        self.policy.started(time.monotonic())
+        try:
+            self._child = child = self._spawn(self.program)
+        except OSError as error:
+            self._restart(f"could not start: {error}")
+            return
+        self.state = State.RUNNING
+        self._reactor.watch(child.output, lambda: self._read_output(child))
+        self._reactor.watch(child.notes, lambda: self._read_notes(child))
+        self._reactor.watch(child.exited, lambda: self._exited(child))
+        self._check_at(self.policy.stuck_at)
+        self._on_change()
+
+    def stop(self) -> None:
+        """Ask the child to end, and start no other."""
+        self._end_child(State.STOPPING, State.STOPPED)
+
+    def kill(self) -> None:
+        """Kill the child. The reactor notices its exit like any other."""
+        if self._child is not None:
+            self._child.kill()
+
+    # -- reading the child's pipes
+
+    def _read_output(self, child: Child) -> None:
+        data = read_available(child.output)
+        if data == b"":
+            self._reactor.forget(child.output)  # it closed its stderr, or has ended
+        elif data is not None:
+            self._forward(child, self._lines.feed(data))
+
+    def _read_notes(self, child: Child) -> None:
+        data = read_available(child.notes)
+        if data == b"":
+            self._reactor.forget(child.notes)
+        elif data is not None:
+            self._handle_notes(data)
+
+    def _handle_notes(self, data: bytes) -> None:
+        for line in map(text_of, self._notes.feed(data)):
+            if line == "ALIVE":
+                self.policy.alive(time.monotonic())
+            elif line == "READY":
+                self._ready()
+            elif line:
+                self._on_note(line)
+
+    def _ready(self) -> None:
+        if self.state is not State.RUNNING:  # too late
+            return
+        self.policy.ready(time.monotonic())
+        self._check_at(self.policy.stuck_at)  # from now on signs of life come more often
+        self._on_change()
+
+    def _forward(self, child: Child, lines: list[bytes]) -> None:
+        for text in map(text_of, lines):
+            if text:
+                self._on_line(child.pid, text)
+
+    # -- the timer
+
+    def _start_after_request(self) -> None:
+        wait_s = self.policy.request_delay_s(time.monotonic())
+        if wait_s > 0:
+            self._start_in(wait_s)
+        else:
+            self.start()
+
+    def _start_in(self, wait_s: float) -> None:
+        self.state = State.WAITING
+        self._timer = self._reactor.after(wait_s, self.start)
+
+    def _check_at(self, due: float) -> None:
+        self._cancel_timer()
+        self._timer = self._reactor.at(due, self._check_alive)
+
+    def _check_alive(self) -> None:
+        if time.monotonic() < self.policy.stuck_at:
+            self._check_at(self.policy.stuck_at)
+            return
+        log.error("%s gives no sign of life: killed", self.program.name)
+        self.state = State.STUCK
+        self.kill()
+
+    def _kill_overdue(self) -> None:
+        log.warning("%s did not stop within %g s: killed", self.program.name, self.program.stop_timeout_s)
+        self.kill()
+
+    def _cancel_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    # -- the end of a child
+
+    def _end_child(self, ending: State, ended: State) -> None:
+        """Ask the child to end. The state is ``ending``, or already ``ended`` if there is none."""
+        self._cancel_timer()
+        if self._child is not None:
+            self.state = ending
+            self._child.terminate()
+        else:
+            self.state = ended
+            self.policy.stopped(None)
+            self._on_change()
+
+    def _exited(self, child: Child) -> None:
+        child.kill()  # what it started must not go on without it; until it is reaped the group's number is its own
+        self._read_rest(child)
+        for descriptor in (child.output, child.notes, child.exited):
+            with suppress(KeyError):  # already forgotten at end of file
+                self._reactor.forget(descriptor)
+        how = child.end()
+        self._child = None
+        self._cancel_timer()
+        if self.state in (State.RUNNING, State.STUCK):
+            self._restart("stuck, killed" if self.state is State.STUCK else how)
+        else:
+            self._ended_as_asked(how)
+        self._on_end()
+
+    def _ended_as_asked(self, how: str) -> None:
+        again = self.state is State.REPLACED
+        self.state = State.STOPPED if self.state is State.STOPPING else State.IDLE
+        self.policy.stopped(how)
+        self._on_change()
+        if again:
+            self._start_after_request()
+
+    def _read_rest(self, child: Child) -> None:
+        self._handle_notes(read_available(child.notes) or b"")
+        for _ in range(_LAST_READS):
+            data = read_available(child.output)
+            if not data:
+                break
+            self._forward(child, self._lines.feed(data))
+        self._forward(child, [self._lines.rest()])
+
+    def _restart(self, how: str) -> None:
+        was_in_crash_loop = self.policy.in_crash_loop
+        wait_s = self.policy.exited(time.monotonic(), how)
+        self._start_in(wait_s)
+        name = self.program.name
+        if not self.policy.in_crash_loop:
+            log.warning("%s ended (%s): starting it again in %.1f s", name, how, wait_s)
+        elif not was_in_crash_loop:
+            log.error(
+                "%s ended %d times within %d s, last: %s. Trying again every %d s",
+                name, LOOP_EXITS, LOOP_WINDOW_S, how, wait_s,
+            )  # fmt: skip
+        self._on_change()
+
+
+def _splitter() -> LineSplitter:
+    return LineSplitter(LINE_LIMIT, truncate=True)

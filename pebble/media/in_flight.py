@@ -1,0 +1,53 @@
+"""What a connection has accepted and the other side has not acknowledged, by byte counts alone. Pure: times come in."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+
+class Sent(NamedTuple):
+    size: int  # bytes on the wire
+    at: float  # seconds
+
+
+class InFlight:
+    """The unacknowledged messages of one connection, oldest first; ``limit`` bounds how many are remembered.
+
+    TCP acknowledges bytes in order. Of the unacknowledged bytes the newest message has up to its size, the one before
+    it the next, and so on: a message is acknowledged when none are left for it. ``slack`` bytes of pings and headers
+    may be unacknowledged although the message before them is not.
+    """
+
+    def __init__(self, slack: int, limit: int | None = None) -> None:
+        self._slack = slack
+        self._messages: deque[Sent] = deque(maxlen=limit)
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @property
+    def oldest(self) -> Sent | None:
+        return self._messages[0] if self._messages else None
+
+    def sent(self, size: int, now: float) -> None:
+        self._messages.append(Sent(size, now))
+
+    def acknowledge(self, waiting: int) -> list[Sent]:
+        """Remove and return the acknowledged messages, while ``waiting`` bytes are unacknowledged."""
+        acknowledged = []
+        newer = sum(message.size for message in self._messages)
+        while self._messages:
+            newer -= self._messages[0].size
+            if waiting > newer + self._slack:
+                break
+            acknowledged.append(self._messages.popleft())
+        return acknowledged
+
+    def age_s(self, now: float) -> float:
+        """Seconds since the oldest message was sent; 0 without one."""
+        return now - self._messages[0].at if self._messages else 0.0
+
+    def clear(self) -> None:
+        """The connection is lost, and all messages with it."""
+        self._messages.clear()

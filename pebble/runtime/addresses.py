@@ -1,0 +1,64 @@
+"""The topic, QoS and retain flag that one robot uses for each channel, after its config (paper Table A.6)."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any, NamedTuple
+
+from pebble.config import Config
+from pebble.contract import CHANNELS, Channel, Override, channel_of
+
+
+class Address(NamedTuple):
+    """The effective topic and delivery of a channel."""
+
+    topic: str  # of a pattern channel: a filter
+    qos: int
+    retain: bool
+
+
+class Addresses:
+    """Looks up the address of a channel, and the channel of a topic."""
+
+    def __init__(self, config: Config) -> None:
+        self.base = config.base
+        self._of = {channel: _address(channel, config) for channel in CHANNELS}
+        self._channels = {address.topic: channel for channel, address in self._of.items() if not channel.is_pattern}
+
+    def __getitem__(self, channel: Channel) -> Address:
+        """A channel that is not in the contract, but made while running, has its own defaults."""
+        found = self._of.get(channel)
+        return found if found is not None else _default(channel, self.base)
+
+    def channel(self, topic: str) -> Channel | None:
+        """The channel that travels under ``topic``, renamed or not; None for topics the contract does not know."""
+        renamed = self._channels.get(topic)
+        if renamed is not None or not topic.startswith(self.base + "/"):
+            return renamed
+        known = channel_of(topic[len(self.base) + 1 :])
+        return known if known is not None and known.is_pattern else None
+
+
+def _address(channel: Channel, config: Config) -> Address:
+    default = _default(channel, config.base)
+    return default if channel.override is None else _overridden(default, channel.override, config)
+
+
+def _default(channel: Channel, base: str) -> Address:
+    return Address(channel.filter(base), channel.default_qos, channel.default_retain)
+
+
+def _overridden(default: Address, override: Override, config: Config) -> Address:
+    topic, qos, retain = (
+        _at(config, path) if path else None for path in (override.topic, override.qos, override.retain)
+    )
+    return Address(
+        default.topic if topic is None else topic,
+        default.qos if qos is None else qos,
+        default.retain if retain is None else retain,
+    )
+
+
+def _at(config: Config, path: str) -> Any:
+    """The value at a dotted path of the config tree; None where the key was not set."""
+    return reduce(getattr, path.split("."), config)

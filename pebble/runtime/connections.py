@@ -1,0 +1,118 @@
+"""Makes a robot's transports from its config: the local transport and the connection to operators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pebble.config import Config, Mqtt, RemoteConnection, Tls
+from pebble.errors import ConfigError, TransportError
+from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
+
+LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
+
+
+def local_transport(config: Config, name: str, *, will: Message | None = None, as_published: bool = False) -> Transport:
+    """The local transport of the process called ``name``, not yet opened."""
+    return create(config.transport.kind, f"{config.base}-{name}", local_settings(config, as_published), will=will)
+
+
+def check_kinds(config: Config) -> None:
+    """Raise ConfigError for a transport that is not installed: only the machine where the robot runs can know."""
+    remote = config.services.mqtt_bridge.remote
+    places = {"transport.kind": config.transport.kind}
+    if remote is not None:
+        places["services.mqtt_bridge.remote.kind"] = remote.kind
+    problems = []
+    for place, kind in places.items():
+        try:
+            check_kind(kind)
+        except TransportError as error:
+            problems.append(f"{place}: {error}")
+    if problems:
+        raise ConfigError(problems)
+
+
+def local_settings(config: Config, as_published: bool = False) -> Any:
+    """The settings of the local transport, by its kind; a third party's gets ``transport.settings`` as it is."""
+    kind = config.transport.kind
+    if kind == "mqtt":
+        return mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
+    if kind == "zenoh":
+        return zenoh_settings(config)
+    return config.transport.settings
+
+
+def remote_transport(config: Config, name: str, *, will: Message | None = None) -> Transport:
+    """The bridge's connection to operators, not yet opened: ``remote`` where it is set, else ``remote_mqtt``."""
+    bridge = config.services.mqtt_bridge
+    client_id = f"{config.base}-{name}"
+    if bridge.remote is None:
+        settings = mqtt_settings(bridge.remote_mqtt, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
+        return create("mqtt", client_id, settings, will=will)
+    return create(bridge.remote.kind, client_id, _remote_settings(config, bridge.remote), will=will)
+
+
+def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:
+    """The mirror's connection to the broker on the robot, not yet opened."""
+    settings = mqtt_settings(mirror, as_published=True, reconnect_max_s=LOCAL_RECONNECT_S)
+    return create("mqtt", f"{config.base}-{name}", settings)
+
+
+def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
+    """A Zenoh uplink is a client of a hub elsewhere, separate from the robot's local transport."""
+    if remote.kind != "zenoh":
+        return remote.settings
+    return ZenohSettings(
+        run_dir=config.run_dir() / "remote",
+        connect=tuple(remote.connect),
+        tls=tls_settings(remote.tls),
+        lease_ms=remote.lease_ms,
+        client=True,
+    )
+
+
+def zenoh_settings(config: Config, *, client: bool = False) -> ZenohSettings:
+    """A peer of this robot's processes; ``client`` for a short-lived tool. Only the hub connects to other machines."""
+    return ZenohSettings(run_dir=config.run_dir(), lease_ms=config.transport.lease_ms, client=client)
+
+
+def hub_settings(config: Config) -> ZenohSettings:
+    """The hub of this robot's local transport, with its endpoints for other machines and its journal."""
+    transport = config.transport
+    return ZenohSettings(
+        run_dir=config.run_dir(),
+        listen=tuple(transport.listen),
+        connect=tuple(transport.connect),
+        tls=tls_settings(transport.tls),
+        lease_ms=transport.lease_ms,
+        journal=transport.journal,
+    )
+
+
+def mqtt_settings(mqtt: Mqtt, *, as_published: bool = False, reconnect_max_s: float) -> MqttSettings:
+    """One broker's section of a config as connection settings."""
+    return MqttSettings(
+        host=mqtt.host,
+        port=mqtt.port,
+        keepalive_s=mqtt.keepalive,
+        username=mqtt.username,
+        password=mqtt.password,
+        tls=tls_settings(mqtt.tls),
+        protocol=mqtt.protocol,
+        as_published=as_published,
+        reconnect_max_s=reconnect_max_s,
+        silence_s=mqtt.silence_seconds,
+    )
+
+
+def tls_settings(tls: Tls) -> TlsSettings | None:
+    """Certificates, or None where TLS is off."""
+    if not tls.enabled:
+        return None
+    return TlsSettings(
+        ca_cert=tls.ca_cert,
+        client_cert=tls.client_cert,
+        client_key=tls.client_key,
+        insecure=tls.insecure,
+        ciphers=tls.ciphers,
+    )

@@ -1,0 +1,61 @@
+"""The Zenoh hub as a process: ``python -m pebble.runtime.hub SETTINGS``.
+
+SETTINGS is JSON with the fields of :class:`pebble.transports.ZenohSettings`; only ``run_dir`` is required. The launcher
+starts the hub of a robot with this command; on another machine a hub runs the same way. It avoids the imports of
+pebble.runtime.process, which would be a good part of this small process.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import msgspec
+
+from pebble.errors import PebbleError
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
+from pebble.transports.settings import ZenohSettings
+from pebble.transports.zenoh.hub import ZenohHub
+
+log = logging.getLogger(__name__)
+
+
+def main(arguments: list[str]) -> int:
+    set_up_logging("INFO")
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        run_hub(_settings(arguments), stop)
+    except PebbleError as error:
+        log.error("%s", error)
+        return 1
+    return 0
+
+
+def run_hub(settings: ZenohSettings, stop: threading.Event) -> None:
+    """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
+    notify = Notifier()
+    hub = ZenohHub(settings).open()
+    try:
+        notify.ready()
+        while not stop.wait(ALIVE_PERIOD_S):
+            notify.alive()
+    finally:
+        hub.close()
+
+
+def _settings(arguments: list[str]) -> ZenohSettings:
+    if len(arguments) != 1:
+        raise PebbleError("usage: python -m pebble.runtime.hub SETTINGS (JSON: the fields of ZenohSettings)")
+    try:
+        return msgspec.json.decode(arguments[0], type=ZenohSettings, dec_hook=lambda _kind, text: Path(text))
+    except msgspec.DecodeError as error:
+        raise PebbleError(f"settings of the hub: {error}") from None
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,58 @@
+"""The bounded queue of a service, in which a newer job can replace a waiting one of the same name."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable
+from itertools import count
+
+from pebble.transports.wakeup import Wakeup
+
+Job = Callable[[], None]
+
+
+class Inbox:
+    """Jobs posted by any thread, taken by one. Beyond ``limit`` waiting jobs the oldest is dropped and counted.
+
+    A signal handler may post while its own thread is inside any of these methods: the lock is reentrant, and so is the
+    wakeup.
+    """
+
+    def __init__(self, limit: int = 1000) -> None:
+        self._limit = limit
+        self._lock = threading.RLock()
+        self._wakeup = Wakeup()
+        self._jobs: OrderedDict[Hashable, Job] = OrderedDict()
+        self._internal: deque[Job] = deque()
+        self._numbers = count()
+        self.dropped = 0
+
+    def post(self, job: Job, *, newest_of: Hashable = None) -> None:
+        """Queue ``job``; with ``newest_of`` it takes the place of a waiting job of the same name."""
+        with self._lock:
+            if len(self._jobs) >= self._limit and newest_of not in self._jobs:
+                self._jobs.popitem(last=False)
+                self.dropped += 1
+            self._jobs[next(self._numbers) if newest_of is None else newest_of] = job
+        self._wakeup.set()
+
+    def post_internal(self, job: Job) -> None:
+        """Queue a job of the service's own life cycle: first in line and never dropped."""
+        self._internal.append(job)
+        self._wakeup.set()
+
+    def take(self, timeout: float | None) -> Job | None:
+        """The next job, waiting up to ``timeout`` seconds for one; None when there was none."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while (job := self._next()) is None:
+            if not self._wakeup.wait(end):
+                return None
+        return job
+
+    def _next(self) -> Job | None:
+        if self._internal:
+            return self._internal.popleft()
+        with self._lock:
+            return self._jobs.popitem(last=False)[1] if self._jobs else None

@@ -1,0 +1,57 @@
+"""Split a stream of bytes into lines, or frames, of limited length."""
+
+from __future__ import annotations
+
+LINE_LIMIT = 256  # bytes; the longest line of any text protocol of an MCU is under 150
+
+
+class LineSplitter:
+    """Takes chunks of any size and returns complete lines; never holds more than ``limit`` bytes of an unfinished one.
+
+    A longer line is discarded up to the next ``end``. With ``truncate``, its first ``limit`` bytes are returned as
+    soon as they are complete, and only the rest is discarded.
+    """
+
+    def __init__(self, limit: int = LINE_LIMIT, end: bytes = b"\n", *, truncate: bool = False) -> None:
+        self.discarded_lines = 0  # lines that were longer than the limit
+        self.discarded_bytes = 0
+        self._limit, self._separator, self._truncate = limit, end, truncate
+        self._tail = b""
+        self._skipping = False  # inside the rest of a line that was too long
+
+    def feed(self, chunk: bytes) -> list[bytes]:
+        """Return the lines that ``chunk`` completes, without their end; a CR stays, for the protocol to ignore."""
+        lines: list[bytes] = []
+        *complete, tail = chunk.split(self._separator)
+        for part in complete:
+            self._grow(part, lines)
+            if not self._skipping:
+                lines.append(self._tail)
+            self.reset()
+        self._grow(tail, lines)
+        return lines
+
+    def rest(self) -> bytes:
+        """Return the unfinished line, at the end of the stream."""
+        left = self._tail
+        self.reset()
+        return left
+
+    def reset(self) -> None:
+        """Forget an unfinished line, because the stream begins anew."""
+        self._tail = b""
+        self._skipping = False
+
+    def _grow(self, part: bytes, lines: list[bytes]) -> None:
+        if self._skipping:
+            self.discarded_bytes += len(part)
+            return
+        self._tail += part
+        if len(self._tail) > self._limit:
+            returned = self._limit if self._truncate else 0
+            if returned:
+                lines.append(self._tail[:returned])
+            self.discarded_lines += 1
+            self.discarded_bytes += len(self._tail) - returned
+            self._tail = b""
+            self._skipping = True

@@ -1,0 +1,117 @@
+"""What a process owes the launcher that started it: end with it, notify it, and log in the format it reads."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import logging
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+NOTIFY_FD = "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, "WANT …", "LACKS …"
+WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predecessor of this process requested
+ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
+LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
+ALIVE_PERIOD_S = 1.0
+LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
+_PR_SET_PDEATHSIG = 1
+
+log = logging.getLogger(__name__)
+
+
+def set_up_logging(level: str) -> None:
+    """Write log lines to stderr in the format that the launcher forwards."""
+    logging.basicConfig(level=level, format=LOG_FORMAT, datefmt="%H:%M:%S", stream=sys.stderr)
+
+
+def die_with_launcher() -> None:
+    """Ask the kernel for SIGTERM when the launcher dies, so that a killed launcher leaves no orphans."""
+    launcher = os.environ.get(LAUNCHER_PID)
+    if launcher is None:
+        return
+    end_with_parent(signal.SIGTERM)
+    if os.getppid() != int(launcher):  # it died before we could ask
+        sys.exit(1)
+
+
+def end_with_parent(number: int = signal.SIGKILL) -> None:
+    """Have the kernel send this process ``number`` when the thread that started it has ended."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+
+
+def tied_to_parent(command: Sequence[str], number: signal.Signals = signal.SIGKILL) -> list[str]:
+    """Extend ``command`` so that the process gets ``number`` when the thread that starts it has ended.
+
+    This holds from a few milliseconds after the start on, when setpriv has asked the kernel for it.
+    Raises FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2
+    may wait for ever for a lock that a thread of Zenoh held.
+    """
+    if shutil.which(command[0]) is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
+    return ["setpriv", "--pdeathsig", number.name.removeprefix("SIG"), "--", *command]
+
+
+class ProgramRequest(NamedTuple):
+    """Whether an on-demand program is to run, and the encoding it begins with; empty: as configured."""
+
+    on: bool
+    encoding: str = ""
+
+
+def earlier_requests() -> dict[str, ProgramRequest]:
+    """The on-demand programs that run because a predecessor of this process requested them."""
+    words = (word.partition("=") for word in os.environ.get(WANTED, "").split())
+    return {name: ProgramRequest(on=True, encoding=encoding) for name, _, encoding in words}
+
+
+def requested_encoding() -> str | None:
+    """The encoding in the request that started this program; None: as configured. Later requests it receives itself."""
+    return os.environ.get(ENCODING) or None
+
+
+class Notifier:
+    """Notifies the launcher that this process is ready and alive; does nothing without a launcher."""
+
+    def __init__(self) -> None:
+        number = os.environ.get(NOTIFY_FD)
+        self._fd = None if number is None else int(number)
+        if self._fd is not None:
+            os.set_blocking(self._fd, False)
+        self._no_launcher_logged = False
+
+    def ready(self) -> None:
+        self._write(b"READY\n")
+
+    def alive(self) -> None:
+        self._write(b"ALIVE\n")
+
+    def request(self, program: str, request: ProgramRequest) -> bool:
+        """Request or release an on-demand program. False: the launcher was too busy, repeat it.
+
+        Only programs with ``may_request`` (pebble.launcher.programs) may; their requests expire 5 s after their end.
+        """
+        if self._fd is None and not self._no_launcher_logged:
+            self._no_launcher_logged = True
+            log.info("there is no launcher to start %s", program)
+        return self._write(f"WANT {program} {int(request.on)} {request.encoding}".rstrip().encode() + b"\n")
+
+    def lacks(self, feature: str, lacking: bool) -> bool:
+        """Report that this process cannot provide ``feature``, or can again, until it ends; the capabilities follow.
+
+        False: the launcher was too busy, repeat it.
+        """
+        return self._write(f"{'LACKS' if lacking else 'HAS'} {feature}\n".encode())
+
+    def _write(self, line: bytes) -> bool:
+        if self._fd is None:
+            return True
+        try:
+            os.write(self._fd, line)  # a line is short: the pipe takes all of it or nothing
+        except OSError:  # the launcher is gone or busy: the next sign of life may reach it
+            log.debug("the launcher did not take %s", line)
+            return False
+        return True

@@ -1,0 +1,88 @@
+"""The outermost lines of a service process: arguments, logging, signals, and notifications to the launcher."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from pebble.config import Config, load
+from pebble.errors import ConfigError, PebbleError
+from pebble.runtime.connections import local_transport
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
+from pebble.runtime.service import Service
+
+_STOP_DEADLINE_S = 3.0
+
+log = logging.getLogger(__name__)
+
+
+def run(
+    service_class: type[Service],
+    arguments: list[str] | None = None,
+    *,
+    choose: Callable[[Config], type[Service]] | None = None,
+) -> int:
+    """Run one service as this process: ``CONFIG [INSTANCE]``; returns the exit code.
+
+    ``choose`` picks the class for a config where there are several; ``service_class`` is their base then.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not 1 <= len(arguments) <= 2:
+        sys.stderr.write(f"usage: python -m pebble.services.{service_class.name} CONFIG [INSTANCE]\n")
+        return 2
+    instance = arguments[1] if len(arguments) == 2 else ""
+    set_up_logging("INFO")
+    try:
+        config = load(Path(arguments[0]))
+        program = f"{service_class.name}:{instance}" if instance else service_class.name
+        logging.getLogger().setLevel(config.log_level_of(program))
+        view = view_of(config, instance)
+        return _serve(service_class if choose is None else choose(view), view, instance)
+    except PebbleError as error:
+        for line in str(error).splitlines():
+            log.error("%s", line)
+        return 1
+    except Exception:  # the process boundary: log why, exit non-zero, be restarted
+        log.exception("%s ended unexpectedly", service_class.name)
+        return 1
+
+
+def _serve(service_class: type[Service], config: Config, instance: str) -> int:
+    name = f"{service_class.name}-{instance}" if instance else service_class.name
+    transport = local_transport(config, service_class.client_name or name, as_published=service_class.as_published)
+    service = service_class(config, transport, instance=instance)
+    notify = Notifier()
+
+    def quit_(_signal: int, _frame: object) -> None:
+        exit_at_the_latest()
+        service.quit()
+
+    signal.signal(signal.SIGTERM, quit_)
+    signal.signal(signal.SIGINT, quit_)
+    service.timers.add(service.clock(), notify.alive, period=ALIVE_PERIOD_S)
+    service.run(ready=notify.ready)
+    return 0
+
+
+def view_of(config: Config, instance: str) -> Config:
+    """The config of one serial instance: its merged entry replaces the shared one."""
+    if not instance:
+        return config
+    instances = config.serial_instances()
+    if instance not in instances:
+        raise ConfigError(f'services.serial_mcu_bridge.instances: there is no enabled instance "{instance}"')
+    return replace(config, services=replace(config.services, serial_mcu_bridge=instances[instance]))
+
+
+def exit_at_the_latest() -> None:
+    """End the process after 3 s even if stopping hangs; hardware that moves has its own deadline besides.
+
+    The kernel does it, because this is called in signal handlers, where starting a thread may wait for ever.
+    """
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_REAL, _STOP_DEADLINE_S)

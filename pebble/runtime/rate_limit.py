@@ -1,0 +1,55 @@
+"""Limits the rate of log lines about events that may happen a thousand times a second."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+
+class RateLimitedLog:
+    """Writes at most ``burst`` lines per ``period_s`` and subject, each with the number of events so far.
+
+    A subject is a name from a fixed set, never text from the wire.
+    """
+
+    def __init__(self, log: logging.Logger, *, burst: int = 1, period_s: float = 5.0) -> None:
+        self._log, self._burst, self._period = log, burst, period_s
+        self._lock = threading.Lock()
+        self._totals: dict[str, int] = {}
+        self._windows: dict[str, tuple[float, int]] = {}  # when it began, lines written in it
+
+    def warning(self, subject: str, text: str, *values: object, times: int = 1) -> None:
+        """Count ``times`` events, and log one line if the limit allows."""
+        total = self._count(subject, times)
+        if total:
+            self._log.warning(text + " (%d so far)", *values, total)
+
+    def exception(self, subject: str, text: str, *values: object) -> None:
+        """Like :meth:`warning`, as an error with the traceback of the exception that is being handled."""
+        total = self._count(subject)
+        if total:
+            self._log.error(text + " (%d so far)", *values, total, exc_info=True)
+
+    def log(self, subject: str, level: int, text: str, *values: object) -> None:
+        """Like :meth:`warning`, at ``level`` and without the number."""
+        if self._count(subject):
+            self._log.log(level, text, *values)
+
+    def totals(self) -> dict[str, int]:
+        """How often each subject came up, logged or not."""
+        with self._lock:
+            return dict(self._totals)
+
+    def _count(self, subject: str, times: int = 1) -> int:
+        """How often ``subject`` has come up if it may be logged now, else 0."""
+        now = time.monotonic()
+        with self._lock:
+            total = self._totals[subject] = self._totals.get(subject, 0) + times
+            began, lines = self._windows.get(subject, (float("-inf"), 0))
+            if now - began >= self._period:
+                began, lines = now, 0
+            if lines >= self._burst:
+                return 0
+            self._windows[subject] = (began, lines + 1)
+            return total

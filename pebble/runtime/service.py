@@ -1,0 +1,286 @@
+"""What every service shares: one thread, an inbox, timers, a lifecycle, and channels instead of topics."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any, ClassVar, TypeVar
+
+from pebble.config import Config
+from pebble.contract import Channel, Kind, codec
+from pebble.errors import PayloadError
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.inbox import Inbox
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.runtime.timers import Timer, Timers
+from pebble.transports import Message, QoS, State, Subscription, Transport
+from pebble.transports.counters import Counters
+
+_ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
+WAIT_LIMIT_S = 0.5  # of a drive command in the inbox; with a transport's silence limit of 2 s, none acts after 2.5 s
+
+Method = TypeVar("Method", bound=Callable[..., None])
+
+
+def on(channel: Channel, *, direct: bool = False) -> Callable[[Method], Method]:
+    """Mark a method as the handler of ``channel``; it is called with the decoded payload.
+
+    For a pattern channel, the names in the topic are arguments too: ``def report(self, report, program)``.
+    ``direct`` is for a handler with an inbox of its own: it runs on the transport's thread, and must return at once.
+    Channels are subscribed to in the order of their methods.
+    """
+
+    def mark(method: Method) -> Method:
+        method.__dict__["channel"] = channel
+        method.__dict__["direct"] = direct
+        return method
+
+    return mark
+
+
+def every(seconds: float) -> Callable[[Method], Method]:
+    """Mark a method to be called every ``seconds``."""
+
+    def mark(method: Method) -> Method:
+        method.__dict__["period"] = seconds
+        return method
+
+    return mark
+
+
+def _marked(cls: type, mark: str) -> list[str]:
+    """Names of the methods that carry ``mark``, in the order of their definition, base classes first."""
+    names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
+    return [name for name in names if mark in getattr(getattr(cls, name), "__dict__", ())]
+
+
+class Service:
+    """One process of a robot. Handlers and timers all run on the thread that called :meth:`run`: no locks needed.
+
+    A subclass gives ``name`` and ``publishes``, marks methods with ``@on`` and ``@every``, opens its device in
+    ``start`` and leaves it safe in ``stop``. A reader thread of a blocking device only ever calls ``post``.
+    Every attribute is set in ``__init__``; what ``start`` opens is closed by :meth:`on_stop`::
+
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self._remote = remote_transport(self.config, "lamp")
+
+        def start(self) -> None:
+            self._remote.open(timeout=0.0)
+            self.on_stop(self._remote.close)
+
+    Times come from ``clock``, which tests may replace.
+    """
+
+    name: ClassVar[str]
+    publishes: ClassVar[tuple[Channel, ...]] = ()
+    client_name: ClassVar[str] = ""  # of its transport, after the robot's base; empty: the service's name
+    as_published: ClassVar[bool] = False  # how its transport is opened, where there is a choice (T7)
+
+    def __init__(
+        self,
+        config: Config,
+        transport: Transport,
+        *,
+        instance: str = "",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.config, self.transport, self.instance, self.clock = config, transport, instance, clock
+        self.addresses = Addresses(config)
+        self.log = logging.getLogger(f"pebble.{self.name}")
+        self.counters = Counters()
+        self.timers = Timers()
+        self._quiet_log = RateLimitedLog(self.log)
+        self._inbox = Inbox()
+        self._states: dict[str, tuple[Channel, bytes]] = {}
+        self._handled: dict[Channel, Subscription] = {}  # of the methods marked with @on
+        self._on_stop = ExitStack()
+        self._running = True
+
+    # -- to override
+
+    def start(self) -> None:
+        """Open hardware; the transport is not open yet. Raise to exit; the launcher restarts the process."""
+
+    def stop(self) -> None:
+        """Leave hardware safe. Runs however :meth:`run` ends, before the :meth:`on_stop` callbacks; not if killed."""
+
+    def on_connected(self) -> None:
+        """React to a new connection, before the states are published on it."""
+
+    # -- to use
+
+    def on_stop(self, callback: Callable[[], object]) -> None:
+        """Call ``callback`` after :meth:`stop`, however :meth:`run` ends; the last one added is called first.
+
+        All are called even if one raises.
+        """
+        self._on_stop.callback(callback)
+
+    def publish(self, channel: Channel, value: Any, **names: str) -> bool:
+        """Send ``value`` on ``channel`` to its effective topic; ``names`` fill a pattern channel's levels."""
+        topic = self._topic(channel, names)
+        raw = codec.encode(channel, value)
+        if channel.kind is Kind.STATE:
+            self._states[topic] = (channel, raw)
+        return self._send(channel, topic, raw)
+
+    def retract(self, channel: Channel, **names: str) -> None:
+        """Clear the retained message of a STATE ``channel``, and publish it no more."""
+        topic = self._topic(channel, names)
+        if self._states.pop(topic, None) is not None:
+            self._send(channel, topic, b"")
+
+    def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
+        """Handle ``channel`` from now on, as ``@on`` does from the start; until the subscription is closed."""
+
+        def receive(message: Message) -> None:
+            self._receive(channel, method, message, direct=direct)
+
+        topic = self.addresses[channel].topic
+        return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
+
+    def refused(self, channel: Channel) -> bool:
+        """Whether the other end refuses to deliver ``channel`` to its ``@on`` method (T21)."""
+        return channel in self._handled and self._handled[channel].refused
+
+    def post(self, job: Callable[[], None], *, newest_of: str | None = None) -> None:
+        """Run ``job`` on the service's thread. With ``newest_of``, a waiting job of that name is replaced."""
+        self._inbox.post(job, newest_of=newest_of)
+
+    def post_first(self, job: Callable[[], None]) -> None:
+        """Run ``job`` before everything that waits. It is never dropped, so at most one of a kind may wait."""
+        self._inbox.post_internal(job)
+
+    def call_at(self, due: float, job: Callable[[], None]) -> Timer:
+        """Run ``job`` at ``due`` on ``clock``, on the service's thread (call from there)."""
+        return self.timers.add(due, job)
+
+    def quit(self) -> None:
+        """End :meth:`run` soon. Safe from any thread and from signal handlers."""
+        self._running = False
+        self._inbox.post_internal(lambda: None)
+
+    def run(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Run until :meth:`quit`. ``ready`` is called once the service has subscribed."""
+        try:
+            self.start()
+            self.transport.on_state(self._on_state)
+            self.transport.open(timeout=0.0)
+            for name in _marked(type(self), "channel"):
+                method = getattr(self, name)
+                self._handled[method.channel] = self.listen(method.channel, method, direct=method.direct)
+            self._set_timers()
+            ready()
+            self._loop()
+        finally:
+            try:
+                with self._on_stop:
+                    self.stop()
+            finally:
+                self._log_totals()
+                self.transport.close()
+
+    @classmethod
+    def handles(cls) -> tuple[Channel, ...]:
+        """The channels this service subscribes to."""
+        return tuple(getattr(cls, name).channel for name in _marked(cls, "channel"))
+
+    # -- the service's thread
+
+    def _loop(self) -> None:
+        while self._running:
+            job = self._inbox.take(self.timers.wait(self.clock()))
+            if job is not None:
+                job()
+            self.timers.run_due(self.clock())
+
+    def _set_timers(self) -> None:
+        now = self.clock()
+        for name in _marked(type(self), "period"):
+            method = getattr(self, name)
+            self.timers.add(now, method, period=method.period)
+        interval = self.republish_interval_s
+        if interval > 0:
+            self.timers.add(now + interval, self._republish, period=interval)
+
+    @property
+    def republish_interval_s(self) -> float:
+        """How often retained state is published again; 0 for never."""
+        return self.config.services.defaults.retained_publish_interval_seconds
+
+    def _begin_connection(self) -> None:
+        self.on_connected()
+        self._republish()
+
+    def _republish(self) -> None:
+        for topic, (channel, raw) in self._states.items():
+            self._send(channel, topic, raw)
+
+    def _topic(self, channel: Channel, names: dict[str, str]) -> str:
+        return self.addresses[channel].topic if not names else channel.topic(self.config.base, **names)
+
+    def _send(self, channel: Channel, topic: str, raw: bytes) -> bool:
+        address = self.addresses[channel]
+        return self.transport.publish(topic, raw, qos=QoS(address.qos), retain=address.retain)
+
+    def _log_totals(self) -> None:
+        totals = self._quiet_log.totals()
+        if totals or self._inbox.dropped:
+            self.log.info("refused in all: %s; dropped from the inbox: %d", totals or "nothing", self._inbox.dropped)
+
+    def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
+        """Call the handler, unless the command has waited so long, in a hung or suspended process, that it is stale.
+
+        Only commands that newer ones replace are dropped. A handler that fails on a message is counted, and
+        the service goes on: a retained message would end it again after each restart.
+        """
+        if channel.kind is Kind.COMMAND and channel.newest and self.clock() - arrived > WAIT_LIMIT_S:
+            self.count_late(channel)
+            return
+        try:
+            method()
+        except Exception:  # noqa: BLE001 - a message comes from another process, and must not end this one
+            self.counters.add("handler_errors")
+            self._quiet_log.exception(f"{channel.metric} failed", "failed on a message on %s", channel.metric)
+
+    def count_late(self, channel: Channel) -> None:
+        """Count and log a command that waited longer than WAIT_LIMIT_S, and that the caller drops."""
+        self.counters.add("late")
+        self._quiet_log.warning(f"{channel.metric} late", "dropped a late %s", channel.metric)
+
+    # -- the transport's threads: decode and post, nothing else
+
+    def _receive(self, channel: Channel, method: Callable[..., None], message: Message, *, direct: bool) -> None:
+        """Refuse what is stale or malformed *before* it can replace a valid message in the inbox."""
+        if message.retain and channel.kind in _ONE_SHOT:
+            self.counters.add("stale")
+            self._quiet_log.warning(f"{channel.metric} retained", "refused a retained message on %s", channel.metric)
+            return
+        names = channel.names(message.topic) if channel.is_pattern else {}
+        if channel.is_pattern and not names:  # the filter's + also matches an empty level
+            self.counters.add("refused")
+            self._quiet_log.warning(
+                f"{channel.metric} unnamed", "refused a message with an empty level in its topic: %r", message.topic
+            )
+            return
+        try:
+            value = codec.decode(channel, message.payload)
+        except PayloadError as error:
+            self.counters.add("refused")
+            self._quiet_log.warning(channel.metric, "refused a message: %s", error)
+            return
+        if direct:
+            method(value, **names)
+            return
+        arrived = self.clock()
+        self._inbox.post(
+            lambda: self._handle(channel, lambda: method(value, **names), arrived),
+            newest_of=message.topic if channel.newest else None,
+        )
+
+    def _on_state(self, state: State) -> None:
+        if state is State.CONNECTED:
+            self._inbox.post_internal(self._begin_connection)

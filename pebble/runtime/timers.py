@@ -1,0 +1,54 @@
+"""Timers of a single thread, on the monotonic clock."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from itertools import count
+
+
+class Timer:
+    """A call that is due once, or again and again."""
+
+    def __init__(self, due: float, job: Callable[[], None], period: float | None) -> None:
+        self.due, self.job, self.period = due, job, period
+        self.cancelled = False
+
+    def cancel(self) -> None:
+        self.cancelled = True
+
+
+class Timers:
+    """A heap of timers; its owner asks how long to sleep and runs what is due. Clock values are passed in."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[float, int, Timer]] = []
+        self._order = count()
+
+    def add(self, due: float, job: Callable[[], None], *, period: float | None = None) -> Timer:
+        timer = Timer(due, job, period)
+        self._push(timer)
+        return timer
+
+    def wait(self, now: float) -> float | None:
+        """Seconds until the next timer is due; None without timers."""
+        self._discard_cancelled()
+        return max(0.0, self._heap[0][0] - now) if self._heap else None
+
+    def run_due(self, now: float) -> None:
+        """Run what is due. A periodic timer that fell behind skips the missed turns instead of making them up."""
+        self._discard_cancelled()
+        while self._heap and self._heap[0][0] <= now:
+            timer = heapq.heappop(self._heap)[2]
+            if timer.period is not None:
+                timer.due = timer.due + timer.period if timer.due + timer.period > now else now + timer.period
+                self._push(timer)
+            timer.job()
+            self._discard_cancelled()
+
+    def _push(self, timer: Timer) -> None:
+        heapq.heappush(self._heap, (timer.due, next(self._order), timer))
+
+    def _discard_cancelled(self) -> None:
+        while self._heap and self._heap[0][2].cancelled:
+            heapq.heappop(self._heap)

@@ -1,1 +1,0 @@
-"""Hardware that is not there: robots run, and are tested, without any."""

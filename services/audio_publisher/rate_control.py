@@ -1,0 +1,127 @@
+"""What is reduced when the connection is slow: first headers, then bits. Pure: times are passed in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from pebble.media.in_flight import InFlight
+from pebble.media.opus import BUNDLE_LIMIT
+from pebble.transports.base import Outgoing
+
+LEAST_BITRATE: Final = 16_000  # of Opus: below it speech gets hard to follow
+#: Age of the oldest packet in flight, beyond a round trip, above which the newest are dropped. On a slow connection
+#: Opus gets smaller; what it waits for are packets that were lost and are sent again. Measured behind `pebble impair`
+#: at 64 kbit/s and 5 % loss, windows of 12 s: with 0.2 s it lost 3 to 8 % of the sound, with 0.5 s 0 to 1.5 %.
+WAITING_LIMIT_S: Final = 0.2
+OPUS_WAITING_LIMIT_S: Final = 0.5
+_SLOW_S = 0.12  # packets wait for longer than this: the connection cannot carry what is sent
+_FAST_S = 0.08  # an acknowledgement may be delayed by 40 ms and is noticed only 20 ms later: less says nothing
+_EMPTY_S = 0.03  # nothing waits
+_BEACON_S = 0.15  # so often at least where an access point delays acknowledgements until its beacon (every 102.4 ms)
+_PATIENCE_S = 0.3  # of slowness, before something is done
+_PAUSE_S = 0.4  # before more is done: what waits already takes longer to leave, and commands wait behind it
+_FIRST_CALM_S = 1.0  # of fastness, before a step up is tried while the connection has never been slow
+_CALM_S = 10.0  # the same once it was; twice that after each try that failed
+_CALMEST_S = 300.0
+_GAP_S = 2.0  # without a poll, for want of a connection or of Opus: older measurements say nothing
+_OVERHEAD = 60  # bytes of a topic, headers and pings that a packet may add to what is in flight
+_LIMIT = 256  # packets in flight that are remembered; far more than may wait
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """How Opus is encoded; ``reduced`` is for display."""
+
+    bundle: int
+    bitrate: int
+    reduced: str = ""
+
+
+def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
+    """From as configured to as little as still makes sense; only steps that save something."""
+    found = [Step(bundle, bitrate)]
+    if bundle < BUNDLE_LIMIT:
+        found.append(Step(BUNDLE_LIMIT, bitrate, f"{BUNDLE_LIMIT} parts a packet"))
+    if bitrate > LEAST_BITRATE:
+        reduced = f"{BUNDLE_LIMIT} parts a packet, {LEAST_BITRATE // 1000} kbit/s"
+        found.append(Step(BUNDLE_LIMIT, LEAST_BITRATE, reduced))
+    return tuple(found)
+
+
+class RateController:
+    """Decides how Opus is encoded, ``step``, and which packets are sent. ``outgoing()`` says what is unacknowledged."""
+
+    def __init__(self, bundle: int, bitrate: int, now: float, outgoing: Callable[[], Outgoing]) -> None:
+        self._steps, self._outgoing = steps(bundle, bitrate), outgoing
+        self._levels = LevelControl(len(self._steps) - 1, now)
+        self._in_flight = InFlight(_OVERHEAD, _LIMIT)
+        self._age_s = 0.0  # of the oldest packet in flight, beyond a round trip
+
+    @property
+    def step(self) -> Step:
+        return self._steps[self._levels.level]
+
+    @property
+    def configured(self) -> Step:
+        """With nothing reduced."""
+        return self._steps[0]
+
+    def poll(self, now: float, encoding: str) -> Step | None:
+        """Measure how long packets wait; returns the new step if it changes, which it does for Opus only."""
+        outgoing = self._outgoing()
+        self._in_flight.acknowledge(outgoing.waiting)
+        self._age_s = max(0.0, self._in_flight.age_s(now) - outgoing.round_trip_s)
+        return self.step if encoding == "opus" and self._levels.poll(self._age_s, now) else None
+
+    def may_send(self, encoding: str) -> bool:
+        """Would another packet arrive in time, by the last poll?"""
+        return self._age_s <= (OPUS_WAITING_LIMIT_S if encoding == "opus" else WAITING_LIMIT_S)
+
+    def sent(self, size: int, now: float) -> None:
+        """The connection has accepted a packet of ``size`` bytes."""
+        self._in_flight.sent(size + _OVERHEAD, now)
+
+    def connection_lost(self) -> None:
+        """The packets in flight are lost."""
+        self._in_flight.clear()
+
+
+class LevelControl:
+    """Begins with the last step, because the connection is not known yet. Goes up while packets do not wait, more
+    slowly after each try that failed, and down while they do.
+    """
+
+    def __init__(self, last: int, now: float) -> None:
+        self.level = self._last = last  # which step; 0 is as configured
+        self._slow_since: float | None = None
+        self._fast_since: float | None = None
+        self._polled_at = self._empty_at = float("-inf")
+        self._changed_at = now
+        self._raised_at = float("-inf")
+        self._calm_s = _FIRST_CALM_S
+
+    def poll(self, age_s: float, now: float) -> bool:
+        """The oldest packet has waited for ``age_s``; True if the level changes."""
+        if now - self._polled_at > _GAP_S:
+            self._slow_since = self._fast_since = None
+        self._polled_at = now
+        self._slow_since = (self._slow_since or now) if age_s > _SLOW_S else None
+        self._empty_at = now if age_s < _EMPTY_S else self._empty_at
+        fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S
+        self._fast_since = (self._fast_since or now) if fast else None
+        if now - self._changed_at < _PAUSE_S:
+            return False
+        if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:
+            failed = now - self._raised_at < 2 * self._calm_s
+            self._calm_s = min(max(_CALM_S, (1 + failed) * self._calm_s), _CALMEST_S)
+            return self._change(1, now)
+        if self.level and self._fast_since is not None and now - max(self._fast_since, self._changed_at) > self._calm_s:
+            self._raised_at = now
+            return self._change(-1, now)
+        return False
+
+    def _change(self, by: int, now: float) -> bool:
+        self.level, self._changed_at = self.level + by, now
+        return True

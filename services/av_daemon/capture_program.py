@@ -1,0 +1,106 @@
+"""A program that captures pictures or sound and writes them to its standard output; it ends with this process."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import subprocess
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, cast
+
+from pebble.errors import DeviceError
+from pebble.runtime.parent import tied_to_parent
+
+SILENCE_S = 3.0  # without output: the device hangs
+_FIRST_SILENCE_S = 10.0  # it may take its time to start
+_ERROR_LIMIT = 500  # bytes of its standard error that are remembered
+_LAST_READS = 64  # of 4096 bytes: more than a pipe holds
+_CHUNK = 256 * 1024
+
+
+class CaptureProgram:
+    """A running program. ``read`` fails when it ends or writes nothing for 3 s; ``stop_s``: before it is killed."""
+
+    def __init__(self, command: Sequence[str], *, stop_s: float = 5.0, pipe_bytes: int = 0) -> None:
+        self.name = Path(command[0]).name
+        self._stop_s = stop_s
+        self._errors = b""
+        self._silence_s = _FIRST_SILENCE_S
+        try:
+            self._process = subprocess.Popen(
+                tied_to_parent(command),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            raise DeviceError(f"cannot start {self.name}: {error}") from error
+        self._pipes = cast(tuple[IO[bytes], IO[bytes]], (self._process.stdout, self._process.stderr))
+        self._out, self._err = (pipe.fileno() for pipe in self._pipes)
+        os.set_blocking(self._out, False)
+        os.set_blocking(self._err, False)
+        if pipe_bytes:
+            with suppress(OSError):  # more than the system allows; a smaller pipe is only slower
+                fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, pipe_bytes)
+        self._poll = select.poll()
+        self._poll.register(self._out, select.POLLIN)
+        self._poll.register(self._err, select.POLLIN)
+
+    def read(self, limit: int = _CHUNK) -> bytes:
+        """What it has written since, at least one byte. Raises DeviceError when it ends or hangs."""
+        deadline = time.monotonic() + self._silence_s
+        while True:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise DeviceError(f"{self.name} hangs: nothing came for {self._silence_s:.0f} s{self._last_error()}")
+            ready = dict(self._poll.poll(left * 1000))
+            if self._err in ready:
+                self._read_errors()
+            if self._out in ready:
+                chunk = os.read(self._out, limit)
+                if not chunk:
+                    raise DeviceError(self._end())
+                self._silence_s = SILENCE_S
+                return chunk
+
+    def interrupt(self) -> None:
+        """From any thread: kill it, which makes a waiting ``read`` fail."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """Terminate it, and kill it if it does not end in time."""
+        self._process.terminate()
+        for pipe in self._pipes:  # frees a program that is blocked in a write
+            pipe.close()
+        try:
+            self._process.wait(self._stop_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _read_errors(self) -> None:
+        chunk = os.read(self._err, 4096)
+        if chunk:
+            self._errors = (self._errors + chunk)[-_ERROR_LIMIT:]
+        else:
+            self._poll.unregister(self._err)
+
+    def _end(self) -> str:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.5)
+        with suppress(BlockingIOError, KeyError):  # nothing more now, or end of file
+            for _ in range(_LAST_READS):
+                self._read_errors()
+        code = self._process.poll()
+        how = "closed its output" if code is None else f"exit code {code}" if code >= 0 else f"signal {-code}"
+        return f"{self.name} ended: {how}{self._last_error()}"
+
+    def _last_error(self) -> str:
+        lines = self._errors.decode("utf-8", "replace").split("\n")
+        last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        return f" ({''.join(c if c.isprintable() else '?' for c in last)})" if last else ""

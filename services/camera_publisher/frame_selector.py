@@ -1,0 +1,43 @@
+"""Which of a camera's frames are sent, so that the configured rate is what arrives. Pure: times are passed in."""
+
+from __future__ import annotations
+
+_EARLY = 0.25  # of a period: how far ahead of its turn a frame may be, because cameras have jitter
+_LATE = 1.0  # periods that may be made up for; a longer pause is not
+
+
+class FrameSelector:
+    """Turns come at the configured rate, on the clock of the capture times; a frame that is due uses up one turn.
+
+    Comparing each frame with the one sent before it would round every wait up to the camera's next frame: 15 frames per
+    second thinned out to 10 would become 7.5. Turns do not drift: a frame sent late leaves the next one its time.
+    """
+
+    def __init__(self, fps: float) -> None:
+        self._period = 1.0 / fps
+        self._turn: float | None = None  # seconds; None until the first frame
+        self._captured = float("-inf")  # of the last frame
+
+    @property
+    def fps(self) -> float:
+        return 1.0 / self._period
+
+    @fps.setter
+    def fps(self, fps: float) -> None:
+        self._period = 1.0 / fps
+        if self._turn is not None:
+            self._turn = min(self._turn, self._captured + self._period)
+
+    def due(self, captured_s: float) -> bool:
+        """Is it the turn of a frame captured at ``captured_s``? A clock that went back begins anew."""
+        if captured_s < self._captured:
+            self._turn = None
+        self._captured = captured_s
+        return self._turn is None or captured_s >= self._turn - _EARLY * self._period
+
+    def use(self, captured_s: float) -> float:
+        """Take the frame: the next turn is one period after the one it used up. Returns how many turns were missed."""
+        turn = captured_s if self._turn is None else self._turn
+        missed = max(0.0, (captured_s - turn) / self._period - _LATE)
+        self._turn = turn + (1.0 + missed) * self._period
+        return missed

@@ -1,0 +1,224 @@
+"""How many frames a connection gets and how large they are: first less quality, then less size, then fewer frames.
+
+What counts is how long the connection was busy with each frame, compared with the time between two frames. Nothing is
+ever measured by sending more than is configured. Pure: times are passed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+
+from pebble.services.camera_publisher.frame_selector import FrameSelector
+from pebble.services.camera_publisher.send_window import Acknowledged, SendWindow
+from pebble.transports.base import Outgoing
+from pebble.transports.counters import Counters
+
+_FULL = 0.85  # share of the time the connection may be busy before something is reduced
+_AIM = 0.6  # share it should be busy afterwards, and may be once something is restored
+_LOST = 0.05  # frames lost for each that was sent; more means that the connection is full, however short its times
+_STUCK_S = 0.5  # a frame that takes longer is answered at once
+_WINDOW_S = 3.0  # of the frames that count; long enough for a full picture among the differences
+_MEASURE_S = 1.0  # after a change, before an average means anything
+_PATIENCE_S, _LONGEST_PATIENCE_S = 4.0, 60.0  # of good times before something is restored
+_PROBATION_S = 10.0  # something that was restored too early shows by then
+#: Bytes beside payload and topic that a message takes on the wire: MQTT's header, and TLS's for each record of 16 KiB.
+#: Too many do no harm: what is in flight seems to have arrived by that much earlier.
+_HEADER, _PER_RECORD, _RECORD = 8, 30, 16 << 10
+
+
+def wire_size(topic: str, payload: bytes) -> int:
+    """The bytes that a message takes on the wire, roughly."""
+    size = _HEADER + len(topic) + len(payload)
+    return size + _PER_RECORD * (1 + size // _RECORD)
+
+
+class RateController:
+    """Decides which frames are encoded, and how: ``step``. No picture is sent that would wait behind another.
+
+    ``outgoing()`` says what is unacknowledged on the connection. A frame that was due and not encoded because of that
+    is counted as ``held_back``.
+    """
+
+    def __init__(self, fps: float, now: float, outgoing: Callable[[], Outgoing], counters: Counters) -> None:
+        self._fps, self._outgoing, self._counters = fps, outgoing, counters
+        self._selector, self._window, self._levels = FrameSelector(fps), SendWindow(), LevelControl(fps, now)
+        self._blocked = False  # was a frame held back since the last one that was encoded, because of a late one?
+        self._changed = False  # has ``step`` changed since the last poll?
+
+    @property
+    def step(self) -> Step:
+        """How the next frame is to be encoded."""
+        return self._levels.step
+
+    @property
+    def in_flight(self) -> bool:
+        """Is a picture in flight? Then :meth:`poll` has to be called every 20 ms, to measure how long it takes."""
+        return len(self._window) > 0
+
+    def may_encode(self, captured_s: float, now: float) -> bool:
+        """Is the frame captured at ``captured_s`` due, and would its picture wait for no other? Uses up its turn."""
+        if not self._selector.due(captured_s):
+            return False
+        round_trip_s = self._update(now)
+        if self._window.full(round_trip_s, now):
+            self._blocked = self._blocked or self._window.age_s(round_trip_s, now) > 0
+            self._counters.add("held_back")
+            return False
+        missed = self._selector.use(captured_s)
+        if self._blocked:  # else the camera was late
+            self._levels.lost(missed, now)
+        self._blocked = False
+        return True
+
+    def sent(self, size: int, now: float) -> None:
+        """The connection has accepted a picture that takes ``size`` bytes on the wire."""
+        self._window.sent(size, now)
+
+    def poll(self, now: float) -> Step | None:
+        """Measure what was acknowledged; returns the step if it has changed since the last poll."""
+        self._update(now)
+        changed, self._changed = self._changed, False
+        return self.step if changed else None
+
+    def connection_lost(self) -> None:
+        """The pictures in flight are lost."""
+        self._window.clear()
+
+    def _update(self, now: float) -> float:
+        outgoing = self._outgoing()
+        acknowledged = self._window.poll(outgoing.waiting, outgoing.round_trip_s, now)
+        if self._levels.poll(acknowledged, self._window.age_s(outgoing.round_trip_s, now), now):
+            self._selector.fps = self._fps * float(self.step.rate)
+            self._changed = True
+        return outgoing.round_trip_s
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What is sent, as shares of what is configured."""
+
+    quality: Fraction
+    size: Fraction  # of width and of height
+    rate: Fraction
+    bytes: float  # of one picture, roughly
+
+    @property
+    def cost(self) -> float:
+        """Share of the bytes per second. Fewer frames differ more from each other."""
+        return self.bytes * math.pow(self.rate, 0.9)
+
+    def __str__(self) -> str:
+        """What is reduced, for display: "quality 1/2, size 3/4"; empty if nothing is."""
+        parts = {"quality": self.quality, "size": self.size, "rate": self.rate}
+        return ", ".join(f"{name} {share}" for name, share in parts.items() if share != 1)
+
+
+def _step(quality: str, size: str, rate: str) -> Step:
+    """Costs as JPEG has them: half the quality is two thirds of the bytes, and small pictures are denser."""
+    q, s, r = Fraction(quality), Fraction(size), Fraction(rate)
+    return Step(q, s, r, math.pow(q, 0.6) * math.pow(s, 1.6))
+
+
+#: From everything to the least that still shows something.
+STEPS = (
+    _step("1", "1", "1"),
+    _step("3/4", "1", "1"),
+    _step("1/2", "1", "1"),
+    _step("1/2", "3/4", "1"),
+    _step("1/2", "1/2", "1"),
+    _step("1/2", "3/8", "1"),
+    _step("1/2", "1/4", "1"),
+    _step("1/2", "1/4", "2/3"),
+    _step("1/2", "1/4", "1/2"),
+    _step("1/2", "1/4", "1/4"),
+    _step("1/2", "1/4", "1/8"),
+)
+
+
+class LevelControl:
+    """Chooses one of STEPS: down at once and as far as it takes, up one step at a time, and more slowly each time that
+    went wrong.
+    """
+
+    def __init__(self, fps: float, now: float) -> None:
+        self.level = 0
+        self._period = 1.0 / fps
+        self._seen: deque[tuple[float, float]] = deque()  # when a frame was acknowledged, and how long it took
+        self._lost: deque[tuple[float, float]] = deque()  # when turns were lost, and how many
+        self._changed_at = self._good_since = now
+        self._rose_at: float | None = None  # None: nothing was restored since the last step down
+        self._patience = _PATIENCE_S
+
+    @property
+    def step(self) -> Step:
+        return STEPS[self.level]
+
+    def lost(self, turns: float, now: float) -> None:
+        """So many frames could not be sent just now because those before them were late."""
+        if now - (turns + 1) * self._frame_s > self._changed_at:  # else those before them were of another step
+            self._lost.append((now, turns))
+
+    def poll(self, acknowledged: list[Acknowledged], age_s: float, now: float) -> bool:
+        """Frames were ``acknowledged``; the oldest in flight is ``age_s`` old. True: another step from now on."""
+        self._seen.extend((now, frame.took_s) for frame in acknowledged if frame.sent_at >= self._changed_at)
+        for memory in (self._seen, self._lost):
+            while memory and now - memory[0][0] > _WINDOW_S:
+                memory.popleft()
+        stuck_s = age_s if age_s <= now - self._changed_at else 0.0  # sent since the last change
+        if stuck_s > _STUCK_S:
+            return self._go_down(max(stuck_s / self._frame_s, self._load), now)
+        if now - self._changed_at < _MEASURE_S or not self._seen:
+            self._good_since = now
+            return False
+        load = self._load
+        if load > _FULL:
+            return self._go_down(load, now)
+        if self.level == 0 or load * STEPS[self.level - 1].cost / self.step.cost > _AIM:
+            self._good_since = now
+        elif now - self._good_since >= self._patience:
+            return self._go_up(now)
+        return False
+
+    @property
+    def _frame_s(self) -> float:
+        """Seconds from one frame to the next at this step."""
+        return self._period / float(self.step.rate)
+
+    @property
+    def _load(self) -> float:
+        """Share of the time the connection is busy if every due frame is sent: may well be above 1."""
+        if not self._seen:
+            return 0.0
+        frames = len(self._seen)
+        busy = sum(took for _, took in self._seen) / frames / self._frame_s
+        lost = sum(turns for _, turns in self._lost) / frames
+        return max(busy, 1.0 + lost) if lost > _LOST else busy
+
+    def _go_down(self, load: float, now: float) -> bool:
+        """As far as it takes; what was just restored is reduced again, and restored later than the last time."""
+        lower = range(self.level + 1, len(STEPS))
+        affordable = self.step.cost * _AIM / load
+        if self._rose_at is not None and now - self._rose_at < _PROBATION_S:
+            self._patience = min(_LONGEST_PATIENCE_S, 2 * self._patience)
+            affordable = self.step.cost if load <= 2 * _FULL else affordable
+        self._rose_at = None
+        level = next((level for level in lower if STEPS[level].cost <= affordable), len(STEPS) - 1)
+        return self._change(level, now)
+
+    def _go_up(self, now: float) -> bool:
+        if self._rose_at is not None and now - self._rose_at > _PROBATION_S:
+            self._patience = max(_PATIENCE_S, self._patience / 2)
+        self._rose_at = now
+        return self._change(self.level - 1, now)
+
+    def _change(self, level: int, now: float) -> bool:
+        changed = level != self.level
+        self.level = level
+        self._seen.clear()
+        self._lost.clear()
+        self._changed_at = self._good_since = now
+        return changed

@@ -1,0 +1,100 @@
+"""How many frames may be in flight, and how long the connection was busy with each. Pure: times and bytes come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pebble.media.in_flight import InFlight
+
+#: The other side's TCP may delay an acknowledgement by 40 ms: this much says nothing about the connection.
+SLACK_S = 0.05
+#: An access point delays it until its next beacon, every 102.4 ms as a rule, while the radio here saves power. Then
+#: this much says nothing either; but only then, because on a slow connection commands wait behind such pictures.
+BEACON_SLACK_S = 0.12
+_BEACON_S = 3.0  # for how long an observed beacon delay is assumed to go on
+_PROBE_S = 2.0  # between two frames that are sent to observe it
+_PROMPT_S = 0.1  # beyond a round trip: a frame that took no longer did not wait behind another
+_MOST = 32  # frames in flight at once; 30 per second need no more over a round trip of a second
+_SLACK_BYTES = 64  # of pings and headers
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledged:
+    """A frame the other side has acknowledged."""
+
+    sent_at: float
+    took_s: float  # how long it kept the connection busy; short times are given the benefit of the doubt
+
+
+class SendWindow:
+    """The frames in flight on one connection, and how many may be.
+
+    Over a long round trip several frames travel at once: at first one, then one more for each that arrived promptly,
+    because the capacity of the path shows only after a round trip.
+
+    Delayed acknowledgements come together: a late frame is acknowledged at once with younger ones, for which a slow
+    connection would have needed longer. To tell the two apart, a younger frame has to be in flight: when only one is,
+    and late, another is let through now and then.
+    """
+
+    def __init__(self) -> None:
+        self._frames = InFlight(_SLACK_BYTES)
+        self._limit = 1  # frames that may be in flight
+        self._free_at = 0.0  # when the newest acknowledged one was
+        self._round_trip_s, self._polled_at = 0.0, float("-inf")  # at the last poll
+        self._beacon_until = self._probed_at = float("-inf")
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def clear(self) -> None:
+        """The connection is lost, and all frames in flight with it."""
+        self._frames.clear()
+        self._limit = 1
+
+    def sent(self, size: int, now: float) -> None:
+        oldest = self._frames.oldest
+        if oldest is not None and len(self._frames) == 1 and now - oldest.at - self._round_trip_s > SLACK_S:
+            self._probed_at = now
+        self._frames.sent(size, now)
+
+    def poll(self, waiting: int, round_trip_s: float, now: float) -> list[Acknowledged]:
+        """The frames acknowledged since the last poll, while ``waiting`` bytes are not."""
+        self._round_trip_s, since_s, self._polled_at = round_trip_s, now - self._polled_at, now
+        frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
+        acknowledged = []
+        for frame in frames:
+            began = max(frame.at + round_trip_s, self._free_at)
+            self._free_at = now
+            prompt = now - frame.at - round_trip_s <= _PROMPT_S
+            self._limit = max(1, min(_MOST, self._limit + (1 if prompt else -1)))
+            acknowledged.append(Acknowledged(frame.at, _credible(max(0.0, now - began), slack_s)))
+        if len(frames) > 1:
+            sizes = [frame.size for frame in frames]
+            needed_s = since_s * sizes[0] / sum(sizes[1:])  # by the first frame, at the pace of those that came with it
+            if now - frames[0].at - round_trip_s > max(SLACK_S, 2 * needed_s):
+                self._beacon_until = now + _BEACON_S
+        return acknowledged
+
+    def full(self, round_trip_s: float, now: float) -> bool:
+        """Would another frame have to wait for those before it?"""
+        if len(self._frames) >= self._limit:
+            return True
+        late_s = self.age_s(round_trip_s, now)
+        probe = len(self._frames) == 1 and late_s <= BEACON_SLACK_S - SLACK_S and now - self._probed_at >= _PROBE_S
+        return late_s > 0 and not probe
+
+    def age_s(self, round_trip_s: float, now: float) -> float:
+        """How much longer than a mere round trip the oldest frame has been in flight; 0 without one."""
+        if not len(self._frames):
+            return 0.0
+        return max(0.0, self._frames.age_s(now) - round_trip_s - self._slack_s(now))
+
+    def _slack_s(self, now: float) -> float:
+        """By how much an acknowledgement may be late and say nothing about the connection."""
+        return BEACON_SLACK_S if now < self._beacon_until else SLACK_S
+
+
+def _credible(took_s: float, slack_s: float) -> float:
+    """The part of it that is surely due to the connection: none below the slack, all from twice the slack on."""
+    return took_s * min(1.0, max(0.0, took_s / slack_s - 1.0))

@@ -1,0 +1,94 @@
+"""Detects that the bridge's two sides are one broker, whatever addresses lead to it (paper A.5.1).
+
+Then nothing may be mirrored: every message would come back and circulate for ever. A probe that is published on the
+remote side and received on the local side proves it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+from pebble.config import Config
+from pebble.contract import BRIDGE_PROBE
+from pebble.forwarding.forwarder import barrier
+from pebble.forwarding.probes import PROBE_REQUEST, new_probe
+from pebble.transports import Message, QoS, State, Transport
+
+_REMEMBERED = 64  # probes that may still arrive
+_PERIOD_S = 1.0
+
+
+class SameBrokerProbe:
+    """Sends probes in rounds, and remembers in which round one was received on the local side.
+
+    On a robot with a mirror each probe is also announced on the robot's own transport; the mirror compares it with
+    what it receives from its broker.
+    """
+
+    def __init__(self, config: Config, local: Transport, remote: Transport, clock: Callable[[], float]) -> None:
+        section = config.services.mqtt_bridge.remote
+        self.topic = BRIDGE_PROBE.topic(config.base)
+        self.possible = config.transport.kind == ("mqtt" if section is None else section.kind)
+        self.announces = config.transport.mqtt_mirror is not None
+        self._local, self._remote, self._clock = local, remote, clock
+        self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._sent_at = float("-inf")
+        self._round = 0
+        self._same_in_round = -1  # the newest round in which both sides were one broker
+
+    @property
+    def both_connected(self) -> bool:
+        return self._local.state is State.CONNECTED and self._remote.state is State.CONNECTED
+
+    def send(self) -> bool:
+        """Send a new probe; False if the remote transport does not accept it."""
+        self._sent_at = self._clock()
+        payload = new_probe(now_ms())
+        self._sent.append(payload)
+        if self.announces and self._remote.state is State.CONNECTED:
+            self._local.publish(self.topic, payload, qos=QoS.DELIVERED)
+        return self._remote.publish(self.topic, payload, qos=QoS.DELIVERED)
+
+    def send_again(self) -> None:
+        """Send a new probe, at most one per second."""
+        if self._clock() - self._sent_at >= _PERIOD_S:
+            self.send()
+
+    def answer_request(self) -> None:
+        if self._remote.state is State.CONNECTED:
+            self.send()
+
+    def begin_round(self, remote_filter: str) -> int | None:
+        """Send a probe and wait, bounded, until it would have arrived; None if a connection was lost meanwhile.
+
+        The barrier is first on the side the probe went to, then on the side where it would arrive.
+        """
+        self._round += 1
+        if not self.send():
+            return None
+        barrier(self._remote, remote_filter)
+        barrier(self._local, self.topic)
+        return self._round if self.both_connected else None
+
+    def proves_two_brokers(self, round_: int) -> bool:
+        """Whether no probe came back in this round, and no newer round has begun."""
+        return round_ == self._round != self._same_in_round and self.both_connected
+
+    # -- the transports' threads
+
+    def proves_same_broker(self, message: Message) -> bool:
+        """Whether ``message``, received on the local side on :attr:`topic`, is one of our probes."""
+        if message.payload not in tuple(self._sent):
+            return False
+        self._same_in_round = self._round
+        return True
+
+    def is_request(self, message: Message) -> bool:
+        """Whether the mirror requests a probe."""
+        return self.announces and message.payload == PROBE_REQUEST
+
+
+def now_ms() -> int:
+    return time.time_ns() // 1_000_000

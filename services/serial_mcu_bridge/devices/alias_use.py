@@ -1,0 +1,82 @@
+"""The aliases of a device that are in use: those that no other device claims."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
+from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
+from pebble.transports import Subscription
+
+
+class AliasUse:
+    """``begin`` starts the use of an alias (and returns its subscription, if it has one), ``end`` ends it."""
+
+    def __init__(
+        self,
+        log: logging.Logger,
+        peers: PeerDevices,
+        begin: Callable[[Device, Route, Alias], Subscription | None],
+        end: Callable[[Alias], None],
+    ) -> None:
+        self._log, self._peers, self._begin, self._end = log, peers, begin, end
+        self.permitted = False  # other devices have had time to object
+        self._device: Device | None = None
+        self._used: dict[str, tuple[Alias, Subscription | None]] = {}  # by claim
+        self._rivals: dict[str, list[str]] = {}  # by claim, as last logged
+
+    def __contains__(self, alias: Alias) -> bool:
+        return alias.claim in self._used
+
+    def announce(self, device: Device) -> None:
+        """Set a device whose manifest was just published; no alias is in use yet."""
+        self._device, self.permitted = device, False
+
+    def permit(self, device: Device) -> None:
+        """Use aliases from now on: other devices have had time to object."""
+        if device is self._device:
+            self.permitted = True
+            self.update()
+
+    def update(self) -> None:
+        """Use the aliases that no other device claims, and release the others: while two claim one, neither uses it."""
+        if self._device is None:
+            return
+        for route in self._device.routes.values():
+            if route.alias is not None:
+                self._update(self._device, route, route.alias)
+
+    def withdraw(self) -> None:
+        """Release all aliases, because the device has gone."""
+        for claim in list(self._used):
+            self._release(claim)
+        self._device, self.permitted = None, False
+        self._rivals.clear()
+
+    def _update(self, device: Device, route: Route, alias: Alias) -> None:
+        rivals = self._peers.claimants(alias.claim)
+        self._log_conflict(device, alias.claim, rivals)
+        if rivals:
+            self._release(alias.claim)
+        elif self.permitted and alias.claim not in self._used:
+            self._used[alias.claim] = alias, None  # counts as used already, so that begin can publish on it
+            self._used[alias.claim] = alias, self._begin(device, route, alias)
+
+    def _release(self, claim: str) -> None:
+        if claim in self._used:
+            alias, subscription = self._used.pop(claim)
+            if subscription is not None:
+                subscription.close()
+            self._end(alias)
+
+    def _log_conflict(self, device: Device, claim: str, rivals: list[str]) -> None:
+        before = self._rivals.pop(claim, [])
+        if rivals:
+            self._rivals[claim] = rivals
+        if rivals and not before:
+            others = " and ".join(rivals)
+            text = "%s and %s both claim %s: neither has it until one of them leaves, both use mcu/… only"
+            self._log.warning(text, device.uid, others, claim)
+        elif before and not rivals:
+            self._log.info("%s: %s is in use again", device.uid, claim)

@@ -1,0 +1,344 @@
+"""Owns the serial line to a self-describing MCU (``pebble_serial_v1``), whose manifest defines its topics."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from functools import partial
+from typing import Any
+
+from pebble.contract import IMU, IMU_FAST, MCU_COMMAND, MCU_DESCRIBE, MCU_VALUE, Channel, Kind, codec
+from pebble.contract.payloads import McuManifest, McuSample
+from pebble.errors import DeviceError, PayloadError
+from pebble.runtime.service import every, on
+from pebble.runtime.timers import Timer
+from pebble.services.serial_mcu_bridge.devices.alias_use import AliasUse
+from pebble.services.serial_mcu_bridge.devices.aliases import claims
+from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
+from pebble.services.serial_mcu_bridge.devices.imu import FAMILY, MOTION, ImuReports, ImuWatchdog
+from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
+from pebble.services.serial_mcu_bridge.line.serial_line import LineState
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (
+    Answer,
+    Described,
+    Event,
+    Gone,
+    Reading,
+    RefusedInput,
+    Send,
+    Session,
+)
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
+    PROTOCOL,
+    RESERVED,
+    Direction,
+    InterfaceKind,
+    Manifest,
+)
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.uid_claim import Move, UidClaim
+from pebble.services.serial_mcu_bridge.serial_service import SerialService
+from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
+from pebble.transports import Message, Subscription
+
+_CLAIM_S = 0.25  # between publishing claims and using them: another device has objected by then
+_WATCH_S = 0.5
+
+#: Published to request a uid or to check a retained manifest; the process that has the device publishes its manifest.
+_UID_QUERY = Channel(
+    metric=MCU_COMMAND.metric.replace("{name}", RESERVED),
+    kind=Kind.COMMAND,
+    payload=dict[str, Any],
+    doc="Which process has the device of this uid?",
+)
+
+
+class DescribedBridge(SerialService):
+    """Publishes the topics of one MCU while it is connected, and clears its retained messages when it has gone."""
+
+    publishes = (MCU_DESCRIBE, MCU_VALUE, IMU_FAST, IMU)
+    end = END
+    boot_s = 0.0  # bytes that are no frame are skipped
+    retry_s = 0.25  # the topics exist within 2 s of plugging in
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._session = Session()
+        self._watchdog = ImuWatchdog(self.options, self.instance)
+        self._peers = PeerDevices()
+        self._uid = UidClaim(secrets.token_hex(8))
+        self._candidate: Manifest | None = None  # described, possibly under a uid that another device holds
+        self._conflict_logged = False
+        self._device: Device | None = None
+        self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
+        self._generic: list[Subscription] = []  # of the device that was described last, connected or not
+        self._aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias)
+        self._timer: Timer | None = None
+
+    def start(self) -> None:
+        self.post(self._subscribe_to_manifests)
+        super().start()
+
+    def stop(self) -> None:
+        self._device_gone("the bridge ends")
+
+    # -- the line
+
+    def on_line_state(self, state: LineState) -> None:
+        now = self.clock()
+        if state is LineState.READY:
+            self._session.opened(now)
+            self._watchdog.begin(now)
+        elif state is LineState.ABSENT:
+            self._watchdog.end()
+            self._handle_events(self._session.closed())
+            self.exit_if_configured()
+        self._arm()
+
+    def on_input(self, chunk: bytes) -> None:
+        self._handle_events(self._session.feed(chunk, self.clock()))
+        self._arm()
+
+    @every(_WATCH_S)
+    def watch(self) -> None:
+        if self._watchdog.expired(self.clock()):
+            raise DeviceError(f"no sample for {self._watchdog.timeout_s:g} s")
+
+    def _tick(self) -> None:
+        self._timer = None
+        self._handle_events(self._session.tick(self.clock(), _now_ms()))
+        for uid in self._peers.left_over(self.clock()):
+            self.log.info("%s: its retained manifest is stale; cleared", uid)
+            self._send(MCU_DESCRIBE, MCU_DESCRIBE.topic(self.config.base, uid=uid), b"")
+            self._aliases.update()
+        self._perform(self._uid.tick(self.clock()))
+        self._arm()
+
+    def _arm(self) -> None:
+        """Ensure that the timer is early enough; one that is too early has no effect."""
+        times = (self._session.due, self._peers.due, self._uid.due)
+        due = min((due for due in times if due is not None), default=None)
+        if due is None or (self._timer is not None and self._timer.due <= due):
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self.call_at(due, self._tick)
+
+    # -- events of the MCU
+
+    def _handle_events(self, events: list[Event]) -> None:
+        for event in events:
+            match event:
+                case Reading():
+                    self._report(event)
+                case Send(kind, data):
+                    self.line.send(kind, data)
+                case Described(manifest):
+                    self._candidate = manifest
+                    self._perform(self._uid.request(manifest.uid, self.clock()))
+                case Gone(why):
+                    self._device_gone(why)
+                case Answer():
+                    self._log_answer(event)
+                case DeviceLogLine(level, text):
+                    self.device_log.log("log", level, "MCU: %s", text)
+                case RefusedInput(subject, reason, level):
+                    self.counters.add(subject)
+                    if level > logging.DEBUG:
+                        self.device_log.log(subject, level, "%s", reason)
+
+    def _report(self, reading: Reading) -> None:
+        device, now_ms = self._device, _now_ms()
+        if device is None or not device.has_motion or reading.interface.profile == MOTION:
+            self._watchdog.sample(self.clock())
+        if reading.interface.kind is InterfaceKind.STATE:
+            self._published_states[reading.interface.id] = reading, now_ms
+        if device is not None:
+            route = device.routes[reading.interface.id]
+            sample = device.sample(reading, now_ms)
+            self.publish(route.generic, sample)
+            if route.alias is not None:
+                self._publish_alias(device, route, sample, route.alias)
+
+    def _publish_alias(self, device: Device, route: Route, sample: McuSample, alias: Alias) -> None:
+        body = device.alias_body(route, sample)  # also while unused, as a summary needs the newest motion
+        if alias in self._aliases and body is not None:
+            self.publish(alias.channel, body)
+
+    def _log_answer(self, answer: Answer) -> None:
+        if answer.accepted:
+            self.log.debug("%s: command %d accepted", answer.command, answer.sequence)
+        elif answer.accepted is None:
+            self.counters.add("unanswered")
+            self._quiet_log.warning("unanswered", "%s: no answer to command %d", answer.command, answer.sequence)
+        else:
+            self.counters.add("nack")
+            reason = answer.reason or "no reason given"
+            text = "%s: the MCU refuses command %d: %s"
+            self.device_log.log("nack", logging.WARNING, text, answer.command, answer.sequence, reason)
+
+    # -- the device appears and leaves
+
+    def _perform(self, move: Move) -> None:
+        candidate, device = self._candidate, self._device
+        match move:
+            case Move.ASK if candidate is not None:
+                self._ask(candidate.uid, self._uid.token)
+            case Move.INSIST if candidate is not None:
+                self._ask(candidate.uid, self._uid.token, has=True)
+            case Move.ANSWER if device is not None:
+                self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
+            case Move.HOLD if candidate is not None:
+                self._publish_device(candidate)
+            case Move.YIELD if candidate is not None:
+                self._yield(candidate.uid)
+
+    def _yield(self, uid: str) -> None:
+        self._withdraw("released to another device")  # both held it if the local transport was disconnected
+        if not self._conflict_logged:
+            self._conflict_logged = True
+            text = "%s: another device has this uid already; this one is not used until that one leaves"
+            self.log.warning(text, uid)
+
+    def _ask(self, uid: str, token: str = "", *, has: bool = False) -> None:
+        """Ask which process holds this uid. No process yields to a question without a ``token``."""
+        self.publish(MCU_COMMAND, {"from": token, "has": has}, uid=uid, name=RESERVED)
+
+    @on(_UID_QUERY)
+    def on_question(self, question: dict[str, Any], uid: str) -> None:
+        token, has = str(question.get("from", "")), question.get("has") is True
+        self._perform(self._uid.on_question(uid, token, self.clock(), has=has))
+        self._arm()
+
+    def _publish_device(self, manifest: Manifest) -> None:
+        port = str(self.options.serial.port)
+        reports = ImuReports(device=port, protocol=self.options.protocol, instance=self.instance)
+        device = self._device = Device(manifest, self.addresses, reports)
+        hello = device.hello
+        self.log.info("%s: %r, firmware %r, %d interfaces", device.uid, hello.model, hello.firmware_version,
+                      len(device.routes))  # fmt: skip
+        for name, reason in device.claims.refused.items():
+            self.log.warning("%s: no alias for %s: %s", device.uid, name, reason)
+        if any(route.interface.profile.startswith(FAMILY) for route in device.routes.values()):
+            self._watchdog.found_imu()
+        self._peers.forget(device.uid)
+        self._close_generic()
+        self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
+        self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)  # then the MQTT bridge knows what is private
+        self._listen_generic(device, private=True)
+        for reading, received_ms in self._published_states.values():  # received before we held the uid
+            self.publish(device.routes[reading.interface.id].generic, device.sample(reading, received_ms))
+        self._aliases.announce(device)
+        self.call_at(self.clock() + _CLAIM_S, partial(self._aliases.permit, device))
+
+    def _device_gone(self, why: str) -> None:
+        """Remove the device's retained messages. Its commands are still received, counted and dropped."""
+        self._candidate, self._conflict_logged = None, False
+        self._published_states.clear()
+        self._uid.release()
+        self._withdraw(why)
+
+    def _withdraw(self, why: str) -> None:
+        device, self._device = self._device, None
+        if device is None:
+            return
+        self.log.info("%s: %s", device.uid, why)
+        self._aliases.withdraw()
+        for route in device.routes.values():
+            if route.generic.kind is Kind.STATE:
+                self.retract(route.generic)
+        self.retract(MCU_DESCRIBE, uid=device.uid)
+
+    def _listen_generic(self, device: Device, *, private: bool) -> None:
+        self._generic += [
+            self.listen(route.generic, partial(self._command, device, route))
+            for route in device.routes.values()
+            if route.interface.direction is Direction.IN and route.interface.local_only is private
+        ]
+
+    def _close_generic(self) -> None:
+        subscriptions, self._generic = self._generic, []
+        for subscription in subscriptions:
+            subscription.close()
+
+    # -- commands
+
+    def _command(self, device: Device, route: Route, values: dict[str, Any]) -> None:
+        name = route.interface.name
+        if device is not self._device:
+            self.counters.add("no_device")
+            self._quiet_log.warning("no device", "%s: dropped a command, the device is not there", name)
+            return
+        try:
+            send = self._session.command(route.interface, values, self.clock(), _now_ms())
+        except PayloadError as error:
+            self.counters.add("refused")
+            self._quiet_log.warning("command", "refused a command: %s", error)
+            return
+        if not self.line.send(send.kind, send.data):
+            self.counters.add("no_device")
+        self._arm()
+
+    # -- aliases
+
+    def _begin_alias(self, device: Device, route: Route, alias: Alias) -> Subscription | None:
+        if route.interface.direction is Direction.IN:
+            return self.listen(alias.channel, partial(self._command, device, route))
+        newest = self._published_states.get(route.interface.id)
+        if newest is not None:
+            self._publish_alias(device, route, device.sample(*newest), alias)
+        return None
+
+    def _end_alias(self, alias: Alias) -> None:
+        address = self.addresses[alias.channel]
+        if alias.channel.kind is Kind.STATE:
+            self.retract(alias.channel)
+        elif address.retain:  # the config retains a stream
+            self._send(alias.channel, address.topic, b"")
+
+    # -- the other devices of this robot
+
+    def _subscribe_to_manifests(self) -> None:
+        self.transport.subscribe(self.addresses[MCU_DESCRIBE].topic, self._on_manifest, echo=False, direct=True)
+
+    def _on_manifest(self, message: Message) -> None:
+        """On the transport's thread."""
+        uid = MCU_DESCRIBE.names(message.topic).get("uid")
+        if uid is None:  # the filter's + also matches an empty level
+            self.counters.add("refused")
+            return
+        manifest = None
+        if message.payload:
+            try:
+                manifest = codec.decode(MCU_DESCRIBE, message.payload)
+            except PayloadError:
+                return
+            if manifest.protocol != PROTOCOL or manifest.device_uid != uid:
+                return
+        handle = partial(self._receive_manifest, uid, manifest, message.retain)
+        self.post(partial(self._handle, MCU_DESCRIBE, handle, self.clock()))
+
+    def _receive_manifest(self, uid: str, manifest: McuManifest | None, retained: bool) -> None:
+        now = self.clock()
+        if self._device is not None and uid == self._device.uid:
+            if manifest is None:
+                self._republish()  # another process removed it, for example one that has yielded the uid
+            else:
+                self._perform(self._uid.on_manifest(uid, now))
+            return
+        if manifest is None:
+            self._peers.forget(uid)
+            self._perform(self._uid.on_withdrawal(uid, now))
+        else:
+            self._peers.add(uid, frozenset(claims(manifest).granted), now, retained=retained)
+            if retained:
+                self._ask(uid)  # unless its bridge publishes it again in time, _tick removes it
+            else:
+                self._perform(self._uid.on_manifest(uid, now))
+        self._aliases.update()
+        self._arm()
+
+
+def _now_ms() -> int:
+    return time.time_ns() // 1_000_000

@@ -1,0 +1,126 @@
+"""A described MCU on this robot: the channel and the payloads of each of its interfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pebble import contract as c
+from pebble.contract.payloads import McuManifest, McuSample, Payload
+from pebble.runtime.addresses import Addresses
+from pebble.services.serial_mcu_bridge.devices import imu
+from pebble.services.serial_mcu_bridge.devices.aliases import Claims, claims
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import Reading
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Direction, Interface, InterfaceKind, Manifest
+
+_Object = dict[str, Any]
+
+#: How an interface of each kind travels: sensor readings may be lost, states may not.
+_KINDS = {
+    InterfaceKind.SAMPLE: (c.Kind.STREAM, 0),
+    InterfaceKind.STATE: (c.Kind.STREAM, 1),
+    InterfaceKind.EVENT: (c.Kind.EVENT, 1),
+    InterfaceKind.COMMAND: (c.Kind.COMMAND, 1),
+}
+
+Body = Callable[[McuSample], Payload | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Alias:
+    """A channel of an interface's own, and the claim that no other device may make."""
+
+    claim: str
+    channel: c.Channel
+    body: str  # the profile whose body it carries; empty: the generic one
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    interface: Interface
+    generic: c.Channel
+    alias: Alias | None
+
+
+class Device:
+    """``payload`` is the manifest to publish: as the MCU sent it, with channels renamed as in the robot's config."""
+
+    def __init__(self, manifest: Manifest, addresses: Addresses, reports: imu.ImuReports) -> None:
+        self._addresses, self._reports = addresses, reports
+        self.uid = manifest.uid
+        self.hello = manifest.hello
+        interfaces = tuple(map(self._renamed, manifest.interfaces))
+        self.payload: McuManifest = Manifest(manifest.hello, interfaces).payload()
+        self.claims: Claims = claims(self.payload, self._robots_channel)
+        self.routes = {one.id: self._route(one) for one in interfaces}
+
+    @property
+    def has_motion(self) -> bool:
+        """Whether there is an inertial sensor, which sends continuously."""
+        return any(route.interface.profile == imu.MOTION for route in self.routes.values())
+
+    def sample(self, reading: Reading, t: int) -> McuSample:
+        """Return the payload of the generic topic."""
+        interface = reading.interface
+        return McuSample(
+            t=t,
+            seq=reading.sequence,
+            mcu_ms=reading.mcu_ms,
+            device_uid=self.uid,
+            interface=interface.name,
+            profile=interface.profile,
+            value=reading.values,
+        )
+
+    def alias_body(self, route: Route, sample: McuSample) -> Payload | None:
+        """Return the alias's payload; None where there is none yet."""
+        body = "" if route.alias is None else route.alias.body
+        if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
+            motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)  # summaries repeat it
+            return motion if body else sample
+        if body:
+            return self._reports.summary(sample.t, sample.seq, sample.mcu_ms, sample.value)
+        return sample
+
+    def _route(self, interface: Interface) -> Route:
+        incoming = interface.direction is Direction.IN
+        pattern = c.MCU_COMMAND if incoming else c.MCU_VALUE
+        metric = pattern.metric.format(uid=self.uid, name=interface.name)
+        payload = _Object if incoming else McuSample
+        generic = _channel(metric, interface.kind, payload, retain=interface.retain)
+        return Route(interface, generic, self._alias(interface, payload))
+
+    def _alias(self, interface: Interface, payload: Any) -> Alias | None:
+        claim = f"{c.INCOMING if interface.direction is Direction.IN else c.OUTGOING}/{interface.channel}"
+        if self.claims.granted.get(claim) != interface.name:
+            return None
+        channel = self._robots_channel(claim)
+        if channel in (c.IMU_FAST, c.IMU):
+            return Alias(claim, channel, interface.profile)
+        own = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
+        # a payload that must stay on the robot names its device, so that the MQTT bridge recognises it
+        profiled = interface.profile in (imu.MOTION, imu.SUMMARY) and not interface.local_only
+        fits = profiled and imu.fits(interface.profile, {field.name for field in interface.fields})
+        return Alias(claim, own, interface.profile if fits else "")
+
+    def _renamed(self, interface: Interface) -> Interface:
+        """Return it with the channel's effective name, if the config sets one and the name is valid as a channel."""
+        if interface.direction is Direction.IN:
+            return interface
+        channel = c.channel_of(f"{c.OUTGOING}/{interface.channel}")
+        family = f"{self._addresses.base}/{c.OUTGOING}/"
+        if channel not in (c.IMU_FAST, c.IMU) or not self._addresses[channel].topic.startswith(family):
+            return interface
+        return replace(interface, channel=self._addresses[channel].topic.removeprefix(family))
+
+    def _robots_channel(self, suffix: str) -> c.Channel | None:
+        return self._addresses.channel(f"{self._addresses.base}/{suffix}") or c.channel_of(suffix)
+
+
+def _channel(metric: str, kind: InterfaceKind, payload: Any, *, retain: bool = False) -> c.Channel:
+    """Return a channel created at run time. Only a state is retained: a retained sample would be stale."""
+    what, qos = _KINDS[kind]
+    if kind is InterfaceKind.STATE and retain:
+        what = c.Kind.STATE
+    return c.Channel(metric=metric, kind=what, payload=payload, doc="", qos=qos)

@@ -1,0 +1,118 @@
+"""Inertial sensors: from values to the payloads of ``sensors/imu*``, and a watchdog for missing samples. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any, Final
+
+from pebble.config import SerialBridge
+from pebble.contract.payloads import Imu, ImuFast, ImuFastValues, ImuHealth, ImuValues, Orientation, Vector
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+
+#: Profiles of interfaces: every sample, and the summary for operators.
+MOTION: Final = "imu.motion.v1"
+SUMMARY: Final = "imu.summary.v1"
+FAMILY: Final = "imu."
+
+TIMEOUT_S = 5.0  # without a sample
+FIRST_S = 2.0  # more for the first sample: the board boots, and is asked for its manifest
+
+_FIELDS = {
+    MOTION: frozenset(("ax", "ay", "az", "gx", "gy", "gz", "temp_c", "roll_deg", "pitch_deg")),
+    SUMMARY: frozenset(
+        (
+            *("accel_norm_g", "gyro_bias_x_dps", "gyro_bias_y_dps", "gyro_bias_z_dps"),
+            *("samples_ok", "samples_error", "calibration_samples"),
+        )
+    ),
+}
+
+Values = Mapping[str, Any]
+
+
+def fits(profile: str, names: Collection[str]) -> bool:
+    """Return whether fields of these names include all fields of the profile."""
+    return _FIELDS[profile] <= set(names)
+
+
+class ImuReports:
+    """Makes the payloads of one sensor; a summary repeats the newest sample."""
+
+    def __init__(self, *, device: str, protocol: str, instance: str) -> None:
+        self._device, self._protocol, self._instance = device, protocol, instance
+        self._newest: ImuFastValues | None = None
+
+    def motion(self, t: int, seq: int, mcu_ms: int, values: Values) -> ImuFast:
+        """``values``: m/s², degrees per second, °C and degrees, by the names of the profile's fields."""
+        self._newest = ImuFastValues(
+            accel_mps2=_vector(values, "ax", "ay", "az"),
+            gyro_dps=_vector(values, "gx", "gy", "gz"),
+            temp_c=round(values["temp_c"], 3),
+            orientation_deg=Orientation(roll=round(values["roll_deg"], 3), pitch=round(values["pitch_deg"], 3)),
+        )
+        return ImuFast(t=t, seq=seq, mcu_ms=mcu_ms, value=self._newest)
+
+    def summary(self, t: int, seq: int, mcu_ms: int, values: Values) -> Imu | None:
+        """Return None before the first sample."""
+        newest = self._newest
+        if newest is None:
+            return None
+        value = ImuValues(
+            accel_mps2=newest.accel_mps2,
+            gyro_dps=newest.gyro_dps,
+            temp_c=newest.temp_c,
+            orientation_deg=newest.orientation_deg,
+            accel_norm_g=round(values["accel_norm_g"], 4),
+            gyro_bias_dps=_vector(values, "gyro_bias_x_dps", "gyro_bias_y_dps", "gyro_bias_z_dps"),
+            health=ImuHealth(
+                device=self._device,
+                protocol=self._protocol,
+                instance=self._instance,
+                samples_ok=values["samples_ok"],
+                samples_error=values["samples_error"],
+                calibration_samples=values["calibration_samples"],
+            ),
+        )
+        return Imu(t=t, seq=seq, mcu_ms=mcu_ms, value=value)
+
+
+class ImuWatchdog:
+    """Measures the time without a sample while a device is connected; when it expires, the process must end.
+
+    The clock is passed in.
+    """
+
+    def __init__(self, options: SerialBridge, instance: str) -> None:
+        self._configured = options.health.imu_sample_timeout_seconds
+        self._is_imu = SERIAL_PROTOCOLS[options.protocol].has_imu(instance)
+        self._since: float | None = None  # the newest sample, or the opening of the line
+
+    @property
+    def timeout_s(self) -> float:
+        """0 for never."""
+        if self._configured is not None:
+            return self._configured
+        return TIMEOUT_S if self._is_imu else 0.0
+
+    def found_imu(self) -> None:
+        """Record that the device is an inertial sensor."""
+        self._is_imu = True
+
+    def begin(self, now: float) -> None:
+        self._since = now + FIRST_S
+
+    def end(self) -> None:
+        """Stop waiting, because there is no device."""
+        self._since = None
+
+    def sample(self, now: float) -> None:
+        if self._since is not None:
+            self._since = now
+
+    def expired(self, now: float) -> bool:
+        return self.timeout_s > 0 and self._since is not None and now - self._since > self.timeout_s
+
+
+def _vector(values: Values, *names: str) -> Vector:
+    x, y, z = (round(values[name], 4) for name in names)
+    return Vector(x=x, y=y, z=z)

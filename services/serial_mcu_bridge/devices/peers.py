@@ -1,0 +1,48 @@
+"""The other self-describing MCUs of this robot and the channels that their manifests claim. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+#: A retained manifest may have outlived its device. We ask; if its bridge does not publish it again within 5 s, it is
+#: removed.
+CONFIRM_S = 5.0
+
+_MOST = 256  # a robot has a handful; limits forged ones
+
+
+@dataclass(frozen=True, slots=True)
+class _PeerDevice:
+    claims: frozenset[str]
+    confirm_by: float | None  # None: published by a running process
+
+
+class PeerDevices:
+    """Claims by device. A retained manifest counts too, until its confirmation times out."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, _PeerDevice] = {}
+
+    def add(self, uid: str, claims: frozenset[str], now: float, *, retained: bool) -> None:
+        if uid in self._of or len(self._of) < _MOST:
+            self._of[uid] = _PeerDevice(claims, now + CONFIRM_S if retained else None)
+
+    def forget(self, uid: str) -> None:
+        """Remove a device that has withdrawn its manifest, or is this one."""
+        self._of.pop(uid, None)
+
+    def claimants(self, claim: str) -> list[str]:
+        """Return the uids of all devices that claim this channel, sorted."""
+        return sorted(uid for uid, peer in self._of.items() if claim in peer.claims)
+
+    @property
+    def due(self) -> float | None:
+        """When the next confirmation times out; None if none is pending."""
+        return min((one.confirm_by for one in self._of.values() if one.confirm_by is not None), default=None)
+
+    def left_over(self, now: float) -> list[str]:
+        """Remove the devices that were not confirmed in time, and return their uids."""
+        gone = [uid for uid, one in self._of.items() if one.confirm_by is not None and one.confirm_by <= now]
+        for uid in gone:
+            del self._of[uid]
+        return gone

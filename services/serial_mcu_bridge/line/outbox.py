@@ -1,0 +1,60 @@
+"""The lines that wait to be sent: only the newest of each kind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_DRIVE = "drive"
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    line: bytes
+    expires: float  # on the caller's monotonic clock
+
+
+class Outbox:
+    """One slot for drive lines and one per other kind; a newer line replaces an older one. A line may be a frame.
+
+    Pure: the clock is passed in. A drive line that could not be sent in time is replaced by the stop line.
+    """
+
+    def __init__(self, stop: bytes, drive_timeout_s: float) -> None:
+        self.superseded = 0  # lines that a newer one replaced before they were sent
+        self.expired = 0  # drive lines that became a stop
+        self._stop, self._drive_timeout = stop, drive_timeout_s
+        self._slots: dict[str, _Waiting] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._slots)
+
+    def drive(self, line: bytes, now: float, valid_s: float) -> None:
+        """Add a drive line that is valid for so long, at most for the timeout."""
+        self._place(_DRIVE, _Waiting(line, now + min(valid_s, self._drive_timeout)))
+
+    def halt(self) -> None:
+        """Make the stop line the newest drive line. It never expires."""
+        self._place(_DRIVE, _Waiting(self._stop, float("inf")))
+
+    def put(self, kind: str, line: bytes) -> None:
+        """Add any other line, for example ``put("lights", …)``; it never expires."""
+        self._place(kind, _Waiting(line, float("inf")))
+
+    def take(self, now: float) -> bytes | None:
+        """Return the line to send next, drive lines first; None if nothing waits."""
+        kind = _DRIVE if _DRIVE in self._slots else next(iter(self._slots), None)
+        if kind is None:
+            return None
+        waiting = self._slots.pop(kind)
+        if now <= waiting.expires:
+            return waiting.line
+        self.expired += 1
+        return self._stop
+
+    def clear(self) -> None:
+        self._slots.clear()
+
+    def _place(self, kind: str, waiting: _Waiting) -> None:
+        if self._slots.pop(kind, None) is not None:
+            self.superseded += 1
+        self._slots[kind] = waiting

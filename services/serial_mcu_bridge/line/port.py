@@ -1,0 +1,92 @@
+"""An open serial device and its non-blocking system calls."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import struct
+import termios
+from contextlib import suppress
+from pathlib import Path
+
+import serial
+
+from pebble.errors import DeviceError
+
+_CHUNK = 4096
+
+
+class Port:
+    """An open tty in raw mode, 8N1, with old input discarded. Raises DeviceError when it cannot be opened or has gone.
+
+    Exclusive by flock: TIOCEXCL would outlive a killed process on a pty, a flock never does. HUPCL stays set:
+    when our process ends, DTR drops, which resets (so stops) some boards.
+    """
+
+    def __init__(self, path: str, baud: int) -> None:
+        self.path = path
+        try:
+            self._serial = serial.Serial(path, baud, timeout=0, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
+            raise DeviceError(f"cannot open {path}: {_reason(error)}") from error
+
+    def fileno(self) -> int:
+        return int(self._serial.fileno())
+
+    def read(self) -> bytes:
+        """Return what was received, at most 4096 bytes; empty if nothing was."""
+        try:
+            data = os.read(self.fileno(), _CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise DeviceError(f"{self.path} has gone: {error}") from error
+        if not data:
+            raise DeviceError(f"{self.path} has gone: hung up")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Write as many bytes as the kernel accepts at once; return how many."""
+        try:
+            return os.write(self.fileno(), data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise DeviceError(f"{self.path} has gone: {error}") from error
+
+    def queued(self) -> int:
+        """Return how many bytes the kernel holds that are not sent yet; always 0 on a pty."""
+        try:
+            answer = fcntl.ioctl(self.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
+        except OSError as error:
+            raise DeviceError(f"{self.path} has gone: {error}") from error
+        return int(struct.unpack("i", answer)[0])
+
+    def discard_output(self) -> None:
+        """Discard what the kernel holds and has not sent."""
+        with suppress(termios.error):  # a port that has gone raises at the next read
+            termios.tcflush(self.fileno(), termios.TCOFLUSH)
+
+    def is_replaced(self) -> bool:
+        """Return whether the path is another device now: a replug often creates a new node for the symlink."""
+        try:
+            return Path(self.path).stat().st_rdev != os.fstat(self.fileno()).st_rdev
+        except OSError:
+            return False  # no such path, perhaps just being created: a read fails when the device has gone
+
+    def close(self) -> None:
+        """Close without waiting: unsent output is discarded, because it can block close() for 30 s."""
+        with suppress(DeviceError):
+            if self.queued():
+                self.discard_output()
+        with suppress(OSError):
+            self._serial.close()
+
+
+def _reason(error: Exception) -> str:
+    """Return the plain reason; pyserial nests the path and the error number in its text."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number == errno.EAGAIN:  # from flock
+        return "another program has it open"
+    return os.strerror(number) if number else str(error)

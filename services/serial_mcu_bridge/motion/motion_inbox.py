@@ -1,0 +1,115 @@
+"""What waits to be judged before it reaches the motors: stops, resets and drive commands."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from pebble.contract.payloads import Drive, EstopCommand, EstopReset
+from pebble.motion.arbiter import PERSON, UNKNOWN_RUN
+
+_STOPS = 8  # as many names as a latch remembers
+_RESETS = 8
+_SENDERS = 8  # the person, and runs of scripts
+
+
+class ReceivedDrive(NamedTuple):
+    """A drive command, and when it was received on the service's clock."""
+
+    drive: Drive
+    at: float
+
+
+class ReceivedReset(NamedTuple):
+    """A reset, and when it was received on the service's clock."""
+
+    reset: EstopReset
+    at: float
+
+
+@dataclass(slots=True)
+class Batch:
+    """All that was waiting, to be judged in the order of the fields."""
+
+    stops: list[EstopCommand] = field(default_factory=list)
+    resets: list[ReceivedReset] = field(default_factory=list)
+    drives: list[ReceivedDrive] = field(default_factory=list)
+
+
+class MotionInbox:
+    """Bounded. Any thread puts, one takes; a ``put`` returns True if nothing was waiting before: wake the one up then.
+
+    Of drive commands the newest of each sender waits, and before it the zero that it replaced: a zero is always judged.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._lock = threading.Lock()
+        self._stops: list[EstopCommand] = []
+        self._resets: list[ReceivedReset] = []
+        self._drives: OrderedDict[int, list[ReceivedDrive]] = OrderedDict()  # by sender, the newest sender last
+
+    def put_stop(self, stop: EstopCommand) -> bool:
+        with self._lock:
+            was_empty = self._empty
+            if stop not in self._stops:
+                self._stops.append(stop)
+            if len(self._stops) > _STOPS:
+                self._drop(self._stops)
+            return was_empty
+
+    def put_reset(self, reset: EstopReset, now: float) -> bool:
+        with self._lock:
+            was_empty = self._empty
+            self._resets.append(ReceivedReset(reset, now))
+            if len(self._resets) > _RESETS:
+                self._drop(self._resets)
+            return was_empty
+
+    def put_drive(self, drive: Drive, now: float) -> bool:
+        with self._lock:
+            was_empty = self._empty
+            sender = run_of(drive)
+            waiting = self._drives.pop(sender, [])
+            if len(self._drives) >= _SENDERS:
+                del self._drives[next(key for key in self._drives if key != PERSON)]
+                self.dropped += 1
+            self._drives[sender] = _replaced(waiting, ReceivedDrive(drive, now))
+            return was_empty
+
+    def take(self) -> Batch:
+        """Return all that waits, and forget it."""
+        with self._lock:
+            drives = [received for waiting in self._drives.values() for received in waiting]
+            batch = Batch(self._stops, self._resets, drives)
+            self._stops, self._resets, self._drives = [], [], OrderedDict()
+            return batch
+
+    @property
+    def _empty(self) -> bool:
+        return not (self._stops or self._resets or self._drives)
+
+    def _drop(self, waiting: list[EstopCommand] | list[ReceivedReset]) -> None:
+        del waiting[0]
+        self.dropped += 1
+
+
+def run_of(drive: Drive) -> int:
+    """The run of a script's command; PERSON, or UNKNOWN_RUN."""
+    if not drive.signed:
+        return PERSON
+    return drive.run if isinstance(drive.run, int) else UNKNOWN_RUN
+
+
+def _replaced(waiting: list[ReceivedDrive], newest: ReceivedDrive) -> list[ReceivedDrive]:
+    """At most one zero and one command after it.
+
+    Two zeros become one: as new as the newer one, and final if either of them is.
+    """
+    zeros = [received for received in waiting if not received.drive.moves]
+    if newest.drive.moves or not zeros:
+        return [*zeros, newest]
+    final = next((received for received in zeros if received.drive.valid_ms == 0), None)
+    return [newest if final is None else ReceivedDrive(final.drive, newest.at)]

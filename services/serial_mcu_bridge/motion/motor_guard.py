@@ -1,0 +1,205 @@
+"""Decides for one motor owner which drive commands move its motors, and stops them: latch, arbiter and deadline."""
+
+from __future__ import annotations
+
+import logging
+import operator
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from msgspec import UNSET
+
+from pebble.contract.payloads import LAST_RUN, Drive, EstopCommand, EstopReset, EstopState
+from pebble.motion.arbiter import HOLD_MS, PERSON, REFUSED, Arbiter
+from pebble.motion.latch import Latch, stop_of
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.services.serial_mcu_bridge.motion.motion_inbox import run_of
+from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
+from pebble.transports.counters import Counters
+
+log = logging.getLogger(__name__)
+
+NAMES = 8  # names of stops that are remembered
+_STATES_PER_S = 4
+_REPEAT_S = 0.25  # a repetition that comes sooner after a state was sent before that arrived: it needs no answer
+_HOLD_S = HOLD_MS / 1000 + 0.01  # the arbiter counts whole milliseconds
+
+
+#: By ``reset_refused``.
+_REFUSED_RESETS = {
+    "boot": "it is for another motor owner, or for this one before it restarted",
+    "count": "another stop has been received since",
+    "old": "it was received too long ago",
+}
+
+
+class MotorGuard:
+    """The emergency stop and the arbiter of a Linux robot's motor owner; on the service's thread.
+
+    ``publish(state)`` is called with each new state, at most four times a second. Call :meth:`tick` at :attr:`due`.
+    Call :meth:`begin` first. ``file`` outlives a power cut, ``barred_file`` this process, as running scripts do.
+    """
+
+    def __init__(
+        self,
+        file: StateFile,
+        barred_file: StateFile,
+        publish: Callable[[EstopState], object],
+        counters: Counters,
+        *,
+        watchdog_s: float,
+        now: float,
+    ) -> None:
+        self._file, self._barred_file, self._publish, self._counters = file, barred_file, publish, counters
+        self._latch = Latch(secrets.token_hex(4), NAMES, operator.sub)
+        self._arbiter = Arbiter(self._latch, _ms(now), operator.sub, round(1000 * watchdog_s))
+        self._saving = self._saved = 0  # numbers of writes: the newest one, and the newest one that succeeded
+        self._publish_at: float | None = None  # when a state is published that could not be before
+        self._hold_until: float | None = None  # of the person who commanded last
+        self._published = deque([float("-inf")] * _STATES_PER_S, maxlen=_STATES_PER_S)
+        self._barred = 0  # as noted last
+        self._log = RateLimitedLog(log, burst=5)
+        self._can_save = False
+
+    def begin(self, now: float) -> None:
+        """Continue as the file says, and publish the state."""
+        self._can_save = self._file.can_save()
+        if not self._can_save:
+            log.warning("%s cannot be written: an emergency stop ends with a power cut", self._file.path)
+        saved = self._file.load()
+        if saved is not None:
+            self._latch.restore(saved)
+            self._save()  # again: a process that was killed while it wrote may have left what a power cut undoes
+        barred = self._barred_file.load()
+        if type(barred) is int and 0 < barred <= LAST_RUN:
+            self._arbiter.barred = self._barred = barred
+        if self.latched:
+            self._log.log("stop", logging.WARNING, "still stopped by %s", _described(self._latch.by, self._latch.why))
+        self._changed(now)
+
+    @property
+    def latched(self) -> bool:
+        return self._latch.latched
+
+    @property
+    def persisted(self) -> bool | None:
+        """Whether the file holds the state as it is; None where nothing can be saved."""
+        return self._saving == self._saved if self._can_save else None
+
+    def stop(self, command: EstopCommand, now: float) -> None:
+        """Latch. The caller has stopped the motors before."""
+        name = command.stop if isinstance(command.stop, str) else secrets.token_hex(8)
+        by, why = _given(command.by), _given(command.why)
+        if self._arbiter.stop(name, by, why, time.time_ns() // 1_000_000):
+            self._log.log("stop", logging.WARNING, "emergency stop by %s", _described(by, why))
+            self._save()
+            self._changed(now)
+        elif now >= self._published[-1] + _REPEAT_S:
+            self._changed(now)
+
+    def reset(self, reset: EstopReset, age_s: float, now: float) -> None:
+        if self._latch.reset(reset.boot, reset.count, _ms(age_s), _ms(now)):
+            self._log.log("reset", logging.WARNING, "emergency stop reset by %s", _described(_given(reset.by), ""))
+            self._save()
+        elif self._latch.reset_refused:
+            why = _REFUSED_RESETS[self._latch.reset_refused]
+            self._log.log("refused", logging.WARNING, "refused a reset: %s", why)
+        self._changed(now)
+
+    def judge(self, drive: Drive, now: float) -> float | None:
+        """For how many seconds from now this command moves the motors, 0: it stops them; None: it has no effect."""
+        valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
+        run = run_of(drive)
+        limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now))
+        self._note_barred(now)
+        if limit == REFUSED:
+            reason = "latched" if self.latched else "overruled"
+            self._counters.add(reason)
+            self._log.warning(reason, "refused a drive command: %s", self._why_refused(run))
+            return None
+        if run == PERSON:
+            self._hold_until = now + _HOLD_S
+        return limit / 1000
+
+    @property
+    def due(self) -> float | None:
+        """When :meth:`tick` has something to do; None: nothing."""
+        return min((at for at in (self._publish_at, self._hold_until) if at is not None), default=None)
+
+    def tick(self, now: float) -> None:
+        """Let a person's hold end, and publish a state that had to wait."""
+        if self._hold_until is not None and now >= self._hold_until:
+            self._hold_until = None
+            self._arbiter.tick(_ms(now))
+            self._note_barred(now)
+        if self._publish_at is not None and now >= self._publish_at:
+            self._publish_state(now)
+
+    def on_saved(self, number: int, succeeded: bool, now: float) -> None:
+        """A write has ended."""
+        if succeeded:
+            self._saved = number
+        if number == self._saving:
+            self._changed(now)
+
+    def save_again(self) -> None:
+        """Repeat a write that failed; nothing to do otherwise. One that takes long is not repeated."""
+        if self.persisted is False and not self._file.busy:
+            self._save()
+
+    def repeat_state(self, now: float) -> None:
+        """Publish the state again: a broker that was restored from an older save retains an older one."""
+        self._changed(now)
+
+    def state(self) -> EstopState:
+        fields: dict[str, Any] = self._latch.state(self.persisted)
+        return EstopState(**fields, barred=self._barred or UNSET)
+
+    def _changed(self, now: float) -> None:
+        """Publish the state, now or as soon as the rate allows."""
+        allowed_at = self._published[0] + 1.0
+        if now >= allowed_at:
+            self._publish_state(now)
+        else:
+            self._publish_at = allowed_at
+
+    def _publish_state(self, now: float) -> None:
+        self._publish_at = None
+        self._published.append(now)
+        self._publish(self.state())
+
+    def _why_refused(self, run: int) -> str:
+        if self.latched:
+            return "the robot is stopped"
+        if run == PERSON:
+            return "after the reset no zero and no pause was received yet"
+        if run <= self._arbiter.barred:
+            return f"run {run} has ended"
+        return f"run {run} has to wait: a person drives, or this process has just started"
+
+    def _note_barred(self, now: float) -> None:
+        if self._arbiter.barred != self._barred:
+            self._barred = self._arbiter.barred
+            self._barred_file.save(self._barred)
+            self._changed(now)
+
+    def _save(self) -> None:
+        if self._can_save:
+            self._saving = self._file.save(self._latch.saved())
+
+
+def _described(by: str, why: str) -> str:
+    """Who and why, of a stop or a reset, fit for a log."""
+    _, by, why = stop_of({"by": by, "why": why})
+    return f"{by or 'an unnamed sender'}{f' ({why})' if why else ''}"
+
+
+def _given(text: object) -> str:
+    return text if isinstance(text, str) else ""
+
+
+def _ms(seconds: float) -> int:
+    return int(1000 * seconds)

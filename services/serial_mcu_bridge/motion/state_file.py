@@ -1,0 +1,132 @@
+"""A small file that survives a power cut, written by a thread of its own: a disk may take seconds."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pebble.runtime.rate_limit import RateLimitedLog
+
+log = logging.getLogger(__name__)
+
+_LONGEST = 16_384  # bytes; more is no file of ours
+_END_S = 1.0  # longest wait for a write that is under way when closing
+
+
+class Unreadable:
+    """The content of a file that exists and cannot be read."""
+
+
+class StateFile:
+    """The newest of the values passed to :meth:`save`, as JSON; older ones that wait are not written.
+
+    ``on_saved(number, ok)`` is called on the writing thread after each attempt, with the number that ``save`` returned.
+    """
+
+    def __init__(self, path: Path, on_saved: Callable[[int, bool], None] = lambda _number, _succeeded: None) -> None:
+        self.path = path
+        self._on_saved = on_saved
+        self._changed = threading.Condition()
+        self._newest: tuple[int, Any] | None = None
+        self._number = 0
+        self._writing = False
+        self._closing = False
+        self._thread: threading.Thread | None = None
+        self._log = RateLimitedLog(log)
+
+    def can_save(self) -> bool:
+        """Whether the folder can be written, or made."""
+        existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
+        return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+
+    def load(self) -> Any:
+        """What was saved last; None without a file, Unreadable() if it is damaged."""
+        try:
+            file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # else a FIFO in its place waits for ever
+            try:
+                raw = os.read(file, _LONGEST + 1)
+            finally:
+                os.close(file)
+            value = json.loads(raw) if len(raw) <= _LONGEST else None
+            return Unreadable() if value is None else value
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, RecursionError):
+            return Unreadable()
+
+    def save(self, value: Any) -> int:
+        """Write ``value`` soon; returns at once."""
+        with self._changed:
+            self._number += 1
+            self._newest = self._number, value
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name=f"pebble-save {self.path.name}", daemon=True)
+                self._thread.start()
+            self._changed.notify()
+            return self._number
+
+    @property
+    def busy(self) -> bool:
+        """Whether a value waits or is being written: its result follows."""
+        with self._changed:
+            return self._newest is not None or self._writing
+
+    def close(self) -> None:
+        """Wait, bounded, until the newest value is written."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(_END_S)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while self._newest is None and not self._closing:
+                    self._changed.wait()
+                if self._newest is None:
+                    return
+                (number, value), self._newest, self._writing = self._newest, None, True
+            succeeded = self._write(value)
+            with self._changed:
+                self._writing = False
+            self._on_saved(number, succeeded)
+
+    def _write(self, value: Any) -> bool:
+        """Replace the file in one step: after a power cut it holds the old value or the new one."""
+        new = self.path.with_suffix(".new")
+        try:
+            _make(self.path.parent)
+            new.unlink(missing_ok=True)  # left by a power cut; opening a FIFO would wait for ever
+            with new.open("xb") as file:
+                file.write(json.dumps(value).encode())
+                file.flush()
+                os.fsync(file.fileno())
+            new.replace(self.path)
+            _sync(self.path.parent)  # else a power cut may undo the renaming
+        except OSError as error:
+            self._log.log("failed", logging.ERROR, "%s cannot be written: %s", self.path, error.strerror)
+            return False
+        return True
+
+
+def _make(folder: Path) -> None:
+    """Make a folder and those above it, so that they survive a power cut, too."""
+    if folder.is_dir():
+        return
+    _make(folder.parent)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    _sync(folder.parent)
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

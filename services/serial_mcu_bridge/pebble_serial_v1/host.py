@@ -1,0 +1,285 @@
+"""The host's side of ``pebble_serial_v1``: requests the manifest of an MCU, decodes its readings and encodes commands.
+
+Pure: bytes and clock values in, events out; the bytes to send are events too. docs/mcu.md describes the wire.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from pebble.errors import PayloadError
+from pebble.runtime.lines import LineSplitter
+from pebble.services.serial_mcu_bridge.pebble_serial_v1 import struct_v1
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import (
+    END,
+    FRAME_LIMIT,
+    Frame,
+    FrameError,
+    Type,
+    decode,
+    encode,
+)
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
+    Direction,
+    Hello,
+    Interface,
+    Manifest,
+    parse_describe,
+    parse_hello,
+)
+from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, printable
+
+ASK_AFTER_OPENING_S = 1.0  # a board that resets when its port is opened has booted by then
+ASK_AFTER_HELLO_S = 0.25
+ASK_AGAIN_S = 2.0
+PING_S = 5.0  # of silence
+SILENCE_S = 15.0  # despite pings: the device counts as gone
+ANSWER_S = 10.0  # an outlet controller that switches a power outlet over Wi-Fi takes seconds
+
+_DOUBT_S = 10.0  # between two requests because of readings that do not fit the manifest
+_REMEMBERED = 16  # manifests
+_OPEN_COMMANDS = 64  # that wait for their answers
+_WAITING = 8  # kinds per interface: so many commands may wait to be sent; a newer one replaces the oldest
+_U32 = 0xFFFFFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Bytes to send. A newer event of the same ``kind`` replaces one that still waits."""
+
+    kind: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """The manifest of the MCU from now on; ``remembered``: known from an earlier DESCRIBE, selected by a HELLO."""
+
+    manifest: Manifest
+    remembered: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Gone:
+    """The described device has gone, or describes itself differently."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """The values of an interface. ``mcu_ms`` is the MCU's clock."""
+
+    interface: Interface
+    sequence: int
+    mcu_ms: int
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer to the command of this name. ``accepted`` is None when none was received in time."""
+
+    command: str
+    sequence: int
+    accepted: bool | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedInput:
+    """Received bytes that could not be used. ``subject`` is the kind of error, for counters."""
+
+    subject: str
+    reason: str
+    level: int = logging.WARNING
+
+
+Event: TypeAlias = Send | Described | Gone | Reading | Answer | DeviceLogLine | RefusedInput
+
+
+@dataclass(frozen=True, slots=True)
+class _Command:
+    name: str
+    due: float
+
+
+class Session:
+    """One MCU on one serial line. ``now`` is a monotonic clock's, ``wall_ms`` epoch milliseconds.
+
+    Call :meth:`opened` and :meth:`closed` when the serial line opens and closes, :meth:`feed` with received bytes, and
+    :meth:`tick` at ``due``.
+    """
+
+    def __init__(self) -> None:
+        self.manifest: Manifest | None = None
+        self._splitter = LineSplitter(FRAME_LIMIT, END)
+        self._too_long = 0
+        self._by_id: dict[int, Interface] = {}
+        self._known: OrderedDict[Hello, Manifest] = OrderedDict()
+        self._commands: OrderedDict[int, _Command] = OrderedDict()
+        self._slots: dict[int, int] = {}  # of the newest command, by interface
+        self._sequence = 0
+        self._ask_at: float | None = None
+        self._received_at = self._pinged_at = self._asked_at = float("-inf")
+
+    @property
+    def due(self) -> float | None:
+        """When :meth:`tick` has something to do; None for never."""
+        times = [] if self._ask_at is None else [self._ask_at]
+        if self._commands:
+            times.append(next(iter(self._commands.values())).due)
+        if self.manifest is not None:
+            times.append(min(max(self._received_at, self._pinged_at) + PING_S, self._received_at + SILENCE_S))
+        return min(times, default=None)
+
+    def opened(self, now: float) -> None:
+        """Begin a session with an unknown device."""
+        self._splitter.reset()
+        self._commands.clear()
+        self._received_at = now
+        self._ask_at = now + ASK_AFTER_OPENING_S
+
+    def closed(self) -> list[Event]:
+        self._ask_at = None
+        self._commands.clear()
+        return self._forget("the line is gone")
+
+    def feed(self, chunk: bytes, now: float) -> list[Event]:
+        """Return the events of the frames that ``chunk`` completes. Never raises."""
+        events = [event for stuffed in self._splitter.feed(chunk) if stuffed for event in self._receive(stuffed, now)]
+        return events + self._count_too_long()
+
+    def tick(self, now: float, wall_ms: int) -> list[Event]:
+        """Request the manifest, send pings and end timeouts, each when it is due."""
+        events: list[Event] = []
+        if self.manifest is not None and now - self._received_at >= SILENCE_S:
+            events += self._forget(f"has been silent for {SILENCE_S:g} s")
+            self._ask_at = now
+        if self._ask_at is not None and now >= self._ask_at:
+            self._ask_at, self._asked_at = now + ASK_AGAIN_S, now
+            # the zero before it ends the part of a frame that the MCU may hold from an earlier host
+            events.append(Send("ask", END + self._frame(Type.DESCRIBE_REQ, wall_ms)))
+        elif self.manifest is not None and now - max(self._received_at, self._pinged_at) >= PING_S:
+            self._pinged_at = now
+            events.append(Send("ping", self._frame(Type.PING, wall_ms)))
+        while self._commands and next(iter(self._commands.values())).due <= now:
+            sequence, command = self._commands.popitem(last=False)
+            events.append(Answer(command.name, sequence, None))
+        return events
+
+    def command(self, interface: Interface, values: Mapping[str, Any], now: float, wall_ms: int) -> Send:
+        """Return the frame that sets ``interface`` to ``values``. Raises PayloadError for values out of range."""
+        try:
+            payload = struct_v1.pack(interface.fields, values)
+        except PayloadError as error:
+            raise PayloadError(f"{interface.name}: {error}") from None
+        data = self._frame(Type.CMD, wall_ms, interface.id, payload)
+        self._commands[self._sequence] = _Command(interface.name, now + ANSWER_S)
+        if len(self._commands) > _OPEN_COMMANDS:
+            self._commands.popitem(last=False)
+        slot = self._slots[interface.id] = (self._slots.get(interface.id, 0) + 1) % _WAITING
+        return Send(f"command {interface.id}/{slot}", data)
+
+    # -- received frames
+
+    def _receive(self, stuffed: bytes, now: float) -> Iterator[Event]:
+        try:
+            frame = decode(stuffed)
+            self._received_at = now
+            yield from self._understand(frame, now)
+        except FrameError as error:
+            yield RefusedInput(error.subject, str(error))
+        except PayloadError as error:
+            yield RefusedInput(frame.type.name.lower(), f"{frame.type.name} refused: {error}")
+
+    def _understand(self, frame: Frame, now: float) -> Iterator[Event]:
+        match frame.type:
+            case Type.HELLO:
+                yield from self._hello(parse_hello(frame.payload), now)
+            case Type.DESCRIBE:
+                yield from self._describe(parse_describe(frame.payload))
+            case Type.SAMPLE | Type.STATE:
+                yield from self._reading(frame, now)
+            case Type.ACK | Type.NACK:
+                yield from self._answer(frame)
+            case Type.LOG:
+                yield DeviceLogLine(logging.INFO, printable(frame.payload))
+            case Type.PONG:
+                return
+            case _:
+                raise PayloadError("only a host sends this type")
+
+    def _hello(self, hello: Hello, now: float) -> Iterator[Event]:
+        if self.manifest is not None and self.manifest.hello == hello:
+            return  # it has restarted, and its manifest is the same
+        yield from self._forget("its HELLO differs")
+        known = self._known.get(hello)
+        if known is not None:
+            self._known.move_to_end(hello)
+            yield from self._begin(Described(known, remembered=True))
+        else:  # a repeated HELLO does not delay the request
+            self._ask_at = min(now + ASK_AFTER_HELLO_S, self._ask_at or float("inf"))
+
+    def _describe(self, manifest: Manifest) -> Iterator[Event]:
+        self._known[manifest.hello] = manifest
+        self._known.move_to_end(manifest.hello)
+        if len(self._known) > _REMEMBERED:
+            self._known.popitem(last=False)
+        if manifest == self.manifest:
+            self._ask_at = None
+            return
+        yield from self._forget("its manifest differs")
+        yield from self._begin(Described(manifest))
+
+    def _begin(self, described: Described) -> Iterator[Event]:
+        self._ask_at = None
+        self.manifest = described.manifest
+        self._by_id = {one.id: one for one in described.manifest.interfaces}
+        self._slots.clear()
+        yield described
+
+    def _reading(self, frame: Frame, now: float) -> Iterator[Event]:
+        if self.manifest is None:
+            yield RefusedInput("early", "a reading before the manifest", logging.DEBUG)
+            return
+        interface = self._by_id.get(frame.interface)
+        try:
+            if interface is None or interface.direction is not Direction.OUT:
+                raise PayloadError(f"there is no interface {frame.interface} that sends values")
+            values = struct_v1.unpack(interface.fields, frame.payload)
+        except PayloadError:
+            self._doubt(now)
+            raise
+        yield Reading(interface, frame.sequence, frame.timestamp, values)
+
+    def _answer(self, frame: Frame) -> Iterator[Event]:
+        command = self._commands.pop(frame.sequence, None)
+        reason = "" if frame.type is Type.ACK else printable(frame.payload)
+        if command is None:
+            raise PayloadError(f"answers no command of ours, number {frame.sequence} {reason}".rstrip())
+        yield Answer(command.name, frame.sequence, frame.type is Type.ACK, reason)
+
+    def _doubt(self, now: float) -> None:
+        """Request the manifest again, at most every 10 s: the device may run other firmware now."""
+        if self._ask_at is None and now - self._asked_at >= _DOUBT_S:
+            self._ask_at = now
+
+    def _forget(self, why: str) -> list[Event]:
+        if self.manifest is None:
+            return []
+        self.manifest, self._by_id = None, {}
+        return [Gone(why)]
+
+    def _count_too_long(self) -> list[Event]:
+        more = self._splitter.discarded_lines - self._too_long
+        self._too_long += more
+        return [RefusedInput("too long", f"a frame of more than {FRAME_LIMIT} bytes")] * more
+
+    def _frame(self, kind: Type, wall_ms: int, interface: int = 0, payload: bytes = b"") -> bytes:
+        self._sequence = self._sequence % _U32 + 1
+        return encode(Frame(kind, payload, interface, self._sequence, wall_ms & _U32))

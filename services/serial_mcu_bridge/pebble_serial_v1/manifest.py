@@ -1,0 +1,252 @@
+"""Parses and checks the two messages in which an MCU describes itself: HELLO and DESCRIBE."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final
+
+from pebble.contract.identity import LEVEL, LEVEL_RULE
+from pebble.contract.payloads import McuManifest
+from pebble.errors import PayloadError
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import Field, FieldType, shortest
+
+PROTOCOL: Final = "pebble_serial_v1"
+#: The level below ``mcu/{uid}/`` that is the topic of the manifest itself.
+RESERVED: Final = "describe"
+
+_MOST_INTERFACES = 64  # with 64 fields each they exceed FRAME_LIMIT: frame.py says what fits
+_MOST_FIELDS = 64  # of one interface
+_MOST_LEVELS = 8  # of a channel
+_ENCODINGS = {1: "struct_v1"}
+_RETAIN, _LOCAL_ONLY = 1, 2  # bits of an interface's flags; the others are reserved
+
+_level = re.compile(LEVEL).search
+
+
+class Direction(IntEnum):
+    """Seen from the robot, as in its topics."""
+
+    IN = 1
+    OUT = 2
+
+
+class InterfaceKind(IntEnum):
+    SAMPLE = 1
+    STATE = 2
+    COMMAND = 3
+    EVENT = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """One thing that the MCU reports, or accepts as a command. ``channel`` is its alias, empty where it has none."""
+
+    id: int
+    name: str
+    direction: Direction
+    kind: InterfaceKind
+    retain: bool
+    local_only: bool
+    rate_hz: int
+    channel: str
+    profile: str
+    fields: tuple[Field, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """The identity of an MCU and of its manifest: the key by which a manifest is remembered."""
+
+    schema_version: int
+    interface_count: int
+    schema_hash: str
+    device_uid: str
+    firmware_version: str
+    model: str
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    hello: Hello
+    interfaces: tuple[Interface, ...]
+
+    @property
+    def uid(self) -> str:
+        return self.hello.device_uid
+
+    def payload(self) -> McuManifest:
+        """Return it as it is published on ``outgoing/mcu/{uid}/describe``, with the original's keys."""
+        hello = self.hello
+        return McuManifest(
+            protocol=PROTOCOL,
+            schema_version=hello.schema_version,
+            interface_count=hello.interface_count,
+            schema_hash=hello.schema_hash,
+            device_uid=hello.device_uid,
+            firmware_version=hello.firmware_version,
+            model=hello.model,
+            interfaces=[_plain_interface(interface) for interface in self.interfaces],
+        )
+
+
+def parse_hello(payload: bytes) -> Hello:
+    """Return the HELLO. Raises PayloadError for anything that is not exactly one."""
+    reader = _Reader(payload)
+    hello = _hello(reader)
+    reader.end()
+    return hello
+
+
+def parse_describe(payload: bytes) -> Manifest:
+    """Return the manifest. PayloadError names what is wrong: bytes missing or left over, invalid topic levels, …"""
+    reader = _Reader(payload)
+    hello = _hello(reader)
+    if hello.interface_count > _MOST_INTERFACES:
+        raise PayloadError(f"{hello.interface_count} interfaces, more than {_MOST_INTERFACES}")
+    interfaces = tuple(_interface(reader) for _ in range(hello.interface_count))
+    reader.end()
+    _all_differ("interface id", [interface.id for interface in interfaces])
+    for direction in Direction:
+        names = [interface.name for interface in interfaces if interface.direction is direction]
+        _all_differ(f"{direction.name.lower()}-going interface name", names)
+    return Manifest(hello, interfaces)
+
+
+class _Reader:
+    """Takes little-endian values off the front of a payload."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._at = data, 0
+
+    def take(self, layout: struct.Struct) -> tuple[Any, ...]:
+        if self._at + layout.size > len(self._data):
+            raise PayloadError(f"ends after {len(self._data)} bytes, in the middle of a value")
+        values = layout.unpack_from(self._data, self._at)
+        self._at += layout.size
+        return values
+
+    def string(self) -> str:
+        """Take a text: its length in one byte, and as many bytes of UTF-8."""
+        (length,) = self.take(_LENGTH)
+        raw = self._data[self._at : self._at + length]
+        if len(raw) != length:
+            raise PayloadError(f"ends after {len(self._data)} bytes, in the middle of a text")
+        self._at += length
+        try:
+            return raw.decode()
+        except UnicodeDecodeError:
+            raise PayloadError(f"{raw[:40]!r} is not UTF-8") from None
+
+    def end(self) -> None:
+        left = len(self._data) - self._at
+        if left:
+            raise PayloadError(f"{left} bytes too many")
+
+
+_LENGTH = struct.Struct("<B")
+_HELLO = struct.Struct("<BB")  # schema version, interfaces
+_INTERFACE = struct.Struct("<HBBBH")  # id, direction, kind, flags, rate in Hz
+_ENCODING = struct.Struct("<BB")  # encoding, fields
+_FIELD = struct.Struct("<Bff")  # type, scale, offset
+
+
+def _hello(reader: _Reader) -> Hello:
+    version, count = reader.take(_HELLO)
+    hello = Hello(version, count, reader.string(), reader.string(), reader.string(), reader.string())
+    _check_level("device uid", hello.device_uid)
+    return hello
+
+
+def _interface(reader: _Reader) -> Interface:
+    number, direction, kind, flags, rate_hz = reader.take(_INTERFACE)
+    name, channel, profile = reader.string(), reader.string(), reader.string()
+    encoding, count = reader.take(_ENCODING)
+    _check_level("interface name", name)
+    _check_channel(name, channel)
+    if name == RESERVED:
+        raise PayloadError(f'interface name "{RESERVED}" is taken')
+    if number == 0:
+        raise PayloadError(f"{name}: id 0 is the protocol's own")
+    if encoding not in _ENCODINGS:
+        raise PayloadError(f"{name}: unknown encoding {encoding}")
+    if count > _MOST_FIELDS:
+        raise PayloadError(f"{name}: {count} fields, more than {_MOST_FIELDS}")
+    way, what = _enum(Direction, direction, name, "direction"), _enum(InterfaceKind, kind, name, "kind")
+    if (way is Direction.IN) != (what is InterfaceKind.COMMAND):
+        raise PayloadError(f"{name}: a {what.name.lower()} cannot go {way.name.lower()}")
+    fields = tuple(_field(reader, name) for _ in range(count))
+    _all_differ(f"field of {name}", [field.name for field in fields])
+    retain, local_only = bool(flags & _RETAIN), bool(flags & _LOCAL_ONLY)
+    return Interface(number, name, way, what, retain, local_only, rate_hz, channel, profile, fields)
+
+
+def _field(reader: _Reader, interface: str) -> Field:
+    name = reader.string()
+    number, scale, offset = reader.take(_FIELD)
+    unit = reader.string()
+    where = f"{interface}.{name}"
+    if not name or not name.isprintable():
+        raise PayloadError(f"{interface}: {name!r} is no name of a field")
+    kind: FieldType = _enum(FieldType, number, where, "type")
+    if kind is FieldType.BOOL:
+        return Field(name, kind, unit=unit)
+    if not (math.isfinite(scale) and math.isfinite(offset)) or scale == 0:
+        raise PayloadError(f"{where}: scale {scale:g} and offset {offset:g} make no number")
+    return Field(name, kind, shortest(scale), shortest(offset), unit)
+
+
+def _enum(kind: Any, number: int, where: str, what: str) -> Any:
+    try:
+        return kind(number)
+    except ValueError:
+        raise PayloadError(f"{where}: unknown {what} {number}") from None
+
+
+def _check_level(what: str, text: str) -> None:
+    # braces are how the contract writes a level that varies
+    if not _level(text) or "{" in text or "}" in text:
+        raise PayloadError(f"{what} {text!r}: must be {LEVEL_RULE}")
+
+
+def _check_channel(name: str, channel: str) -> None:
+    if not channel:
+        return
+    levels = channel.split("/")
+    if len(levels) > _MOST_LEVELS:
+        raise PayloadError(f"{name}: a channel of {len(levels)} levels, more than {_MOST_LEVELS}")
+    for level in levels:
+        _check_level(f"{name}: in the channel {channel!r},", level)
+
+
+def _all_differ(what: str, values: list[Any]) -> None:
+    twice = next((value for value in values if values.count(value) > 1), None)
+    if twice is not None:
+        raise PayloadError(f"{what} {twice!r} is there twice")
+
+
+def _plain_interface(interface: Interface) -> dict[str, Any]:
+    plain: dict[str, Any] = {
+        "id": interface.id,
+        "name": interface.name,
+        "dir": interface.direction.name.lower(),
+        "kind": interface.kind.name.lower(),
+        "channel": interface.channel,
+        "profile": interface.profile,
+        "rate_hz": interface.rate_hz,
+        "encoding": {"kind": _ENCODINGS[1], "fields": [_plain_field(field) for field in interface.fields]},
+    }
+    flags = {"retain": interface.retain, "local_only": interface.local_only}
+    return plain | {name: True for name, is_set in flags.items() if is_set}
+
+
+def _plain_field(field: Field) -> dict[str, Any]:
+    plain: dict[str, Any] = {"name": field.name, "type": field.type.word}
+    if field.scale != 1.0:
+        plain["scale"] = field.scale
+    if field.offset != 0.0:
+        plain["offset"] = field.offset
+    return plain | ({"unit": field.unit} if field.unit else {})

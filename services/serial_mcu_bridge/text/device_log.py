@@ -1,0 +1,21 @@
+"""Log lines of an MCU, made printable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+LIMIT = 200  # characters
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceLogLine:
+    """A line for the log: an answer, a boot message, a malformed report. ``level`` is one of logging's."""
+
+    level: int
+    text: str
+
+
+def printable(raw: bytes) -> str:
+    """Return at most 200 printable characters; invalid UTF-8 is escaped, so that the rest is not lost."""
+    text = raw.strip()[: 4 * LIMIT].decode("utf-8", "backslashreplace")[:LIMIT]
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)

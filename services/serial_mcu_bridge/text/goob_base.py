@@ -1,0 +1,130 @@
+"""The text protocol ``goob_base_v1`` of the motor MCUs of Goob and Fred: bytes in and out, no I/O.
+
+Host to MCU: ``M <left> <right>``, ``L <b> <g> <r>``, ``F <b> <g> <r> <period>``. MCU to host: ``T`` (sensors), ``C``
+(battery), ``OK``/``WARN``/``ERR`` (answers), anything else is a log line.
+A line ends with LF, a CR before it is ignored.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from pebble.errors import PayloadError
+from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, printable
+
+SHORTEST_FLASH_S, LONGEST_FLASH_S = 0.05, 3600.0  # one full fade in and out
+
+_TOUCH_NAMES = ((b"a0", b"a1", b"a2"), (b"t0", b"t1", b"t2"))  # Goob's and Fred's spelling
+_INTEGER = re.compile(rb"[+-]?[0-9]{1,6}\Z")  # an ADC has at most 16 bits
+_DECIMAL = re.compile(rb"[+-]?[0-9]{1,6}(?:\.[0-9]{0,9})?\Z")  # what printf("%.3f") makes; never nan or inf
+_LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR}
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """Three sensors as the ADC reads them (10 or 12 bits). On Goob they are the wheels' hall sensors."""
+
+    a0: int
+    a1: int
+    a2: int
+
+
+@dataclass(frozen=True, slots=True)
+class Charging:
+    """Whether the charger is connected; None where the board cannot tell (``chg=-1``)."""
+
+    value: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Battery voltage."""
+
+    volts: float
+
+
+Report: TypeAlias = Touch | Charging | Level | DeviceLogLine
+
+
+def parse(line: bytes) -> list[Report]:
+    """Return all reports of one line: ``T t0=1 t1=2 t2=3 chg=1`` is a Touch and a Charging. Empty for a blank line.
+
+    Never raises. A ``T`` or ``C`` line without a valid field is reported as a warning.
+    """
+    kind, *rest = line.split() or [b""]
+    if kind in (b"T", b"C"):
+        fields = dict(token.split(b"=", 1) for token in rest if b"=" in token)
+        reports = _touch(fields) if kind == b"T" else []
+        reports += _charging(fields) + _level(fields)
+        return reports or [DeviceLogLine(logging.WARNING, f"not understood: {printable(line)}")]
+    text = printable(line)
+    return [DeviceLogLine(_LEVELS.get(kind, logging.INFO), text)] if text else []
+
+
+def mix(x: float, z: float) -> tuple[float, float]:
+    """Return the wheel speeds (left, right), each −1..1, for steering ``x`` (> 0 turns right) and throttle ``z``.
+
+    Raises PayloadError for NaN and infinities: with them min() and max() would return full speed.
+    """
+    _finite(x, z)
+    return _clamp(z + x, -1.0), _clamp(z - x, -1.0)
+
+
+def drive_line(left: float, right: float) -> bytes:
+    """``M <left> <right>``, each −1..1. Raises PayloadError for NaN and infinities."""
+    return _command("M", *(_clamp(speed, -1.0) for speed in _finite(left, right)))
+
+
+def lights_line(blue: float, green: float, red: float) -> bytes:
+    """``L <b> <g> <r>``, each 0..1. Raises PayloadError for NaN and infinities."""
+    return _command("L", *(_clamp(part, 0.0) for part in _finite(blue, green, red)))
+
+
+def flash_line(blue: float, green: float, red: float, period_s: float) -> bytes:
+    """``F <b> <g> <r> <period_s>``: fade from dark to the colour and back once per period, for ever."""
+    colour = [_clamp(part, 0.0) for part in _finite(blue, green, red)]
+    (period,) = _finite(period_s)
+    return _command("F", *colour, max(SHORTEST_FLASH_S, min(LONGEST_FLASH_S, period)))
+
+
+def _touch(fields: dict[bytes, bytes]) -> list[Report]:
+    for names in _TOUCH_NAMES:
+        values = [fields.get(name, b"") for name in names]
+        if all(_INTEGER.match(value) for value in values):
+            return [Touch(*map(int, values))]
+    return []
+
+
+def _charging(fields: dict[bytes, bytes]) -> list[Report]:
+    raw = fields.get(b"chg", b"")
+    if not _INTEGER.match(raw):
+        return []
+    value = int(raw)
+    return [Charging(None if value < 0 else value > 0)]
+
+
+def _level(fields: dict[bytes, bytes]) -> list[Report]:
+    raw = fields.get(b"v", b"")
+    return [Level(float(raw))] if _DECIMAL.match(raw) else []
+
+
+def _finite(*values: float) -> tuple[float, ...]:
+    if not all(map(math.isfinite, values)):
+        raise PayloadError(f"not a finite number among {values}")
+    return values
+
+
+def _clamp(value: float, lowest: float) -> float:
+    return max(lowest, min(1.0, value))
+
+
+def _command(letter: str, *values: float) -> bytes:
+    # adding 0.0 turns a rounded −0.0 into 0.0: a stop is always the same bytes
+    return " ".join([letter, *(f"{round(value, 3) + 0.0:.3f}" for value in values)]).encode() + b"\n"
+
+
+STOP = drive_line(0.0, 0.0)

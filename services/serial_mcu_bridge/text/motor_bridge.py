@@ -1,0 +1,291 @@
+"""Owns the serial line to a motor MCU: sends drive and lights commands, publishes sensor reports."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, ClassVar, Protocol
+
+from pebble.contract import (
+    CHARGING_LEVEL,
+    CHARGING_STATUS,
+    DRIVE,
+    ESTOP,
+    ESTOP_RESET,
+    ESTOP_STATE,
+    LIGHTS_FLASH,
+    LIGHTS_SOLID,
+    TOUCH_SENSORS,
+)
+from pebble.contract.payloads import (
+    ChargingLevel,
+    ChargingStatus,
+    Drive,
+    EstopCommand,
+    EstopReset,
+    EstopState,
+    LightsFlash,
+    LightsSolid,
+    TouchSensors,
+    TouchValues,
+)
+from pebble.errors import TransportError
+from pebble.runtime.lines import LineSplitter
+from pebble.runtime.parent import Notifier
+from pebble.runtime.service import WAIT_LIMIT_S, every, on
+from pebble.runtime.timers import Timer
+from pebble.services.serial_mcu_bridge.line.serial_line import LineState
+from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox, ReceivedDrive
+from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
+from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
+from pebble.services.serial_mcu_bridge.serial_service import SerialService
+from pebble.services.serial_mcu_bridge.text import goob_base
+from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
+from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Report, Touch
+
+_LIGHTS = "lights"  # a steady colour and a fade replace one another
+_SAVE_AGAIN_S = 1.0
+_REPEAT_S = 5.0  # as often as boards repeat their reports
+_CHECK_S = 1.0  # an answer to a subscription may come later than the connection
+_FINAL_ZERO = Drive(x=0.0, z=0.0, valid_ms=0)
+
+
+class MotorProtocol(Protocol):
+    """What the bridge needs of a text protocol that drives motors; a module can be one, as goob_base is."""
+
+    def parse(self, line: bytes) -> list[Report]: ...
+    def mix(self, x: float, z: float) -> tuple[float, float]: ...
+    def drive_line(self, left: float, right: float) -> bytes: ...
+    def lights_line(self, blue: float, green: float, red: float) -> bytes: ...
+    def flash_line(self, blue: float, green: float, red: float, period_s: float) -> bytes: ...
+
+
+class MotorBridge(SerialService):
+    """Drives the motors as its guard permits, and stops them when the last drive command is no longer valid.
+
+    SerialLine sends the stop at the start, and at the end from its close(), which runs by :meth:`on_stop`.
+
+    A bridge of another text protocol sets ``protocol`` and ``stop_line``.
+    """
+
+    publishes = (ESTOP_STATE, TOUCH_SENSORS, CHARGING_STATUS, CHARGING_LEVEL)
+    protocol: ClassVar[MotorProtocol] = goob_base
+    stop_line = goob_base.STOP
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._publishes_touch = self.options.telemetry.publish_touch_sensors
+        self._owner = self.config.motor_owner(self.instance)
+        self._waiting = MotionInbox()
+        self._file = StateFile(self.config.state_file(f"estop-{self._owner}"), self._on_saved)
+        self._barred_file = StateFile(self.config.run_dir() / f"barred-{self._owner}.json")
+        self._guard = MotorGuard(
+            self._file,
+            self._barred_file,
+            self._publish_state,
+            self.counters,
+            watchdog_s=self.options.safety.drive_timeout_seconds,
+            now=self.clock(),
+        )
+        self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
+        self._guard_timer: Timer | None = None
+        self._notifier = Notifier()
+        self._announced = self._notified = True  # that it latches: to operators, and to the launcher
+        self._charging: ChargingStatus | None = None
+        self._splitter = LineSplitter()
+
+    def start(self) -> None:
+        self.on_stop(self._file.close)
+        self.on_stop(self._barred_file.close)
+        self._guard.begin(self.clock())
+        super().start()
+
+    # -- on the transport's threads; the stop is subscribed to before the drive commands
+
+    @on(ESTOP, direct=True)
+    def receive_stop(self, stop: EstopCommand) -> None:
+        self._judge_soon(self._waiting.put_stop(stop))
+
+    @on(ESTOP_RESET, direct=True)
+    def receive_reset(self, reset: EstopReset) -> None:
+        self._judge_soon(self._waiting.put_reset(reset, self.clock()))
+
+    @on(DRIVE, direct=True)
+    def receive_drive(self, drive: Drive) -> None:
+        self._judge_soon(self._waiting.put_drive(drive, self.clock()))
+
+    def _judge_soon(self, was_empty: bool) -> None:
+        if was_empty:
+            self.post_first(self._judge)
+
+    # -- commands
+
+    def _judge(self) -> None:
+        """Stops first: they void every drive command that waits with them."""
+        batch = self._waiting.take()
+        latches = self._latches
+        for stop in batch.stops:
+            self._halt()
+            if latches:
+                self._guard.stop(stop, self.clock())
+            else:
+                self._quiet_log.warning("unlatched", "a stop only halts: it could not be reset")
+                self._guard.judge(_FINAL_ZERO, self.clock())
+        for reset, at in batch.resets:
+            self._guard.reset(reset, self.clock() - at, self.clock())
+        for received in batch.drives:
+            if latches or not (batch.stops and received.drive.moves):
+                self._drive(received)
+        self._arm_guard()
+        self._count_dropped()
+
+    def _count_dropped(self) -> None:
+        dropped = self._waiting.dropped - self.counters["motion_dropped"]
+        if dropped:
+            self.counters.add("motion_dropped", dropped)
+            text = "dropped commands of many senders or stops that waited"
+            self._quiet_log.warning("motion_dropped", text, times=dropped)
+
+    def _drive(self, received: ReceivedDrive) -> None:
+        now, drive = self.clock(), received.drive
+        if drive.moves and now - received.at > WAIT_LIMIT_S:
+            self.count_late(DRIVE)
+            return
+        valid_s = self._guard.judge(drive, now)
+        if valid_s is None:
+            return
+        if self._deadline is not None and now >= self._deadline.due:
+            self._halt()  # the dead-man's switch is late: the last drive command ends before this one begins
+        valid_s -= now - received.at
+        if valid_s <= 0:
+            self._halt()
+            return
+        self.line.drive(self.protocol.drive_line(*self.protocol.mix(drive.x, drive.z)), valid_s)
+        self._set_deadline(now + valid_s)
+
+    def _halt(self) -> None:
+        self._set_deadline(None)
+        self.line.halt()
+
+    def _set_deadline(self, due: float | None) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = None if due is None else self.call_at(due, self._halt)
+
+    # -- what the other end refuses to deliver
+
+    @property
+    def _latches(self) -> bool:
+        """Whether a stop latches. Without the resets it would have no end, and without the stops it is no promise."""
+        return not (self.refused(ESTOP) or self.refused(ESTOP_RESET))
+
+    def on_connected(self) -> None:
+        self.check_subscriptions()
+
+    @every(_CHECK_S)
+    def check_subscriptions(self) -> None:
+        """Withdraw the emergency stop while its topics are refused. Raises TransportError if the drive topic is."""
+        if self.refused(DRIVE):
+            raise TransportError(
+                f"the broker refuses the subscription to {self.addresses[DRIVE].topic}: nothing can drive this robot."
+                " Permit the user in local_mqtt to subscribe to it"
+            )
+        if self._latches is not self._announced:
+            self._announced = self._latches
+            self._announce()
+        if self._notified is not self._announced and self._notifier.lacks("estop", not self._announced):
+            self._notified = self._announced
+
+    def _announce(self) -> None:
+        if self._announced:
+            self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
+            self.repeat_state()
+            return
+        topics = [self.addresses[channel].topic for channel in (ESTOP, ESTOP_RESET) if self.refused(channel)]
+        self.log.error(
+            "the broker refuses the subscription to %s: this robot has no emergency stop, a stop only halts it%s."
+            " Permit the user in local_mqtt to subscribe to both %s and %s",
+            " and ".join(topics),
+            ", and it stays stopped now" if self._guard.latched else "",
+            self.addresses[ESTOP].topic,
+            self.addresses[ESTOP_RESET].topic,
+        )
+        self.retract(ESTOP_STATE, owner=self._owner)
+
+    # -- the guard
+
+    def _arm_guard(self) -> None:
+        due = self._guard.due
+        if due is None or (self._guard_timer is not None and self._guard_timer.due <= due):
+            return
+        if self._guard_timer is not None:
+            self._guard_timer.cancel()
+        self._guard_timer = self.call_at(due, self._tick_guard)
+
+    def _tick_guard(self) -> None:
+        self._guard_timer = None
+        self._guard.tick(self.clock())
+        self._arm_guard()
+
+    @every(_SAVE_AGAIN_S)
+    def save_again(self) -> None:
+        self._guard.save_again()
+
+    @every(_REPEAT_S)
+    def repeat_state(self) -> None:
+        self._guard.repeat_state(self.clock())
+        self._arm_guard()
+
+    def _publish_state(self, state: EstopState) -> None:
+        """While a stop does not latch, remove it instead, again and again: a bridge may have missed the first time."""
+        if self._latches:
+            self.publish(ESTOP_STATE, state, owner=self._owner)
+        else:
+            self._send(ESTOP_STATE, ESTOP_STATE.topic(self.config.base, owner=self._owner), b"")
+
+    def _on_saved(self, number: int, succeeded: bool) -> None:
+        """On the file's thread."""
+
+        def note() -> None:
+            self._guard.on_saved(number, succeeded, self.clock())
+            self._arm_guard()
+
+        self.post(note, newest_of="saved")
+
+    # -- lights
+
+    @on(LIGHTS_SOLID)
+    def lights_solid(self, colour: LightsSolid) -> None:
+        self.line.send(_LIGHTS, self.protocol.lights_line(colour.b, colour.g, colour.r))
+
+    @on(LIGHTS_FLASH)
+    def lights_flash(self, colour: LightsFlash) -> None:
+        self.line.send(_LIGHTS, self.protocol.flash_line(colour.b, colour.g, colour.r, colour.period))
+
+    # -- reports
+
+    def on_line_state(self, state: LineState) -> None:
+        if state is LineState.BOOTING:
+            self._splitter.reset()
+
+    def on_input(self, chunk: bytes) -> None:
+        for line in self._splitter.feed(chunk):
+            for report in self.protocol.parse(line):
+                self._report(report)
+        self.count_discarded(self._splitter.discarded_lines)
+
+    def _report(self, report: Report) -> None:
+        match report:
+            case Touch(a0, a1, a2):
+                if self._publishes_touch:
+                    self.publish(TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=a0, a1=a1, a2=a2)))
+            case Charging(value):
+                self._publish_charging(ChargingStatus(value=value))
+            case Level(volts):
+                self.publish(CHARGING_LEVEL, ChargingLevel(value=volts))
+            case DeviceLogLine(level, text):
+                self.device_log.log(logging.getLevelName(level), level, "MCU: %s", text)
+
+    def _publish_charging(self, status: ChargingStatus) -> None:
+        if status != self._charging:
+            self._charging = status
+            self.publish(CHARGING_STATUS, status)

@@ -1,1 +1,0 @@
-"""Somebody else's streaming program, run while operators want video."""

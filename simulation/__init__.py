@@ -1,0 +1,1 @@
+"""Simulated robots and boards, on which the real firmware runs without hardware."""

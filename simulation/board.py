@@ -1,0 +1,184 @@
+"""Simulated serial MCUs of Goob and Fred: bytes in, bytes out, a clock passed in.
+
+They run the firmware of the real boards (``firmware/``) on simulated pins, whose outputs move a simulated body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pebble.errors import ConfigError
+from pebble.simulation.bodies import BoardState, Light, Pair, body_of
+from pebble.simulation.micropython.board import UID, Board
+from pebble.simulation.micropython.clock import VirtualClock
+from pebble.simulation.micropython.runner import Runner
+
+__all__ = ["KINDS", "BoardState", "Light", "Profile", "SimulatedMcu"]
+
+_REPLAYED_S = 0.5  # a pause up to this is replayed turn by turn; output during a longer one is discarded
+_TOKENS = 6  # of a line; the rest is ignored
+_LONGEST_LINE = 300  # bytes; more than the firmware accepts
+_DEADLINES_S = 2.0  # simulated part of a longer pause: all deadlines of the firmware are over by then
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """How to run a board: ``turn_s`` is the period of its firmware's loop, ``tick_s`` that of calling ``tick``."""
+
+    turn_s: float
+    tick_s: float
+    is_text: bool = True  # its protocol is goob_base_v1
+
+
+KINDS: Final = {
+    "goob": Profile(0.005, 0.02),
+    "fred": Profile(0.005, 0.02),
+    "goob_imu": Profile(0.0025, 0.005, is_text=False),
+}
+
+
+class SimulatedMcu:
+    """One board. Pass host data to ``receive``, call ``tick`` often, and send what both return to the host.
+
+    ``now`` is a monotonic time in seconds from one clock for all calls. ``failsafe_s`` replaces the firmware's own
+    limit; ``uid`` is the MCU's unique id. ``on_motors(now, (left, right))`` is called at each change of the motors,
+    + = forward.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        now: float,
+        *,
+        failsafe_s: float | None = None,
+        charging: bool = False,
+        uid: bytes = UID,
+        on_motors: Callable[[float, Pair], None] | None = None,
+    ) -> None:
+        if kind not in KINDS:
+            raise ConfigError(f"unknown simulated MCU {kind!r}; known: {', '.join(KINDS)}")
+        if failsafe_s is not None and not KINDS[kind].is_text:
+            raise ConfigError(f"{kind} has no motors and no failsafe")
+        self.kind, self.failsafe_s = kind, failsafe_s
+        self.profile = KINDS[kind]
+        self._clock = VirtualClock(now)
+        self.board = Board(self._clock, uid=uid)
+        self.body = body_of(kind, self.board)
+        self.body.on_motors = on_motors or self.body.on_motors
+        self.motion, self.battery = self.body.motion, self.body.battery
+        self.battery.charging = charging
+        self._boot_output = self._line = self._last = self._drive_line = b""
+        self._commands = self._trips = 0
+        self._firmware: Any = None  # its robot object, since the last boot
+        self._runner = Runner(self.board, kind, on_boot=self._on_boot)
+        self._start()
+
+    @property
+    def resets(self) -> int:
+        """How often the board has restarted by itself."""
+        return self.board.resets
+
+    def boot(self, now: float) -> None:
+        """Press the reset button: pose and battery remain, everything else restarts."""
+        self._clock.until(now)
+        self._runner.boot()
+        self._start()
+
+    def disturb(self, on: bool) -> None:
+        """Make every device on the board's I2C bus fail, or work again."""
+        self.board.bus.disturbed = on
+
+    def receive(self, data: bytes, now: float) -> bytes:
+        """Process ``data``, which may end in the middle of a line. Returns the board's output."""
+        output = self._advance(now, self.profile.tick_s)
+        if not self.profile.is_text:
+            return output + self._write_input(data, now)
+        if not self._firmware.lines.length:  # the firmware has dropped half a line
+            self._line = b""
+        *lines, rest = data.split(b"\n")
+        for line in lines:
+            answer = self._write_input(line + b"\n", now)
+            self._count_command(self._line + line, answer)
+            self._line = b""
+            output += answer
+        if rest:
+            self._line = (self._line + rest)[:_LONGEST_LINE]
+            output += self._write_input(rest, now)
+        return output
+
+    def tick(self, now: float) -> bytes:
+        """Advance to ``now``. Returns the board's output until then."""
+        first, self._boot_output = self._boot_output, b""
+        return first + self._advance(now, self.profile.turn_s) + self._turn(now)
+
+    def state(self) -> BoardState:
+        return self.body.state(self._drive(), self._commands, self._last.decode("ascii", "replace"))
+
+    # -- time
+
+    def _advance(self, now: float, turn_s: float) -> bytes:
+        """Run the loop every ``turn_s`` up to just before ``now``. Returns the board's output."""
+        output = b""
+        behind = now - self._clock.now()
+        if behind <= turn_s:
+            return output
+        replayed = behind <= _REPLAYED_S
+        until = now if replayed else self._clock.now() + _DEADLINES_S
+        while (moment := self._clock.now() + turn_s) < min(now, until):
+            turned = self._turn(moment)
+            output += turned if replayed else b""
+        return output
+
+    def _turn(self, now: float) -> bytes:
+        """Run one turn of the firmware's loop at ``now``, unless the firmware is still blocked then."""
+        if self._clock.now() > now:
+            return b""
+        self._clock.until(now)
+        self._runner.step()
+        self.body.end_turn()
+        return self.board.take_output()
+
+    def _write_input(self, data: bytes, now: float) -> bytes:
+        self.board.type(data)
+        output = self._turn(now)
+        while (unread := self.board.unread) and self._clock.now() <= now:
+            output += self._turn(now)
+            if self.board.unread == unread:  # the firmware reads nothing now
+                break
+        return output
+
+    def _start(self) -> None:
+        """Run the first turn; its output belongs to the boot and is no answer to a command."""
+        self._runner.step()
+        self._boot_output = self.board.take_output()
+
+    # -- commands
+
+    def _on_boot(self, robot: Any) -> None:
+        if self.failsafe_s is not None:
+            robot.deadman.limit_ms = round(self.failsafe_s * 1000)
+        self._firmware = robot
+        self._line = self._last = self._drive_line = b""
+        self._commands = self._trips = 0
+
+    def _count_command(self, line: bytes, answer: bytes) -> None:
+        """Count ``line`` if the firmware answered OK."""
+        at = answer.find(b"OK ")
+        if at < 0:
+            return
+        self._commands += 1
+        self._last = b" ".join(line.split()[:_TOKENS])
+        if answer[at + 3 : at + 4] == b"M":
+            self._drive_line, self._trips = self._last, self._firmware.deadman.trips
+
+    def _drive(self) -> Pair | None:
+        """The wheel speeds of the last drive command as the firmware parses them; 0 after its failsafe tripped."""
+        if not self.profile.is_text:
+            return None
+        if not self._drive_line or self._firmware.deadman.trips != self._trips:
+            return 0.0, 0.0
+        read = self.board.firmware.module("common.lines")
+        left, right = (read.clamp(read.number(token, 0, len(token)), -1.0) for token in self._drive_line.split()[1:3])
+        return left, right

@@ -1,0 +1,1 @@
+"""Simulated MicroPython boards, which run the real firmware files on simulated pins."""

@@ -1,0 +1,53 @@
+"""Answers of a DNS server and an SNTP server to the packets of a board. Pure: bytes in, bytes out."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Callable
+
+NO_SUCH_NAME = 3  # RFC 1035, 4.1.1
+
+_SINCE_1900_S = 2_208_988_800  # of the Unix epoch, in the era of NTP
+_A, _IN, _ANSWER = 1, 1, 0x8180  # a host address; the internet; an answer, recursion desired and available
+_TTL_S = 60
+
+
+def name_answer(query: bytes, address_of: Callable[[str], str | None]) -> bytes | None:
+    """Answer a DNS query for one IPv4 address; None for any other packet (RFC 1035, 4.1)."""
+    try:
+        name, end = _name(query, 12)
+        kind, class_ = struct.unpack_from("!HH", query, end)
+    except (IndexError, struct.error, UnicodeDecodeError):
+        return None
+    if len(query) < 12 or query[2] & 0x80 or kind != _A or class_ & 0x7FFF != _IN:  # the top bit: mDNS, by unicast
+        return None
+    address = address_of(name)
+    question = query[12 : end + 4]
+    if address is None:
+        return query[:2] + struct.pack("!HHHHH", _ANSWER | NO_SUCH_NAME, 1, 0, 0, 0) + question
+    record = struct.pack("!HHHIH", 0xC00C, _A, _IN, _TTL_S, 4) + socket.inet_aton(address)
+    return query[:2] + struct.pack("!HHHHH", _ANSWER, 1, 1, 0, 0) + question + record
+
+
+def time_answer(request: bytes, epoch_s: float) -> bytes | None:
+    """Answer an SNTP request as a stratum 2 server; None for any other packet (RFC 4330, 4)."""
+    if len(request) < 48 or request[0] & 7 != 3:
+        return None
+    stamp = struct.pack("!II", *_stamp(epoch_s))
+    head = struct.pack("!BBbbII4s", (request[0] & 0x38) | 4, 2, 6, -20, 0, 0, b"SIM\0")
+    return head + stamp + request[40:48] + stamp + stamp
+
+
+def _stamp(epoch_s: float) -> tuple[int, int]:
+    seconds = int(epoch_s)
+    return (seconds + _SINCE_1900_S) & 0xFFFFFFFF, int((epoch_s - seconds) * (1 << 32))
+
+
+def _name(packet: bytes, at: int) -> tuple[str, int]:
+    """Return the dotted name that starts at ``at``, in lower case, and its end."""
+    labels = []
+    while length := packet[at]:
+        labels.append(packet[at + 1 : at + 1 + length].decode("ascii").lower())
+        at += 1 + length
+    return ".".join(labels), at + 1

@@ -1,0 +1,1 @@
+"""MicroPython's built-in modules, on simulated pins, sockets and time."""

@@ -1,0 +1,86 @@
+"""A record of a simulated MCU's input, motor changes and output, with their times."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import msgspec
+
+_RETAINED = 100_000  # entries in memory; a file has all of them
+
+Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "said"]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line from the host or (``said``) to it, a change of the port or of the motors.
+
+    ``ns`` is time.monotonic_ns() when the line's last byte was received, just before it was written, or when the
+    outputs changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot,
+    however its motors are mounted.
+    """
+
+    ns: int
+    event: Event
+    line: str = ""
+
+    @property
+    def drive(self) -> tuple[float, float] | None:
+        """Left and right speed, if this is a well-formed drive line."""
+        tokens = self.line.split(" ")
+        return _pair(tokens[1:]) if tokens[0] == "M" else None
+
+    @property
+    def motors(self) -> tuple[float, float] | None:
+        """The new speeds of the motors: left and right, -1..1."""
+        return _pair(self.line.split(" ")) if self.event == "motors" else None
+
+
+def _pair(tokens: list[str]) -> tuple[float, float] | None:
+    if len(tokens) != 2:
+        return None
+    try:
+        return float(tokens[0]), float(tokens[1])
+    except ValueError:
+        return None
+
+
+def motors_entry(ns: int, motors: tuple[float, float]) -> Entry:
+    """Make the entry for a change of the motors."""
+    left, right = (round(speed, 3) + 0.0 for speed in motors)  # + 0.0: no "-0.000"
+    return Entry(ns, "motors", f"{left:.3f} {right:.3f}")
+
+
+class Trace:
+    """Entries in the order of arrival; with ``path`` also a file with one JSON object per line, unbuffered."""
+
+    def __init__(self, path: Path | None = None) -> None:
+        self._entries: deque[Entry] = deque(maxlen=_RETAINED)
+        self._file: BinaryIO | None = path.open("ab", buffering=0) if path is not None else None
+
+    def add(self, entry: Entry) -> None:
+        self._entries.append(entry)
+        if self._file is not None:
+            self._file.write(msgspec.json.encode(entry) + b"\n")
+
+    def entries(self) -> list[Entry]:
+        """A copy, oldest first."""
+        return list(self._entries.copy())
+
+    def lines(self) -> list[str]:
+        """Only the lines, oldest first."""
+        return [entry.line for entry in self.entries() if entry.event == "line"]
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def read_trace(path: Path) -> list[Entry]:
+    """Read the entries of a trace file, without a last line that is incomplete."""
+    raw = path.read_bytes()
+    return [msgspec.json.decode(line, type=Entry) for line in raw[: raw.rfind(b"\n") + 1].splitlines()]

@@ -1,0 +1,80 @@
+"""The conditions are the paper's, and their schedules are the same each time."""
+
+import pytest
+
+from pebble.bench.impair.conditions import Handover, Schedule, Shape, chosen, trials
+from pebble.errors import PebbleError
+
+NAMES = [
+    *("base-start", "1024k", "512k", "256k", "128k", "64k", "1%", "2%", "5%", "10%"),
+    *("256k+1%", "128k+2%", "64k+5%", "base-end", "starlink", "wifi-power-save"),
+]
+SATELLITE = Shape(delay_ms=25, handover=Handover(15, first_s=5, gap_ms=100, extra_ms=40, recovery_s=1))
+
+
+def test_the_trials_are_the_papers_and_two_profiles() -> None:
+    assert [condition.name for condition in trials()] == NAMES
+
+
+def test_names_match_their_shapes() -> None:
+    shapes = {condition.name: condition.up for condition in trials()}
+    assert shapes["base-start"] == shapes["base-end"] == Shape()
+    assert shapes["512k"] == Shape(kbit=512)
+    assert shapes["10%"] == Shape(loss=0.1)
+    assert shapes["64k+5%"] == Shape(kbit=64, loss=0.05)
+
+
+def test_only_the_uplink_is_shaped_unless_both_ways_are_asked_for() -> None:
+    assert {condition.down for condition in trials()[:14]} == {Shape()}
+    assert all(condition.down == condition.up for condition in trials(both_ways=True)[:14])
+
+
+def test_the_profiles_have_their_own_downlink() -> None:
+    assert trials()[14:] == trials(both_ways=True)[14:]
+    assert all(condition.up.timed and condition.down.timed for condition in trials()[14:])
+    assert not any(condition.up.timed for condition in trials()[:14])
+
+
+def test_some_trials_can_be_chosen() -> None:
+    assert [each.name for each in chosen(["base-end", "256k"])] == ["256k", "base-end"]
+    with pytest.raises(PebbleError, match=r"no trial '300k': choose from base-start, 1024k"):
+        chosen(["256k", "300k"])
+
+
+@pytest.mark.parametrize("problem", [{"kbit": 0}, {"loss": 1.0}, {"loss": -0.1}, {"delay_ms": -1}])
+def test_impossible_shapes_are_refused(problem: dict[str, float]) -> None:
+    with pytest.raises(PebbleError):
+        Shape(**problem)
+
+
+def test_without_delay_everything_arrives_as_it_is_sent() -> None:
+    assert Schedule(Shape(), "up").arrival(1.5) == 1.5
+
+
+def test_jitter_stays_in_its_band_and_is_the_same_for_the_same_seed() -> None:
+    shape, times = Shape(delay_ms=20, jitter_ms=5), [n * 0.013 for n in range(500)]
+    one, same, other = ([Schedule(shape, seed).arrival(t) for t in times] for seed in ("up", "up", "down"))
+    delays = [arrival - sent for arrival, sent in zip(one, times, strict=True) if arrival is not None]
+    assert len(delays) == 500
+    assert 0.015 - 1e-9 <= min(delays) < 0.016
+    assert 0.024 < max(delays) <= 0.025 + 1e-9
+    assert one == same != other
+
+
+@pytest.mark.parametrize("handover", [5.0, 20.0, 35.0])
+def test_a_handover_is_a_gap_and_then_a_longer_way_for_a_while(handover: float) -> None:
+    schedule = Schedule(SATELLITE, "up")
+    assert schedule.arrival(handover + 0.05) is None
+    times = [handover - 0.01, handover + 0.1001, handover + 0.6, handover + 1.2]
+    delays_ms = [((schedule.arrival(sent) or 0) - sent) * 1000 for sent in times]
+    assert delays_ms == pytest.approx([25, 65, 45, 25], abs=0.1)
+
+
+def test_no_handover_before_the_first() -> None:
+    assert Schedule(SATELLITE, "up").arrival(0.0) == pytest.approx(0.025)
+
+
+def test_power_save_holds_everything_until_a_beacon() -> None:
+    schedule = Schedule(Shape(delay_ms=2, beacon_ms=100), "down")
+    arrivals = [schedule.arrival(sent) for sent in (0.001, 0.05, 0.097, 0.099, 0.15)]
+    assert arrivals == pytest.approx([0.1, 0.1, 0.1, 0.2, 0.2])

@@ -1,0 +1,304 @@
+"""Metrics, cells and assessments of synthetic recordings."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import pytest
+from rich.console import Console
+
+from pebble.bench.impair import cells, metrics
+from pebble.bench.impair.cells import Trial, cells_of, over_time
+from pebble.bench.impair.messages import Command, Heartbeat, Picture, Record, Sound, Window
+from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.plan import NAMES, QUICK, ImpairPlan
+from pebble.bench.impair.report import assessment, tables
+from pebble.bench.results import Cell, Results
+from pebble.errors import PebbleError
+from pebble.simulation.trace import Entry, motors_entry
+
+S, MS = 1_000_000_000, 1_000_000
+WINDOW = Window(10 * S, 20 * S, first_s=0.5)
+
+
+def packet(number: int, late_ms: float = 50, at_ms: float | None = None) -> Sound:
+    """Packet ``number`` of the window, 40 ms long."""
+    captured = 10 * S + round((40 * number if at_ms is None else at_ms) * MS)
+    return Sound(captured, captured + round(late_ms * MS), 0.04, number)
+
+
+def heartbeat(at_s: float, delay_ms: float = 20, *, online: bool = True) -> Heartbeat:
+    return Heartbeat(round(at_s * S) - round(delay_ms * MS), round(at_s * S), online)
+
+
+def line(ns: int, left: float, right: float) -> Entry:
+    return Entry(ns, "line", f"M {left:.3f} {right:.3f}")
+
+
+# -- sound
+
+
+def test_all_sound_of_the_window_is_a_hundred_per_cent() -> None:
+    assert metrics.sound_percent(map(packet, range(-5, 300)), WINDOW) == pytest.approx(100)
+
+
+def test_late_sound_is_delivered_and_not_on_time() -> None:
+    sounds = [packet(number, late_ms=1500 if number % 2 else 50) for number in range(250)]
+    assert metrics.sound_percent(sounds, WINDOW) == pytest.approx(100)
+    assert metrics.sound_percent(sounds, WINDOW, 1.0) == pytest.approx(50)
+
+
+def test_lost_sound_is_not_delivered() -> None:
+    assert metrics.sound_percent(map(packet, range(0, 250, 4)), WINDOW) == pytest.approx(25, abs=0.5)
+    assert metrics.sound_percent([], WINDOW) == 0
+
+
+def test_a_packet_that_comes_twice_counts_once() -> None:
+    assert metrics.sound_percent([packet(1), packet(1), packet(2)], WINDOW) == pytest.approx(0.8)
+
+
+def test_packets_at_the_edges_count_for_their_part_in_the_window() -> None:
+    edges = [packet(1, at_ms=-30), packet(2, at_ms=9990)]
+    assert [metrics.overlap_s(sound, WINDOW) for sound in edges] == [pytest.approx(0.01), pytest.approx(0.01)]
+    assert metrics.received([packet(3, at_ms=-40), packet(4, at_ms=10_000)], WINDOW) == []
+
+
+def test_packets_sent_are_as_many_as_the_windows_sound_would_be() -> None:
+    assert metrics.sent_packets([packet(3), packet(4), packet(9)], 60.0) == 5
+    assert metrics.sent_packets([], 0.0) is None
+
+
+# -- pictures
+
+
+def test_gaps_reach_from_edge_to_edge() -> None:
+    assert metrics.gaps_s([9 * S, 12 * S, 13 * S, 21 * S], WINDOW) == [2, 1, 7]
+
+
+def test_without_any_picture_the_window_is_one_gap() -> None:
+    assert metrics.gaps_s([], WINDOW) == [10]
+
+
+# -- heartbeats
+
+
+def test_a_steady_heartbeat_is_never_offline() -> None:
+    assert metrics.offline_s([heartbeat(8 + number / 4) for number in range(48)], WINDOW) == []
+
+
+def test_silence_is_offline_after_the_operators_timeout() -> None:
+    heartbeats = [heartbeat(8 + number / 4) for number in range(17)] + [
+        heartbeat(15 + number / 4) for number in range(20)
+    ]
+    (spell,) = metrics.offline_s(heartbeats, WINDOW)  # from 12 to 15, less two intervals
+    assert spell == pytest.approx(2.5, abs=0.02)
+
+
+def test_silence_until_the_end_counts_until_the_end() -> None:
+    (spell,) = metrics.offline_s([heartbeat(8 + number / 4) for number in range(17)], WINDOW)
+    assert spell == pytest.approx(7.5, abs=0.02)
+
+
+def test_an_offline_message_is_offline_at_once() -> None:
+    heartbeats = [heartbeat(8 + number / 4) for number in range(17)]
+    goodbye, back = heartbeat(12.1, online=False), [heartbeat(12.6 + number / 4) for number in range(30)]
+    (spell,) = metrics.offline_s([*heartbeats, goodbye, *back], WINDOW)
+    assert spell == pytest.approx(0.5, abs=0.02)
+
+
+# -- driving
+
+COMMANDS = [Command(0.2 + number / 1000, 0.3, (10 + number) * S) for number in range(5)]
+
+
+def test_latency_is_to_the_first_line_that_sets_the_wheels() -> None:
+    entries = [line(10 * S + 5 * MS, 0.2, 0.3), line(11 * S + 9 * MS, 0.2, 0.3)]
+    assert metrics.driven_ms(COMMANDS, entries) == [(COMMANDS[0], 5)]
+
+
+def test_an_overtaken_command_has_waited_for_the_one_that_overtook_it() -> None:
+    entries = [line(10 * S + 5 * MS, 0.2, 0.3), line(13 * S + 7 * MS, 0.203, 0.3)]
+    took = [(COMMANDS[0], 5), (COMMANDS[1], 2007), (COMMANDS[2], 1007), (COMMANDS[3], 7)]
+    assert metrics.driven_ms(COMMANDS, entries) == took
+    assert metrics.overtaken(COMMANDS, entries) == 2
+    assert metrics.overtaken(COMMANDS, []) == 0
+
+
+def test_a_repeated_stop_between_commands_counts_once() -> None:
+    entries = [line(10 * S, 0.2, 0.3), line(11 * S, 0, 0), line(11 * S + 1, 0, 0), line(12 * S, 0.202, 0.3)]
+    assert metrics.trips(COMMANDS, entries) == 1
+
+
+def test_the_stops_before_the_first_and_after_the_last_command_are_no_trips() -> None:
+    entries = [line(9 * S, 0, 0), line(10 * S, 0.2, 0.3), line(15 * S, 0, 0)]
+    assert metrics.trips(COMMANDS, entries) == 0
+    assert metrics.trips([], entries) == 0
+
+
+def test_wheels_are_at_rest_before_the_first_command_comes_and_after_each_stop() -> None:
+    moves = [motors_entry(round(s * S), (speed, speed)) for s, speed in ((9, 0), (10.5, 0.2), (12, 0), (13, 0.2))]
+    assert metrics.rest_s(COMMANDS, [*moves, motors_entry(15 * S, (0, 0))]) == pytest.approx(1.5)
+    assert metrics.rest_s(COMMANDS, []) == 4
+    assert metrics.rest_s([], moves) == 0
+
+
+# -- cells, tables, assessment
+
+
+def trial(
+    subject: str = "zenoh h264 opus",
+    name: str = "256k",
+    late_ms: float = 50,
+    reached: slice | None = None,
+    **more: object,
+) -> Trial:
+    """A window of video, one of audio, and three seconds before them; everything arrives after ``late_ms``.
+
+    ``reached``: those of the 200 commands that reach the MCU.
+    """
+    video, audio = Window(3 * S, 10 * S, 0.4), WINDOW
+    commands = [Command(round(0.1 + number / 1000, 3), 0.5, number * S // 10) for number in range(200)]
+    late = round(late_ms * MS)
+    record = {
+        "commands": commands,
+        "heartbeats": [heartbeat(number / 4) for number in range(80)],
+        "pictures": [Picture(ns, ns + late) for ns in range(3 * S, 10 * S - late, S // 10)],
+        "sounds": [packet(number, late_ms) for number in range(250)],
+        "alone": Window(0, 3 * S),
+        "video": video,
+        "audio": audio,
+        "payloads": 70,
+    }
+    reached = commands if reached is None else commands[reached]
+    entries = [line(command.sent_ns + 10 * MS, command.left, command.right) for command in reached]
+    entries += [motors_entry(command.sent_ns + 10 * MS, (command.left, command.right)) for command in reached[:1]]
+    traffic = dict.fromkeys(("alone", "video", "audio"), (Traffic(1000, 500), Traffic(126_000, 1750, dropped_up=3)))
+    return Trial(subject, name, Record(**{**record, **more}), entries, traffic)
+
+
+def of(found: list[Cell], measure: str) -> Cell:
+    (cell,) = (cell for cell in found if cell.measure == measure)
+    return cell
+
+
+def test_a_good_trial_has_all_its_cells() -> None:
+    found = cells_of([trial()], fps=10)
+    assert len({cell.measure for cell in found}) == len(found) == 9
+    sound, video = of(found, cells.SOUND), of(found, cells.PICTURES)
+    assert sound.figures["delivered_percent"] == sound.figures["on_time_percent"] == 100
+    assert (sound.lost, sound.percentile(95), sound.figures["window_s"]) == (0, 50, 10)
+    assert (sound.figures["kbit_up"], sound.figures["dropped_up"]) == (100, 3)
+    assert video.figures["fps"] == pytest.approx(10, abs=0.2)
+    assert (video.figures["frozen_s"], of(found, cells.PICTURE_GAP).unit) == (0, "s")
+    assert of(found, cells.HEARTBEAT_GAP).figures["longest_offline_s"] == 0
+    drive = of(found, cells.DRIVE)
+    assert (drive.figures["sent"], drive.figures["delivered_percent"], drive.figures["trips"]) == (200, 100, 0)
+    assert [len(of(found, name).samples) for name in (cells.DRIVE_ALONE, cells.DRIVE_VIDEO, cells.DRIVE_AUDIO)] == [
+        *(30, 70, 100)
+    ]
+
+
+def test_a_trial_in_which_nothing_arrived_has_metrics_too() -> None:
+    nothing = trial(pictures=[], sounds=[], heartbeats=[], payloads=0)
+    found = cells_of([nothing], fps=10)
+    assert of(found, cells.SOUND).figures["delivered_percent"] == 0
+    assert math.isnan(of(found, cells.SOUND).percentile(95))
+    assert of(found, cells.PICTURES).figures["frozen_s"] == 7
+    assert of(found, cells.HEARTBEAT_GAP).figures["longest_gap_s"] == 20
+    assert any("nothing arrived" in sentence and "missed" in sentence for sentence in assessment(found))
+
+
+def test_series_over_time_are_ordered_and_begin_with_the_run() -> None:
+    sound, drive = over_time([trial(), trial(name="64k+5%")], began_ns=-5 * S)
+    assert (sound.measure, drive.measure) == (cells.SOUND_OVER_TIME, cells.DRIVE_OVER_TIME)
+    times, latencies = sound.rounds
+    assert len(times) == len(latencies) == 500
+    assert times == sorted(times)
+    assert times[0] == pytest.approx(15.05)
+
+
+def test_the_aims_are_met_or_missed_by_so_much() -> None:
+    good, bad = trial("mqtt h264 opus"), trial("zenoh h264 opus", late_ms=500)
+    lines = assessment(cells_of([good, bad], fps=10))
+    aim, window = "h264 opus at 256k, sound p95 at most 400 ms", "window of 10 s"
+    assert f"aim: mqtt {aim}: met (50.0 ms, {window})" in lines
+    assert f"aim: zenoh {aim}: missed (500 ms, by 100 ms, {window})" in lines
+    assert not any("64k+5%" in sentence for sentence in lines)
+
+
+def test_lost_messages_are_infinitely_late() -> None:
+    few = assessment(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 50])], fps=10))
+    many = assessment(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 10])], fps=10))
+    aim = "aim: zenoh h264 opus at 256k, sound p95 at most 400 ms"
+    assert f"{aim}: met (50.0 ms, 2.00 % lost, window of 10 s)" in few
+    assert f"{aim}: missed (too much was lost, 10.0 % lost, window of 10 s)" in many
+
+
+def test_commands_that_were_overtaken_or_lost_count_for_the_aim() -> None:
+    lines = assessment(
+        cells_of([trial(name="64k+5%", reached=one) for one in (slice(None, None, 10),)], fps=10)
+        + cells_of([trial("mqtt h264 opus", "64k+5%", reached=slice(100))], fps=10)
+    )
+    aim = "h264 opus at 64k+5%, drive p95 at most 500 ms"
+    assert f"aim: zenoh {aim}: missed (910 ms, by 410 ms, 4.50 % lost, window of 20 s)" in lines
+    assert f"aim: mqtt {aim}: missed (too much was lost, 50.0 % lost, window of 20 s)" in lines
+
+
+def test_rest_times_show_a_robot_that_nothing_reached() -> None:
+    (line,) = (line for line in assessment(cells_of([trial(reached=slice(0))], fps=10)) if line.startswith("Stops"))
+    assert "zenoh h264 opus 0 (wheels at rest for 19.9 of 20.0 s)" in line
+
+
+def test_transports_are_compared_where_both_were_tried() -> None:
+    both = [trial(f"{kind} original", name, late_ms=50) for name in QUICK for kind in ("mqtt", "zenoh")]
+    lines = assessment(cells_of(both, fps=10))
+    assert any("original, sound p50 over 4 trials: zenoh / mqtt = 1.00" in sentence for sentence in lines)
+    assert not any(sentence.startswith("aim:") for sentence in lines)
+    assert not any("zenoh and mqtt" in sentence for sentence in assessment(cells_of(both[::2], fps=10)))
+
+
+@pytest.mark.parametrize(("width", "number"), [(80, 2), (105, 4), (120, 4)])
+def test_the_tables_fit(width: int, number: int) -> None:
+    tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in NAMES]
+    results = Results(bench="impair", cells=cells_of(tried, fps=10), options={"link_words": "a proxy", "window_s": 8.0})
+    console = Console(file=io.StringIO(), width=width)
+    shown = list(tables(results, width))
+    assert len(shown) == number
+    for table in shown:
+        assert console.measure(table).maximum <= width
+        assert "a proxy" in str(table.title)
+
+
+# -- plans
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        ImpairPlan(trials=["512"]),
+        ImpairPlan(subjects=["pigeon"]),
+        ImpairPlan(subjects=[]),
+        ImpairPlan(network="string"),
+        ImpairPlan(window_s=0.1),
+        ImpairPlan(window_s=math.nan),
+    ],
+)
+def test_invalid_options_are_refused_before_anything_starts(plan: ImpairPlan) -> None:
+    with pytest.raises(PebbleError):
+        plan.check()
+
+
+def test_a_full_plan_groups_transports_and_a_quick_one_all_subjects() -> None:
+    assert [[one.name for one in group] for group in ImpairPlan().groups()] == [list(NAMES[:2]), list(NAMES[2:])]
+    assert [len(group) for group in ImpairPlan(quick=True).groups()] == [4]
+    assert tuple(condition.name for condition in ImpairPlan(quick=True).conditions()) == QUICK
+    assert len(ImpairPlan().conditions()) == 16
+
+
+def test_the_command_line_repeats_the_plan() -> None:
+    assert ImpairPlan().command() == ["pebble", "impair", "--link", "auto", "--window", "8"]
+    plan = ImpairPlan(trials=["256k", "1%"], subjects=[NAMES[3]], both_ways=True, network="proxy", quick=True)
+    assert plan.command()[4:] == [
+        *("--window", "4", "--trials", "256k,1%", "--subjects", "zenoh h264 opus", "--both-ways", "--quick")
+    ]

@@ -1,0 +1,23 @@
+"""A network process that does not answer in time is not used again."""
+
+import os
+import signal
+
+import pytest
+
+from pebble.bench import worker
+from pebble.bench.impair import network_process as module
+from pebble.bench.impair.network_process import NetworkProcess
+from pebble.errors import PebbleError
+
+
+def test_a_late_answer_is_not_taken_for_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    process = NetworkProcess("network", "pebble.bench.impair.proxy_process")
+    monkeypatch.setattr(module, "_ANSWER_S", 0.1)
+    monkeypatch.setattr(worker, "_END_S", 0.1)
+    os.kill(process.pid, signal.SIGSTOP)
+    with pytest.raises(PebbleError, match="network did not answer"):
+        process.ask("count")
+    with pytest.raises(PebbleError, match="network is closed"):
+        process.ask("count")
+    process.close()

@@ -1,0 +1,160 @@
+"""The course of the trials, with robots that only send scripted reports."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import pytest
+from rich.console import Console
+
+from pebble.bench.impair import run as module
+from pebble.bench.impair.conditions import Condition
+from pebble.bench.impair.messages import OperatorReport, Record, RecoveryRequest, TrialRequest, Window
+from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.plan import ImpairPlan, Subject
+from pebble.bench.impair.run import run
+from pebble.bench.results import load
+from pebble.errors import PebbleError
+
+S = 1_000_000_000
+NOTHING = Record(
+    commands=[],
+    heartbeats=[],
+    pictures=[],
+    sounds=[],
+    alone=Window(0, S),
+    video=Window(S, 2 * S),
+    audio=Window(2 * S, 3 * S),
+    payloads=0,
+)
+TRIAL = [OperatorReport(phase=phase) for name in ("alone", "video", "audio") for phase in (name, "")] + [
+    OperatorReport(record=NOTHING)
+]
+
+
+class QuietNetwork:
+    kind = "proxy"
+
+    def __init__(self, log: list[str], name: str) -> None:
+        self._log, self._name = log, name
+
+    def apply(self, condition: Condition) -> None:
+        self._log.append(f"{self._name}: {condition.name}")
+
+    def traffic(self) -> Traffic:
+        return Traffic()
+
+
+class FakeRobot:
+    """Reports ``trials`` trials, then nothing."""
+
+    def __init__(self, subject: Subject, log: list[str], trials: int) -> None:
+        self.subject, self.network = subject, QuietNetwork(log, subject.name)
+        printed = [
+            OperatorReport(ready=True),
+            *(one for _ in range(trials) for one in (OperatorReport(ready=True), *TRIAL)),
+        ]
+        self._reports: Iterator[OperatorReport] = iter(printed)
+
+    def send(self, request: TrialRequest | RecoveryRequest) -> None: ...
+
+    def next_report(self, timeout: float) -> OperatorReport:
+        printed = next(self._reports, None)
+        if printed is None:
+            raise PebbleError(f"{self.subject.name} said nothing for {timeout:.0f} s")
+        return printed
+
+    def entries(self, _since_ns: int) -> list[object]:
+        return []
+
+
+class FakeTestBed:
+    """Replaces pebble.bench.impair.robots.TestBed."""
+
+    def __init__(self, log: list[str], trials: int) -> None:
+        self._log, self._trials = log, trials
+        self.robots: list[FakeRobot] = []
+
+    def __call__(self, subjects: Sequence[Subject], _kind: str) -> Self:
+        self.robots = [FakeRobot(subject, self._log, self._trials) for subject in subjects]
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
+    ) -> None: ...
+
+    def end_trials(self) -> None:
+        self._log.append("hurry")
+
+
+PLAN = ImpairPlan(trials=["1024k", "5%"], subjects=["mqtt original", "zenoh original", "mqtt h264 opus"])
+
+
+def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int, network: str = "proxy") -> tuple[list[str], str]:
+    log: list[str] = []
+    printed = io.StringIO()
+    monkeypatch.setattr(module, "TestBed", FakeTestBed(log, trials))
+    monkeypatch.setattr("pebble.bench.output.find_spec", lambda _name: None)  # no plots
+    plan = ImpairPlan(trials=PLAN.trials, subjects=PLAN.subjects, network=network, output=folder)
+    try:
+        run(plan, Console(file=printed, width=120))
+    except PebbleError as error:
+        log.append(str(error))
+    return log, printed.getvalue()
+
+
+def test_each_group_runs_each_condition_and_then_a_clean_network(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    log, printed = go(monkeypatch, tmp_path, trials=2)
+    pair, single = ("mqtt original", "zenoh original"), ("mqtt h264 opus",)
+    turns = [(pair, "1024k"), (single, "1024k"), (single, "5%"), (pair, "5%")]  # the last one comes first
+    expected = [sorted(f"{one}: {what}" for one in group) for group, name in turns for what in (name, "clean")]
+    applied = iter(log)
+    assert [sorted(islice(applied, len(group))) for group in expected] == expected
+    assert list(applied) == ["hurry"]
+    assert "loss modelled" in printed
+
+
+def test_the_file_records_the_conditions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    go(monkeypatch, tmp_path, trials=2)
+    results = load(tmp_path / "impair.json")
+    assert (results.bench, results.options["link"], results.options["window_s"]) == ("impair", "proxy", 8.0)
+    marks = [mark.partition("@")[0] for mark in str(results.options["marks"]).split(";")]
+    assert marks == ["1024k", "5%"]
+    assert results.command[:4] == ["pebble", "impair", "--link", "proxy"]
+    assert results.options["why_proxy"] is None
+
+
+def test_an_automatic_proxy_is_explained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: "not permitted")
+    _, printed = go(monkeypatch, tmp_path, trials=2, network="auto")
+    assert "A proxy replaces the network namespaces: not permitted" in printed
+    results = load(tmp_path / "impair.json")
+    assert (results.options["link"], results.options["why_proxy"]) == ("proxy", "not permitted")
+    assert results.command[:4] == ["pebble", "impair", "--link", "proxy"]
+
+
+def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    log, _ = go(monkeypatch, tmp_path, trials=1)
+    assert log[-1].startswith("the trials ended early: ")
+    assert log[-1].endswith(" said nothing for 30 s")
+    results = load(tmp_path / "impair.json")
+    assert results.find("mqtt h264 opus", trial="1024k") is not None
+    assert results.assessment[0] == log[-1].replace("the trials", "The trials")
+
+
+def test_robots_that_fail_at_once_leave_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    log, printed = go(monkeypatch, tmp_path, trials=0)
+    assert log[0] == "hurry"
+    assert log[1].endswith("original said nothing for 30 s")
+    assert "trial" not in printed
+    assert not (tmp_path / "impair.json").exists()

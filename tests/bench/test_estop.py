@@ -1,0 +1,175 @@
+"""The comparison of emergency stops without robots: when wheels are at rest, cells, the assessment and the driver."""
+
+import io
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pebble.bench import estop
+from pebble.bench.estop import EstopPlan, run
+from pebble.bench.estop_report import (
+    ALL,
+    CONFIRMED,
+    ESTOP,
+    HOLD,
+    REST,
+    WIRE,
+    ZERO,
+    Samples,
+    assessment,
+    cells_of,
+    show,
+)
+from pebble.bench.estop_robots import Rest, is_moving, rest
+from pebble.bench.plots import pictures
+from pebble.bench.results import Cell, Results, load
+from pebble.bench.worker import Worker, end_workers
+from pebble.errors import PebbleError
+from pebble.simulation.fleet import Moved
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.support import Broker, until
+
+MS = 1_000_000
+AHEAD, OFF = (0.5, 0.5), (0.0, 0.0)
+
+
+def moves(*changes: tuple[int, tuple[float, float]]) -> list[Moved]:
+    return [Moved(ms * MS, "rover", motors) for ms, motors in changes]
+
+
+def test_wheels_are_at_rest_when_both_motors_are_off() -> None:
+    found = rest(moves((10, AHEAD), (20, OFF), (30, AHEAD), (52, (0.0, 0.5)), (55, OFF)), 50 * MS)
+    assert found == Rest(55 * MS, again=False)
+
+
+def test_wheels_that_turn_again_are_noticed() -> None:
+    assert rest(moves((10, AHEAD), (52, OFF), (70, AHEAD), (75, OFF)), 50 * MS) == Rest(52 * MS, again=True)
+
+
+def test_wheels_that_never_rest_have_no_time() -> None:
+    assert rest(moves((10, AHEAD), (60, (0.4, 0.5))), 50 * MS) == Rest(None, again=False)
+
+
+def test_a_robot_moves_after_its_last_change() -> None:
+    assert not is_moving([])
+    assert is_moving(moves((10, OFF), (20, AHEAD)))
+    assert not is_moving(moves((10, AHEAD), (20, OFF)))
+
+
+# -- cells and assessment
+
+
+def one_round(stop_ms: float, *, again: bool = False, lost: bool = False) -> Samples:
+    samples = Samples()
+    for variant, ms in ((ESTOP, stop_ms), (ZERO, 1.0)):
+        for _ in range(2):
+            samples.add(REST, "mqtt", variant, 5 * MS, round((5 + ms) * MS), again=again and variant == ESTOP)
+    samples.add(REST, ALL, ESTOP, 0, None if lost else round(100 * MS))
+    samples.add(CONFIRMED, "mqtt", ESTOP, 0, 600 * MS)
+    samples.add(HOLD, "mqtt", ESTOP, 0, 3 * MS)
+    samples.add(WIRE, "mqtt", "pebble estop", 0, 180 * MS)
+    return samples
+
+
+def cells(*rounds: Samples) -> list[Cell]:
+    return cells_of([samples.all for samples in rounds])
+
+
+def test_a_cell_has_the_samples_of_each_round() -> None:
+    first, second = one_round(2.0), one_round(4.0, lost=True)
+    found = {(cell.measure, cell.variant, cell.conditions()): cell for cell in cells(first, second)}
+    assert found[REST, ESTOP, "mqtt"].rounds == [[2.0, 2.0], [4.0, 4.0]]
+    assert found[REST, ESTOP, ALL].lost == 1
+    assert next(iter(found)) == (REST, ESTOP, "mqtt")
+
+
+def test_aims_are_judged_from_enough_samples() -> None:
+    lines = assessment(cells(*(one_round(2.0) for _ in range(10))))
+    assert "aim: mqtt, wheels at rest, p95 at most 50 ms: met (2.00 ms)" in lines
+    assert f"aim: {ALL}, wheels at rest, p95 at most 250 ms: met (100 ms)" in lines
+    assert "aim: mqtt, confirmed, p95 at most 500 ms: missed (600 ms)" in lines
+    assert "aim: mqtt, latched under a hold, p95 at most 1000 ms: met (3.00 ms)" in lines
+    assert lines[0].startswith(f"{REST}, mqtt: emergency stop takes 2.00× the time of plain zero (99 % interval")
+    assert lines[1] == "mqtt: pebble estop sends its first stop 180 ms (p50) after it is entered, 180 ms at most"
+    assert lines[-1].endswith(": met (0 of 30 turned again)")
+
+
+def test_few_samples_are_not_judged() -> None:
+    assert all("not judged" in line for line in assessment(cells(one_round(2.0))) if "p95" in line)
+
+
+def test_a_stop_that_did_not_happen_misses_its_aim() -> None:
+    rounds = [*(one_round(2.0) for _ in range(9)), one_round(2.0, again=True, lost=True)]
+    lines = assessment(cells(*rounds))
+    assert f"aim: {ALL}, wheels at rest, p95 at most 250 ms: missed (not at all)" in lines
+    assert lines[-1].endswith(": missed (2 of 30 turned again)")
+
+
+def test_the_table_names_every_measure_within_130_columns() -> None:
+    out = io.StringIO()
+    show(cells(one_round(2.0)), Console(file=out, width=130))
+    assert all(measure in out.getvalue() for measure in (REST, CONFIRMED, HOLD, WIRE))
+    assert "…" not in out.getvalue()
+
+
+def test_measures_with_enough_samples_have_pictures() -> None:
+    results = Results(bench="estop", cells=cells(*(one_round(2.0) for _ in range(10))))
+    assert [picture.name for picture in pictures(results)] == ["estop-wheels-at-rest"]
+
+
+def test_a_plan_repeats_itself() -> None:
+    assert " ".join(EstopPlan(quick=True, boards=8).command()) == "pebble bench estop --rounds 2 --boards 8 --quick"
+    assert EstopPlan().count * EstopPlan().stops >= 100
+    assert EstopPlan().count * EstopPlan().all_stops >= 20
+    assert EstopPlan().count >= 10
+    with pytest.raises(PebbleError, match="boards must be"):
+        EstopPlan(boards=-1).check()
+
+
+def test_results_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    swept: list[bool] = []
+    monkeypatch.setattr(estop, "_round", lambda _plan, _show: one_round(2.0))
+    monkeypatch.setattr(estop, "sweep", lambda: swept.append(True))
+    out = io.StringIO()
+    assert run(EstopPlan(rounds=2, output=tmp_path), Console(file=out, width=130)) == 0
+    assert swept == [True]
+    assert load(tmp_path / "estop.json").assessment[-1].startswith("Load of the machine before the run: ")
+
+
+# -- the driver
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path)
+    yield broker
+    broker.kill()
+
+
+def test_the_driver_sends_a_zero_before_and_after_its_commands(broker: Broker, tmp_path: Path) -> None:
+    received: list[tuple[str, float]] = []
+
+    def note(message: Message) -> None:
+        received.append((message.topic.split("/")[2], json.loads(message.payload)["z"]))
+
+    driver = Worker(
+        "driver", [sys.executable, "-m", "pebble.bench.estop_driver", str(broker.port)], tmp_path / "driver.log"
+    )
+    with create("mqtt", "test", MqttSettings(host="127.0.0.1", port=broker.port)) as transport:
+        try:
+            transport.subscribe("+/+/+/incoming/drive-values", note, qos=QoS.DELIVERED, direct=True)
+            driver.send("pebble/robots/a pebble/robots/b")
+            assert until(lambda: received.count(("a", 0.5)) >= 3 <= received.count(("b", 0.5)))
+            driver.send("pebble/robots/b")
+            assert until(lambda: received.count(("a", 0.0)) == 2)
+            count = received.count(("b", 0.5))
+            assert until(lambda: received.count(("b", 0.5)) > count)
+        finally:
+            end_workers([driver])
+    assert [received.count((name, 0.0)) for name in "ab"] == [2, 1]
+    assert next(z for name, z in received if name == "a") == 0.0
+    assert [z for name, z in received if name == "a"][-1] == 0.0

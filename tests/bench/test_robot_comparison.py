@@ -1,0 +1,73 @@
+"""Results of two robots in words: what is claimed, and what is not."""
+
+import pytest
+
+from pebble.bench.measured_robot import check_kinds
+from pebble.bench.results import Cell
+from pebble.bench.robot_comparison import against, caveat, sentence, spread
+from pebble.errors import PebbleError
+
+
+def cells(mqtt: list[float], zenoh: list[float]) -> list[Cell]:
+    return [
+        Cell(variant=kind, measure="m", unit="ms", rounds=[[figure] for figure in figures])
+        for kind, figures in (("mqtt", mqtt), ("zenoh", zenoh))
+    ]
+
+
+def printed(mqtt: list[float], zenoh: list[float]) -> str:
+    return sentence("M", cells(mqtt, zenoh), quantity="time")
+
+
+def test_a_spread_is_the_median_and_both_ends() -> None:
+    assert spread(cells([3.0, 1.0, 2.0], [])[0]) == "2.00 (1.00 to 3.00)"
+    assert spread(cells([3.0], [])[0]) == "3.00"
+    assert spread(cells([], [])[0]) == "–"
+
+
+def test_enough_rounds_give_an_interval() -> None:
+    pair = cells([10.0 + n / 100 for n in range(8)], [20.0 + n / 100 for n in range(8)])
+    assert sentence("M", pair, quantity="time").startswith("M: zenoh takes 2.00× the time of mqtt (99 % interval ")
+    assert against(pair).startswith("2.00 (")
+    assert caveat(pair) == []
+
+
+def test_what_differs_by_chance_is_equal() -> None:
+    noisy = [10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0]
+    assert "equal within noise" in printed(noisy, noisy[::-1])
+
+
+def test_few_rounds_give_no_interval_and_a_note() -> None:
+    low, high = [1.0, 2.0, 3.0, 4.0, 5.0], [6.0, 7.0, 8.0, 9.0, 10.0]
+    assert printed(low, high).endswith(": mqtt takes less time in every round")
+    assert printed(high, low).endswith(": zenoh takes less time in every round")
+    assert printed(low, [5.0, *high[1:]]).endswith(": no clear difference")
+    pair = cells([1.0, 2.0], [2.0, 4.0])
+    assert against(pair) == "2.00"
+    (line,) = caveat(pair)
+    assert line.startswith("2 rounds, and a 99 % interval needs 8")
+
+
+def test_what_happens_by_chance_is_not_claimed() -> None:
+    """Of two equal robots, all four values of one lie beyond those of the other in one run of 35."""
+    assert printed([1.0, 2.0, 3.0, 4.0], [6.0, 7.0, 8.0, 9.0]).endswith("(6.00 to 9.00) ms")
+
+
+def test_one_round_claims_nothing() -> None:
+    assert printed([1.0], [2.0]) == "M: mqtt 1.00 ms, zenoh 2.00 ms"
+    assert caveat(cells([1.0], [2.0])) == ["One round is not enough to compare; a 99 % interval needs 8."]
+
+
+def test_a_single_robot_is_not_compared() -> None:
+    assert sentence("M", cells([1.0, 2.0], [])[:1], quantity="time") == "M: mqtt 1.50 (1.00 to 2.00) ms"
+
+
+@pytest.mark.parametrize("kinds", [[], ["carrier-pigeon"], ["mqtt", ""]])
+def test_unknown_transports_are_refused(kinds: list[str]) -> None:
+    with pytest.raises(PebbleError, match="there are mqtt, zenoh"):
+        check_kinds(kinds)
+
+
+def test_no_robot_is_compared_with_itself() -> None:
+    with pytest.raises(PebbleError, match="name each transport once"):
+        check_kinds(["mqtt", "zenoh", "mqtt"])

@@ -1,0 +1,353 @@
+"""What an emergency stop sends, when, and when it counts as confirmed."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import pytest
+
+from pebble.client.estop import MAX_ROBOTS, Progress, StopSender, new_name
+from pebble.transports import Message
+from tests.client.estop_robot import Robot, capabilities, outgoing
+
+GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
+ESTOP, DRIVE = f"{GOOB}/incoming/estop", f"{GOOB}/incoming/drive-values"
+
+
+def sender(*robots: str, hold: bool = False, by: str = "ann@desk", why: str = "") -> StopSender:
+    return StopSender(new_name(), by=by, why=why, now=0.0, robots=robots or None, hold=hold)
+
+
+def receive(stop: StopSender, *messages: Message, now: float) -> None:
+    for message in messages:
+        stop.receive(message, now)
+
+
+def topics(messages: list[Message]) -> list[str]:
+    return [message.topic for message in messages]
+
+
+def sent_times(stop: StopSender, until: float) -> list[float]:
+    """When ``stop`` publishes, called exactly when it is due."""
+    times = []
+    while stop.due is not None and stop.due <= until:
+        now = stop.due
+        if stop.tick(now):
+            times.append(now)
+    return times
+
+
+def test_the_first_stop_needs_nothing_from_the_robot() -> None:
+    stop = sender(GOOB, why="dog")
+    first = stop.tick(0.0)
+    assert topics(first) == [ESTOP, DRIVE]
+    assert json.loads(first[0].payload) == {"stop": stop.name, "by": "ann@desk", "why": "dog"}
+    assert json.loads(first[1].payload) == {"x": 0, "z": 0, "y": 0, "valid_ms": 0}
+    assert [(message.qos, message.retain) for message in first] == [(1, False), (1, False)]
+    assert (stop.tick(0.1), stop.due) == ([], 0.5)
+
+
+def test_a_name_is_new_for_every_stop_and_valid() -> None:
+    assert new_name() != new_name()
+    with pytest.raises(ValueError, match="16 hex digits"):
+        StopSender("now", by="", why="", now=0.0, robots=[GOOB])
+
+
+def test_it_is_confirmed_by_every_owner_and_then_silent() -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "left", "right")
+    receive(stop, robot.capabilities(), now=0.01)
+    left, right = robot.take(stop.tick(0.01))
+    receive(stop, left, now=0.1)
+    assert stop.robots[GOOB].why == "right has not confirmed"
+    assert (stop.confirmed, stop.finished) == (False, False)
+    receive(stop, right, now=0.125)
+    assert (stop.robots[GOOB].progress, stop.robots[GOOB].confirmed_s) == (Progress.CONFIRMED, 0.125)
+    assert (stop.confirmed, stop.finished, stop.due, stop.tick(9.0)) == (True, True, None, [])
+
+
+def test_states_may_arrive_before_capabilities() -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "serial")
+    receive(stop, *robot.take(stop.tick(0.0)), now=0.1)
+    assert stop.robots[GOOB].why == "it has not published its capabilities"
+    receive(stop, robot.capabilities(), now=0.2)
+    assert stop.confirmed
+
+
+def test_the_retained_state_of_an_earlier_stop_confirms_nothing() -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "serial")
+    robot.take(sender(GOOB).tick(0.0))
+    receive(stop, robot.capabilities(), robot.owners[0].state(retain=True), now=0.1)
+    assert robot.owners[0].latch.latched
+    assert stop.robots[GOOB].why == "serial has not confirmed: it may be off"
+    assert sent_times(stop, 2.0) == [0.1, 0.6, 1.1, 1.6]
+
+
+@pytest.mark.parametrize(("persisted", "confirmed", "saved"), [(True, True, True), (None, True, False)])
+def test_an_owner_that_cannot_save_confirms_all_the_same(persisted: bool | None, confirmed: bool, saved: bool) -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "mcu", persisted=persisted)
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    assert (stop.confirmed, stop.robots[GOOB].saved) == (confirmed, saved)
+
+
+def test_it_goes_on_until_the_state_is_on_disk() -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "serial", persisted=False)
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    assert stop.robots[GOOB].why == "serial has not saved it"
+    assert topics(stop.tick(0.6)) == [ESTOP, DRIVE]
+    assert robot.owners[0].latch.count == 1
+    robot.owners[0].persisted = True
+    receive(stop, robot.owners[0].state(), now=0.7)
+    assert stop.confirmed
+
+
+def test_a_robot_that_never_answers_is_given_up_after_a_minute() -> None:
+    stop = sender(GOOB)
+    times = sent_times(stop, 100.0)
+    assert (len(times), times[0], times[-1]) == (120, 0.0, 59.5)
+    assert (stop.finished, stop.confirmed, stop.tick(61.0)) == (True, False, [])
+    assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
+    assert stop.robots[GOOB].why == "nothing was received: it may be off"
+
+
+def test_an_owner_that_never_answers_is_named() -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "left", "right")
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0))[:1], now=0.1)
+    sent_times(stop, 100.0)
+    assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
+    assert stop.robots[GOOB].unconfirmed == {"right": "has not confirmed"}
+
+
+@pytest.mark.parametrize("owners", [[], None, ["a/b"], [1], ["x"] * 17, "serial"])
+def test_a_robot_without_valid_owners_is_never_confirmed(owners: object) -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "serial", estop={"available": True, "owners": owners})
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    assert stop.robots[GOOB].why == "its capabilities list no valid motor owners"
+    assert not stop.confirmed
+
+
+@pytest.mark.parametrize("section", [{}, {"estop": {}}, {"estop": 5}])
+def test_an_old_robot_gets_zeros_and_one_end_of_its_script(section: dict[str, object]) -> None:
+    stop = sender(GOOB)
+    value = {"drive": {"available": True, "topic": "else/where"}, "autonomy": {"command_topic": "a/script"}, **section}
+    receive(stop, capabilities(GOOB, value), now=0.0)
+    first = stop.tick(0.0)
+    assert topics(first) == ["a/script", "else/where"]
+    assert first[0].payload == b'{"action":"stop"}'
+    assert topics(stop.tick(0.5)) == ["else/where"]
+    assert stop.robots[GOOB].progress is Progress.OLD
+    assert sent_times(stop, 100.0)[-1] == 59.5
+    assert (stop.finished, stop.confirmed, stop.robots[GOOB].progress) == (True, False, Progress.OLD)
+
+
+def test_a_robot_whose_broker_refuses_stops_gets_them_and_zeros_and_is_not_old() -> None:
+    stop = sender(GOOB)
+    receive(stop, capabilities(GOOB, {"drive": {"available": True}, "estop": {"available": False}}), now=0.0)
+    assert topics(stop.tick(0.0)) == topics(stop.tick(0.5)) == [ESTOP, DRIVE]
+    assert stop.robots[GOOB].progress is Progress.WAITING
+    assert stop.robots[GOOB].why == "its broker refuses emergency stops, so it gets zeros"
+    assert sent_times(stop, 100.0)[-1] == 59.5
+    assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
+
+
+def test_capabilities_that_arrive_later_lead_to_the_right_topic_at_once() -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "serial", drive={"topic": "else/where"})
+    assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
+    receive(stop, robot.capabilities(), now=0.05)
+    assert stop.due == 0.05
+    assert topics(stop.tick(0.05)) == [ESTOP, "else/where"]
+
+
+@pytest.mark.parametrize("topic", ["a/#", "$SYS/x", "", 5, "x" * 2000, "a\x1b[31m"])
+def test_a_topic_that_cannot_be_published_to_is_not_used(topic: object) -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "serial", drive={"topic": topic})
+    receive(stop, robot.capabilities(), now=0.0)
+    assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
+
+
+def test_a_robot_that_is_reset_on_purpose_stays_free() -> None:
+    stop, robot = sender(GOOB, FRED), Robot(GOOB, "serial")
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    latch = robot.owners[0].latch
+    assert latch.reset(latch.boot, latch.count, 0, 0)
+    receive(stop, robot.owners[0].state(), now=0.2)
+    assert topics(stop.tick(0.5)) == [f"{FRED}/incoming/estop", f"{FRED}/incoming/drive-values"]
+
+
+def test_a_person_may_end_it() -> None:
+    stop = sender(GOOB, hold=True)
+    stop.tick(0.0)
+    stop.end()
+    assert (stop.finished, stop.due, stop.tick(0.5)) == (True, None, [])
+    assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
+
+
+# -- all robots
+
+
+def test_all_robots_are_stopped_as_they_are_found_for_three_seconds() -> None:
+    stop = sender()
+    assert (stop.tick(0.0), stop.due) == ([], 3.0)
+    receive(stop, outgoing(GOOB, "online", {"t": 1}), now=0.2)
+    assert stop.due == 0.2
+    assert topics(stop.tick(0.2)) == [ESTOP, DRIVE]
+    receive(stop, outgoing(FRED, "front-camera", "a picture"), now=2.9)
+    assert topics(stop.tick(2.9)) == [ESTOP, DRIVE, f"{FRED}/incoming/estop", f"{FRED}/incoming/drive-values"]
+    receive(stop, outgoing("pebble/robots/late", "online", {"t": 1}), now=3.1)
+    assert list(stop.robots) == [GOOB, FRED]
+
+
+def test_without_any_robot_it_ends_after_three_seconds_unconfirmed() -> None:
+    stop = sender()
+    stop.tick(3.0)
+    assert (stop.finished, stop.confirmed) == (True, False)
+
+
+def test_all_ends_when_all_are_confirmed_but_not_before_the_three_seconds() -> None:
+    stop, robot = sender(), Robot(GOOB, "serial")
+    receive(stop, robot.capabilities(), now=0.1)
+    receive(stop, *robot.take(stop.tick(0.1)), now=0.2)
+    assert (stop.confirmed, stop.finished, stop.due) == (True, False, 3.0)
+    stop.tick(3.0)
+    assert stop.finished
+
+
+def test_a_component_that_does_not_drive_is_spared_once_that_is_known() -> None:
+    stop = sender()
+    receive(stop, outgoing(GOOB, "online", {"t": 1}), now=0.0)
+    assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
+    receive(stop, capabilities(GOOB, {"drive": {"available": False}}), now=0.1)
+    assert (stop.tick(0.5), stop.robots[GOOB].progress) == ([], Progress.SPARED)
+    receive(stop, capabilities(FRED, {"drive": {"available": False}}), now=0.6)
+    assert stop.tick(0.6) == []
+    assert not stop.confirmed, "no robot was stopped"
+
+
+def test_a_named_robot_is_never_spared() -> None:
+    stop = sender(GOOB)
+    receive(stop, capabilities(GOOB, {"drive": {"available": False}}), now=0.0)
+    assert topics(stop.tick(0.0)) == [f"{GOOB}/incoming/autonomy-command", DRIVE]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Message("other/topic", b"1"),
+        Message(f"{GOOB}/incoming/drive-values", b"{}"),
+        Message(f"{GOOB}/outgoing/status", b"", retain=True),
+        Message("a\x1bb/robots/goob/outgoing/online", b"{}"),
+        Message(f"{'x' * 65}/robots/goob/outgoing/online", b"{}"),
+    ],
+)
+def test_what_no_robot_publishes_finds_none(message: Message) -> None:
+    stop = sender()
+    receive(stop, message, now=0.1)
+    assert stop.robots == {}
+
+
+def test_the_number_of_robots_is_limited_and_the_rest_is_reported() -> None:
+    stop = sender()
+    for number in range(MAX_ROBOTS + 5):
+        receive(stop, outgoing(f"pebble/robots/r{number}", "online", {}), now=0.1)
+    assert (len(stop.robots), stop.omitted, stop.confirmed) == (MAX_ROBOTS, 5, False)
+
+
+def test_remains_of_other_robots_take_no_place_of_one_that_is_there() -> None:
+    stop, robot = sender(), Robot(GOOB, "serial")
+    for number in range(MAX_ROBOTS):
+        receive(stop, outgoing(f"pebble/robots/r{number}", "status", {}, retain=True), now=0.1)
+    receive(stop, outgoing(FRED, "status", {}, retain=True), outgoing(GOOB, "online", {}), now=0.2)
+    assert (FRED in stop.robots, GOOB in stop.robots, len(stop.robots)) == (False, True, MAX_ROBOTS)
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.2)), now=0.3)
+    assert robot.owners[0].latch.latched
+    assert (stop.omitted, stop.confirmed) == (2, False)
+
+
+# -- hold
+
+
+def test_a_hold_stops_every_robot_that_comes_online_under_one_name() -> None:
+    stop = sender(hold=True)
+    assert (stop.tick(0.0), stop.due, stop.finished) == ([], None, False)
+    robot = Robot(GOOB, "serial")
+    receive(stop, outgoing(GOOB, "online", {"t": 1}), now=1000.0)
+    first = stop.tick(1000.0)
+    assert json.loads(first[0].payload)["stop"] == stop.name
+    receive(stop, robot.capabilities(), *robot.take(first), now=1000.1)
+    assert (stop.confirmed, stop.due, stop.finished) == (True, None, False)
+    late = Robot(FRED, "mcu")
+    receive(stop, late.capabilities(), now=5000.0)
+    assert topics(stop.tick(5000.0)) == [f"{FRED}/incoming/estop", f"{FRED}/incoming/drive-values"]
+
+
+def test_a_hold_repeats_beyond_the_minute_so_a_robot_that_was_off_is_stopped_within_a_second() -> None:
+    stop = sender(GOOB, hold=True)
+    times = sent_times(stop, 120.0)
+    assert times[-1] == 120.0
+    assert max(later - earlier for earlier, later in pairwise(times)) == 0.5
+
+
+def test_a_hold_stops_a_robot_again_that_has_lost_its_memory_and_no_other() -> None:
+    stop, robot = sender(GOOB, hold=True), Robot(GOOB, "mcu", persisted=None)
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    latch = robot.owners[0].latch
+    latch.reset(latch.boot, latch.count, 0, 0)
+    receive(stop, robot.owners[0].state(), now=10.0)
+    assert stop.tick(10.0) == [], "reset on purpose"
+    restarted = Robot(GOOB, "mcu", persisted=None)
+    restarted.owners[0].latch.boot = "ffffffff"
+    receive(stop, restarted.owners[0].state(), now=20.0)
+    assert topics(stop.tick(20.0)) == [ESTOP, DRIVE]
+    receive(stop, *restarted.take(stop.tick(20.5)), now=20.6)
+    assert stop.confirmed
+
+
+def test_a_hold_is_not_disturbed_by_later_stops_of_others() -> None:
+    stop, robot = sender(GOOB, hold=True), Robot(GOOB, "serial")
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    robot.owners[0].persisted = False
+    receive(stop, *robot.take(sender(GOOB).tick(0.0)), now=1.0)
+    assert (stop.confirmed, stop.tick(1.0)) == (True, [])
+
+
+def test_more_holds_than_an_owner_remembers_names_come_to_rest() -> None:
+    """Else each would take the place of another for ever, and a robot that is reset on purpose would not stay free."""
+    stops, robot = [sender(GOOB, hold=True) for _ in range(9)], Robot(GOOB, "serial")
+    for now in range(10):
+        for stop in stops:
+            states = robot.take(stop.tick(float(now)))
+            for other in stops:
+                receive(other, robot.capabilities(), *states, now=float(now))
+    assert all(stop.confirmed for stop in stops)
+    latch = robot.owners[0].latch
+    assert latch.count == 9
+    assert latch.reset(latch.boot, latch.count, 0, 0)
+    for stop in stops:
+        receive(stop, robot.owners[0].state(), now=20.0)
+    assert [stop.tick(20.0) for stop in stops] == [[]] * 9
+
+
+def test_states_that_change_quickly_do_not_make_it_send_more_often() -> None:
+    stop, robot = sender(GOOB, hold=True), Robot(GOOB, "serial")
+    robot.owners[0].latch.boot = "ffffffff"
+    free = robot.owners[0].state()
+    robot.owners[0].latch.boot = "00000000"
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    latched = robot.owners[0].state()
+    sent = 0
+    for step in range(100):
+        receive(stop, free, latched, free, now=0.2 + step / 100)
+        sent += bool(stop.tick(0.2 + step / 100))
+    assert sent == 2
+
+
+# -- what goes out
+
+
+def test_who_and_why_are_cut_and_made_harmless() -> None:
+    stop = sender(GOOB, by="ann\x1b[31m@" + "d" * 50, why='say "stop" ' + "é" * 50)
+    body = json.loads(stop.tick(0.0)[0].payload)
+    assert (len(body["by"]), len(body["why"])) == (32, 40)
+    assert body["by"].startswith("ann?[31m@d")
+    assert body["why"].startswith("say ?stop? ?")
+    assert len(stop.tick(0.5)[0].payload) < 128

@@ -1,0 +1,43 @@
+"""Short names of topics."""
+
+from __future__ import annotations
+
+import pytest
+
+from pebble.client.names import Names, base_of
+from pebble.errors import PebbleError
+
+GOOB = "pebble/robots/goob"
+
+
+@pytest.mark.parametrize(
+    ("name", "filters"),
+    [
+        ("drive-values", [f"{GOOB}/incoming/drive-values"]),
+        ("online", [f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/heartbeat"]),
+        ("audio", [f"{GOOB}/outgoing/audio"]),
+        ("incoming/audio", [f"{GOOB}/incoming/audio"]),
+        ("outlets/o1/power", [f"{GOOB}/incoming/outlets/o1/power"]),
+        ("flags/reboot", [f"{GOOB}/incoming/flags/reboot"]),
+        ("pebble/robots/fred/outgoing/online", ["pebble/robots/fred/outgoing/online"]),
+        ("#", ["#"]),
+        ("house/lamp", ["house/lamp"]),
+    ],
+)
+def test_names_to_listen_to(name: str, filters: list[str]) -> None:
+    assert Names(GOOB).filters(name) == filters
+
+
+def test_names_to_publish_to() -> None:
+    names = Names(base_of("goob"))
+    assert names.topic("audio") == f"{GOOB}/incoming/audio"
+    assert names.topic("outgoing/audio") == f"{GOOB}/outgoing/audio"
+    assert Names().filters("drive-values") == ["+/+/+/incoming/drive-values"]
+    with pytest.raises(PebbleError, match="--robot"):
+        Names().topic("drive-values")
+
+
+@pytest.mark.parametrize("name", ["drive-valus", "flags/mqtt-vdeo", "incoming/drive-valus"])
+def test_a_misspelt_name_gets_a_suggestion(name: str) -> None:
+    with pytest.raises(PebbleError, match="did you mean"):
+        Names(GOOB).filters(name)

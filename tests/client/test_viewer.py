@@ -1,0 +1,121 @@
+"""What a viewer changes about a robot, and what it leaves as it was."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from pebble.client.viewer import Viewer
+from pebble.errors import PebbleError
+from pebble.transports import QoS
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.support import until
+
+BASE = "pebble/robots/goob"
+REQUEST, FLAG, CAMERA = (
+    f"{BASE}/incoming/front-camera",
+    f"{BASE}/incoming/flags/mqtt-video",
+    f"{BASE}/outgoing/front-camera",
+)
+CAN = (
+    b'{"t":1,"schema":"pebble-capabilities/v1","value":{"video":{"available":true,"controls":true,'
+    b'"topic":"pebble/robots/goob/outgoing/front-camera","encodings":["json","h264"]}}}'
+)
+
+
+class Robot:
+    """The robot's end: publishes capabilities, flags and pictures, and records requests and flags."""
+
+    def __init__(self) -> None:
+        self.hub = MemoryHub()
+        self.transport = MemoryTransport("robot", self.hub).open()
+        self.requests: list[bytes] = []
+        self.flags: list[bytes] = []
+        self.transport.publish(f"{BASE}/outgoing/capabilities", CAN, qos=QoS.DELIVERED, retain=True)
+        self.transport.subscribe(REQUEST, lambda message: self.requests.append(message.payload), direct=True)
+        self.transport.subscribe(FLAG, lambda message: self.flags.append(message.payload), echo=False, direct=True)
+
+    def publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+        self.transport.publish(topic, payload, qos=QoS.DELIVERED, retain=retain)
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    robot = Robot()
+    yield robot
+    robot.transport.close()
+
+
+@pytest.fixture
+def viewer(robot: Robot) -> Iterator[Viewer]:
+    transport = MemoryTransport("viewer", robot.hub).open()
+    viewer = Viewer(transport, BASE, lambda _medium, _payload: None)
+    viewer.wait_for_capabilities(5)
+    yield viewer
+    transport.close()
+
+
+def test_it_raises_the_flag_and_requests_and_undoes_both(robot: Robot, viewer: Viewer) -> None:
+    viewer.request("video", "h264")
+    assert until(lambda: robot.requests == [b'{"enabled":true,"encoding":"h264"}'])
+    assert robot.flags == [b'{"value":true}']
+    viewer.close()
+    assert until(lambda: robot.requests[-1] == b'{"enabled":false}')
+    assert robot.flags == [b'{"value":true}', b'{"value":false}']
+
+
+def test_a_flag_that_was_up_stays_up(robot: Robot, viewer: Viewer) -> None:
+    robot.publish(FLAG, b"true", retain=True)
+    viewer.request("video")
+    viewer.close()
+    assert until(lambda: robot.requests == [b'{"enabled":true}', b'{"enabled":false}'])
+    assert robot.flags == []
+
+
+def test_a_flag_lowered_by_another_operator_stays_down(
+    robot: Robot, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pebble.client.viewer._REPEAT_S", 0.0)
+    viewer.request("video")
+    assert until(lambda: robot.flags == [b'{"value":true}'])
+    robot.publish(FLAG, b"false", retain=True)
+    assert until(lambda: not viewer._flags[FLAG])
+    viewer.repeat_requests()
+    viewer.close()
+    assert until(lambda: robot.requests[-1] == b'{"enabled":false}')
+    assert robot.flags == [b'{"value":true}']
+
+
+def test_a_stream_that_another_operator_requested_is_neither_changed_nor_ended(robot: Robot, viewer: Viewer) -> None:
+    robot.publish(FLAG, b"true", retain=True)
+    stop = False
+
+    def show() -> bool:
+        robot.publish(CAMERA, b"a picture")
+        return stop
+
+    thread = threading.Thread(target=lambda: until(show, 10, step=0.02))
+    thread.start()
+    viewer.request("video")
+    viewer.request_keyframe("h264")
+    viewer.close()
+    stop = True
+    thread.join(10)
+    assert robot.requests == [b'{"enabled":true,"encoding":"h264","keyframe":true}']
+
+
+def test_requesting_what_is_not_offered_is_an_error(viewer: Viewer) -> None:
+    with pytest.raises(PebbleError, match="offers no audio"):
+        viewer.request("audio")
+    with pytest.raises(PebbleError, match="only as json, h264"):
+        viewer.request("video", "pbvd")
+
+
+def test_another_thread_may_repeat_requests_from_the_first_moment(robot: Robot, viewer: Viewer) -> None:
+    requesting = threading.Thread(target=viewer.request, args=("video",))
+    requesting.start()
+    while requesting.is_alive():  # for the 0.4 s in which it looks whether pictures come anyway
+        viewer.repeat_requests()
+    assert until(lambda: robot.requests == [b'{"enabled":true}'])

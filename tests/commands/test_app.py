@@ -1,0 +1,155 @@
+"""Help, usage, errors and exit codes of every command."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pebble.commands import app
+from tests.commands.command_line import Run, config_file, program
+from tests.support import ROOT, until
+
+GROUP = ("list", "echo", "pub", "hz", "bw")
+
+
+def test_a_command_leaves_logging_as_it_was(run: Run) -> None:
+    before = list(logging.getLogger("pebble").handlers)
+    assert run("--version") == 0
+    assert run("nonsense") == 2
+    assert logging.getLogger("pebble").handlers == before
+
+
+@pytest.mark.parametrize("argument", ["--version", "--help", "nonsense"])
+def test_the_package_runs_as_the_command_does(argument: str) -> None:
+    package, command = (
+        subprocess.run([sys.executable, "-m", module, argument], cwd=ROOT, capture_output=True, text=True, check=False)
+        for module in ("pebble", "pebble.cli")
+    )
+    assert (package.returncode, package.stdout, package.stderr) == (command.returncode, command.stdout, command.stderr)
+
+
+@pytest.mark.parametrize("command", [(name,) for name in app.COMMANDS] + [("topic", name) for name in GROUP])
+def test_every_command_explains_itself_with_an_example(run: Run, command: tuple[str, ...]) -> None:
+    assert run(*command, "--help") == 0
+    assert f"\n      pebble {command[0]}" in run.out
+    assert max(map(len, run.out.splitlines())) <= 80
+    assert run.err == ""
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("topic",)])
+def test_without_a_command_the_commands_are_listed(run: Run, arguments: tuple[str, ...]) -> None:
+    assert run(*arguments) == 0
+    assert "Commands:" in run.out
+    assert max(map(len, run.out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named", "help_"),
+    [
+        (("flyy",), "flyy", "pebble --help"),
+        (("up",), "config", "pebble up --help"),
+        (("topics", "--bad"), "--bad", "pebble topics --help"),
+        (("sim", "bob"), "bob", "pebble sim --help"),
+        (("topic", "pub", "drive-values"), "payload", "pebble topic --help"),
+        (("topic", "pub", "drive-values", "{}", "--qos", "2"), "qos", "pebble topic --help"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_and_exit_code_2(
+    run: Run, arguments: tuple[str, ...], named: str, help_: str
+) -> None:
+    assert run(*arguments) == 2
+    assert run.out == ""
+    assert run.err.startswith("pebble: ")
+    assert run.err.count("\n") == 1
+    assert named in run.err
+    assert help_ in run.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("up", "/nowhere/goob.json"), "/nowhere/goob.json"),
+        (("doctor", "/nowhere/goob.json"), "/nowhere/goob.json"),
+        (("topic", "list"), "--config CONFIG or --url URL"),
+        (("topic", "list", "--config", "a", "--url", "b"), "--config CONFIG or --url URL"),
+        (("topic", "list", "--url", "http://x"), "mqtt://HOST"),
+        (("topic", "list", "--url", "mqtt://127.0.0.1", "--remote"), "--remote"),
+        (("topic", "echo", "online", "--url", "mqtt://127.0.0.1", "--robot", "a/b"), "--robot a/b"),
+        (("topic", "list", "--url", "mqtt://127.0.0.1", "--password-file", "/nowhere/p"), "/nowhere/p"),
+        (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1"),
+        (("topics", "--base", "a/b"), "a/b"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_exit_code_1(run: Run, arguments: tuple[str, ...], named: str) -> None:
+    assert run(*arguments) == 1
+    assert run.err.startswith("pebble: ")
+    assert run.err.count("\n") == 1
+    assert named in run.err
+
+
+def test_version(run: Run) -> None:
+    from pebble.version import __version__
+
+    assert run("--version") == 0
+    assert run.out == f"pebble {__version__}\n"
+
+
+def test_up_loads_nothing_that_a_running_robot_does_not_need(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.argv = ['pebble', 'up', sys.argv[1]];"
+        "from pebble import cli; from pebble.launcher import launcher;"
+        "launcher.Launcher.run = lambda self: 7; code = cli.main();"
+        "print(code, sorted({'typer', 'click', 'rich', 'numpy', 'zenoh', 'paho', 'serial'} & set(sys.modules)))"
+    )
+    command = [sys.executable, "-c", code, str(config_file(tmp_path))]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "7 []\n"
+
+
+def test_up_refuses_a_robot_that_runs_on_its_own_mcu(run: Run, tmp_path: Path) -> None:
+    assert run("up", config_file(tmp_path, robot={"id": "benjr", "platform": "esp8266"})) == 1
+    assert "runs on its own MCU" in run.err
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    read, write = os.pipe()
+    fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, 4096)
+    # Unbuffered, Python itself would lose what a broken pipe did not accept, without an error.
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    process = program("topics", "--json", stdout=write, env=env)
+    os.close(write)
+    assert os.read(read, 1) == b"["
+    os.close(read)
+    assert process.communicate(timeout=60)[1] == ""
+    assert process.returncode == 1
+
+
+def test_demo_hands_over(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pebble.demo import main
+
+    asked: list[float | None] = []
+    monkeypatch.setattr(main, "run", lambda seconds: asked.append(seconds) or 3)
+    assert run("demo") == 3
+    assert run("demo", "--seconds", "20") == 3
+    assert asked == [None, 20.0]
+
+
+def test_sim_is_there_until_ctrl_c(tmp_path: Path) -> None:
+    link = tmp_path / "goob"
+    process = program("sim", "goob", "--link", link)
+    try:
+        assert until(link.exists, 30)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (0, "")
+    assert str(link) in out
+    assert not link.exists()

@@ -1,0 +1,75 @@
+"""What ``pebble check`` prints and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.commands.command_line import Run, config_file
+from tests.support import ROOT
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("[!s]*.json")), ids=lambda path: path.stem)
+def test_every_config_we_ship_is_right(run: Run, path: Path) -> None:
+    assert run("check", path) == 0
+    assert run.err == ""
+    assert run.out.startswith("pebble/")
+    assert max(map(len, run.out.splitlines())) <= 80
+
+
+def test_check_knows_which_transports_there_are(run: Run, tmp_path: Path) -> None:
+    assert run("check", config_file(tmp_path, transport={"kind": "zenho"})) == 1
+    assert 'transport.kind: no transport "zenho": known are ' in run.err
+    assert "mqtt" in run.err
+
+
+def test_all_of_our_configs_can_be_checked_at_once(run: Run) -> None:
+    assert run("check", *sorted((ROOT / "configs").glob("*.json"))) == 0
+    assert run.err == "pebble: schema.json: the JSON Schema of configs, not a config\n"
+
+
+def test_check_shows_links_processes_and_effective_topics_but_no_secret(run: Run, tmp_path: Path) -> None:
+    remote = {"host": "broker.example", "username": "goob", "password": "hush-hush"}
+    bridge = {"enabled": True, "remote_mqtt": remote, "heartbeat": {"topic": "else/where"}}
+    serial = {"enabled": True, "serial": {"port": "/dev/ttyACM7"}}
+    path = config_file(
+        tmp_path, transport={"kind": "zenoh"}, services={"mqtt_bridge": bridge, "serial_mcu_bridge": serial}
+    )
+    assert run("check", path, columns=120) == 0
+    for expected in ("broker.example:1883", "user goob, password ***", "/dev/ttyACM7", "else/where",
+                     "zenoh_hub, announcer, serial_mcu_bridge, mqtt_bridge",
+                     "incoming/drive-values", "incoming/flags/reboot"):  # fmt: skip
+        assert expected in run.out
+    assert "outgoing/online" not in run.out
+    assert run("check", path, "--json") == 0
+    assert json.loads(run.out)["services"]["mqtt_bridge"]["heartbeat"]["topic"] == "else/where"
+    assert "hush-hush" not in run.out
+
+
+def test_check_shows_what_runs_on_request(run: Run, tmp_path: Path) -> None:
+    services = {
+        "av_daemon": {"enabled": True},
+        "mqtt_bridge": {
+            "enabled": True,
+            "remote_mqtt": {"host": "broker.example"},
+            "media": {"audio_receiver": {"topic": "else/where"}},
+        },
+    }
+    assert run("check", config_file(tmp_path, services=services), columns=120) == 0
+    lines = [" ".join(line.split()) for line in run.out.splitlines()]
+    assert "processes launcher, announcer, av_daemon, mqtt_bridge" in lines
+    assert "on request camera_publisher, audio_publisher, audio_receiver" in lines
+    for expected in ("camera_publisher publishes outgoing/front-camera", "audio_receiver subscribes else/where"):
+        assert any(line.startswith(expected) for line in lines)
+
+
+def test_check_reports_every_problem_of_every_file(run: Run, tmp_path: Path) -> None:
+    wrong = {"robot": {"id": "goob", "sistem": "x"}, "local_mqtt": {"port": "1883"}, "services": {"mqtt_brigde": {}}}
+    path = config_file(tmp_path, **wrong)
+    assert run("check", path, ROOT / "configs" / "fred.json") == 1
+    assert len(run.err.splitlines()) == 3
+    for named in ("robot.sistem", "local_mqtt.port", "services.mqtt_brigde"):
+        assert f"pebble: robot.json: {named}" in run.err
+    assert "pebble/robots/fred" in run.out

@@ -1,0 +1,498 @@
+"""``pebble estop`` with a real broker and robots whose motor owners are scripted around the real latch."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import pty
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+from pebble.commands import estop
+from pebble.transports import Message, MqttSettings, State, create
+from tests.client.estop_robot import Robot, outgoing
+from tests.commands.command_line import Run, config_file, program
+from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
+
+_numbers = itertools.count(1)
+
+
+class LiveRobot:
+    """A robot on a broker: answers stops and resets, and records every command."""
+
+    def __init__(self, port: int, *owners: str, persisted: bool | None = True, **more: Any) -> None:
+        self.id = f"robot{next(_numbers)}"
+        self.base = f"pebble/robots/{self.id}"
+        self.robot = Robot(self.base, *owners, persisted=persisted, **more)
+        self.commands: list[Message] = []
+        self.deaf = False
+        self.on_stop: Callable[[], None] = lambda: None
+        self._lock = threading.Lock()
+        self._transport = create("mqtt", self.id, MqttSettings(host="127.0.0.1", port=port)).open()
+        assert self._transport.state is State.CONNECTED
+        self._transport.subscribe(f"{self.base}/incoming/#", self._take)
+        self.publish(self.robot.capabilities(), *(owner.state() for owner in self.robot.owners))
+
+    def publish(self, *messages: Message) -> None:
+        for message in messages:
+            assert self._transport.publish(message.topic, message.payload, qos=message.qos, retain=True)
+
+    def stop(self, name: str = "0123456789abcdef", by: str = "ann@desk", why: str = "dog") -> None:
+        """Stop it as another operator."""
+        body = json.dumps({"stop": name, "by": by, "why": why}).encode()
+        self._take(Message(f"{self.base}/incoming/estop", body))
+
+    def publish_heartbeat(self) -> None:
+        heartbeat = json.dumps({"t": int(1000 * time.time()), "online": True}).encode()
+        self._transport.publish(f"{self.base}/outgoing/online", heartbeat)
+
+    @property
+    def latched(self) -> bool:
+        return all(owner.latch.latched for owner in self.robot.owners)
+
+    def count(self, metric: str) -> int:
+        return sum(message.topic == f"{self.base}/incoming/{metric}" for message in self.commands)
+
+    def close(self) -> None:
+        """Leave without a trace."""
+        for owner in self.robot.owners:
+            self.publish(Message(owner.state().topic, b""))
+        self.publish(Message(self.robot.capabilities().topic, b""))
+        self._transport.close()
+
+    def _take(self, message: Message) -> None:
+        with self._lock:
+            self.commands.append(message)
+            if message.topic.endswith("/estop"):
+                self.on_stop()
+            if not self.deaf:
+                self.publish(*self.robot.take([message]))
+
+
+class Heartbeat:
+    """Publishes the heartbeat of a robot, until it is stopped."""
+
+    def __init__(self, robot: LiveRobot) -> None:
+        self._robot, self._stopping = robot, threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping.wait(0.1):
+            self._robot.publish_heartbeat()
+
+
+Make = Callable[..., LiveRobot]
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("b"))
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def url(broker: Broker) -> str:
+    return f"--url=mqtt://127.0.0.1:{broker.port}"
+
+
+@pytest.fixture
+def robot_on(broker: Broker) -> Iterator[Make]:
+    robots: list[LiveRobot] = []
+
+    def make(*owners: str, **options: Any) -> LiveRobot:
+        robots.append(LiveRobot(broker.port, *owners, **options))
+        return robots[-1]
+
+    yield make
+    for robot in robots:
+        robot.close()
+
+
+@pytest.fixture
+def unread() -> Iterator[IO[str]]:
+    """The writing end of a pipe that is closed at its other end."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as output:
+        yield output
+
+
+# -- stop
+
+
+def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("left", "right")
+    assert run("estop", robot.id, url, "--why", "dog") == 0
+    assert robot.latched
+    assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
+    latch = robot.robot.owners[0].latch
+    assert (latch.by, latch.why, latch.count) == (estop._me()[:32], "dog", 1)
+    assert json.loads(robot.commands[1].payload)["valid_ms"] == 0
+
+
+def test_the_first_stop_is_sent_before_anything_is_known_of_the_robot(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    assert run("estop", robot.id, url) == 0
+    assert [message.topic.rpartition("/")[2] for message in robot.commands[:2]] == ["estop", "drive-values"]
+
+
+def test_an_owner_that_saves_nothing_is_stopped_with_a_remark(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("mcu", persisted=None)
+    assert run("estop", robot.id, url) == 0
+    assert "NOT SAVED: a restart frees it" in run.out
+
+
+def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    process = program("estop", robot.id, url)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"{robot.id}: stop sent\n"
+        assert "not confirmed yet: serial has not confirmed" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert out.startswith(f"{robot.id}: NOT CONFIRMED, no longer sent: serial has not confirmed")
+    assert (process.returncode, err) == (1, "")
+    assert robot.count("estop") == robot.count("drive-values") >= 2
+
+
+def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printed(
+    robot_on: Make, url: str, unread: IO[str]
+) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    process = program("estop", robot.id, url, stdout=unread)
+    try:
+        assert until(lambda: robot.count("estop") >= 4, 30)
+        robot.deaf = False
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (0, "")
+    assert robot.latched
+
+
+def test_a_hold_goes_on_although_nothing_can_be_printed(robot_on: Make, url: str, unread: IO[str]) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    process = program("estop", "--all", "--hold", url, stdout=unread, stderr=unread)
+    try:
+        assert until(lambda: robot.count("estop") >= 4, 30)
+    finally:
+        process.kill()
+        process.wait(30)
+
+
+def test_an_old_robot_gets_zeros(robot_on: Make, url: str) -> None:
+    robot = robot_on(estop={})
+    process = program("estop", robot.id, url)
+    try:
+        assert until(lambda: robot.count("drive-values") >= 3, 30)
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert out.endswith(
+        f"{robot.id}: old firmware: zeros are sent, it cannot be latched\n"
+        f"{robot.id}: old firmware: NOT LATCHED, zeros are no longer sent\n"
+    )
+    assert (process.returncode, robot.count("autonomy-command")) == (1, 1)
+    assert robot.count("estop") <= 2, "only before its capabilities had arrived"
+
+
+def test_all_robots_are_stopped_and_others_spared(run: Run, robot_on: Make, url: str) -> None:
+    robots = [robot_on("serial"), robot_on("mcu", "arm")]
+    outlet = robot_on(estop=None, drive={"available": False})
+    began = time.monotonic()
+    assert run("estop", "--all", url) == 0
+    assert 3.0 <= time.monotonic() - began < 10.0
+    assert all(robot.latched for robot in robots)
+    assert run.out.count("stopped and confirmed") == 2
+    assert f"{outlet.id}: does not drive" in run.out
+
+
+def test_no_robot_at_all_is_a_failure(run: Run, tmp_path: Path) -> None:
+    empty = Broker(tmp_path)
+    try:
+        assert run("estop", "--all", f"--url=mqtt://127.0.0.1:{empty.port}") == 1
+    finally:
+        empty.stop()
+    assert "NOTHING IS STOPPED" in run.out
+
+
+def at_rest(robot: LiveRobot) -> bool:
+    """Whether no stop arrives for longer than the time between two of them."""
+    before = robot.count("estop")
+    time.sleep(0.8)
+    return robot.count("estop") == before
+
+
+def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) -> None:
+    early = robot_on("serial")
+    process = program("estop", "--all", "--hold", url)
+    try:
+        assert until(lambda: early.latched, 30)
+        late = robot_on("serial")
+        assert until(lambda: late.latched, 5)
+        latch = late.robot.owners[0].latch
+        assert latch.reset(latch.boot, latch.count, 0, 0)
+        late.publish(late.robot.owners[0].state())
+        last = robot_on("serial")
+        assert until(lambda: last.latched, 5)
+        assert not late.latched, "reset on purpose"
+        assert until(lambda: at_rest(last)), "its confirmation has arrived"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    names = {robot.robot.owners[0].latch.recent[0] for robot in (early, late, last)}
+    assert (process.returncode, err, len(names)) == (0, "", 1)
+    assert f"stop {names.pop()} is held" in out
+    assert f"{late.id}: was stopped, and reset since" in out
+
+
+def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    robot = LiveRobot(broker.port, "serial")
+    robot.deaf = True
+    process = program("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}")
+    try:
+        assert until(lambda: robot.count("estop") >= 1, 30)
+        broker.kill()
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith(
+            "pebble: warning: nothing is sent until there is a connection again"
+        )
+        robot.deaf = False
+        broker.start()
+        out, _ = process.communicate(timeout=50)
+    finally:
+        process.kill()
+        robot.close()
+        broker.stop()
+    assert process.returncode == 0, out
+    assert robot.latched
+
+
+def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    times: list[float] = []
+    robot.on_stop = lambda: times.append(time.monotonic())
+    with TcpProxy(broker.port, delay_s=0.2) as proxy:
+        process = program("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}")
+        try:
+            assert until(lambda: len(times) >= 2, 30)
+        finally:
+            process.kill()
+            process.communicate()
+    assert times[1] - times[0] < 1.2, "two seconds if it waited for its subscriptions"
+
+
+def test_a_config_file_leads_to_the_robots_own_side_and_to_the_remote_one(
+    run: Run, robot_on: Make, broker: Broker, tmp_path: Path
+) -> None:
+    robot = robot_on("serial")
+    nowhere = {"host": "127.0.0.1", "port": 1}
+    there = {"host": "127.0.0.1", "port": broker.port}
+    local = config_file(tmp_path, robot={"id": robot.id}, local_mqtt=there)
+    assert run("estop", local) == 0
+    assert run("estop", robot.id, "--config", local) == 0
+    assert run("estop", "reset", local) == 0
+    bridge = {"enabled": True, "remote_mqtt": there}
+    remote = config_file(tmp_path, robot={"id": robot.id}, local_mqtt=nowhere, services={"mqtt_bridge": bridge})
+    assert run("estop", remote, "--remote") == 0
+    assert robot.latched
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "named"),
+    [
+        (("goob",), 1, "goob is not a config file"),
+        (("--all",), 1, "--config CONFIG or --url URL"),
+        (("--hold", "--url", "mqtt://127.0.0.1:1"), 2, "--all"),
+        (("goob", "--all", "--url", "mqtt://127.0.0.1:1"), 2, "either --all or goob"),
+        (("goob", "fred", "--url", "mqtt://127.0.0.1:1"), 2, "one robot at a time"),
+        (("reset", "--url", "mqtt://127.0.0.1:1"), 2, "name the robot"),
+        ((), 2, "nothing was stopped: name the robot, or add --all"),
+        (("stauts", "goob", "--url", "mqtt://127.0.0.1:1"), 2, 'did you mean "pebble estop status goob"?'),
+        (("reset", "--all", "--url", "mqtt://127.0.0.1:1"), 2, "not for reset"),
+        (("reset", "reset", "--url", "mqtt://127.0.0.1:1"), 2, "system/type/id"),
+        (("status",), 1, "--config CONFIG or --url URL"),
+        (("goob", "--url", "mqtt://127.0.0.1:1"), 1, "cannot connect"),
+        (("goob", "--url", "mqtt://ann:geheim@127.0.0.1:1"), 1, "--password-file"),
+    ],
+)
+def test_wrong_command_lines(run: Run, arguments: tuple[str, ...], code: int, named: str) -> None:
+    assert run("estop", *arguments) == code
+    assert run.err.count("\n") == 1
+    assert named in run.err
+    assert "geheim" not in run.err
+
+
+def test_a_robot_called_reset_can_be_stopped() -> None:
+    assert estop._parse(["pebble/robots/reset"]) == ("", "pebble/robots/reset")
+    assert estop._parse(["reset", "pebble/robots/status"]) == ("reset", "pebble/robots/status")
+
+
+# -- reset and status
+
+
+def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("left", "right")
+    robot.stop(by="ann@desk", why="dog")
+    assert run("estop", "reset", robot.id, url) == 0
+    lines = run.out.splitlines()
+    assert lines[0].startswith(f"{robot.id}: stopped by ann@desk, ")
+    assert [line.endswith(f": dog ({owner})") for line, owner in zip(lines, ("left", "right"), strict=False)] == [
+        True
+    ] * 2
+    assert lines[2] == f"{robot.id}: free; it moves again once drive commands have paused for half a second"
+    assert not any(owner.latch.latched for owner in robot.robot.owners)
+    assert run("estop", "reset", robot.id, url) == 0
+    assert run.out == f"{robot.id}: free\n"
+    assert robot.count("estop-reset") == 2
+
+
+def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.stop()
+    master, slave = pty.openpty()
+    process = program("estop", "reset", robot.id, url, stdin=slave)
+    try:
+        assert process.stdout is not None
+        assert "stopped by ann@desk" in process.stdout.readline()
+        robot.stop("fedcba9876543210", by="bob@door")
+        os.write(master, b"y\n")
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+        os.close(master)
+        os.close(slave)
+    why = "serial: stopped again meanwhile by bob@door"
+    assert err == f"pebble: {robot.id} is still stopped: {why}; look again, then repeat\n"
+    assert (process.returncode, robot.latched, robot.count("estop-reset")) == (1, True, 1)
+
+
+def test_a_declined_reset_resets_nothing(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.stop()
+    master, slave = pty.openpty()
+    process = program("estop", "reset", robot.id, url, stdin=slave)
+    try:
+        os.write(master, b"n\n")
+        assert process.wait(30) == 1
+    finally:
+        process.kill()
+        process.communicate()
+        os.close(master)
+        os.close(slave)
+    assert (robot.latched, robot.count("estop-reset")) == (True, 0)
+
+
+def test_a_reset_without_an_answer_is_a_failure(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.stop()
+    robot.deaf = True
+    assert run("estop", "reset", robot.id, url) == 1
+    assert "still stopped: serial: no answer" in run.err
+    assert run("estop", "reset", "unknown", url) == 1
+    assert run.err == "pebble: unknown publishes no emergency stop: is it on, and is this its broker?\n"
+
+
+def test_status_of_one_and_of_all(run: Run, robot_on: Make, url: str) -> None:
+    free, stopped, old, silent = (
+        robot_on("serial"),
+        robot_on("mcu", persisted=None),
+        robot_on(estop=None),
+        robot_on("serial"),
+    )
+    stopped.stop()
+    silent.publish(Message(silent.robot.owners[0].state().topic, b""))
+    assert run("estop", "status", url) == 0
+    last = "no heartbeat; its last state: "
+    assert {line.split(": ", 1)[1][: len(last)] for line in run.out.splitlines()} == {last}
+    alive = [Heartbeat(robot) for robot in (free, stopped, old, silent)]
+    assert run("estop", "status", url) == 0
+    lines = dict(line.split(": ", 1) for line in run.out.splitlines())
+    assert lines[free.id] == "free"
+    assert lines[stopped.id].startswith("stopped by ann@desk, ")
+    assert lines[stopped.id].endswith(": dog (mcu, NOT SAVED)")
+    assert lines[old.id] == "its firmware has none"
+    assert lines[silent.id] == "unknown, no state of serial"
+    assert run("estop", "status", stopped.id, url) == 0
+    assert list(dict(line.split(": ", 1) for line in run.out.splitlines())) == [stopped.id]
+    assert run("estop", "status", "unknown", url) == 1
+    for one in alive:
+        one.stop()
+
+
+def test_no_name_from_the_network_reaches_the_terminal_unchanged(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("a\u202eb")
+    state = {"latched": True, "boot": "0", "count": 1, "recent": [], "by": "\x1b[31m", "why": "\u202e", "since": 1}
+    robot.publish(outgoing(robot.base, "estop/a\u202eb", state))
+    assert run("estop", "status", robot.id, url) == 0
+    assert "\x1b" not in run.out
+    assert "\u202e" not in run.out
+    assert "stopped by ?[31m" in run.out
+
+
+# -- other commands
+
+
+def test_a_stopped_robot_is_not_driven_unless_forced(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("left", "right")
+    drive = ("topic", "pub", "drive-values", '{"z": 0.3}', url, f"--robot={robot.id}")
+    assert run(*drive) == 0
+    robot.stop()
+    assert run(*drive) == 1
+    assert run.err.count("\n") == 1
+    assert run.err.startswith(f"pebble: {robot.id} is stopped by ann@desk, ")
+    assert f"pebble estop reset {robot.id}" in run.err
+    assert run("topic", "pub", f"{robot.base}/incoming/drive-values", "{}", url) == 0, "a zero moves nothing"
+    assert run("topic", "pub", "lights-solid", "{}", url, f"--robot={robot.id}") == 0
+    assert robot.count("drive-values") == 2
+    assert run(*drive, "--force") == 0
+    assert until(lambda: robot.count("drive-values") == 3)
+
+
+def test_driving_ends_when_the_robot_is_stopped(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    process = program("topic", "pub", "drive-values", '{"z": 0.3}', "--rate=50", url, f"--robot={robot.id}")
+    try:
+        assert until(lambda: robot.count("drive-values") >= 3, 30)
+        robot.stop()
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 1
+    assert f"{robot.id} is stopped by ann@desk" in err
+
+
+def test_topic_list_and_topic_echo_show_a_stopped_robot(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    options = (url, f"--robot={robot.id}", "--seconds=0.3")
+    assert run("topic", "list", *options) == 0
+    assert "stopped" not in run.out
+    robot.stop()
+    assert run("topic", "list", *options) == 0
+    assert run.out.splitlines()[-1].startswith(f"{robot.id} is stopped by ann@desk, ")
+    assert run("topic", "echo", "capabilities", *options) == 0
+    assert run.err.startswith(f"pebble: {robot.id} is stopped by ann@desk, ")

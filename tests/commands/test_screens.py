@@ -1,0 +1,66 @@
+"""Pictures and sound into files, where there is no screen."""
+
+from __future__ import annotations
+
+import wave
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.client.media_receiver import MediaReceiver
+from pebble.commands.screens import Files, save_picture
+from pebble.errors import PebbleError
+from pebble.media.decode import Decoded
+from pebble.media.sound import ReceivedSound
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.client.estop_robot import outgoing
+
+
+@pytest.fixture
+def receiver() -> MediaReceiver:
+    return MediaReceiver(MemoryTransport("viewer", MemoryHub()).open(), "pebble/robots/goob")
+
+
+def received(rate: int, sequence: int = 1) -> ReceivedSound:
+    return ReceivedSound(np.full((rate // 50, 1), 1000, np.int16), rate, 1, 0, sequence, "pcm")
+
+
+def test_pictures_and_sound_become_files(receiver: MediaReceiver, tmp_path: Path) -> None:
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:, :, 2] = 200
+    receiver.newest = Decoded(picture, 0, 1, True, "json")
+    receiver._received.extend([received(16_000), received(16_000), received(8_000)])
+    files = Files(tmp_path / "new" / "folder")
+    files.show(receiver)
+    files.close()
+    assert cv2.imread(str(tmp_path / "new" / "folder" / "0001.png")).tolist() == picture.tolist()
+    with wave.open(str(tmp_path / "new" / "folder" / "sound.wav")) as first:
+        assert (first.getframerate(), first.getnframes()) == (16_000, 640)
+    with wave.open(str(tmp_path / "new" / "folder" / "sound-2.wav")) as second:
+        assert (second.getframerate(), second.getnframes()) == (8_000, 160)
+    assert files.summary().endswith("folder: 1 pictures, 0.1 s of sound")
+
+
+def test_a_stopped_robot_is_shown(receiver: MediaReceiver, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = Files(tmp_path)
+    files.show(receiver)
+    assert "STOP" not in capsys.readouterr().out
+    state = {"latched": True, "boot": "0", "count": 1, "recent": [], "by": "ann", "why": "dog", "since": 1}
+    receiver.estop.receive(outgoing("pebble/robots/goob", "estop/serial", state))
+    files._due = 0.0
+    files.show(receiver)
+    assert "EMERGENCY STOP: goob is stopped by ann, " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["picture.xyz", "no/such/folder/picture.png"])
+def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(PebbleError, match=name):
+        save_picture(np.zeros((4, 4, 3), np.uint8), tmp_path / name)
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(PebbleError, match="cannot be made"):
+        Files(tmp_path / "file" / "folder")

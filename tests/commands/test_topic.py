@@ -1,0 +1,130 @@
+"""``pebble topic`` with real brokers and hubs."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.commands.command_line import config_file, program
+from tests.support import Broker
+from tests.transports.zenoh_net import HubProcess
+
+_numbers = itertools.count(1)
+
+
+@pytest.fixture(scope="module")
+def local_transports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """A broker and a hub, by kind of transport, as URLs."""
+    folder = tmp_path_factory.mktemp("b")
+    run_dir = tmp_path_factory.mktemp("z")
+    broker = Broker(folder)
+    hub = HubProcess(run_dir).start()
+    yield {"mqtt": f"mqtt://127.0.0.1:{broker.port}", "zenoh": f"zenoh:{run_dir}"}
+    hub.end()
+    broker.stop()
+
+
+@pytest.fixture(params=["mqtt", "zenoh"])
+def at(request: pytest.FixtureRequest, local_transports: dict[str, str]) -> tuple[str, str, str]:
+    """Options that lead there, with a robot of the test's own."""
+    return "--url", local_transports[request.param], f"--robot=r{next(_numbers)}"
+
+
+def test_what_is_published_is_echoed_on_either_transport(at: tuple[str, str, str]) -> None:
+    echo = program("topic", "echo", "drive-values", "--count", "3", "--seconds", "60", *at)
+    pub = program("topic", "pub", "drive-values", '{"x": 0.5}', "--rate", "20", *at)
+    try:
+        out, err = echo.communicate(timeout=90)
+    finally:
+        pub.send_signal(signal.SIGINT)
+        pub_output = pub.communicate(timeout=30)
+        echo.kill()
+    assert (echo.returncode, err) == (0, "")
+    assert out.splitlines()[1::2] == ['{"x": 0.5}'] * 3
+    assert "incoming/drive-values  10 B  qos 1" in out
+    assert (pub.returncode, pub_output) == (130, ("", ""))
+
+
+def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[str, str, str]) -> None:
+    assert program("topic", "pub", "flags/mqtt-video", "true", *at).wait(60) == 0
+    assert program("topic", "pub", "heartbeat", '{"t": 1710969600123}', *at).wait(60) == 0
+    out, err = program("topic", "list", "--seconds", "1", *at).communicate(timeout=60)
+    assert err == ""
+    rows = {line.split()[0]: line.split()[1:] for line in out.splitlines()}
+    assert rows["incoming/flags/mqtt-video"] == ["yes", "4", "B", "?", "flag"]
+    assert rows["outgoing/heartbeat"][0] == "yes"
+    assert rows["outgoing/heartbeat"][-3:] == ["state", "(like", "online)"]
+    out, _ = program("topic", "echo", "online", "--raw", "--count", "1", "--seconds", "30", *at).communicate(timeout=60)
+    assert out == '{"t": 1710969600123}\n'
+
+
+def test_rates_are_measured_and_retained_messages_do_not_count(at: tuple[str, str, str]) -> None:
+    assert program("topic", "pub", "charging-level", '{"value": 7.4}', *at).wait(60) == 0
+    silent = program("topic", "hz", "charging-level", "--seconds", "1.5", *at)
+    pub = program("topic", "pub", "drive-values", "{}", "--rate", "40", *at)
+    hz = program("topic", "hz", "drive-values", "--seconds", "3", *at)
+    bw = program("topic", "bw", "drive-values", "--seconds", "3", *at)
+    try:
+        assert " Hz  min " in hz.communicate(timeout=60)[0]
+        assert " kbit/s)  mean 2 B" in bw.communicate(timeout=60)[0]
+        assert set(silent.communicate(timeout=60)[0].splitlines()) == {"no new messages"}
+    finally:
+        pub.kill()
+        pub.communicate()
+    assert (hz.returncode, bw.returncode, silent.returncode) == (0, 0, 1)
+
+
+def test_ctrl_c_ends_an_echo_quietly(at: tuple[str, str, str]) -> None:
+    assert program("topic", "pub", "flags/mqtt-audio", "true", *at).wait(60) == 0
+    process = program("topic", "echo", "flags/mqtt-audio", *at)
+    try:
+        assert process.stdout is not None
+        assert "retained" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (130, "")
+
+
+def test_a_config_leads_to_its_own_side_and_to_the_remote_one(tmp_path: Path, local_transports: dict[str, str]) -> None:
+    port = int(local_transports["mqtt"].rpartition(":")[2])
+    path = config_file(
+        tmp_path,
+        robot={"id": "two-sided"},
+        transport={"kind": "zenoh", "run_dir": local_transports["zenoh"].removeprefix("zenoh:")},
+        services={"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": port}}},
+    )
+    sides = {"robot": ("--config", path), "operators": ("--config", path, "--remote")}
+    for side, where in sides.items():
+        assert program("topic", "pub", "status", json.dumps({"value": {"side": side}}), *where).wait(60) == 0
+    for side, where in sides.items():
+        out, _ = program("topic", "echo", "status", "-n", "1", "-s", "30", "--raw", *where).communicate(timeout=60)
+        assert json.loads(out)["value"]["side"] == side
+
+
+def test_a_password_comes_from_a_file_or_the_environment(tmp_path: Path) -> None:
+    passwords = tmp_path / "passwords"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", str(passwords), "ann", "geheim"], check=True, capture_output=True)
+    passwords.chmod(0o644)
+    broker = Broker(tmp_path, "allow_anonymous false", f"password_file {passwords}")
+    (tmp_path / "right").write_text("geheim\n")
+    url = f"mqtt://ann@127.0.0.1:{broker.port}"
+    pub = ("topic", "pub", "status", "{}", "--robot", "goob", "--url", url)
+    try:
+        assert program(*pub, "--password-file", tmp_path / "right").wait(60) == 0
+        assert program(*pub, env={**os.environ, "PEBBLE_PASSWORD": "geheim"}).wait(60) == 0
+        refused = program(*pub)
+        _, err = refused.communicate(timeout=60)
+    finally:
+        broker.stop()
+    assert refused.returncode == 1
+    assert err.count("\n") == 1
+    assert "cannot connect" in err

@@ -1,0 +1,474 @@
+"""Every form a payload may take on the wire, and everything that must be refused (paper A.4.5, A.8.2 to A.8.11)."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import string
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from msgspec import UNSET
+
+from pebble import contract as c
+from pebble.contract import CHANNELS, Channel, codec
+from pebble.contract.payloads import (
+    AutonomyCommand,
+    ChargingLevel,
+    Drive,
+    EstopCommand,
+    EstopReset,
+    Heartbeat,
+    LightsFlash,
+    LightsSolid,
+    OutletCommand,
+    SoundboardCommand,
+)
+from pebble.errors import PayloadError
+
+BOOLEANS = [channel for channel in CHANNELS if channel.payload is bool]
+JSON_COMMANDS = [channel for channel in CHANNELS if channel.direction == "incoming" and channel.payload is not bytes]
+
+
+def refused(channel: Channel, raw: bytes) -> str:
+    """The reason; the test fails when ``raw`` is accepted."""
+    with pytest.raises(PayloadError) as caught:
+        codec.decode(channel, raw)
+    return str(caught.value)
+
+
+# -- boolean controls
+
+
+@pytest.mark.parametrize("channel", BOOLEANS, ids=lambda channel: channel.metric)
+@pytest.mark.parametrize("value", [True, False])
+@pytest.mark.parametrize("form", ["{}", '{{"value": {}}}', '{{"enabled": {}}}', '{{"value": 1, "enabled": {}}}'])
+def test_a_boolean_control_has_three_forms(channel: Channel, value: bool, form: str) -> None:
+    assert codec.decode(channel, form.format(json.dumps(value)).encode()) is value
+
+
+def test_value_wins_over_enabled() -> None:
+    assert codec.decode(c.MQTT_VIDEO, b'{"value": false, "enabled": true}') is False
+
+
+@pytest.mark.parametrize(
+    "raw", [b"1", b"0", b'"true"', b"null", b"[true]", b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"on": true}',
+            b'{"value": {"value": true}}', b"TRUE", b"true false", b""],
+)  # fmt: skip
+def test_nothing_else_switches_a_boolean_control(raw: bytes) -> None:
+    assert "flags/reboot" in refused(c.REBOOT, raw)
+
+
+# -- drive values
+
+
+@pytest.mark.parametrize(
+    ("raw", "drive"),
+    [
+        (b'{"x": 0.2, "z": 0.5}', Drive(x=0.2, z=0.5)),
+        (b'{"value": {"x": 0.2, "z": 0.5}}', Drive(x=0.2, z=0.5)),
+        (b'{"x": 0.2, "z": 0.5, "y": -1}', Drive(x=0.2, z=0.5, y=-1)),
+        (b'{"z": 1}', Drive(z=1)),
+        (b'{"x": 1}', Drive(x=1)),
+        (b"{}", Drive()),
+        (b'{"value": {}}', Drive()),
+        (b'{"x": "0.25", "z": " -1e-1 "}', Drive(x=0.25, z=-0.1)),
+        (b'{"value": {"x": 1}, "x": -1, "z": 1}', Drive(x=1)),
+        (b'{"value": null, "x": 0.5}', Drive(x=0.5)),
+        (b'{"x": 7, "z": -7, "y": "1e9"}', Drive(x=1, z=-1, y=1)),
+        (b'{"x": 123456789012345678901234567890}', Drive(x=1)),
+        (b'{"x": -1, "x": 1}', Drive(x=1)),
+        (b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1)),
+    ],
+)
+def test_drive_values_are_bare_or_wrapped_numbers_or_numeric_strings(raw: bytes, drive: Drive) -> None:
+    assert codec.decode(c.DRIVE, raw) == drive
+
+
+@pytest.mark.parametrize(
+    ("raw", "drive"),
+    [
+        (b'{"z": 1, "source": "autonomy", "run": 17}', Drive(z=1, source="autonomy", run=17)),
+        (b'{"value": {"z": 1, "source": "autonomy", "run": 17}}', Drive(z=1, source="autonomy", run=17)),
+        (b'{"z": 1, "source": "joystick", "valid_ms": 400}', Drive(z=1, source="joystick", valid_ms=400)),
+        (b'{"z": 1, "source": null, "run": null, "valid_ms": null}', Drive(z=1)),
+        (b'{"z": 1, "valid_ms": 250.9}', Drive(z=1, valid_ms=250)),
+        (b'{"z": 0, "valid_ms": 0}', Drive(valid_ms=0)),
+        (b'{"source": "autonomy", "run": 17}', Drive(source="autonomy", run=17)),
+    ],
+)
+def test_a_drive_command_may_name_its_source_its_run_and_how_long_it_is_valid(raw: bytes, drive: Drive) -> None:
+    assert codec.decode(c.DRIVE, raw) == drive
+
+
+def test_absent_fields_are_not_written() -> None:
+    assert codec.encode(c.DRIVE, Drive(z=0.5)) == b'{"x":0.0,"z":0.5,"y":0.0}'
+    signed = codec.encode(c.DRIVE, Drive(x=-0.25, z=0.625, source="autonomy", run=1_000_000, valid_ms=400))
+    assert signed == b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'
+    assert len(b"pebble/robots/minilamp/incoming/drive-values" + signed) < 256  # a sketch's buffer
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *('"source": 5', '"source": ["autonomy"]', '"source": {"a": 1}', '"source": true'),
+        *('"run": "17"', '"run": 1.5', '"run": true', '"run": 0', '"run": -1', '"run": 1073741824'),
+        *('"valid_ms": "400"', '"valid_ms": -1', '"valid_ms": true', '"valid_ms": 1e300', f'"valid_ms": {10**300}'),
+    ],
+)
+def test_a_wrong_field_refuses_a_command_that_moves_and_never_a_stop(wrong: str) -> None:
+    key = wrong.split('"')[1]
+    rest = "" if key == "source" else ', "source": "autonomy"'
+    rest += ', "run": 17' if key == "valid_ms" else ""
+    assert key in refused(c.DRIVE, f'{{"z": 0.5, {wrong}{rest}}}'.encode())
+    assert not codec.decode(c.DRIVE, f'{{"z": 0, {wrong}{rest}}}'.encode()).moves
+
+
+def test_a_scripts_command_without_its_run_and_one_that_is_valid_for_no_time_move_nothing() -> None:
+    assert "run" in refused(c.DRIVE, b'{"z": 0.5, "source": "autonomy"}')
+    assert "valid_ms" in refused(c.DRIVE, b'{"z": 0.5, "valid_ms": 0}')
+    assert "valid_ms" in refused(c.DRIVE, b'{"z": 0.5, "valid_ms": 0.5}')
+
+
+@pytest.mark.parametrize("axis", ["x", "z", "y"])
+@pytest.mark.parametrize("wrapper", ["{}", '{{"value": {}}}'])
+@pytest.mark.parametrize(
+    "value", ["NaN", "Infinity", "-Infinity", "1e999", '"nan"', '"inf"', '"-Infinity"', '"1e999"', "null", "true",
+              "[1]", '{"x": 1}', '"fast"', '""', '"1_0"', '"0x1"', '"\\u0663"', "9" * 400, "9" * 5000],
+)  # fmt: skip
+def test_an_axis_that_is_no_finite_number_refuses_the_whole_command(axis: str, wrapper: str, value: str) -> None:
+    refused(c.DRIVE, wrapper.format(f'{{"{axis}": {value}}}').encode())
+
+
+@pytest.mark.parametrize(
+    "raw", [b"", b" ", b"null", b"[]", b"1", b'"x"', b"true", b'{"x": 1', b'{"x": 1}}', b"{'x': 1}"]
+)
+def test_drive_values_must_be_an_object(raw: bytes) -> None:
+    refused(c.DRIVE, raw)
+
+
+def test_a_long_string_of_digits_costs_no_time() -> None:
+    refused(c.DRIVE, b'{"x": "' + b"1" * 60_000 + b'!"}')
+
+
+# -- other commands
+
+
+def test_lights_are_clamped_and_missing_colours_are_dark() -> None:
+    assert codec.decode(c.LIGHTS_SOLID, b'{"b": 2, "g": -1}') == LightsSolid(b=1.0, g=0.0, r=0.0)
+    assert codec.decode(c.LIGHTS_SOLID, b'{"value": {"r": 0.5}}') == LightsSolid(r=0.5)
+    assert codec.decode(c.LIGHTS_FLASH, b'{"b": 1, "period": 0}') == LightsFlash(b=1.0, period=0.05)
+    assert codec.decode(c.LIGHTS_FLASH, b"{}").period == 2.0
+
+
+@pytest.mark.parametrize("raw", [b'{"b": "1"}', b'{"r": null}', b'{"g": true}', b'{"period": 1e999}', b"[1, 1, 1]"])
+def test_lights_take_numbers_only(raw: bytes) -> None:
+    refused(c.LIGHTS_FLASH, raw)
+
+
+@pytest.mark.parametrize(
+    ("raw", "command"),
+    [
+        (b"true", SoundboardCommand(enabled=True)),
+        (b"false", SoundboardCommand(enabled=False)),
+        (b'{"action": "play", "file": "a.wav"}', SoundboardCommand(action="play", file="a.wav")),
+        (b'{"enabled": true, "file": "a.wav"}', SoundboardCommand(enabled=True, file="a.wav")),
+        (b'{"value": true, "file": "a.wav"}', SoundboardCommand(enabled=True, file="a.wav")),
+        (b'{"value": {"action": "play"}, "file": "a.wav"}', SoundboardCommand(action="play", file="a.wav")),
+        (b'{"value": {"action": "play", "file": "b"}, "file": "a"}', SoundboardCommand(action="play", file="b")),
+        (b'{"action": "stop", "timestamp": 1.5e9}', SoundboardCommand(action="stop")),
+    ],
+)
+def test_a_soundboard_command_is_a_boolean_or_an_object(raw: bytes, command: SoundboardCommand) -> None:
+    assert codec.decode(c.SOUNDBOARD_COMMAND, raw) == command
+
+
+def test_an_autonomy_command_carries_a_config() -> None:
+    bare = b'{"action": "start", "file": "follow", "config": {"tag_id": 13, "deep": [1, {"a": null}]}}'
+    wanted = AutonomyCommand(action="start", file="follow", config={"tag_id": 13, "deep": [1, {"a": None}]})
+    assert codec.decode(c.AUTONOMY_COMMAND, bare) == wanted
+    assert codec.decode(c.AUTONOMY_COMMAND, b'{"value": ' + bare + b"}") == wanted
+    assert codec.decode(c.AUTONOMY_COMMAND, b"false") == AutonomyCommand(enabled=False)
+
+
+@pytest.mark.parametrize("channel", [c.SOUNDBOARD_COMMAND, c.AUTONOMY_COMMAND], ids=lambda channel: channel.metric)
+@pytest.mark.parametrize(
+    "raw", [b"1", b"null", b"[]", b'"play"', b'{"enabled": 1}', b'{"file": 3}', b'{"action": true}']
+)
+def test_switching_commands_refuse_other_types(channel: Channel, raw: bytes) -> None:
+    refused(channel, raw)
+
+
+@pytest.mark.parametrize("raw", [b'{"on": "false"}', b'{"on": 1}', b'{"on": null}', b"{}", b"true"])
+def test_only_a_json_boolean_switches_an_outlet(raw: bytes) -> None:
+    assert codec.decode(c.OUTLET_COMMAND, b'{"value": {"on": false}}') == OutletCommand(on=False)
+    refused(c.OUTLET_COMMAND, raw)
+
+
+def test_binary_channels_are_not_looked_into() -> None:
+    assert codec.decode(c.AUDIO_STREAM, b"PBAT\xff\x00") == b"PBAT\xff\x00"
+    assert codec.encode(c.AUDIO, bytearray(b"PBAT")) == b"PBAT"
+
+
+# -- limits that hold for every command
+
+
+UNREADABLE = [
+    b"\xff",
+    b'{"k": "\xff"}',
+    b'{"k": "\xed\xa0\x80"}',
+    b'{"\xc0\xaf": 1}',
+    b'{"k": "\\ud800"}',
+    b'{"\\udc00": 1}',
+    b'{"k": "\x00"}',
+    b'\xef\xbb\xbf{"x": 1}',
+    b'{"k": NaN}',
+    b'{"k": 1e999}',
+    b'{"k": ' + b"9" * 5000 + b"}",
+    b'{"k": ' + b"[" * 32 + b"]" * 32 + b"}",
+    b"[" * 60_000,
+    b'{"k":' * 10_000,
+]
+
+
+@pytest.mark.parametrize("channel", [one for one in JSON_COMMANDS if one is not c.ESTOP], ids=lambda one: one.metric)
+@pytest.mark.parametrize("raw", UNREADABLE)
+def test_what_is_no_json_is_refused_even_in_keys_that_are_not_read(channel: Channel, raw: bytes) -> None:
+    assert refused(channel, raw).startswith(channel.metric)
+
+
+@pytest.mark.parametrize("raw", [*UNREADABLE, b"stop", b"null", b"[]", b"true", b"x" * 100_000])
+def test_what_cannot_be_read_is_a_stop_without_a_name(raw: bytes) -> None:
+    assert codec.decode(c.ESTOP, raw).stop is UNSET
+
+
+@pytest.mark.parametrize(
+    "name", ["", "stop", "c9a9f10c", "c9a9f10cc9a9f10g", "c9a9f10cc9a9f10c0", 5, None, ["c9a9f10cc9a9f10c"]]
+)
+def test_what_is_no_name_of_a_stop_is_a_stop_without_a_name(name: object) -> None:
+    assert codec.decode(c.ESTOP, json.dumps({"stop": name, "by": "eve"}).encode()) == EstopCommand(by="eve", why="")
+
+
+def test_a_stop_has_a_name_and_short_plain_texts() -> None:
+    named = {"stop": "c9a9f10cc9a9f10c", "by": "eve\x1b[2J" + "e" * 100, "why": 'w"' * 50}
+    stop = codec.decode(c.ESTOP, json.dumps({"value": named}).encode())
+    assert stop == EstopCommand(stop="c9a9f10cc9a9f10c", by=("eve?[2J" + "e" * 100)[:32], why="w?" * 20)
+
+
+def test_an_empty_payload_is_no_stop() -> None:
+    assert "empty" in refused(c.ESTOP, b"")
+
+
+@pytest.mark.parametrize("raw", ["", "{}", '{"boot": "a"}', '{"boot": 1, "count": 1}', '{"boot": "a", "count": true}'])
+def test_a_reset_names_the_boot_and_the_count_of_the_state_it_ends(raw: str) -> None:
+    assert codec.decode(c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}') == EstopReset(boot="a1b2c3d4", count=3)
+    refused(c.ESTOP_RESET, raw.encode())
+
+
+def test_nesting_may_be_32_deep() -> None:
+    deepest = b'{"x": 1, "k": ' + b"[" * 31 + b"]" * 31 + b"}"
+    assert codec.decode(c.DRIVE, deepest) == Drive(x=1)
+    assert "deeper than 32" in refused(c.DRIVE, deepest.replace(b"[]", b"[[]]"))
+
+
+def test_brackets_in_strings_and_side_by_side_are_not_depth() -> None:
+    text = json.dumps({"x": 1, "k": '\\"[{' * 100, "wide": [[]] * 100}).encode()
+    assert codec.decode(c.DRIVE, text) == Drive(x=1)
+
+
+def test_a_command_has_at_most_64_kb() -> None:
+    start, end = b'{"x": 1, "k": "', b'"}'
+    fits = start + b"a" * (64 * 1024 - len(start) - len(end)) + end
+    assert codec.decode(c.DRIVE, fits) == Drive(x=1)
+    assert "65537 bytes" in refused(c.DRIVE, fits.replace(b"aa", b"aaa", 1))
+
+
+def test_what_a_robot_publishes_may_be_larger() -> None:
+    files = json.dumps({"files": ["a" * 100] * 1000, "timestamp": 1.0}).encode()
+    assert len(files) > 64 * 1024
+    assert len(codec.decode(c.SOUNDBOARD_FILES, files).files) == 1000
+
+
+# -- what we say
+
+
+def test_encoding_spells_the_wire_form() -> None:
+    assert json.loads(codec.encode(c.MQTT_VIDEO, True)) == {"value": True}
+    assert json.loads(codec.encode(c.ONLINE, Heartbeat(t=1710969600123))) == {"t": 1710969600123}
+    assert json.loads(codec.encode(c.ONLINE, Heartbeat(t=1, online=False))) == {"t": 1, "online": False}
+    assert json.loads(codec.encode(c.CHARGING_LEVEL, ChargingLevel(value=7.4))) == {"value": 7.4, "unit": "v"}
+    assert json.loads(codec.encode(c.DRIVE, Drive(x=0.5))) == {"x": 0.5, "z": 0.0, "y": 0.0}
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_nothing_that_is_no_number_can_be_published(number: float) -> None:
+    for make in (lambda: Drive(x=number), lambda: ChargingLevel(value=number), lambda: LightsFlash(period=number)):
+        with pytest.raises(ValueError, match="finite"):
+            make()
+
+
+# -- stamps
+
+
+@pytest.mark.parametrize(
+    ("plain", "seconds"),
+    [
+        ({"t": 1710969600123}, 1710969600.123),
+        ({"timestamp": 1710969600.5}, 1710969600.5),
+        ({"timestamp": 1710969600123}, 1710969600.123),
+        ({"t": 1710969600}, 1710969600.0),
+        ({"t": 1e11}, 1e8),
+        ({"t": 99_999_999_999}, 99_999_999_999.0),
+        ({"t": 5, "timestamp": 1.5e9}, 1.5e9),
+        ({"t": 1710969600123, "timestamp": 1.5e9}, 1710969600.123),
+        ({"t": 12345}, None),
+        ({"t": True}, None),
+        ({"t": "1710969600123"}, None),
+        ({"t": math.nan}, None),
+        ({"t": math.inf}, None),
+        ({"t": 10**400}, None),
+        ({"t": -(10**400)}, None),
+        ({}, None),
+        ([1710969600123], None),
+        (1710969600123, None),
+    ],
+)
+def test_a_stamp_is_milliseconds_or_seconds_by_its_size(plain: Any, seconds: float | None) -> None:
+    assert codec.stamp_of(plain) == seconds
+
+
+# -- against an independent reading of the contract
+
+REFUSED = "refused"
+
+
+def _strict_float(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(text)
+    return number
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(name)
+
+
+def _depth(value: Any) -> int:
+    if isinstance(value, dict):
+        return 1 + max(map(_depth, value.values()), default=0)
+    return 1 + max(map(_depth, value), default=0) if isinstance(value, list) else 0
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    json.dumps(pairs, ensure_ascii=False).encode()  # lone surrogates, also under keys that a later one replaces
+    return dict(pairs)
+
+
+def oracle_json(raw: bytes) -> Any:
+    """The standard library's reading, made strict; ValueError or RecursionError for what is no JSON."""
+    plain = json.loads(raw.decode(), parse_float=_strict_float, parse_constant=_no_constant, object_pairs_hook=_object)
+    json.dumps(plain, ensure_ascii=False).encode()
+    if len(raw) > 65536 or _depth(plain) > 32:
+        raise ValueError("too large")
+    return plain
+
+
+def oracle_boolean(plain: Any) -> Any:
+    candidates = [plain, plain.get("value"), plain.get("enabled")] if isinstance(plain, dict) else [plain]
+    return next((candidate for candidate in candidates if isinstance(candidate, bool)), REFUSED)
+
+
+def _axis(value: Any) -> float:
+    if type(value) not in (int, float, str) or (isinstance(value, str) and "_" in value) or not str(value).isascii():
+        raise ValueError(value)
+    return max(-1.0, min(1.0, _strict_float(value)))
+
+
+def oracle_drive(plain: Any) -> Any:
+    command = plain["value"] if isinstance(plain.get("value"), dict) else plain
+    return tuple(_axis(command.get(axis, 0)) for axis in "xzy")
+
+
+def oracle_outlet(plain: Any) -> Any:
+    command = plain["value"] if isinstance(plain.get("value"), dict) else plain
+    return command["on"] if isinstance(command["on"], bool) else REFUSED
+
+
+def judged(oracle: Callable[[Any], Any], raw: bytes) -> Any:
+    try:
+        return oracle(oracle_json(raw))
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        return REFUSED
+
+
+def decoded(channel: Channel, raw: bytes) -> Any:
+    try:
+        value = codec.decode(channel, raw)
+    except PayloadError:
+        return REFUSED
+    if isinstance(value, Drive):
+        return (value.x, value.z, value.y)
+    return value.on if isinstance(value, OutletCommand) else value
+
+
+KEYS = ["x", "z", "y", "value", "enabled", "on", "t", "", "X", "k\u00e9"]
+ATOMS = [
+    "0", "-0", "1", "-1.5", "0.25", "1e3", "1e-400", "1e400", "-1E+2", "01", "1.", ".5", "+1", "NaN", "Infinity",
+    "-Infinity", "true", "false", "null", "True", '"0.5"', '" 1 "', '"nan"', '"inf"', '"1e400"', '"1_0"', '"a"', '""',
+    '"\\u0031"', '"\\ud83d\\ude00"', '"\\ud800"', '"\\udc00x"', '"\\x"', '"\u0663"', '"\t"', "9" * 30,
+    "9" * 400, "9" * 5000,
+    "[]", "{}",
+]  # fmt: skip
+
+
+def _text(rng: random.Random, depth: int) -> str:
+    if depth == 0 or rng.random() < 0.35:
+        return rng.choice(ATOMS)
+    if rng.random() < 0.2:
+        return "[" + ",".join(_text(rng, depth - 1) for _ in range(rng.randrange(3))) + "]"
+    pairs = (f'"{rng.choice(KEYS)}": {_text(rng, depth - 1)}' for _ in range(rng.randrange(4)))
+    return "{" + ", ".join(pairs) + "}"
+
+
+def _good(rng: random.Random) -> str:
+    """Something valid more often than not, so that both answers are tried."""
+    number = rng.choice(["0", "1", "-0.5", '"0.5"', "3"])
+    inner = rng.choice([f'{{"x": {number}, "z": {number}}}', f'{{"y": {number}}}', '{"on": true}', "true", "false"])
+    return rng.choice(["{}", '{{"value": {}}}', '{{"enabled": {}}}', " {}\n", '{{"on": {}}}']).format(inner)
+
+
+def payloads(seed: int, count: int) -> list[bytes]:
+    rng = random.Random(seed)
+    made = []
+    for _ in range(count):
+        text = _good(rng) if rng.random() < 0.3 else _text(rng, 4)
+        if rng.random() < 0.02:
+            brackets = rng.randrange(28, 36)
+            text = f'{{"k": {"[" * brackets}{"]" * brackets}, "x": 1}}'
+        raw = bytearray(text.encode())
+        if raw and rng.random() < 0.25:
+            where = rng.randrange(len(raw))
+            raw[where : where + rng.randrange(3)] = rng.choice(
+                [b"\xff", b"\x00", b'"', b"\\", b"[", b",", b"\xe2\x82", b""]
+            )
+        if rng.random() < 0.02:
+            raw = bytearray(rng.choices(string.printable.encode() + b"\x80\xfe", k=rng.randrange(40)))
+        made.append(bytes(raw))
+    return made
+
+
+@pytest.mark.parametrize(
+    ("channel", "oracle"),
+    [(c.MQTT_AUDIO, oracle_boolean), (c.DRIVE, oracle_drive), (c.OUTLET_COMMAND, oracle_outlet)],
+    ids=["boolean", "drive", "outlet"],
+)
+def test_twenty_thousand_payloads_mean_the_same_to_an_independent_reader(
+    channel: Channel, oracle: Callable[[Any], Any]
+) -> None:
+    tried = payloads(20_261, 20_000)
+    results = [(raw, decoded(channel, raw), judged(oracle, raw)) for raw in tried]
+    assert [result for result in results if result[1] != result[2]] == []
+    accepted = sum(result[1] is not REFUSED for result in results)
+    assert 500 < accepted < 19_500  # both answers were really tried

@@ -1,0 +1,237 @@
+"""The contract is complete, well-formed, and the only place where a topic is spelled."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import pkgutil
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import pytest
+
+import pebble.services
+from pebble import contract as c
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind, channel_of, payloads
+from pebble.contract.identity import Identity, parse_topic
+from pebble.contract.payloads import Payload
+from pebble.service import Service
+from tests.support import ROOT
+
+BASE = "pebble/robots/goob"
+
+# Written out on purpose: this is what the paper and the original's wire say, not what our contract says.
+TABLE_3_1 = [
+    "incoming/drive-values", "incoming/lights-solid", "incoming/front-camera", "incoming/audio",
+    "incoming/flags/mqtt-video", "outgoing/online", "outgoing/capabilities", "outgoing/logs",
+    "outgoing/charging-status", "outgoing/front-camera", "outgoing/wheel-odometry",
+]  # fmt: skip
+TABLE_A2 = ["outgoing/online", "outgoing/capabilities", "outgoing/status", "outgoing/logs"]
+TABLE_A3 = [
+    "incoming/drive-values", "incoming/lights-solid", "incoming/lights-flash", "incoming/front-camera",
+    "incoming/audio", "incoming/audio-stream", "incoming/soundboard-command", "incoming/autonomy-command",
+    "incoming/flags/remote-mirror", "incoming/flags/mqtt-audio", "incoming/flags/mqtt-video", "incoming/flags/reboot",
+    "incoming/flags/git-pull",
+]  # fmt: skip
+TABLE_A4 = [
+    "outgoing/online", "outgoing/capabilities", "outgoing/logs", "outgoing/touch-sensors", "outgoing/charging-status",
+    "outgoing/charging-level", "outgoing/front-camera", "outgoing/audio", "outgoing/soundboard-files",
+    "outgoing/soundboard-status", "outgoing/autonomy-files", "outgoing/autonomy-status", "outgoing/wheel-odometry",
+    "outgoing/apriltag-locations", "outgoing/apriltag-data", "outgoing/video-overlays",
+]  # fmt: skip
+TABLE_A5 = ["outgoing/heartbeat", "outgoing/status", "outgoing/charging-level"]
+ORIGINALS_WIRE = [
+    "incoming/flags/service-restart", "incoming/mcu/goob-imu-nano/led", "incoming/outlets/o1/power",
+    "incoming/mip-raw", "outgoing/sensors/imu-fast", "outgoing/sensors/imu", "outgoing/mcu/goob-imu-nano/describe",
+    "outgoing/mcu/goob-imu-nano/imu_fast", "outgoing/outlets/o4/status", "outgoing/localization-pose",
+    "outgoing/navigation-status", "outgoing/navigation-goal", "outgoing/navigation/local-plan",
+    "outgoing/navigation/global-plan", "outgoing/diagnostics",
+]  # fmt: skip
+
+TABLE_A6 = {
+    "services.launcher.capabilities.topic": "outgoing/capabilities",
+    "services.launcher.logs.topic": "outgoing/logs",
+    "services.mqtt_bridge.topics.remote_mirror": "incoming/flags/remote-mirror",
+    "services.mqtt_bridge.topics.mqtt_audio": "incoming/flags/mqtt-audio",
+    "services.mqtt_bridge.topics.mqtt_video": "incoming/flags/mqtt-video",
+    "services.mqtt_bridge.topics.reboot": "incoming/flags/reboot",
+    "services.mqtt_bridge.topics.service_restart": "incoming/flags/service-restart",
+    "services.mqtt_bridge.topics.git_pull": "incoming/flags/git-pull",
+    "services.mqtt_bridge.topics.audio_control": "incoming/audio",
+    "services.mqtt_bridge.topics.video_control": "incoming/front-camera",
+    "services.mqtt_bridge.heartbeat.topic": "outgoing/online",
+    "services.mqtt_bridge.media.video_publisher.topic": "outgoing/front-camera",
+    "services.mqtt_bridge.media.video_publisher.overlays_topic": "outgoing/video-overlays",
+    "services.mqtt_bridge.media.audio_publisher.topic": "outgoing/audio",
+    "services.mqtt_bridge.media.audio_receiver.topic": "incoming/audio-stream",
+    "services.serial_mcu_bridge.topics.drive_values": "incoming/drive-values",
+    "services.serial_mcu_bridge.topics.lights_solid": "incoming/lights-solid",
+    "services.serial_mcu_bridge.topics.lights_flash": "incoming/lights-flash",
+    "services.serial_mcu_bridge.topics.touch_sensors": "outgoing/touch-sensors",
+    "services.serial_mcu_bridge.topics.charging_status": "outgoing/charging-status",
+    "services.serial_mcu_bridge.topics.charging_level": "outgoing/charging-level",
+    "services.serial_mcu_bridge.topics.high_rate": "outgoing/sensors/imu-fast",
+    "services.serial_mcu_bridge.topics.low_rate": "outgoing/sensors/imu",
+    "services.soundboard_handler.topics.command": "incoming/soundboard-command",
+    "services.soundboard_handler.topics.files": "outgoing/soundboard-files",
+    "services.soundboard_handler.topics.status": "outgoing/soundboard-status",
+    "services.autonomy_manager.topics.command": "incoming/autonomy-command",
+    "services.autonomy_manager.topics.files": "outgoing/autonomy-files",
+    "services.autonomy_manager.topics.status": "outgoing/autonomy-status",
+}
+
+each_channel = pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.suffix)
+
+
+# -- complete
+
+
+@pytest.mark.parametrize("suffix", sorted({*TABLE_3_1, *TABLE_A2, *TABLE_A3, *TABLE_A4, *TABLE_A5, *ORIGINALS_WIRE}))
+def test_every_topic_of_the_paper_and_of_the_original_is_a_channel(suffix: str) -> None:
+    channel = channel_of(suffix)
+    assert channel is not None
+    assert channel.direction == suffix.split("/")[0]
+
+
+def test_every_override_point_of_table_a6_belongs_to_its_channel() -> None:
+    ours = {channel.override.topic: channel.suffix for channel in CHANNELS if channel.override is not None}
+    assert ours == TABLE_A6
+
+
+def test_delivery_rules_are_those_of_the_wire() -> None:
+    def rules(channel: Channel) -> tuple[str, int, bool]:
+        return channel.direction, channel.default_qos, channel.default_retain
+
+    assert rules(c.DRIVE) == (INCOMING, 1, False)
+    assert rules(c.MQTT_VIDEO) == (INCOMING, 1, True)
+    assert rules(c.REBOOT) == (INCOMING, 1, False)
+    assert rules(c.AUDIO_STREAM) == (INCOMING, 0, False)
+    assert rules(c.ONLINE) == (OUTGOING, 1, True)
+    assert rules(c.CAPABILITIES) == (OUTGOING, 1, True)
+    assert rules(c.LOGS) == (OUTGOING, 0, False)
+    assert rules(c.CHARGING_STATUS) == (OUTGOING, 1, True)
+    assert rules(c.TOUCH_SENSORS) == (OUTGOING, 1, False)
+    assert rules(c.IMU_FAST) == (OUTGOING, 0, False)
+    assert rules(c.IMU) == (OUTGOING, 1, False)
+    assert rules(c.CAMERA) == (OUTGOING, 0, False)
+
+
+def test_what_stays_on_the_robot_and_what_never_passes_the_bridge() -> None:
+    inside = [channel.metric for channel in CHANNELS if not channel.remote]
+    assert inside == ["sensors/imu-fast", "media-report/{program}"]
+    assert {channel.suffix for channel in CHANNELS if not channel.bridged} == {
+        "incoming/audio-stream", "outgoing/front-camera", "outgoing/audio",
+    }  # fmt: skip
+
+
+# -- well-formed
+
+
+def test_every_topic_is_declared_once() -> None:
+    suffixes = sorted(channel.suffix for channel in CHANNELS)
+    assert [a for a, b in pairwise(suffixes) if a == b] == []
+
+
+@each_channel
+def test_a_channel_is_well_formed(channel: Channel) -> None:
+    assert re.fullmatch(r"([a-z0-9-]+|{[a-z]+})(/([a-z0-9-]+|{[a-z]+}))*", channel.metric)
+    assert channel.doc.endswith(".")
+    assert channel.default_qos in (0, 1)
+    assert channel.rate_hz >= 0
+    assert channel.payload in (bool, bytes) or issubclass(channel.payload, Payload)
+    assert channel.synonym_of is None or channel_of(f"{channel.direction}/{channel.synonym_of}") is not None
+
+
+@each_channel
+def test_only_state_and_flags_are_retained(channel: Channel) -> None:
+    assert channel.default_retain == (channel.kind in (Kind.STATE, Kind.FLAG))
+
+
+@each_channel
+def test_a_channel_is_found_by_its_own_topic(channel: Channel) -> None:
+    names = dict.fromkeys(re.findall(r"{(\w+)}", channel.metric), "o1")
+    topic = channel.topic(BASE, **names)
+    address = parse_topic(topic)
+    assert address is not None
+    assert address.identity == Identity("pebble", "robots", "goob")
+    assert channel_of(topic.removeprefix(BASE + "/")) is channel
+    assert channel.filter(BASE) == re.sub(r"{\w+}", "+", f"{BASE}/{channel.suffix}")
+    assert channel.names(topic) == names
+    assert channel.names(f"{topic}/more") == {}
+
+
+@pytest.mark.parametrize(
+    "stranger", ["incoming/online", "outgoing/drive-values", "incoming/drive-values/x", "incoming", "", "x/audio",
+                 "outgoing/mcu/a/b/c", "incoming/outlets/o1/status"],
+)  # fmt: skip
+def test_strangers_have_no_channel(stranger: str) -> None:
+    assert channel_of(stranger) is None
+
+
+def test_every_payload_is_frozen_and_has_a_schema() -> None:
+    structs = [kind for kind in vars(payloads).values() if isinstance(kind, type) and issubclass(kind, Payload)]
+    assert len(structs) > 30
+    for kind in structs:
+        assert kind.__struct_config__.frozen, kind
+        msgspec.json.schema(kind)
+
+
+# -- used by services as declared
+
+
+def services() -> list[type[Service]]:
+    for module in pkgutil.walk_packages(pebble.services.__path__, "pebble.services."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    found, queue = [], [Service]
+    while queue:
+        children = queue.pop().__subclasses__()
+        queue += children
+        found += [child for child in children if child.__module__.startswith("pebble.services.")]
+    return found
+
+
+def test_services_publish_what_goes_out_and_handle_what_comes_in() -> None:
+    found = services()
+    assert {"serial_mcu_bridge"} <= {service.name for service in found if hasattr(service, "name")}
+    for service in found:
+        assert [channel.suffix for channel in service.publishes if channel.direction != OUTGOING] == [], service
+        received = [channel for channel in service.handles() if channel.remote]  # others pass between our own programs
+        assert [channel.suffix for channel in received if channel.direction != INCOMING] == [], service
+
+
+# -- and spelled nowhere else
+
+# Metrics that are ordinary words ("audio", "logs") say nothing by themselves; these do.
+DISTINCTIVE = {channel.metric for channel in CHANNELS if re.search("[-/]", channel.metric)}
+SPELLED = re.compile(r"(^|/)(incoming|outgoing)/[\w{+#]")
+
+
+def code_files() -> list[Path]:
+    folders = [ROOT / "pebble", ROOT / "services", ROOT / "transports", ROOT / "simulation", ROOT / "bench"]
+    return sorted(path for folder in folders for path in folder.rglob("*.py") if path.name != "channels.py")
+
+
+def spelled_topics(path: Path) -> Iterator[str]:
+    """String constants that are a topic or a part of one; sentences (docstrings, help, key docs) are none."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and not re.search(r"\s", node.value):
+            text = node.value
+            if SPELLED.search(text) or any(text == metric or text.endswith("/" + metric) for metric in DISTINCTIVE):
+                yield f"{path.relative_to(ROOT)}:{node.lineno}: {text!r}"
+
+
+def test_no_topic_is_spelled_outside_the_contract() -> None:
+    files = code_files()
+    assert len(files) > 20
+    assert [stray for path in files for stray in spelled_topics(path)] == []
+
+
+def test_the_search_for_stray_topics_finds_them(tmp_path: Path) -> None:
+    module = ROOT / "tests" / "contract" / "test_contract.py"
+    found = list(spelled_topics(module))
+    assert any("'incoming/mip-raw'" in stray for stray in found)
+    assert any("'outgoing/online'" in stray for stray in found)

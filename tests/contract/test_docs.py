@@ -1,0 +1,82 @@
+"""The generated documents are complete and those that lie in docs/."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from pebble import contract as c
+from pebble.contract import CHANNELS, Channel, codec
+from pebble.contract import docs as topic_docs
+from pebble.contract.payloads import ChargingLevel, Drive, Heartbeat, TouchSensors, TouchValues
+from pebble.contract.schemas import schemas
+from tests.support import ROOT
+
+
+@pytest.mark.parametrize("name", sorted(topic_docs.documents()))
+def test_the_file_in_docs_is_generated_from_the_contract(name: str) -> None:
+    assert (ROOT / "docs" / name).read_text() == topic_docs.documents()[name], "run: python -m pebble.contract.docs"
+
+
+def test_running_the_module_writes_the_files(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-m", "pebble.contract.docs", str(tmp_path)], cwd=ROOT, check=True, timeout=60)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == topic_docs.documents()
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.suffix)
+def test_every_channel_has_its_lines(channel: Channel) -> None:
+    lines = [line for line in topic_docs.topics_document().splitlines() if line.startswith(f"| `{channel.suffix}` |")]
+    meaning, route = lines
+    assert channel.kind.name in meaning
+    assert channel.doc in meaning
+    paths = [] if channel.override is None else [channel.override.topic]
+    assert [path for path in paths if f"`{path}`" not in route] == []
+
+
+def test_every_link_leads_to_a_payload() -> None:
+    text = topic_docs.topics_document()
+    headings = {heading.lower() for heading in re.findall(r"^### (\w+)$", text, re.MULTILINE)}
+    links = set(re.findall(r"\]\(#(\w+)\)", text))
+    assert links <= headings
+    assert {"drive", "touchvalues", "imuhealth"} <= links
+
+
+def test_who_decides_and_where_it_goes() -> None:
+    assert topic_docs.authority(c.CHARGING_LEVEL) == "robot"
+    assert "live only" in topic_docs.authority(c.DRIVE)
+    assert "last change" in topic_docs.authority(c.MQTT_VIDEO)
+    assert topic_docs.travels(c.IMU_FAST) == "stays on the robot"
+    assert topic_docs.travels(c.MQTT_VIDEO) == "both ways"
+    assert "remote broker" in topic_docs.travels(c.AUDIO_STREAM)
+
+
+def test_units_and_synonyms_are_documented() -> None:
+    text = topic_docs.topics_document()
+    assert "| `t` | integer | required | epoch milliseconds |" in text
+    assert "Understood like `online`." in text
+
+
+@pytest.mark.parametrize(
+    ("channel", "value"),
+    [
+        (c.DRIVE, Drive(x=0.5)),
+        (c.MQTT_VIDEO, True),
+        (c.ONLINE, Heartbeat(t=1710969600123)),
+        (c.CHARGING_LEVEL, ChargingLevel(value=7.4)),
+        (c.TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=1, a1=2, a2=3))),
+    ],
+    ids=lambda value: getattr(value, "metric", ""),
+)
+def test_what_is_published_follows_the_schema(channel: Channel, value: object) -> None:
+    document = schemas()
+    schema = {"$defs": document["$defs"], **document["topics"][channel.suffix]}
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(json.loads(codec.encode(channel, value)), schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate([], schema)

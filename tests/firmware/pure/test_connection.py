@@ -1,0 +1,121 @@
+"""Getting to the broker, noticing its loss, and waiting before the next attempt."""
+
+from common.connection import Connection
+
+MASK = (1 << 30) - 1
+
+
+def online(now: int = 0) -> Connection:
+    connection = Connection()
+    assert connection.step(now, True) == "resolve"
+    connection.move("connecting", now)
+    connection.move("online", now)
+    return connection
+
+
+def test_the_way_there() -> None:
+    connection = Connection()
+    assert connection.step(0, False) == ""
+    assert connection.state == "offline"
+    assert connection.step(10, True) == "resolve"
+    assert connection.state == "resolving"
+    assert connection.step(20, True) == ""
+    connection.move("connecting", 30)
+    assert connection.step(40, True) == ""
+    connection.move("online", 50)
+    assert connection.state == "online"
+
+
+def test_each_step_of_the_way_may_take_so_long_and_no_longer() -> None:
+    connection = Connection()
+    connection.step(0, True)
+    assert connection.step(3499, True) == ""
+    assert connection.step(3500, True) == "drop"
+    assert connection.reason == "resolving took too long"
+    connection.move("connecting", 0)
+    assert connection.step(7999, True) == ""
+    assert connection.step(8000, True) == "drop"
+    assert connection.reason == "connecting took too long"
+    connection.move("subscribing", 0)
+    assert connection.step(1999, True) == ""
+    assert connection.step(2000, True) == "drop"  # the first command may be as old as this
+
+
+def test_silence_ends_a_connection() -> None:
+    connection = online()
+    assert connection.step(1999, True) == ""
+    assert connection.step(2000, True) == "drop"
+    assert connection.reason == "silence"
+
+
+def test_answers_hold_the_connection() -> None:
+    connection = online()
+    connection.received(1100)
+    assert connection.step(3099, True) == ""
+    assert connection.step(3100, True) == "drop"
+
+
+def test_the_loss_of_the_wifi_drops_at_once() -> None:
+    connection = online()
+    assert connection.step(10, False) == "drop"
+    assert connection.state == "offline"
+    connection.lost(10, 0)
+    assert connection.state == "offline"
+    assert connection.step(20, False) == ""
+    assert connection.step(30, True) == "resolve"
+
+
+def waits(connection: Connection, now: int, noise: int) -> int:
+    """How long until the next attempt, after one that failed at ``now``."""
+    connection.lost(now, noise)
+    ms = 0
+    while connection.step(now + ms, True) != "resolve":
+        ms += 1
+    return ms
+
+
+def test_waiting_doubles_up_to_eight_seconds() -> None:
+    connection = Connection()
+    connection.step(0, True)
+    now, seen = 0, []
+    for _ in range(6):
+        ms = waits(connection, now, 128)
+        seen.append(ms)
+        now += ms
+    assert seen == [500, 1000, 2000, 4000, 8000, 8000]
+    assert connection.losses == 6
+
+
+def test_attempts_of_many_robots_are_spread() -> None:
+    def first(noise: int) -> int:
+        connection = Connection()
+        connection.step(0, True)
+        return waits(connection, 0, noise)
+
+    assert (first(0), first(128), first(255)) == (375, 500, 624)
+
+
+def test_a_connection_that_held_makes_the_next_wait_short() -> None:
+    connection = Connection()
+    connection.step(0, True)
+    assert waits(connection, 0, 128) == 500
+    connection.move("online", 0)
+    connection.step(4999, True)
+    assert waits(connection, 4999, 128) == 1000  # it did not hold
+    connection.move("online", 0)
+    connection.received(5000)
+    connection.step(5000, True)
+    assert waits(connection, 5000, 128) == 500
+
+
+def test_that_it_held_is_known_however_long_it_did() -> None:
+    """Ticks a week apart look as if the later ones were the earlier."""
+    connection = online()
+    connection.lost(0, 128)
+    connection.move("online", 0)
+    now = 0
+    while now < 7 * 86_400_000:
+        now += 1_000_000
+        connection.received(now & MASK)
+        assert connection.step(now & MASK, True) == ""
+    assert waits(connection, now, 128) == 500

@@ -1,0 +1,150 @@
+"""The emergency stop: what latches it, what resets it, and what survives a restart."""
+
+from common.latch import Latch, is_name, reset_of, stop_of
+from common.ticks import diff
+
+A, B, C = "00000000000000aa", "00000000000000bb", "00000000000000cc"
+
+
+def stopped(*names: str) -> Latch:
+    latch = Latch("0badcafe", 2, diff)
+    for name in names:
+        latch.stop(name, "ann", "test", 5)
+    return latch
+
+
+def test_it_begins_free() -> None:
+    latch = stopped()
+    assert not latch.latched
+    assert not latch.refuses(True, False, 0)
+    assert latch.state(None)["persisted"] is None
+    assert "barred" not in latch.state(True)
+
+
+def test_a_stop_latches_and_its_repetition_changes_nothing() -> None:
+    latch = stopped()
+    assert latch.stop(A, "ann", "test", 5)
+    assert (latch.latched, latch.count, latch.recent, latch.by, latch.why, latch.since) == (
+        True,
+        1,
+        [A],
+        "ann",
+        "test",
+        5,
+    )
+    assert not latch.stop(A, "bob", "again", 9)
+    assert (latch.count, latch.by, latch.since) == (1, "ann", 5)
+
+
+def test_every_new_stop_counts_and_only_the_newest_names_are_remembered() -> None:
+    latch = stopped(A, B, C)
+    assert latch.count == 3
+    assert latch.recent == [C, B]
+
+
+def test_latched_it_refuses_all_that_moves_and_no_zero() -> None:
+    latch = stopped(A)
+    for script in (True, False):
+        assert latch.refuses(True, script, 0)
+        assert not latch.refuses(False, script, 0)
+
+
+def test_a_reset_must_know_the_newest_state() -> None:
+    latch = stopped(A, B)
+    for boot, count, age, why in (
+        ("0badcaff", 2, 0, "boot"),
+        ("0badcafe", 1, 0, "count"),
+        ("0badcafe", 3, 0, "count"),
+        ("0badcafe", 2, 1000, "old"),
+    ):
+        assert not latch.reset(boot, count, age, 0)
+        assert (latch.latched, latch.reset_refused) == (True, why)
+    assert latch.reset("0badcafe", 2, 999, 0)
+    assert (latch.latched, latch.reset_refused, latch.count) == (False, None, 2)
+    assert not latch.reset("0badcafe", 2, 0, 0)  # there is nothing to reset
+
+
+def test_a_stop_that_was_reset_stays_reset_when_it_is_repeated() -> None:
+    latch = stopped(A)
+    latch.reset("0badcafe", 1, 0, 0)
+    assert not latch.stop(A, "ann", "", 6)
+    assert not latch.latched
+    assert latch.stop(B, "ann", "", 6)
+    assert latch.latched
+
+
+def test_after_a_reset_a_held_stick_moves_nothing_until_it_is_released() -> None:
+    latch = stopped(A)
+    latch.reset("0badcafe", 1, 0, 1000)
+    for now in (1010, 1400, 1800, 2200):  # never 0.5 s without a command
+        assert latch.refuses(True, False, now)
+    assert not latch.refuses(True, True, 2210)  # scripts are none of its business
+    assert not latch.refuses(False, False, 2250)
+    assert not latch.refuses(True, False, 2260)
+
+
+def test_after_a_reset_half_a_second_of_silence_is_a_release() -> None:
+    latch = stopped(A)
+    latch.reset("0badcafe", 1, 0, 1000)
+    assert latch.refuses(True, False, 1499)
+    assert not latch.refuses(True, False, 1999)
+    late = stopped(A)
+    late.reset("0badcafe", 1, 0, (1 << 30) - 100)  # ticks wrap
+    late.tick(400)
+    assert not late.refuses(True, False, 1 << 29)
+
+
+def test_what_is_saved_restores_all_but_boot_and_count() -> None:
+    again = Latch("12345678", 2, diff)
+    again.restore(stopped(A, B).saved())
+    assert (again.latched, again.recent, again.by, again.why, again.since) == (True, [B, A], "ann", "test", 5)
+    assert (again.boot, again.count) == ("12345678", 0)
+    assert not again.stop(B, "ann", "", 6)
+    free = stopped(A)
+    free.reset("0badcafe", 1, 0, 0)
+    again.restore(free.saved())
+    assert not again.latched
+
+
+def test_what_is_not_ours_is_a_stop() -> None:
+    for saved in (None, {}, [], 1, {"latched": 0, "recent": []}, {"latched": False}, {"latched": False, "recent": 3}):
+        latch = stopped()
+        latch.restore(saved)
+        assert latch.latched, saved
+        assert latch.why == "the saved state cannot be read"
+
+
+def test_odd_fields_in_a_saved_state_are_left_out() -> None:
+    latch = stopped()
+    latch.restore({"latched": False, "recent": [A, 5, "x", B, C], "by": 7, "why": 'a"b\\c\n', "since": "now"})
+    assert (latch.latched, latch.recent, latch.by, latch.why, latch.since) == (False, [A, B], "", "a?b?c?", 0)
+
+
+def test_names_are_16_hex_digits() -> None:
+    assert is_name("0123456789abcdef")
+    assert is_name("0123456789ABCDEF")
+    for name in (
+        "",
+        "0123456789abcde",
+        "0123456789abcdef0",
+        "0123456789abcdeg",
+        "<16 hex digits>.",
+        None,
+        5,
+        ["a"] * 16,
+    ):
+        assert not is_name(name), name
+
+
+def test_a_stop_of_any_shape() -> None:
+    assert stop_of({"stop": A, "by": "ann", "why": "w"}) == (A, "ann", "w")
+    assert stop_of({"value": {"stop": A, "by": "b" * 99, "why": "w" * 99}}) == (A, "b" * 32, "w" * 40)
+    for body in (None, 5, [], {}, "x", {"stop": 5, "by": [], "why": {}}, {"value": 3}):
+        assert stop_of(body) == ("", "", ""), body
+
+
+def test_a_reset_has_a_boot_and_a_count() -> None:
+    assert reset_of({"boot": "x", "count": 3}) == ("x", 3)
+    assert reset_of({"value": {"boot": "x", "count": 3}}) == ("x", 3)
+    for body in (None, [], {}, {"boot": "x"}, {"boot": 5, "count": 3}, {"boot": "x", "count": True}):
+        assert reset_of(body) is None, body

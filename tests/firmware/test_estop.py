@@ -1,0 +1,365 @@
+"""MiniLAMP's and BenJr's emergency stop, in virtual time: messages, states, and the file that survives a power cut."""
+
+from __future__ import annotations
+
+import errno
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.contract import ESTOP_STATE, codec
+from pebble.simulation.micropython.faults import failure
+from tests.firmware.drill import BASE, DRIVE, ESTOP, RESET, START_S, STATE, Drill
+from tests.firmware.test_network_robot import AHEAD, KINDS, online, published
+
+FILE = "/estop.json"
+A, B, C = "00000000000000aa", "00000000000000bb", "00000000000000cc"
+TURN_S = 0.2
+
+
+def stop(drill: Drill, name: str = A, **more: str) -> None:
+    drill.broker.publish(ESTOP, json.dumps({"stop": name, **more}).encode(), qos=1)
+
+
+def reset(drill: Drill, **changes: Any) -> None:
+    """With what the newest state says, unless changed."""
+    newest = states(drill)[-1]
+    order = {"boot": newest["boot"], "count": newest["count"], "by": "ann", **changes}
+    drill.broker.publish(RESET, json.dumps(order).encode(), qos=1)
+
+
+def signed(drill: Drill, run: int, z: float = 0.5, **more: Any) -> None:
+    drill.command(0.0, z, source="autonomy", run=run, **more)
+
+
+def states(drill: Drill) -> list[Any]:
+    return published(drill, "estop/mcu")
+
+
+def wait(drill: Drill, seconds: float = TURN_S) -> None:
+    drill.run(drill.seconds + seconds)
+
+
+def stopped(kind: str = "benjr", name: str = A) -> Drill:
+    drill = online(kind)
+    stop(drill, name)
+    wait(drill, 0.5)
+    assert states(drill)[-1]["latched"]
+    return drill
+
+
+def reconnect(drill: Drill) -> None:
+    """A power cut, until the robot has published its state again."""
+    before = len(states(drill))
+    drill.cut_power()
+    while len(states(drill)) == before:
+        drill.turn(0.02)
+        assert drill.seconds < 60
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_stop_halts_latches_and_is_confirmed(kind: str) -> None:
+    drill = online(kind)
+    drill.command(0.0, 0.5)
+    wait(drill)
+    assert drill.outputs() == AHEAD[kind]
+    stop(drill, by="ann", why="test")
+    wait(drill)
+    assert not any(drill.outputs())
+    message = [one.message for one in drill.broker.received if one.message.topic == STATE][-1]
+    assert message.retain
+    state = codec.decode(ESTOP_STATE, message.payload)
+    assert (state.latched, state.count, state.recent, state.by, state.why) == (True, 1, [A], "ann", "test")
+    assert (state.persisted, len(state.boot)) == (True, 8)
+    drill.nonsense(b'{"x": 0, "z": 0.5}')
+    wait(drill)
+    assert not any(drill.outputs())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_reset_of_the_newest_state_frees_once_the_stick_was_released(kind: str) -> None:
+    drill = stopped(kind)
+    reset(drill)
+    drill.nonsense(b'{"z": 0.5}')
+    wait(drill)
+    assert not any(drill.outputs())
+    assert not states(drill)[-1]["latched"]
+    drill.command(0.0, 0.0)
+    drill.command(0.0, 0.5)
+    wait(drill)
+    assert drill.outputs() == AHEAD[kind]
+
+
+@pytest.mark.parametrize(("changes", "why"), [({"boot": "00000000"}, "boot"), ({"count": 0}, "count")])
+def test_a_reset_of_another_state_is_refused(changes: dict[str, Any], why: str) -> None:
+    drill = stopped()
+    reset(drill, **changes)
+    wait(drill, 0.5)
+    assert (states(drill)[-1]["latched"], states(drill)[-1]["reset_refused"]) == (True, why)
+
+
+def test_a_stop_that_is_repeated_changes_nothing_and_is_confirmed_again() -> None:
+    drill = stopped()
+    reset(drill)
+    wait(drill, 1.0)
+    drill.command(0.0, 0.5)
+    wait(drill)
+    count = len(states(drill))
+    stop(drill)
+    wait(drill, 0.5)
+    assert any(drill.outputs())
+    assert len(states(drill)) == count + 1
+    assert not states(drill)[-1]["latched"]
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"{}", b'{"stop": "<16 hex digits>"}', b"x", b"[" * 400, b'{"stop": "', b"\xff", b"x" * 700, b"x" * 5000],
+    ids=["empty object", "no name", "no JSON", "deep", "torn", "no UTF-8", "long", "longer than the memory"],
+)
+def test_what_cannot_be_read_is_a_stop_without_a_name(payload: bytes) -> None:
+    drill = online("benjr")
+    drill.broker.publish(ESTOP, payload, qos=1)
+    wait(drill, 0.6)
+    first = states(drill)[-1]
+    assert (first["latched"], first["count"], len(first["recent"][0])) == (True, 1, 16)
+    drill.broker.publish(ESTOP, payload, qos=0)
+    wait(drill, 0.6)
+    assert states(drill)[-1]["count"] == 2
+    assert states(drill)[-1]["recent"][1:] == first["recent"]
+
+
+@pytest.mark.parametrize("topic", [ESTOP, RESET])
+def test_an_empty_payload_does_nothing(topic: str) -> None:
+    drill = online("benjr")
+    count = len(states(drill))
+    drill.broker.publish(topic, b"", qos=1)
+    wait(drill, 0.5)
+    assert len(states(drill)) == count
+
+
+def test_retained_copies_do_nothing() -> None:
+    drill = Drill("benjr", 1)
+    drill.broker.publish(ESTOP, b"x" * 5000, retain=True)
+    drill.broker.publish(RESET, b"{}", retain=True)
+    while not states(drill):
+        drill.turn(0.02)
+    wait(drill, 1.0)
+    assert [(state["latched"], state["count"]) for state in states(drill)] == [(False, 0)]
+    assert drill.robot.refused == 2
+
+
+@pytest.mark.parametrize("order", ["before", "after", "around"])
+def test_a_stop_voids_all_commands_of_its_batch(order: str) -> None:
+    drill = online("benjr")
+    for step in range(3):
+        if step == {"before": 2, "after": 0, "around": 1}[order]:
+            stop(drill)
+        drill.nonsense(b'{"z": 0.5}')
+    wait(drill)
+    assert drill.seen.moves == 0
+
+
+def test_a_zero_counts_though_a_newer_command_replaces_it() -> None:
+    """A person's zero ends the script that moves, in whatever order they are read."""
+    drill = online("benjr")
+    wait(drill, 3.0)
+    signed(drill, 17)
+    wait(drill)
+    assert any(drill.outputs())
+    drill.command(0.0, 0.0)
+    signed(drill, 17)
+    wait(drill)
+    assert not any(drill.outputs())
+    assert states(drill)[-1]["barred"] == 17
+    wait(drill, 2.5)
+    signed(drill, 17)
+    wait(drill)
+    assert not any(drill.outputs())
+    signed(drill, 18)
+    wait(drill)
+    assert any(drill.outputs())
+
+
+@pytest.mark.parametrize(("valid_ms", "runs_s"), [(300, 0.3), (5000, 0.9)])
+def test_a_command_moves_no_longer_than_it_is_valid(valid_ms: int, runs_s: float) -> None:
+    drill = online("benjr")
+    drill.command(0.0, 0.5, valid_ms=valid_ms)
+    while not any(drill.outputs()):
+        drill.turn(0.005)
+    began = drill.seconds
+    while any(drill.outputs()):
+        drill.turn(0.005)
+    assert drill.seconds - began == pytest.approx(runs_s, abs=0.03)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_latched_survives_a_power_cut_and_so_does_free(kind: str) -> None:
+    drill = stopped(kind)
+    boot = states(drill)[-1]["boot"]
+    reconnect(drill)
+    state = states(drill)[-1]
+    assert (state["latched"], state["count"], state["recent"], state["persisted"]) == (True, 0, [A], True)
+    assert state["boot"] != boot
+    drill.nonsense(b'{"z": 0.5}')
+    wait(drill)
+    assert not any(drill.outputs())
+    reset(drill)
+    wait(drill, 0.5)
+    reconnect(drill)
+    assert (states(drill)[-1]["latched"], states(drill)[-1]["recent"]) == (False, [A])
+
+
+@pytest.mark.parametrize("content", [b"", b'{"latched":false,"rec', b"[]", b"\xff\xff", b'{"latched":0,"recent":[]}'])
+def test_a_file_that_cannot_be_read_is_a_stop(content: bytes) -> None:
+    drill = online("benjr")
+    drill.board.files[FILE] = content
+    reconnect(drill)
+    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, True)
+
+
+def test_the_file_is_written_when_latched_changes_and_not_per_stop() -> None:
+    drill = online("benjr")
+    written: list[str] = []
+    drill.board.files.before = lambda what, path, _data: written.append(f"{what} {path}")
+    for name in (A, B, A, C, A):
+        stop(drill, name)
+        wait(drill, 0.3)
+    assert written == ["write /estop.new", f"rename {FILE}"]
+    reset(drill)
+    wait(drill, 0.3)
+    assert len(written) == 4
+    assert json.loads(drill.board.files[FILE])["recent"] == [C, B, A]
+
+
+def test_motors_are_off_before_the_file_is_written() -> None:
+    drill = online("benjr")
+    drill.command(0.0, 0.5)
+    wait(drill)
+    outputs: list[Any] = []
+    drill.board.files.before = lambda *_: outputs.append(drill.outputs())
+    stop(drill)
+    wait(drill)
+    assert outputs == [(0.0, 0.0)] * 2
+
+
+def test_a_file_that_cannot_be_written_is_no_confirmation_and_is_tried_again_at_the_next_repetition() -> None:
+    drill = online("benjr")
+    drill.board.files.before = _fail(errno.ENOSPC)
+    stop(drill)
+    wait(drill, 0.5)
+    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, False)
+    drill.board.files.before = lambda *_: None
+    stop(drill)
+    wait(drill, 0.5)
+    assert states(drill)[-1]["persisted"] is True
+
+
+def test_a_read_only_file_system_is_null() -> None:
+    drill = online("benjr")
+    drill.board.files.before = _fail(errno.EROFS)
+    stop(drill)
+    wait(drill, 0.5)
+    assert (states(drill)[-1]["latched"], states(drill)[-1]["persisted"]) == (True, None)
+
+
+def _fail(number: int) -> Any:
+    def before(*_: object) -> None:
+        raise failure(number)
+
+    return before
+
+
+class PowerLostError(BaseException):
+    """In place of a power cut in the middle of a change."""
+
+
+@pytest.mark.parametrize("at", ["write", "rename"])
+@pytest.mark.parametrize("torn", [False, True])
+def test_a_power_cut_in_the_middle_leaves_the_old_file_or_the_new_one(at: str, torn: bool) -> None:
+    drill = stopped()
+
+    def before(what: str, path: str, data: bytes) -> None:
+        if what == at:
+            if torn and what == "write":
+                drill.board.files[path] = data[: len(data) // 2]
+            raise PowerLostError
+
+    drill.board.files.before = before
+    reset(drill)
+    with pytest.raises(PowerLostError):
+        wait(drill, 1.0)
+    drill.board.files.before = lambda *_: None
+    reconnect(drill)
+    assert states(drill)[-1]["latched"]
+    assert states(drill)[-1]["recent"] == [A]
+
+
+def test_at_most_four_states_a_second_and_the_newest_gets_out() -> None:
+    drill = online("benjr")
+    start = drill.clock.now()
+    for number in range(100):
+        stop(drill, f"{number:016x}", by="b" * 99, why="w" * 99)
+        wait(drill, 0.03)
+    wait(drill, 0.5)
+    times = [one.at for one in drill.broker.received if one.message.topic == STATE and one.at > start]
+    assert min(later - earlier for earlier, later in pairwise(times)) > 0.2
+    assert states(drill)[-1]["count"] == 100
+    assert states(drill)[-1]["recent"] == [f"{number:016x}" for number in (99, 98, 97, 96)]
+
+
+def test_a_state_has_at_most_300_bytes() -> None:
+    drill = online("benjr")
+    wait(drill, 3.0)
+    signed(drill, (1 << 30) - 1)
+    drill.robot.stops.latch.count = (1 << 30) - 10
+    for name in (A, B, C, "00000000000000dd"):
+        stop(drill, name, by="b" * 99, why="w" * 99)
+    wait(drill, 0.5)
+    reset(drill, count=1)
+    wait(drill, 0.5)
+    payload = drill.received(STATE)[-1]
+    state = json.loads(payload)
+    assert len(payload) == 300
+    assert (state["reset_refused"], state["barred"], state["by"]) == ("count", (1 << 30) - 1, "b" * 32)
+    assert set(state["why"]) == {"w"}
+
+
+@pytest.mark.parametrize("refused", [ESTOP, RESET])
+def test_without_both_topics_a_stop_is_only_a_zero(refused: str) -> None:
+    drill = Drill("benjr", 1)
+    drill.broker.refused = {refused}
+    while drill.robot.connection.state != "online":
+        drill.turn(0.01)
+    wait(drill, 0.5)
+    assert published(drill, "capabilities")[-1]["value"]["estop"]["available"] is False
+    drill.command(0.0, 0.5)
+    wait(drill)
+    stop(drill)
+    wait(drill)
+    assert any(drill.outputs()) == (refused == ESTOP)  # it is not delivered
+    assert states(drill) == []
+    assert not drill.robot.stops.latch.latched
+
+
+def test_the_refusal_of_the_drive_topic_is_fatal() -> None:
+    drill = Drill("benjr", 1)
+    drill.broker.refused = {DRIVE}
+    drill.run(8.0)
+    assert drill.robot.connection.reason == "subscription refused"
+    assert not drill.received(f"{BASE}/outgoing/online", START_S)
+
+
+def test_the_simulated_robot_keeps_its_files_in_a_folder(tmp_path: Path) -> None:
+    from pebble.simulation.micropython.files import Files
+
+    files = Files(tmp_path / "board")
+    with files.open("/estop.new", "w") as file:
+        file.write("{}")  # type: ignore[call-overload]
+    files.rename("/estop.new", FILE)
+    assert dict(Files(tmp_path / "board")) == {FILE: b"{}"}
+    files.remove(FILE)
+    assert dict(Files(tmp_path / "board")) == {}

@@ -1,0 +1,74 @@
+"""In MicroPython: repeats the calls of /traces.jsonl on latch and arbiter, and compares every result."""
+
+import gc
+import json
+
+from common import ticks
+from common.arbiter import Arbiter
+from common.latch import Latch, is_name, reset_of, stop_of
+
+traces = open("/traces.jsonl")  # noqa: SIM115 - read in turns
+count = calls = 0
+ok = True
+
+
+def _subtract(later, earlier):
+    return later - earlier
+
+
+def _plain(result):
+    """As it is after JSON: tuples are lists."""
+    return list(result) if isinstance(result, tuple) else result
+
+
+def bodies():
+    for body, stop, reset, name in json.loads(traces.readline()):
+        if [_plain(stop_of(body)), _plain(reset_of(body)), is_name(body)] != [stop, reset, name]:
+            print("a body differs:", body)
+
+
+def repeat(trace):
+    global calls
+    latches = {}
+    arbiters = {}
+    diffs = {}
+    for number, method, arguments, expected in trace:
+        calls += 1
+        result = None
+        if method == "latch":
+            diffs[number] = ticks.diff if arguments[1] == 4 else _subtract
+            latches[number] = Latch(arguments[0], arguments[1], diffs[number])
+        elif method == "arbiter":
+            arbiters[number] = Arbiter(latches[number], arguments[0], diffs[number], arguments[1])
+        elif method == "restore":
+            latches[number].restore(*arguments)
+            result = latches[number].saved()
+        elif method == "reset":
+            result = [latches[number].reset(*arguments), latches[number].saved()]
+        elif method == "state":
+            result = latches[number].state(*arguments)
+        elif method == "tick":
+            arbiters[number].tick(*arguments)
+            result = arbiters[number].barred
+        else:
+            result = [getattr(arbiters[number], method)(*arguments), arbiters[number].barred]
+        if result != expected:
+            print("differs:", method, arguments, expected, result)
+            return False
+    return True
+
+
+def turn():
+    global count, ok
+    for _ in range(50):
+        line = traces.readline()
+        if not line or not ok:
+            print(json.dumps([count, calls, ok]))
+            return False
+        ok = repeat(json.loads(line))
+        count += 1
+    gc.collect()
+    return True
+
+
+bodies()

@@ -1,0 +1,148 @@
+"""Deliberate bugs in latch, arbiter and what is around them; a history must show each of them."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from pebble.client import estop
+from pebble.simulation.micropython.loader import firmware_root
+from tests.motion import world
+
+_CORES = ("latch", "arbiter", "ticks")
+_MODULES = {"world": world.__file__, "estop": estop.__file__}
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """``original`` in ``file``, a module of the firmware, the sender or world, is replaced by ``mutated``."""
+
+    file: str
+    original: str
+    mutated: str
+
+    def load(self, folder: Path) -> tuple[Any, Any]:
+        """The class World and the cores, one of them with the bug."""
+        (folder / "common").mkdir(parents=True)
+        for name in _CORES:
+            shutil.copy(firmware_root() / "common" / f"{name}.py", folder / "common")
+        source = Path(_MODULES.get(self.file) or folder / "common" / f"{self.file}.py")
+        text = source.read_text()
+        assert text.count(self.original) == 1, f"{self.file} has changed: adapt this mutation"
+        text = text.replace(self.original, self.mutated)
+        if self.file not in _MODULES:
+            source.write_text(text)
+            return world.World, world.load_cores(folder)
+        module = ModuleType(f"mutated_{self.file}")
+        exec(compile(text, str(source), "exec"), module.__dict__)
+        if self.file == "estop":
+            return world.World, world.load_cores(sender=module.StopSender)
+        return module.World, world.CORES
+
+
+MUTATIONS = {
+    "persons ignore the latch": Mutation(
+        "latch", "        if self.latched:\n", "        if self.latched and script:\n"
+    ),
+    "a reset of another life is obeyed": Mutation("latch", '"boot" if boot != self.boot else ', ""),
+    "a reset of an earlier count is obeyed": Mutation("latch", '"count" if count != self.count else ', ""),
+    "an old reset is obeyed": Mutation("latch", "_OLD_MS = 1000", "_OLD_MS = 2000"),
+    "a stop counts only while free": Mutation(
+        "latch",
+        "        self.latched = True\n        self.count += 1\n",
+        "        self.count += not self.latched\n        self.latched = True\n",
+    ),
+    "the second stop of one name resets": Mutation(
+        "latch",
+        "            return False\n        self.recent",
+        "            self.latched = False\n        self.recent",
+    ),
+    "names are not restored": Mutation("latch", "if is_name(name)][: self._names]", "if not is_name(name)]"),
+    "one name is remembered": Mutation("latch", "+ self.recent)[: self._names]", "+ self.recent)[:1]"),
+    "a damaged file is free": Mutation(
+        "latch", "            self.latched = True\n", "            self.latched = False\n"
+    ),
+    "after a reset persons drive on": Mutation("latch", "self._waits = True", "self._waits = False"),
+    "after a reset persons let go too shortly": Mutation("latch", "_QUIET_MS = 500", "_QUIET_MS = 499"),
+    "commands do not prolong the wait after a reset": Mutation(
+        "latch", "        self._waits_from = now\n        return self._waits\n", "        return self._waits\n"
+    ),
+    "a barred run moves": Mutation("arbiter", "0 < run <= self.barred", "0 < run < self.barred"),
+    "an older run moves": Mutation("arbiter", "            self._bar(run - 1)\n", ""),
+    "the newest run may fall": Mutation("arbiter", "if run > self._newest:", "if run > 0:"),
+    "a new run bars itself": Mutation("arbiter", "self._bar(run - 1)", "self._bar(run)"),
+    "a stop bars nothing": Mutation("arbiter", "        self._bar(self._newest)\n        self._scripted = False\n", ""),
+    "a run is not barred while latched": Mutation("arbiter", "            self._bar(run)\n", "            pass\n"),
+    "the hold is too short": Mutation("arbiter", "HOLD_MS = 2000", "HOLD_MS = 1999"),
+    "a start waits too shortly": Mutation("arbiter", "_START_MS = 2000", "_START_MS = 1999"),
+    "a script's zero takes the wheel from a person": Mutation(
+        "arbiter", "        if run == PERSON:\n", "        if run == PERSON or not moves:\n"
+    ),
+    "a final zero lets the run resume": Mutation("arbiter", "(final or self._scripted)", "self._scripted"),
+    "a zero lets the run in effect resume": Mutation("arbiter", "(final or self._scripted)", "final"),
+    "a lost connection lets the run resume": Mutation(
+        "arbiter", "self._resumes = not moves and not final", "self._resumes = True"
+    ),
+    "a release bars": Mutation("arbiter", "self._resumes = not moves and not final", "self._resumes = False"),
+    "valid_ms has no effect": Mutation("arbiter", "else int(valid_ms)", "else self._watchdog_ms"),
+    "valid_ms has no limit": Mutation("arbiter", "valid_ms < 0 or valid_ms > self._watchdog_ms", "valid_ms < 0"),
+    "times do not wrap": Mutation(
+        "ticks", "return ahead if ahead < _HALF else ahead - _HALF - _HALF", "return later - earlier"
+    ),
+    "a zero is lost when it is replaced": Mutation("world", "if old is not None and not old[4]:", "if False:"),
+    "a stop leaves a command in the slot": Mutation(
+        "world", "            self.slot = None\n            self.until = 0\n", "            self.until = 0\n"
+    ),
+    "a stop leaves the wheels turning": Mutation(
+        "world", "            self.slot = None\n            self.until = 0\n", "            self.slot = None\n"
+    ),
+    "saved is what is only renamed": Mutation(
+        "world",
+        "self.stage = RENAMED\n",
+        "self.stage, self.saved_version = RENAMED, self.writing_version\n",
+    ),
+    "saved is what is only written": Mutation(
+        "world", "self.stage = WRITTEN\n", "self.stage, self.saved_version = WRITTEN, self.version\n"
+    ),
+    "an older write counts as the newest": Mutation(
+        "world", "self.saved_version = self.writing_version", "self.saved_version = self.version"
+    ),
+    "what an earlier process has renamed counts as saved": Mutation(
+        "world", "            self.version = 1  #", "            self.version = 0  #"
+    ),
+    "a board counts a failed write": Mutation(
+        "world", "return bool(self._latched_in_file() == self.latch.latched)\n", "return True\n"
+    ),
+    "every life has the same name": Mutation("world", "{self.boots:07x}", "0000000"),
+    "a retained stop counts": Mutation("world", "if copy:", 'if copy and what != "stop":'),
+    "a retained reset counts": Mutation("world", "if copy:", 'if copy and what != "reset":'),
+    "a retained drive counts": Mutation("world", "if copy:", 'if copy and what != "drive":'),
+    "a sender ignores owners that have not answered": Mutation(
+        "estop", "for owner in self.estop.owners if (why", "for owner in self.estop.states if (why"
+    ),
+    "the answer of one owner confirms": Mutation(
+        "estop", "and not self.unconfirmed:", "and len(self.unconfirmed) < len(self.estop.owners):"
+    ),
+    "a sender ignores whether it is saved": Mutation(
+        "estop", "if self.estop.states[owner].persisted is False else", "if False else"
+    ),
+    "a sender takes any stop for its own": Mutation("estop", "and self._stop in state.recent", "and state.latched"),
+    "a hold repeats whenever its name is not listed": Mutation(
+        "estop", "self._boots.get(owner) == state.boot", "self._lists_it(owner)"
+    ),
+    "a stop that cannot be saved counts as saved": Mutation("estop", "persisted is True", "persisted is not False"),
+    "a sender repeats what is confirmed": Mutation("estop", "(Progress.WAITING, Progress.OLD)", "Progress"),
+    "a sender does not repeat": Mutation(
+        "estop", "self._sent_at, self.next = now, now + REPEAT_S", 'self._sent_at, self.next = now, float("inf")'
+    ),
+    "a sender repeats without zeros": Mutation(
+        "estop", "messages.append(_message(DRIVE,", "self.estop.old and messages.append(_message(DRIVE,"
+    ),
+    "a hold ends after 60 s": Mutation("estop", "if not self.hold and now >=", "if now >="),
+    "a sender never gives up": Mutation("estop", "if not self.hold and now >= self._began + GIVE_UP_S:", "if False:"),
+    "the number of a run is not saved": Mutation("world", "self.run = self.saved_run = max(", "self.run = max("),
+    "the manager ignores a restart": Mutation("world", 'if state["latched"] or changed or', 'if state["latched"] or'),
+}

@@ -1,0 +1,214 @@
+"""What one motor owner may do, recomputed from what reached it; independent of latch.py and arbiter.py.
+
+What is promised, exactly:
+
+* No wheel turns while its owner is latched, after its command's deadline, or by a run that is barred.
+* A stop is confirmed only after every owner that the robot lists has executed it and has answered. Until then, for at
+  most 60 s or as long as a hold lasts, its sender sends the stop and a final zero every 0.5 s; after it, nothing.
+* A state with ``persisted`` true is on the disk: of a board whether it is stopped, of others the names, too.
+* A stop that is confirmed survives a power cut of every owner, unless a reset that was asked for after it has ended
+  it, or the owner's file has been removed. A file that is damaged or cannot be read counts as a stop.
+  An owner that can save nothing (``persisted`` null) confirms, but is free after a power cut: its sender must report
+  it as not saved. An owner whose writing fails (``persisted`` false) is stopped, but never confirmed.
+* A reset ends a stop only if its ``boot`` and ``count`` are the newest and it was read less than 1 s ago, so it never
+  ends a stop that was given after it was asked for.
+* Once everything works, senders and holds come to rest, and one reset by a person who looked ends every stop.
+* A run that is barred moves nothing in this life of the owner, and nothing in the first 2 s of the next; later only
+  while its manager has not received the state of the new life.
+* A person's zero is always judged, and stops the motors.
+* A retained copy of a command has no effect.
+
+Times are milliseconds that never wrap. ``order`` counts the steps of a history: a press and a request for a reset have
+the order of the step in which a person made them, however late they arrive.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+WATCHDOG_MS = 750
+HOLD_MS = 2000
+START_MS = 2000
+QUIET_MS = 500
+OLD_MS = 1000
+REPEAT_MS = 500
+GIVE_UP_MS = 60_000
+
+PERSON, UNKNOWN_RUN, REFUSED = 0, -1, -1
+
+MISSING = "missing"  # in place of a file's content
+UNREADABLE = "unreadable"
+
+
+class ViolatedError(AssertionError):
+    """A history in which a rule does not hold."""
+
+
+class Rules:
+    """The rules of one owner. The events are called after the owner has executed them, with what it did."""
+
+    def __init__(self, names: int) -> None:
+        self.names = names
+        self.ended = -1  # when a reset last ended the stop, or its file was removed
+        self.newest_given = -1  # the newest stop that was executed, by when it was given
+        self.counted: dict[str, int] = {}  # stops by when they were executed
+        self.confirmed: dict[str, int] = {}  # saved stops of a sender that was confirmed, by when that was published
+        self.barred_before = 0  # by earlier lives
+        self.latched = False
+        self.recent: list[str] = []
+        self.started(0, MISSING, False)
+
+    def snapshot(self) -> tuple[bool, list[str]]:
+        """What a file that is written now must contain."""
+        return self.latched, self.recent
+
+    def started(self, now: int, saved: Any, latched: bool) -> None:
+        """``saved``: a snapshot, MISSING or UNREADABLE."""
+        if saved == MISSING:
+            self.latched, self.recent = False, []
+        elif saved == UNREADABLE:
+            self.latched, self.recent = True, []
+        else:
+            self.latched, self.recent = saved
+        lost = [name for name, published in self.confirmed.items() if published >= self.counted[name] > self.ended]
+        check(latched or not lost, "a confirmed stop does not survive a restart")
+        check(latched == self.latched, "an owner does not start as its file has it")
+        self.zeros = 0  # of persons, that wait
+        self.count = 0
+        self.barred_before = max(self.barred_before, getattr(self, "barred", 0))
+        self.barred = self.newest = 0
+        self.since = now
+        self.person_at: int | None = None  # when a person's command was last executed
+        self.released = False
+        self.script_until: int | None = None  # the last command is a script's
+        self.quiet_from: int | None = None  # after a reset
+
+    def executes(self, copy: bool) -> None:
+        """A command is executed; ``copy``: it was delivered as a retained one."""
+        check(not copy, "a retained copy of a command has an effect")
+
+    def confirms(self, name: str, state: dict[str, Any] | None) -> None:
+        """A sender takes its stop as confirmed; ``state`` is the newest one that it has received from this owner."""
+        if state is None or name not in self.counted:
+            raise ViolatedError("a stop is confirmed without an owner that has executed it and answered")
+        if state["persisted"] is not None:
+            self.confirmed[name] = state["order"]
+
+    def saved(self, durable: Any, names: bool) -> None:
+        """A state has ``persisted`` true; ``durable`` is what a power cut leaves, as in ``started``."""
+        special = {MISSING: (False, []), UNREADABLE: (True, [])}
+        latched, recent = special[durable] if isinstance(durable, str) else durable
+        check(
+            latched == self.latched and (recent == self.recent or not names),
+            "a state that counts as saved is not on the disk",
+        )
+
+    def stopped(self, name: str, given: int, order: int, latch: Any, moving: bool) -> None:
+        """A stop was executed."""
+        self.newest_given = max(self.newest_given, given)
+        if name not in self.recent:
+            self.recent = [name, *self.recent][: self.names]
+            self.counted[name] = order
+            self.count += 1
+            self.latched = True
+            self.barred = max(self.barred, self.newest)
+            self.script_until = self.quiet_from = None
+            check(not moving, "a wheel turns after a stop")
+        check(latch.latched == self.latched, "a stop that is new latches, and a known one changes nothing")
+        check(latch.count == self.count and latch.recent == self.recent, "names and number of stops are not right")
+
+    def reset(self, boot: str, count: int, age: int, asked: int, now: int, order: int, latch: Any) -> None:
+        """A reset was executed, or refused."""
+        ended = self.latched and not latch.latched
+        if ended:
+            check(self.newest_given < asked, "a reset clears a stop that was given after it was asked for")
+            self.latched = False
+            self.ended, self.quiet_from = order, now
+        allowed = boot == latch.boot and count == self.count and age < OLD_MS
+        check(not ended or allowed, "a reset that must be refused is obeyed")
+        check(not allowed or not latch.latched, "a reset of the newest state is refused")
+        check(latch.latched == self.latched, "a reset latches")
+
+    def received(self, moves: bool, run: int) -> None:
+        """A drive command is in the inbox."""
+        self.zeros += not moves and run == PERSON
+
+    def worked(self) -> None:
+        """All that was in the inbox has been executed."""
+        check(self.zeros <= 0, "a person's zero is not judged")
+        self.zeros = 0
+
+    def judged(self, moves: bool, run: int, valid_ms: float, now: int, result: int) -> None:
+        """A drive command was judged; ``result`` is the milliseconds for which it moves, 0 or REFUSED."""
+        self._end_hold(now)
+        limit = min(WATCHDOG_MS, int(valid_ms)) if valid_ms >= 0 else WATCHDOG_MS
+        held = self.person_at is not None
+        if run > self.newest:
+            self.newest = run
+            self.barred = max(self.barred, run - 1)
+        if self.latched:
+            self.barred = max(self.barred, run)
+            check(result <= 0, "a wheel turns while its owner is latched")
+        if run == PERSON:
+            quiet = self._quiet(moves, now)
+            if not moves:
+                self.zeros -= 1
+                check(result == 0, "a person's zero is not judged")
+            elif self.latched or not quiet:
+                check(result == REFUSED, "a person moves wheels before letting go after a reset")
+                return
+            else:
+                check(result == limit, "a person's command is refused, or lasts too long or too short")
+            self._take(moves, valid_ms == 0, now)
+            return
+        if moves and 0 < run <= self.barred:
+            check(result == REFUSED, "a barred run moves")
+        if held or now - self.since < START_MS or 0 < run <= self.barred or (moves and self.latched):
+            check(result == REFUSED, "a script's command has an effect while a person drives, at the start or barred")
+            return
+        check(result == (limit if moves else 0), "a script's command is refused, or lasts too long or too short")
+        self.script_until = now + limit
+
+    def moving(self, now: int, until: int) -> None:
+        """A wheel turns at ``now``, by a command whose deadline is ``until``."""
+        check(not self.latched, "a wheel turns while its owner is latched")
+        check(now < until, "a wheel turns after its command's deadline")
+
+    def _quiet(self, moves: bool, now: int) -> bool:
+        """Whether persons have let go since the reset."""
+        if self.latched or self.quiet_from is None:
+            return True
+        if not moves or now - self.quiet_from >= QUIET_MS:
+            self.quiet_from = None
+            return True
+        self.quiet_from = now
+        return False
+
+    def _take(self, moves: bool, final: bool, now: int) -> None:
+        in_effect = self.script_until is not None and now < self.script_until
+        if not moves and (final or in_effect):
+            self.barred = max(self.barred, self.newest)
+        self.released = not moves and not final
+        self.person_at = now
+        self.script_until = None
+
+    def _end_hold(self, now: int) -> None:
+        if self.person_at is not None and now - self.person_at >= HOLD_MS:
+            self.person_at = None
+            if not self.released:
+                self.barred = max(self.barred, self.newest)
+
+    def ticked(self, now: int, barred: int) -> None:
+        """Time has passed; ``barred`` is the owner's."""
+        self._end_hold(now)
+        check(barred == self.barred, "a run is barred that is not, or the other way round")
+
+    def file_removed(self, order: int) -> None:
+        """Nothing is promised of the stops before."""
+        self.ended = order
+
+
+def check(holds: bool, rule: str) -> None:
+    """Raise :class:`ViolatedError` unless ``holds``."""
+    if not holds:
+        raise ViolatedError(rule)

@@ -1,0 +1,125 @@
+"""Repeats what the cores did in histories, call by call, in the real MicroPython.
+
+``python -m tests.motion.traces --histories 10000``
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from pebble.flash.boards import FIRMWARE
+from pebble.motion.latch import is_name, reset_of, stop_of
+from tests.firmware.micropython import SCRIPTS, compile_module, run
+from tests.motion.histories import generate, violation
+from tests.motion.world import CORES, World
+
+_BODIES: tuple[Any, ...] = (
+    *(None, 0, True, "stop", [], [1], {}, {"stop": None}, {"stop": 7}, {"stop": "0" * 15}, {"stop": "0" * 17}),
+    *({"stop": "0123456789abcdef"}, {"stop": "0123456789ABCDEF"}, {"stop": "0123456789abcdeg"}, {"stop": "ü" * 16}),
+    *({"value": {"stop": "0123456789abcdef", "by": "anna"}}, {"value": [], "stop": "0123456789abcdef"}),
+    *({"by": "a" * 40, "why": "w" * 50}, {"by": 'a"b\\c\n\x00\x7fü€😀', "why": ["x"]}, {"by": {}, "why": True}),
+    *({"boot": "00c0ffee", "count": 3}, {"boot": "00c0ffee", "count": True}, {"boot": "00c0ffee", "count": 3.0}),
+    *({"boot": 7, "count": 3}, {"boot": "", "count": -1}, {"boot": "x", "count": 1 << 40}, {"boot": "x"}),
+    *({"value": {"boot": "x", "count": 1}, "boot": "y", "count": 2}, {"stop": "\uff10123456789abcde"}),
+)
+
+
+def bodies() -> str:
+    """What the parsing functions return for commands of every shape."""
+    return json.dumps([[body, stop_of(body), reset_of(body), is_name(body)] for body in _BODIES], ensure_ascii=False)
+
+
+def traces(seed: int, count: int) -> Iterator[str]:
+    """One line for each history: calls as ``[object, method, arguments, result]``."""
+    for number in range(count):
+        calls: list[Any] = []
+        assert violation(generate(seed, number), World, _recording(calls)) == ""
+        yield json.dumps(calls, separators=(",", ":"))
+
+
+def _recording(calls: list[Any]) -> Any:
+    """Cores that add every call from outside to ``calls``."""
+
+    class Latch(CORES.Latch):  # type: ignore[misc]
+        number = 0
+
+        def __init__(self, boot: str, names: int, diff: Any) -> None:
+            super().__init__(boot, names, diff)
+            self.number = len(calls)
+            calls.append([self.number, "latch", [boot, names], None])
+
+        def restore(self, saved: object) -> None:
+            super().restore(saved)
+            calls.append([self.number, "restore", [saved], self.saved()])
+
+        def reset(self, *arguments: Any) -> bool:
+            result: bool = super().reset(*arguments)
+            calls.append([self.number, "reset", arguments, [result, self.saved()]])
+            return result
+
+        def state(self, persisted: bool | None) -> dict[str, Any]:
+            result: dict[str, Any] = super().state(persisted)
+            calls.append([self.number, "state", [persisted], dict(result)])
+            return result
+
+    class Arbiter(CORES.Arbiter):  # type: ignore[misc]
+        def __init__(self, latch: Any, now: int, diff: Any, watchdog_ms: int) -> None:
+            super().__init__(latch, now, diff, watchdog_ms)
+            self.number = latch.number
+            calls.append([self.number, "arbiter", [now, watchdog_ms], None])
+            self.outside = True
+
+        def judge(self, *arguments: Any) -> int:
+            self.outside = False
+            result: int = super().judge(*arguments)
+            self.outside = True
+            calls.append([self.number, "judge", arguments, [result, self.barred]])
+            return result
+
+        def stop(self, *arguments: Any) -> bool:
+            result: bool = super().stop(*arguments)
+            calls.append([self.number, "stop", arguments, [result, self.barred]])
+            return result
+
+        def tick(self, now: int) -> None:
+            super().tick(now)
+            if self.outside:
+                calls.append([self.number, "tick", [now], self.barred])
+
+    return SimpleNamespace(Latch=Latch, Arbiter=Arbiter, diff=CORES.diff, StopSender=CORES.StopSender)
+
+
+def repeat(folder: Path, lines: Iterable[str]) -> list[str]:
+    """Repeat the calls in MicroPython, on the cores as they are compiled for a board; the lines that it prints.
+
+    The last one is ``[histories, calls, whether all results are the same]``.
+    """
+    for name in ("latch", "arbiter", "ticks"):
+        compile_module(FIRMWARE["minilamp"], Path("common", f"{name}.py"), folder)
+    with (folder / "traces.jsonl").open("w", encoding="utf-8") as file:
+        file.writelines(line + "\n" for line in (bodies(), *lines))
+    done = run(folder, SCRIPTS / "motion.py", heap=8 * 1024 * 1024, timeout_s=600.0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.splitlines()
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--histories", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        printed = repeat(Path(folder), traces(options.seed, options.histories))
+    print(*printed, sep="\n")
+    return int(len(printed) != 1 or json.loads(printed[-1])[2] is not True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

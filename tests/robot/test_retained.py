@@ -1,0 +1,161 @@
+"""Messages retained before the robot starts: commands are stale and are not forwarded, flags are reconciled."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.robot.operator import Operator, retained_messages
+from tests.robot.rig import BASE, Rig
+from tests.support import until
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+
+COMMANDS: dict[str, Any] = {
+    "incoming/drive-values": {"x": 0, "z": 1},
+    "incoming/lights-solid": {"r": 1},
+    "incoming/flags/reboot": True,
+    "incoming/flags/git-pull": {"value": True},
+    "incoming/flags/service-restart": {"enabled": True},
+    "incoming/soundboard-command": {"action": "play", "file": "a.wav"},
+    "incoming/autonomy-command": {"action": "start", "file": "x"},
+    "incoming/not-in-the-contract": {"x": 1},
+}
+
+
+def retain_messages(port: int, messages: dict[str, Any]) -> None:
+    """Publish retained messages to a broker, and wait until it has them."""
+    publisher = Operator(port, BASE)
+    for topic, body in messages.items():
+        publisher.send(topic, body, retain=True)
+    assert until(lambda: set(retained_messages(port, BASE, 0.2)) >= set(messages), 5)
+    publisher.close()
+
+
+def assert_untouched(rig: Rig) -> None:
+    """No wheel turned, no light was switched and no action ran since the robot exists."""
+    assert not [entry.line for entry in rig.mcu.entries() if entry.line[:1] in "LF"]
+    assert not [wheels for _, wheels in rig.mcu.drives() if wheels != (0.0, 0.0)]
+    assert rig.recorded() == []
+
+
+@pytest.fixture(params=["mqtt", "zenoh", "single", "mirror"])
+def unstarted(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    kind, mirror = ("zenoh", True) if request.param == "mirror" else (request.param, False)
+    with Rig(kind, mirror=mirror, start=False) as rig:
+        yield rig
+
+
+@pytest.fixture(params=["mqtt", "mirror"])
+def two_brokers(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    mirror = request.param == "mirror"
+    with Rig("zenoh" if mirror else "mqtt", mirror=mirror, start=False) as rig:
+        yield rig
+
+
+def test_retained_commands_at_the_remote_broker(unstarted: Rig) -> None:
+    """None runs at the start, none after an uplink outage, none crosses."""
+    retain_messages(unstarted.remote.port, COMMANDS)
+    unstarted.start()
+    assert_still_untouched(unstarted)
+    unstarted.uplink.drop()
+    cut = time.monotonic()
+    unstarted.operator.wait_for("outgoing/online", since=cut + 0.3)
+    assert_still_untouched(unstarted)
+
+
+def assert_still_untouched(rig: Rig) -> None:
+    """Nothing happened, not even after a live command that followed the retained ones has been carried out."""
+    began = time.monotonic()
+    rig.operator.send("incoming/lights-flash", {"g": 0.5})
+    assert until(lambda: any(entry.line[:1] == "F" for entry in rig.mcu.entries(began)), 5)
+    assert not [entry.line for entry in rig.mcu.entries() if entry.line[:1] == "L"]
+    assert not [wheels for _, wheels in rig.mcu.drives() if wheels != (0.0, 0.0)]
+    assert rig.recorded() == []
+
+
+def test_a_retained_stop_stops_nothing_and_a_live_one_that_asks_to_be_retained_does(unstarted: Rig) -> None:
+    """Not at the start, nor when the uplink comes back. Afterwards the broker has the live one, which is then old."""
+    rig, state = unstarted, "outgoing/estop/serial"
+    brokers = {broker.port: broker for broker in (rig.local, rig.remote) if broker is not None}
+    for port in brokers:
+        retain_messages(port, {"incoming/estop": {"stop": "00000000000000a0"}})
+    rig.start()
+    for _ in range(3):
+        assert not rig.operator.wait_for(state).json["latched"]
+        began = time.monotonic()
+        assert until(lambda began=began: _turns(rig, began), 5)  # type: ignore[misc]
+        rig.uplink.drop()
+        rig.operator.wait_for("outgoing/online", since=time.monotonic() + 0.3)
+    assert not any(seen.json["latched"] or seen.json["count"] for seen in rig.operator.on(state))
+    assert until(lambda: _is_stopped(rig, state), 5, step=0.2)
+    stopped = time.monotonic()
+    assert not until(lambda: _turns(rig, stopped), 1)
+
+
+def _is_stopped(rig: Rig, state: str) -> bool:
+    """Whether the robot has latched a stop sent now, or an earlier one of the same name."""
+    rig.operator.send("incoming/estop", {"stop": "00000000000000a1", "by": "test"}, retain=True)
+    return [seen.json["recent"] for seen in rig.operator.on(state) if seen.json["latched"]][-1:] == [
+        ["00000000000000a1"]
+    ]
+
+
+def _turns(rig: Rig, since: float) -> bool:
+    """Whether a wheel turns for a command sent now."""
+    rig.operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
+    time.sleep(0.05)
+    return any(wheels != (0.0, 0.0) for _, wheels in rig.mcu.drives(since))
+
+
+def test_retained_commands_do_not_cross_from_remote_to_local(two_brokers: Rig) -> None:
+    assert two_brokers.local is not None
+    retain_messages(two_brokers.remote.port, COMMANDS)
+    two_brokers.start()
+    assert_still_untouched(two_brokers)
+    assert not set(retained_messages(two_brokers.local.port, BASE)) & set(COMMANDS)
+
+
+def test_retained_commands_at_the_local_broker(two_brokers: Rig) -> None:
+    """They are neither executed nor forwarded to the remote side, not even with everything mirrored."""
+    assert two_brokers.local is not None
+    retain_messages(two_brokers.local.port, COMMANDS)
+    retain_messages(two_brokers.remote.port, {"incoming/flags/remote-mirror": True})
+    two_brokers.start()
+    assert_still_untouched(two_brokers)
+    assert not set(retained_messages(two_brokers.remote.port, BASE)) & set(COMMANDS)
+
+
+def test_retained_flags_that_differ_end_with_the_remote_value(two_brokers: Rig) -> None:
+    flag = "incoming/flags/mqtt-video"
+    assert two_brokers.local is not None
+    retain_messages(two_brokers.local.port, {flag: {"value": True}})
+    retain_messages(two_brokers.remote.port, {flag: {"value": False}})
+    watchers = [Operator(broker.port, BASE) for broker in (two_brokers.local, two_brokers.remote)]
+    two_brokers.start()
+    assert until(lambda: watchers[0].last(flag).json == {"value": False}, 10)
+    time.sleep(1)  # long enough for hundreds of rounds, if it flapped
+    for watcher in watchers:
+        assert watcher.last(flag).json == {"value": False}
+        assert len(watcher.on(flag)) <= 3
+        watcher.close()
+
+
+def test_a_flag_set_locally_during_an_outage_wins(two_brokers: Rig) -> None:
+    flag = "incoming/flags/mqtt-audio"
+    assert two_brokers.local is not None
+    two_brokers.start()
+    two_brokers.operator.send(flag, {"value": False}, retain=True)
+    local = Operator(two_brokers.local.port, BASE)
+    assert until(lambda: (seen := local.last(flag)) is not None and seen.json == {"value": False}, 5)
+    two_brokers.uplink.blackhole()
+    time.sleep(3)  # noticed after 2 s
+    local.send(flag, {"value": True}, retain=True)
+    two_brokers.uplink.resume()
+    assert until(lambda: two_brokers.operator.last(flag).json == {"value": True}, 10)
+    assert until(lambda: retained_messages(two_brokers.remote.port, BASE, 0.2)[flag] == b'{"value": true}', 5)
+    assert local.last(flag).json == {"value": True}
+    local.close()

@@ -1,0 +1,27 @@
+"""A few of the random schedules of stops and faults; ``python -m tests.robot.stop_schedules`` runs hundreds."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.robot.stop_schedules.__main__ import perform
+from tests.robot.stop_schedules.schedules import make, setups
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+
+
+@pytest.mark.parametrize(
+    ("transport", "setup"),
+    [("zenoh", "power cut"), ("mqtt", "killed before the state"), ("zenoh", "retained stop"), ("mqtt", "older save")],
+)
+def test_what_people_and_owners_do_is_seen_at_the_wheels(transport: str, setup: str) -> None:
+    (result,) = perform(transport, setup, [2])
+    assert not result.problems
+    assert result.stops
+
+
+@pytest.mark.parametrize("transport", ["zenoh", "mqtt"])
+def test_a_seed_makes_one_schedule(transport: str) -> None:
+    for setup in setups(transport):
+        assert make(transport, setup, 7) == make(transport, setup, 7)
+        assert make(transport, setup, 7) != make(transport, setup, 8)

@@ -1,0 +1,39 @@
+"""Programs that are started tied to us."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pebble.runtime.parent import tied_to_parent
+from tests.support import ROOT, gone, until
+
+PARENT = """
+import signal, subprocess, sys, time
+from pebble.runtime.parent import tied_to_parent
+child = subprocess.Popen(tied_to_parent([sys.executable, "-c", "import time; time.sleep(100)"], signal.SIGTERM))
+print(child.pid, flush=True)
+time.sleep(100)
+"""
+
+
+def test_a_child_goes_when_its_parent_is_killed() -> None:
+    parent = subprocess.Popen(tied_to_parent([sys.executable, "-c", PARENT]), cwd=ROOT, stdout=subprocess.PIPE)
+    try:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        program, cmdline = sys.executable.encode(), Path(f"/proc/{child}/cmdline")
+        assert until(lambda: cmdline.read_bytes().startswith(program)), "until then it is tied to nobody"
+    finally:
+        parent.send_signal(signal.SIGKILL)
+        parent.wait(10)
+    assert until(lambda: gone(child))
+
+
+def test_a_program_that_is_not_there_is_named_before_anything_starts() -> None:
+    with pytest.raises(FileNotFoundError, match="no-such-program"):
+        tied_to_parent(["no-such-program", "--help"])

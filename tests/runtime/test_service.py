@@ -1,0 +1,519 @@
+"""The runtime of a service, on the memory transport."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import parse
+from pebble.contract import (
+    CHARGING_STATUS,
+    DRIVE,
+    MCU_DESCRIBE,
+    MEDIA_REPORT,
+    MQTT_VIDEO,
+    REBOOT,
+    SOUNDBOARD_COMMAND,
+    TOUCH_SENSORS,
+    Channel,
+    Kind,
+)
+from pebble.contract.payloads import (
+    ChargingStatus,
+    Drive,
+    McuManifest,
+    MediaReport,
+    SoundboardCommand,
+    TouchSensors,
+    TouchValues,
+)
+from pebble.service import Service, every, on
+from pebble.transports import Message, QoS, State, Subscription
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.support import until
+
+BASE = "pebble/robots/rover"
+DRIVE_TOPIC, REBOOT_TOPIC = f"{BASE}/incoming/drive-values", f"{BASE}/incoming/flags/reboot"
+CHARGING_TOPIC = f"{BASE}/outgoing/charging-status"
+
+
+class Recorder(Service):
+    """Notes everything that happens to it, and can be made to wait inside a handler."""
+
+    name = "recorder"
+    publishes = (CHARGING_STATUS, TOUCH_SENSORS)
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self.seen: list[Any] = []
+        self.life: list[str] = []
+        self.threads: set[int] = set()
+        self.ticks = 0
+        self.go_on = threading.Event()
+        self.go_on.set()
+
+    def start(self) -> None:
+        self.life.append(f"start {self.transport.state.value}")
+
+    def stop(self) -> None:
+        self.life.append(f"stop {self.transport.state.value}")
+
+    @on(DRIVE)
+    def drive(self, drive: Drive) -> None:
+        self._note(drive.x)
+
+    @on(SOUNDBOARD_COMMAND)
+    def sound(self, command: SoundboardCommand) -> None:
+        self._note(command.file)
+
+    @on(MQTT_VIDEO)
+    def flag(self, value: bool) -> None:
+        self._note(value)
+
+    @on(REBOOT)
+    def reboot(self, value: bool) -> None:
+        self._note(f"reboot {value}")
+
+    @on(MEDIA_REPORT)
+    def report(self, report: MediaReport, program: str) -> None:
+        self._note((program, report.running))
+
+    @every(seconds=0.01)
+    def tick(self) -> None:
+        self.ticks += 1
+        self.threads.add(threading.get_ident())
+
+    def _note(self, value: Any) -> None:
+        self.seen.append(value)
+        self.threads.add(threading.get_ident())
+        self.go_on.wait(10)
+
+
+class Robot:
+    """One service on a thread, and an operator's transport beside it."""
+
+    def __init__(self, service_class: type[Recorder] = Recorder, **services: Any) -> None:
+        self.hub = MemoryHub()
+        config = parse({"robot": {"id": "rover"}, "services": services}, folder=Path("/"), env={})
+        self.ahead_s = 0.0  # of the service's clock before the machine's
+        self.service = service_class(
+            config, MemoryTransport("service", self.hub), clock=lambda: time.monotonic() + self.ahead_s
+        )
+        self.operator = MemoryTransport("operator", self.hub)
+        self.received: list[Message] = []
+        self.error: BaseException | None = None
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        try:
+            self.service.run(ready=self._ready.set)
+        except RuntimeError as error:
+            self.error = error
+
+    def start(self) -> None:
+        self.operator.open()
+        self.operator.subscribe(f"{BASE}/outgoing/#", self.received.append)
+        self._thread.start()
+        assert self._ready.wait(10)
+        assert until(lambda: self.service.transport.state is State.CONNECTED)
+
+    def publish(self, topic: str, payload: str, *, retain: bool = False) -> None:
+        assert self.operator.publish(topic, payload.encode(), qos=QoS.DELIVERED, retain=retain)
+
+    def saw(self, *expected: Any) -> bool:
+        return until(lambda: self.service.seen == list(expected))
+
+    def on_service_thread(self, job: Any) -> None:
+        """Run ``job`` as a handler would, and wait for it."""
+        done = threading.Event()
+
+        def run() -> None:
+            job()
+            done.set()
+
+        self.service.post(run)
+        assert done.wait(10)
+
+    def received_on(self, topic: str) -> list[Message]:
+        return [message for message in self.received if message.topic == topic]
+
+    def end(self) -> None:
+        self.service.go_on.set()
+        self.service.quit()
+        if self._thread.ident is not None:
+            self._thread.join(10)
+            assert not self._thread.is_alive()
+
+    def close(self) -> None:
+        self.end()
+        self.operator.close()
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    made = Robot()
+    yield made
+    made.close()
+
+
+# -- life
+
+
+def test_hardware_opens_before_the_transport_and_is_safe_before_it_closes(robot: Robot) -> None:
+    robot.start()
+    robot.end()
+    assert robot.service.life == ["start closed", "stop connected"]
+    assert robot.service.transport.state is State.CLOSED
+
+
+def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    class Fragile(Recorder):
+        def _note(self, value: Any) -> None:
+            if value == 1.0:
+                raise RuntimeError("handler failed")
+            super()._note(value)
+
+    robot = Robot(Fragile)
+    robot.start()
+    for failures in range(1, 4):
+        robot.publish(DRIVE_TOPIC, '{"x": 1}')
+        assert until(lambda failures=failures: robot.service.counters["handler_errors"] == failures)  # type: ignore[misc]
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert robot.saw(0.5)
+    (record,) = [record for record in caplog.records if "drive-values" in record.message]
+    assert record.message == "failed on a message on drive-values (1 so far)"
+    assert record.levelno == logging.ERROR
+    assert record.exc_text is not None
+    assert "RuntimeError: handler failed" in record.exc_text
+    robot.close()
+    assert robot.error is None
+
+
+@pytest.mark.parametrize("timer", ["every", "call_at", "post"])
+def test_a_timer_or_a_reader_that_fails_ends_the_service_safely(timer: str) -> None:
+    def fail() -> None:
+        raise RuntimeError("it failed")
+
+    robot = Robot()
+    robot.start()
+    begin: dict[str, Callable[[], object]] = {
+        "every": lambda: robot.service.timers.add(0.0, fail, period=0.01),
+        "call_at": lambda: robot.service.call_at(0.0, fail),
+        "post": fail,
+    }
+    robot.service.post(lambda: begin[timer]() and None)
+    assert until(lambda: robot.error is not None)
+    assert robot.service.life[-1] == "stop connected"
+    assert robot.service.transport.state is State.CLOSED
+    robot.close()
+
+
+def test_a_service_that_cannot_start_is_stopped_all_the_same() -> None:
+    class Broken(Recorder):
+        def start(self) -> None:
+            raise RuntimeError("no such device")
+
+    robot = Robot(Broken)
+    with pytest.raises(RuntimeError, match="no such device"):
+        robot.service.run()
+    assert robot.service.life == ["stop closed"]
+
+
+def test_what_was_opened_is_closed_after_stop_in_reverse_order_even_if_one_fails() -> None:
+    class Opener(Recorder):
+        def start(self) -> None:
+            self.on_stop(lambda: self.life.append("close first"))
+            self.on_stop(self.fail)
+            self.on_stop(lambda: self.life.append(f"close last {self.transport.state.value}"))
+
+        def fail(self) -> None:
+            raise RuntimeError("will not close")
+
+    robot = Robot(Opener)
+    robot.start()
+    robot.end()
+    assert robot.service.life == ["stop connected", "close last connected", "close first"]
+    assert str(robot.error) == "will not close"
+    assert robot.service.transport.state is State.CLOSED
+
+
+def test_quit_before_run_ends_at_once(robot: Robot) -> None:
+    robot.service.quit()
+    robot.service.run()
+    assert [entry.split()[0] for entry in robot.service.life] == ["start", "stop"]
+
+
+def test_what_waits_when_the_service_quits_is_not_executed(robot: Robot) -> None:
+    robot.start()
+    robot.service.go_on.clear()
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert robot.saw(0.5)
+    robot.publish(REBOOT_TOPIC, "true")
+    assert until(lambda: robot.service.transport.counters["delivered"] == 2)
+    robot.end()
+    assert robot.service.seen == [0.5]
+
+
+def test_everything_runs_on_one_thread(robot: Robot) -> None:
+    robot.start()
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert robot.saw(0.5)
+    robot.on_service_thread(lambda: robot.service.threads.add(threading.get_ident()))
+    assert until(lambda: robot.service.ticks > 3)
+    assert len(robot.service.threads) == 1
+    assert threading.get_ident() not in robot.service.threads
+
+
+def test_timers_go_on_under_a_flood_and_calls_come_when_they_are_due(robot: Robot) -> None:
+    robot.start()
+    called: list[float] = []
+    due = time.monotonic() + 0.05
+    robot.on_service_thread(lambda: robot.service.call_at(due, lambda: called.append(time.monotonic())))
+    before = robot.service.ticks
+    assert until(lambda: robot.publish(DRIVE_TOPIC, '{"x": 0.1}') or (called and robot.service.ticks > before))
+    assert called[0] >= due
+
+
+# -- receiving
+
+
+def test_of_several_waiting_drive_commands_only_the_newest_is_handled(robot: Robot) -> None:
+    robot.start()
+    robot.service.go_on.clear()
+    robot.publish(DRIVE_TOPIC, '{"x": 0.01}')
+    assert robot.saw(0.01)
+    for number in range(1, 100):
+        robot.publish(DRIVE_TOPIC, f'{{"x": {number / 100}}}')
+    robot.publish(REBOOT_TOPIC, "true")
+    assert until(lambda: robot.service.transport.counters["delivered"] == 101)
+    robot.service.go_on.set()
+    assert robot.saw(0.01, 0.99, "reboot True")
+
+
+def test_a_steering_command_that_waited_too_long_is_dropped(robot: Robot) -> None:
+    robot.start()
+    robot.service.go_on.clear()
+    robot.publish(f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "a"}')
+    assert robot.saw("a")
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    robot.publish(f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "b"}')
+    assert until(lambda: robot.service.transport.counters["delivered"] == 3)
+    robot.ahead_s = 0.6
+    robot.service.go_on.set()
+    assert robot.saw("a", "b")
+    robot.publish(DRIVE_TOPIC, '{"x": 0.25}')
+    assert robot.saw("a", "b", 0.25)
+    assert robot.service.counters["late"] == 1
+
+
+def test_commands_that_must_all_be_handled_are(robot: Robot) -> None:
+    robot.start()
+    robot.service.go_on.clear()
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    for name in ("a", "b", "c"):
+        robot.publish(f"{BASE}/incoming/soundboard-command", f'{{"action": "play", "file": "{name}"}}')
+    robot.service.go_on.set()
+    assert robot.saw(0.5, "a", "b", "c")
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload"),
+    [
+        (DRIVE_TOPIC, '{"x": 1}'),
+        (REBOOT_TOPIC, "true"),
+        (f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "a"}'),
+    ],
+)
+def test_retained_commands_are_refused_and_live_ones_are_not(robot: Robot, topic: str, payload: str) -> None:
+    robot.operator.open()
+    robot.publish(topic, payload, retain=True)
+    robot.operator.close()
+    robot.start()
+    assert until(lambda: robot.service.counters["stale"] == 1)
+    assert robot.service.seen == []
+    robot.publish(topic, payload)
+    assert until(lambda: len(robot.service.seen) == 1)
+
+
+def test_a_retained_flag_is_the_last_position_of_a_switch(robot: Robot) -> None:
+    robot.operator.open()
+    robot.publish(f"{BASE}/incoming/flags/mqtt-video", '{"value": true}', retain=True)
+    robot.operator.close()
+    robot.start()
+    assert robot.saw(True)
+
+
+def test_a_malformed_message_is_counted_logged_once_and_replaces_nothing(
+    robot: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    robot.start()
+    robot.service.go_on.clear()
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert robot.saw(0.5)
+    robot.publish(DRIVE_TOPIC, '{"x": 0}')  # a stop, which must not be lost to what follows
+    for _ in range(100):
+        robot.publish(DRIVE_TOPIC, '{"x": NaN}')
+    assert until(lambda: robot.service.counters["refused"] == 100)
+    robot.service.go_on.set()
+    assert robot.saw(0.5, 0.0)
+    lines = [record.message for record in caplog.records if "refused a message" in record.message]
+    assert len(lines) == 1
+    assert lines[0].endswith("(1 so far)")
+
+
+def test_a_renamed_channel_is_received_under_its_new_name() -> None:
+    robot = Robot(serial_mcu_bridge={"topics": {"drive_values": f"{BASE}/incoming/steer"}})
+    robot.start()
+    robot.publish(DRIVE_TOPIC, '{"x": 1}')
+    robot.publish(f"{BASE}/incoming/steer", '{"x": 0.25}')
+    assert robot.saw(0.25)
+    robot.close()
+
+
+def test_what_a_service_handles_can_be_asked() -> None:
+    assert set(Recorder.handles()) == {DRIVE, SOUNDBOARD_COMMAND, MQTT_VIDEO, REBOOT, MEDIA_REPORT}
+
+
+# -- publishing
+
+
+def charging(value: bool) -> ChargingStatus:
+    return ChargingStatus(value=value)
+
+
+def test_delivery_follows_the_channel(robot: Robot) -> None:
+    robot.start()
+    touch = TouchSensors(value=TouchValues(a0=1, a1=2, a2=3))
+    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
+    robot.on_service_thread(lambda: robot.service.publish(TOUCH_SENSORS, touch))
+    assert until(lambda: len(robot.received) == 2)
+    state, stream = robot.received
+    assert (state.topic, state.payload, state.qos, state.retain_requested) == (
+        CHARGING_TOPIC,
+        b'{"value":true}',
+        QoS.DELIVERED,
+        True,
+    )
+    assert (stream.topic, stream.qos, stream.retain_requested) == (
+        f"{BASE}/outgoing/touch-sensors",
+        QoS.DELIVERED,
+        False,
+    )
+
+
+def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(robot: Robot) -> None:
+    robot.start()
+    robot.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
+    robot.publish(MEDIA_REPORT.topic(BASE, program="audio_receiver"), '{"running": false}')
+    assert robot.saw(("camera_publisher", True), ("audio_receiver", False))
+
+
+def test_a_pattern_without_its_name_is_refused_and_counted(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+    robot.start()
+    for _ in range(3):
+        robot.publish(f"{BASE}/outgoing/media-report/", '{"running": true}', retain=True)
+    robot.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
+    assert robot.saw(("camera_publisher", True))
+    assert robot.service.counters["refused"] == 3
+    assert robot.service.counters["handler_errors"] == 0
+    assert len([record for record in caplog.records if record.message.endswith("media-report/' (1 so far)")]) == 1
+
+
+def test_a_pattern_channel_takes_its_names(robot: Robot) -> None:
+    robot.start()
+    manifest = McuManifest(
+        protocol="pebble_serial_v1",
+        schema_version=1,
+        interface_count=0,
+        schema_hash="h",
+        device_uid="imu-1",
+        firmware_version="1",
+        model="nano",
+        interfaces=[],
+    )
+    robot.on_service_thread(lambda: robot.service.publish(MCU_DESCRIBE, manifest, uid="imu-1"))
+    assert until(lambda: robot.received_on(f"{BASE}/outgoing/mcu/imu-1/describe"))
+
+
+LAMP = Channel(metric="lab/lamp", kind=Kind.COMMAND, payload=dict[str, Any], doc="Made while running.")
+GLOW = Channel(metric="lab/lamp", kind=Kind.STATE, payload=dict[str, Any], doc="Made while running.")
+
+
+def test_a_channel_made_while_running_is_received_until_its_subscription_is_closed(robot: Robot) -> None:
+    robot.start()
+    subscriptions: list[Subscription] = []
+    robot.on_service_thread(lambda: subscriptions.append(robot.service.listen(LAMP, robot.service._note)))
+    assert until(lambda: subscriptions)
+    robot.publish(f"{BASE}/incoming/lab/lamp", '{"value": {"on": true}}')
+    assert robot.saw({"on": True})
+    robot.publish(f"{BASE}/incoming/lab/lamp", "[]")
+    assert until(lambda: robot.service.counters["refused"] == 1)
+    subscriptions[0].close()
+    robot.publish(f"{BASE}/incoming/lab/lamp", '{"on": false}')
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert robot.saw({"on": True}, 0.5)
+
+
+def test_retained_state_can_be_retracted_and_is_not_published_again(robot: Robot) -> None:
+    robot.start()
+    topic = f"{BASE}/outgoing/lab/lamp"
+    robot.on_service_thread(lambda: robot.service.publish(GLOW, {"on": True}))
+    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
+    assert until(lambda: robot.received_on(topic) and robot.received_on(CHARGING_TOPIC))
+    assert robot.hub.retained[topic].payload == b'{"on":true}'
+    robot.on_service_thread(lambda: robot.service.retract(GLOW))
+    assert until(lambda: robot.received_on(topic)[-1].payload == b"")
+    assert topic not in robot.hub.retained
+    robot.on_service_thread(lambda: robot.service.retract(GLOW))
+    robot.received.clear()
+    robot.hub.stop(forget=True)
+    assert until(lambda: robot.service.transport.state is State.CONNECTING)
+    robot.hub.start()
+    assert until(lambda: robot.received_on(CHARGING_TOPIC))
+    assert not robot.received_on(topic)
+
+
+def test_state_is_published_again_after_a_reconnect_and_streams_are_not(robot: Robot) -> None:
+    robot.start()
+    touch = TouchSensors(value=TouchValues(a0=1, a1=2, a2=3))
+    robot.on_service_thread(lambda: robot.service.publish(TOUCH_SENSORS, touch))
+    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(False)))
+    assert until(lambda: len(robot.received) == 2)
+    robot.hub.stop(forget=True)
+    assert until(lambda: robot.service.transport.state is State.CONNECTING)
+    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
+    robot.received.clear()
+    robot.hub.start()
+    assert until(lambda: robot.received_on(CHARGING_TOPIC))
+    assert {message.payload for message in robot.received} == {b'{"value":true}'}, "the current state, and no stream"
+
+
+def test_state_is_published_again_on_the_configured_interval() -> None:
+    robot = Robot(defaults={"retained_publish_interval_seconds": 0.02})
+    robot.start()
+    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
+    assert until(lambda: len(robot.received_on(CHARGING_TOPIC)) > 3)
+    robot.close()
+
+
+def test_a_service_lives_without_a_broker(robot: Robot) -> None:
+    robot.hub.stop()
+    robot.operator.open(timeout=0)
+    thread = threading.Thread(target=robot.service.run)
+    thread.start()
+    assert until(lambda: robot.service.ticks > 3)
+    robot.service.post(lambda: robot.service.publish(CHARGING_STATUS, charging(True)) and None)
+    robot.operator.subscribe(f"{BASE}/outgoing/#", robot.received.append)
+    robot.hub.start()
+    assert until(lambda: robot.received_on(CHARGING_TOPIC))
+    robot.service.quit()
+    thread.join(10)
+    assert not thread.is_alive()

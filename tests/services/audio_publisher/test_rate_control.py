@@ -1,0 +1,111 @@
+"""What the audio publisher reduces on a slow connection, on a clock of its own."""
+
+from __future__ import annotations
+
+from pebble.services.audio_publisher.rate_control import LevelControl, Step, steps
+from pebble.services.audio_publisher.sender import known_encoding
+
+
+def watch(levels: LevelControl, age_s: float, begin: float, seconds: float) -> list[float]:
+    """A poll every 20 ms; returns when the level changed."""
+    return [
+        round(at, 2)
+        for at in (begin + 0.02 * number for number in range(round(50 * seconds)))
+        if levels.poll(age_s, at)
+    ]
+
+
+def test_steps_save_headers_first_and_then_bits() -> None:
+    assert [(step.bundle, step.bitrate) for step in steps(1, 24_000)] == [(1, 24_000), (3, 24_000), (3, 16_000)]
+    assert [(step.bundle, step.bitrate) for step in steps(3, 24_000)] == [(3, 24_000), (3, 16_000)]
+    assert steps(3, 12_000) == (Step(3, 12_000),)
+
+
+def at_ease() -> LevelControl:
+    """One that has found out, by 5.0, that the link takes everything."""
+    levels = LevelControl(2, 0.0)
+    watch(levels, 0.0, 0.0, 5.0)
+    assert levels.level == 0
+    return levels
+
+
+def test_it_begins_small_and_has_everything_soon() -> None:
+    levels = LevelControl(2, 0.0)
+    assert levels.level == 2
+    assert len(watch(levels, 0.06, 0.0, 2.5)) == 2
+    assert levels.level == 0
+
+
+def test_time_in_which_nothing_was_seen_earns_nothing() -> None:
+    levels = LevelControl(2, 1.0)  # and no connection until 20.0
+    assert watch(levels, 0.0, 20.0, 0.9) == []
+    assert len(watch(levels, 0.0, 20.9, 2.0)) == 2
+    watch(levels, 0.18, 60.0, 2.0)
+    assert watch(levels, 0.0, 200.0, 9.0) == []
+
+
+def test_confirmations_that_are_held_back_are_not_a_slow_link() -> None:
+    levels = LevelControl(2, 0.0)
+    for number in range(250):
+        now = 0.02 * number
+        levels.poll(0.01 + now % 0.1024, now)
+    assert levels.level == 0
+
+
+def test_what_stands_in_a_queue_earns_nothing() -> None:
+    levels = LevelControl(2, 0.0)
+    assert watch(levels, 0.09, 0.0, 60) == []
+
+
+def test_a_link_that_is_fast_changes_nothing() -> None:
+    levels = at_ease()
+    assert watch(levels, 0.06, 5.0, 600) == []
+
+
+def test_on_a_link_that_begins_slow_it_stays_small() -> None:
+    levels = LevelControl(2, 0.0)
+    assert watch(levels, 0.18, 0.0, 60) == []
+
+
+def test_slowness_goes_down_step_by_step() -> None:
+    levels = at_ease()
+    changes = watch(levels, 0.18, 10.0, 10)
+    assert len(changes) == 2
+    assert changes[-1] < 10 + 1, "commands wait behind what waits"
+    assert levels.level == 2
+
+
+def test_a_moment_of_slowness_is_nothing() -> None:
+    levels = at_ease()
+    for begin in range(10, 100):
+        assert watch(levels, 0.19, begin, 0.2) == []
+        assert watch(levels, 0.0, begin + 0.2, 0.8) == []
+
+
+def test_steps_back_are_tried_ever_more_rarely() -> None:
+    levels = at_ease()
+    watch(levels, 0.18, 10.0, 3.0)
+    tries, at = [], 13.0
+    for _ in range(4):
+        begin = at
+        while levels.level == 2:
+            at += 0.02
+            levels.poll(0.0, at)
+        tries.append(at - begin)
+        while levels.level == 1:
+            at += 0.02
+            levels.poll(0.18, at)
+    assert tries[0] > 5
+    assert tries == sorted(tries)
+    assert tries[-1] > 4 * tries[0]
+
+
+def test_all_is_as_before_in_the_end() -> None:
+    levels = at_ease()
+    watch(levels, 0.18, 10.0, 5.0)
+    watch(levels, 0.0, 15.0, 100)
+    assert levels.level == 0
+
+
+def test_what_a_request_means() -> None:
+    assert [known_encoding(asked, "opus") for asked in ("pcm", "opus", "mp3", None)] == ["pcm", "opus", "opus", "opus"]

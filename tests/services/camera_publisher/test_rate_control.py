@@ -1,0 +1,192 @@
+"""What is reduced on slow connections: simulated ones, from 64 kbit/s to 2 Mbit/s, that change while pictures flow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import ceil
+
+import pytest
+
+from pebble.services.camera_publisher.rate_control import STEPS, LevelControl, RateController
+from pebble.services.camera_publisher.send_window import Acknowledged, SendWindow
+from pebble.transports.base import Outgoing
+from pebble.transports.counters import Counters
+
+KILOBIT = 125.0  # bytes
+
+
+@dataclass
+class Run:
+    """A publisher, a link of ``kbits(now)`` and ``delay_s`` each way; a full frame has ``full`` bytes, every third
+    one is a full picture and twice that. Confirmations wait for the next multiple of ``beacon_s``."""
+
+    kbits: Callable[[float], float]
+    full: int = 9_000
+    fps: float = 10.0
+    delay_s: float = 0.01
+    beacon_s: float = 0.0
+    ages: list[tuple[float, float]] = field(default_factory=list)  # when a frame had arrived whole, and its age then
+    levels: list[tuple[float, int]] = field(default_factory=list)
+
+    def run(self, seconds: float, *, step_s: float = 0.005) -> Run:
+        waiting, now, camera = 0.0, 0.0, 0.0
+        rate = RateController(self.fps, 0.0, lambda: Outgoing(round(waiting), 2 * self.delay_s), Counters())
+        unsent, frames, number = 0.0, list[list[float]](), 0
+        confirmed: list[tuple[float, float]] = []  # when the confirmation of so many bytes arrives
+        while now < seconds:
+            now += step_s
+            went = min(unsent, self.kbits(now) * KILOBIT * step_s)
+            unsent -= went
+            if went:
+                back = now + 2 * self.delay_s
+                confirmed.append((self.beacon_s * ceil(back / self.beacon_s) if self.beacon_s else back, went))
+            while confirmed and confirmed[0][0] <= now:
+                waiting -= confirmed.pop(0)[1]
+            while went and frames:
+                part = min(went, frames[0][0])
+                frames[0][0] -= part
+                went -= part
+                if frames[0][0] > 1e-6:
+                    break
+                self.ages.append((now, now + self.delay_s - frames.pop(0)[1]))
+            step = rate.poll(now)
+            if step is not None:
+                self.levels.append((now, STEPS.index(step)))
+            if now < camera:
+                continue
+            camera += 1 / 30
+            if rate.may_encode(now, now):
+                size = self.full * rate.step.bytes * (2 if number % 3 == 0 else 1)
+                number += 1
+                rate.sent(round(size), now)
+                frames.append([size, now])
+                unsent += size
+                waiting += size
+        return self
+
+    def worst_age(self, begin: float, end: float = 1e9) -> float:
+        return max(age for at, age in self.ages if begin <= at <= end)
+
+    def rate(self, begin: float, end: float) -> float:
+        return sum(begin <= at < end for at, _ in self.ages) / (end - begin)
+
+    def level_at(self, when: float) -> int:
+        return next((level for at, level in reversed(self.levels) if at <= when), 0)
+
+
+@pytest.mark.parametrize("delay_s", [0.001, 0.05, 0.2])
+@pytest.mark.parametrize("kbits", [64, 128, 256, 512, 1000, 2000])
+def test_pictures_stay_young_on_any_link(kbits: int, delay_s: float) -> None:
+    run = Run(lambda _now: kbits, delay_s=delay_s).run(60)
+    assert run.worst_age(0) < 3.5  # the very first, at full size
+    assert run.worst_age(4) < 0.9 + delay_s
+    assert run.rate(10, 60) > 2
+
+
+@pytest.mark.parametrize("kbits", [256, 512])
+def test_the_rate_is_the_last_to_go(kbits: int) -> None:
+    run = Run(lambda _now: kbits).run(60)
+    assert run.rate(10, 60) == pytest.approx(10, rel=0.04)
+    assert 0 < run.level_at(30) < 7
+
+
+def test_a_good_link_gets_everything() -> None:
+    run = Run(lambda _now: 2000).run(60)
+    assert not run.levels
+    assert run.rate(2, 60) == pytest.approx(10, rel=0.02)
+
+
+def test_a_long_way_is_not_a_slow_link() -> None:
+    run = Run(lambda _now: 20_000, delay_s=0.4).run(60)
+    assert not run.levels
+    assert run.rate(2, 60) == pytest.approx(10, rel=0.02)
+
+
+@pytest.mark.parametrize("beacon_s", [0.05, 0.0666, 0.09, 0.1024])
+@pytest.mark.parametrize("fps", [10.0, 15.0, 30.0])
+def test_confirmations_that_are_held_back_are_not_a_slow_link(fps: float, beacon_s: float) -> None:
+    run = Run(lambda _: 20_000, full=4_000, fps=fps, delay_s=0.002, beacon_s=beacon_s).run(30)
+    assert run.rate(2, 30) > 0.95 * fps
+    assert run.level_at(20) == 0  # the first second may be misunderstood
+
+
+@pytest.mark.parametrize("kbits", [64, 256])
+def test_a_slow_link_is_noticed_behind_confirmations_that_are_held_back(kbits: int) -> None:
+    run = Run(lambda _: kbits, delay_s=0.002, beacon_s=0.1024).run(40)
+    assert run.worst_age(5) < 0.8
+
+
+def test_a_link_that_recovers_gets_everything_back() -> None:
+    run = Run(lambda now: 128 if now < 20 else 4000).run(120)
+    assert run.level_at(19) >= 3
+    assert run.level_at(119) == 0
+    assert run.rate(100, 120) == pytest.approx(10, rel=0.02)
+
+
+def test_a_link_that_breaks_down_is_answered_at_once() -> None:
+    run = Run(lambda now: 2000 if now < 20 else 128).run(60)
+    assert run.worst_age(0, 20) < 0.3
+    assert run.worst_age(20) < 1.6
+    assert run.worst_age(23) < 0.9
+
+
+def test_a_steady_link_is_not_probed_all_the_time() -> None:
+    run = Run(lambda _now: 300).run(300)
+    assert len([at for at, _ in run.levels if at > 60]) <= 16
+
+
+def test_what_is_reduced_has_words() -> None:
+    assert [str(step) for step in STEPS[:4]] == ["", "quality 3/4", "quality 1/2", "quality 1/2, size 3/4"]
+    assert str(STEPS[-1]) == "quality 1/2, size 1/4, rate 1/8"
+    assert all(before.cost > after.cost for before, after in pairwise(STEPS))
+
+
+def test_frames_sent_before_a_change_do_not_count() -> None:
+    levels = LevelControl(10, 0.0)
+    assert levels.poll([], 0.6, 1.0)
+    level = levels.level
+    assert not levels.poll([Acknowledged(0.4, 5.0)], 0.0, 5.4)
+    assert not levels.poll([], 5.0, 5.5)
+    assert levels.level == level
+
+
+class TestSendWindow:
+    def test_bytes_are_confirmed_in_order(self) -> None:
+        queue = SendWindow()
+        queue.sent(1000, 1.0)
+        queue.sent(2000, 2.0)
+        assert not queue.poll(3000, 0.0, 2.5)
+        assert not queue.poll(2500, 0.0, 2.5)
+        assert [frame.sent_at for frame in queue.poll(2000, 0.0, 3.0)] == [1.0]
+        assert queue.age_s(0.0, 3.05) == pytest.approx(1.0)
+        assert [frame.took_s for frame in queue.poll(0, 0.1, 4.1)] == [pytest.approx(1.1)]
+        assert queue.age_s(0.0, 9.0) == 0.0
+        assert len(queue) == 0
+
+    @pytest.mark.parametrize(
+        ("real_s", "counted_s"), [(0.0, 0.0), (0.05, 0.0), (0.075, 0.0375), (0.1, 0.1), (3.0, 3.0)]
+    )
+    def test_short_times_may_be_a_late_acknowledgement(self, real_s: float, counted_s: float) -> None:
+        queue = SendWindow()
+        queue.sent(1000, 1.0)
+        assert [frame.took_s for frame in queue.poll(0, 0.2, 1.2 + real_s)] == [pytest.approx(counted_s, abs=1e-6)]
+
+    def test_a_transport_that_measures_nothing_never_holds_anything_back(self) -> None:
+        queue = SendWindow()
+        for number in range(100):
+            queue.sent(10_000, number)
+            assert len(queue.poll(0, 0.0, number)) == 1
+        assert queue.age_s(0.0, 1e6) == 0.0
+
+    def test_a_ping_is_no_frame(self) -> None:
+        queue = SendWindow()
+        queue.sent(1000, 1.0)
+        assert queue.poll(2, 0.0, 1.01)
+
+    def test_a_lost_connection_takes_everything_along(self) -> None:
+        queue = SendWindow()
+        queue.sent(1000, 1.0)
+        queue.clear()
+        assert queue.age_s(0.0, 100.0) == 0.0

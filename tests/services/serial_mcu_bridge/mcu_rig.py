@@ -1,0 +1,335 @@
+"""A scripted self-describing MCU on a real pty, the bridge for it, and a robot's local transport."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import struct
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from pebble.config import Config, parse
+from pebble.errors import PebbleError
+from pebble.runtime.connections import local_transport
+from pebble.runtime.process import view_of
+from pebble.service import Service
+from pebble.services.serial_mcu_bridge.serial_service import bridge_of
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.services.serial_mcu_bridge import mcu_wire as wire
+from tests.services.serial_mcu_bridge.mcu_wire import M, Received
+from tests.support import Broker, until
+from tests.transports.zenoh_net import HubProcess
+
+ROBOT = "rover"
+BASE = f"pebble/robots/{ROBOT}"
+STEP_S = 0.002
+BOOT_S = 0.05  # before the HELLO: a host discards the input from before it opened the port
+
+
+class ScriptedMcu:
+    """Answers DESCRIBE_REQ and PING, acknowledges commands, and sends the frames that a test passes to it.
+
+    ``stream`` sends a payload of its first interface periodically, numbered from 1 each time it is plugged in.
+    """
+
+    def __init__(self, link: Path, manifest: M, *, sends_hello: bool = False) -> None:
+        self.link, self.manifest, self.sends_hello = link, manifest, sends_hello
+        self.answers: Callable[[Received], bytes] = lambda received: wire.frame(
+            wire.ACK, b"", received.interface, received.sequence
+        )
+        self.after_describing = b""
+        self.half = b""  # the partial frame of an earlier host in its buffer when it is plugged in
+        self.silent = False
+        self.received: list[tuple[float, Received]] = []
+        self.plugged_at = 0.0
+        self.samples_sent = 0  # numbered samples since it was plugged in
+        self._stream: tuple[float, bytes, int] | None = None
+        self._next = 0.0
+        self._master = -1
+        self._host = self._hello_sent = False
+        self._boots_until = 0.0
+        self._rest = b""
+        self._lock = threading.Lock()
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def plug(self) -> None:
+        with self._lock:
+            self._master, slave = os.openpty()
+            tty.setraw(slave)
+            os.set_blocking(self._master, False)
+            new = self.link.with_suffix(".new")
+            new.symlink_to(os.ttyname(slave))
+            os.close(slave)
+            self._rest, self._host, self._hello_sent, self.samples_sent = self.half, False, False, 0
+            self.plugged_at = time.monotonic()
+            new.replace(self.link)
+
+    def unplug(self) -> None:
+        with self._lock:
+            self.link.unlink(missing_ok=True)
+            os.close(self._master)
+            self._master = -1
+
+    def send(self, *frames: bytes) -> None:
+        with self._lock:
+            self._write(b"".join(frames))
+
+    def pour(self, data: bytes) -> None:
+        """Write ``data`` as fast as the host reads it."""
+        poller = select.poll()
+        poller.register(self._master, select.POLLOUT)
+        while data:
+            assert poller.poll(5000), "the host does not read"
+            with self._lock, suppress(BlockingIOError):
+                data = data[os.write(self._master, data) :]
+
+    def stream(self, hertz: float, payload: bytes, kind: int = wire.SAMPLE) -> None:
+        with self._lock:
+            self._stream, self._next = (1 / hertz, payload, kind), time.monotonic()
+
+    def commands(self) -> list[Received]:
+        return [received for _, received in list(self.received) if received.kind == wire.CMD]
+
+    def asked(self) -> int:
+        return sum(received.kind == wire.DESCRIBE_REQ for _, received in list(self.received))
+
+    def close(self) -> None:
+        self._ending = True
+        self._thread.join(5)
+        if self._master >= 0:
+            self.unplug()
+
+    def __enter__(self) -> Self:
+        self.plug()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    # -- on its own thread
+
+    def _run(self) -> None:
+        while not self._ending:
+            time.sleep(STEP_S)
+            with self._lock, suppress(OSError):
+                if self._master >= 0:
+                    self._turn()
+
+    def _turn(self) -> None:
+        poller = select.poll()
+        poller.register(self._master, select.POLLIN)
+        events = poller.poll(0)
+        if not events or not events[0][1] & select.POLLHUP:
+            if not self._host:
+                self._host, self._boots_until = True, time.monotonic() + BOOT_S
+            if self.sends_hello and not self._hello_sent and time.monotonic() >= self._boots_until:
+                self._hello_sent = True
+                self._write(wire.frame(wire.HELLO, self.manifest.hello()))
+        if events and events[0][1] & select.POLLIN:
+            *frames, self._rest = (self._rest + os.read(self._master, 65536)).split(b"\0")
+            for stuffed in frames:
+                if stuffed not in (b"", self.half):
+                    self._receive(wire.received(stuffed))
+        if self._host and self._stream is not None and not self.silent:
+            period_s, payload, kind = self._stream
+            while time.monotonic() >= self._next:
+                self._next += period_s
+                self.samples_sent += 1
+                self._write(wire.frame(kind, payload, 1, self.samples_sent, self.samples_sent * 10))
+
+    def _receive(self, received: Received) -> None:
+        self.received.append((time.monotonic(), received))
+        if self.silent:
+            return
+        if received.kind == wire.DESCRIBE_REQ:
+            self._write(wire.frame(wire.DESCRIBE, self.manifest.describe()) + self.after_describing)
+        elif received.kind == wire.PING:
+            self._write(wire.frame(wire.PONG))
+        elif received.kind == wire.CMD:
+            self._write(self.answers(received))
+
+    def _write(self, data: bytes) -> None:
+        if self._master >= 0 and data:
+            os.write(self._master, data)
+
+
+class LocalNetwork:
+    """A robot's local transport of one kind: ``memory``, ``mqtt`` (a real mosquitto) or ``zenoh`` (our hub)."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.kind, self._ends = kind, ExitStack()
+        self.transport: dict[str, Any] = {}
+        self.local_mqtt: dict[str, Any] = {}
+        if kind == "memory":
+            self._memory = MemoryHub()
+        elif kind == "mqtt":
+            broker = self._broker = Broker(folder)
+            self._ends.callback(broker.stop)
+            self.local_mqtt = {"host": "127.0.0.1", "port": broker.port}
+            self._mqtt = MqttSettings(host="127.0.0.1", port=broker.port)
+        else:
+            self._run_dir = folder / "run"
+            hub = HubProcess(self._run_dir).start()
+            self._ends.callback(hub.kill)
+            self.transport = {"kind": "zenoh", "run_dir": str(self._run_dir)}
+
+    def config(self, folder: Path, serial: dict[str, Any], **services: Any) -> Config:
+        raw = {
+            "robot": {"id": ROBOT},
+            "transport": {"kind": "mqtt", **self.transport, "state_dir": str(folder / "state")},
+            "local_mqtt": self.local_mqtt,
+            "services": {"serial_mcu_bridge": serial, **services},
+        }
+        return parse(raw, folder=folder, env={})
+
+    def robots_transport(self, config: Config, name: str, *, as_published: bool = False) -> Transport:
+        """Return the transport that a process of the robot would use."""
+        if self.kind == "memory":
+            return MemoryTransport(name, self._memory)
+        return local_transport(config, name, as_published=as_published)
+
+    def client(self, name: str) -> Transport:
+        if self.kind == "memory":
+            return MemoryTransport(name, self._memory)
+        if self.kind == "mqtt":
+            return create("mqtt", name, self._mqtt)
+        return create("zenoh", name, ZenohSettings(run_dir=self._run_dir, client=True))
+
+    @contextmanager
+    def outage(self) -> Iterator[None]:
+        """Stop the broker meanwhile. MQTT only: peers on Zenoh exchange messages without a hub."""
+        self._broker.kill()
+        yield
+        self._broker.start()
+
+    def close(self) -> None:
+        self._ends.close()
+
+
+class Listener:
+    """A client that subscribes to all outgoing topics of the robot and can send commands."""
+
+    def __init__(self, transport: Transport) -> None:
+        self.received: list[Message] = []
+        self.at: list[float] = []
+        self.transport = transport.open(10)
+        assert transport.state is State.CONNECTED, transport.problem
+        transport.subscribe(f"{BASE}/outgoing/#", self._receive, direct=True)
+
+    def _receive(self, message: Message) -> None:
+        self.at.append(time.monotonic())
+        self.received.append(message)
+
+    def on(self, metric: str) -> list[Message]:
+        return [message for message in list(self.received) if message.topic == f"{BASE}/outgoing/{metric}"]
+
+    def payloads(self, metric: str) -> list[Any]:
+        return [msgspec.json.decode(message.payload) for message in self.on(metric) if message.payload]
+
+    def first(self, metric: str) -> float:
+        """Return when the first message on this topic was received."""
+        pairs = zip(list(self.received), list(self.at), strict=False)
+        return next(at for message, at in pairs if message.topic == f"{BASE}/outgoing/{metric}")
+
+    def retained(self, metric: str) -> list[bytes]:
+        """Return the payload of the newest message on a topic; an empty list if that message cleared the topic."""
+        return [message.payload for message in self.on(metric)[-1:] if message.payload]
+
+    def command(self, metric: str, body: Any, *, retain: bool = False) -> None:
+        raw = body if isinstance(body, bytes) else json.dumps(body).encode()
+        assert self.transport.publish(f"{BASE}/incoming/{metric}", raw, qos=QoS.DELIVERED, retain=retain)
+
+
+class Running:
+    """Runs a service on a thread of its own, as its process would; ``error`` is what ended it."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.error: PebbleError | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.service.run()
+        except PebbleError as error:
+            self.error = error
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def stop(self) -> None:
+        self.service.quit()
+        self._thread.join(10)
+        assert not self._thread.is_alive(), "the service does not end"
+
+
+class Rig:
+    """A local transport, a subscriber, and any number of serial lines with one MCU each, by instance name."""
+
+    def __init__(self, kind: str, folder: Path) -> None:
+        self.folder, self._ends = folder, ExitStack()
+        self.network = LocalNetwork(kind, folder)
+        self._ends.callback(self.network.close)
+        self.world = self.listener("world")
+        self._config: Config | None = None
+        self.lines: dict[str, Running] = {}
+        self.mcus: dict[str, ScriptedMcu] = {}
+
+    def listener(self, name: str) -> Listener:
+        listener = Listener(self.network.client(name))
+        self._ends.callback(listener.transport.close)
+        return listener
+
+    def mcu(self, manifest: M, name: str = "one", *, plugged: bool = True, sends_hello: bool = False) -> ScriptedMcu:
+        mcu = self.mcus[name] = ScriptedMcu(self.folder / name, manifest, sends_hello=sends_hello)
+        self._ends.callback(mcu.close)
+        if plugged:
+            mcu.plug()
+        return mcu
+
+    def bridge(self, name: str = "one", protocol: str = "pebble_serial_v1", **section: Any) -> Running:
+        """Start the service for the MCU of that name; ``section`` is the rest of its config."""
+        line = {"enabled": True, "protocol": protocol, "serial": {"port": str(self.folder / name)}, **section}
+        config = view_of(self.network.config(self.folder, {"instances": {name: line}}), name)
+        transport = self.network.robots_transport(config, f"serial-{name}")
+        running = self.lines[name] = Running(bridge_of(config)(config, transport, instance=name))
+        self._ends.callback(running.stop)
+        return running
+
+    def claimed(self, name: str = "one") -> bool:
+        """Wait until other devices have had time to object to the aliases, and those of commands are subscribed to."""
+        service, done = self.lines[name].service, threading.Event()
+        if not until(lambda: service._aliases.permitted, 5):  # type: ignore[attr-defined]
+            return False
+        service.post(done.set)  # the subscriptions are made by the job that permits
+        return done.wait(5)
+
+    def close(self) -> None:
+        self._ends.close()
+
+
+def motion(ax: int = 9807) -> bytes:
+    """A payload of the inertial sensor's first interface."""
+    return struct.pack("<9h", ax, -20, 3, 100, -100, 1, 2512, 33, -7)
+
+
+def summary() -> bytes:
+    return struct.pack("<H3hIIH", 1001, 5, -6, 7, 1000, 2, 200)
+
+
+def wait_for_payload(listener: Listener, metric: str) -> bool:
+    return until(lambda: listener.payloads(metric), 5)

@@ -1,0 +1,458 @@
+"""Interfaces that are local_only never leave the robot: the rule alone, and with real bridges."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pebble.forwarding.forwarder import Gate
+from pebble.services.mqtt_bridge.private_topics import PrivateTopics
+from pebble.services.mqtt_bridge.service import MqttBridge
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
+from pebble.transports import Message, MqttSettings, create
+from tests.services.mqtt_bridge.bridge_rig import gate_of
+from tests.services.serial_mcu_bridge import mcu_wire as wire
+from tests.services.serial_mcu_bridge.mcu_rig import BASE, Listener, Rig, Running, motion, wait_for_payload
+from tests.services.serial_mcu_bridge.mcu_wire import IMU, F, I, M
+from tests.support import Broker, until
+
+OUT = f"{BASE}/outgoing"
+#: One interface of each kind, private and public, and an inertial sensor with channels outside the contract.
+SPY = M("spy-1", (
+    I(1, "fast", wire.OUT, wire.KIND_SAMPLE, (F("v", wire.U8),), "lab/fast", "", wire.LOCAL_ONLY),
+    I(2, "slow", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "lab/slow", "", wire.RETAIN),
+    I(3, "secret", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "lab/secret", "", wire.RETAIN | wire.LOCAL_ONLY),
+    I(4, "set", wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), "lab/set"),
+    I(5, "tune", wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), "lab/tune", "", wire.LOCAL_ONLY),
+    *wire.imu_interfaces(6, channels=("lab/imu-fast", "lab/imu")),
+))  # fmt: skip
+PRIVATE = ("mcu/spy-1/fast", "lab/fast", "mcu/spy-1/secret", "lab/secret", "mcu/spy-1/imu_fast", "lab/imu-fast")
+
+
+def manifest(which: M = SPY) -> bytes:
+    return msgspec.json.encode(parse_describe(which.describe()).payload())
+
+
+def described(which: M = SPY, uid: str = "spy-1") -> Message:
+    return Message(f"{OUT}/mcu/{uid}/describe", manifest(which), retain_requested=True)
+
+
+def sample(interface: str, uid: str = "spy-1") -> bytes:
+    body = {"t": 1, "seq": 1, "mcu_ms": 1, "device_uid": uid, "interface": interface, "profile": "", "value": {"v": 1}}
+    return json.dumps(body).encode()
+
+
+def value(metric: str, interface: str, **more: Any) -> Message:
+    return Message(f"{OUT}/{metric}", sample(interface), **more)
+
+
+@pytest.fixture
+def topics() -> PrivateTopics:
+    return PrivateTopics(BASE)
+
+
+def passed(topics: PrivateTopics, message: Message) -> list[str]:
+    return [admitted.topic.removeprefix(f"{OUT}/") for admitted in topics.admit(message)]
+
+
+def test_what_is_private_stays_and_what_is_not_passes(topics: PrivateTopics) -> None:
+    assert passed(topics, described()) == ["mcu/spy-1/describe"]
+    for metric, interface in (("mcu/spy-1/fast", "fast"), ("lab/fast", "fast"), ("mcu/spy-1/secret", "secret")):
+        assert passed(topics, value(metric, interface)) == []
+    for metric, interface in (("mcu/spy-1/slow", "slow"), ("lab/slow", "slow")):
+        assert passed(topics, value(metric, interface)) == [metric]
+    assert topics.is_known(f"{BASE}/incoming/mcu/spy-1/tune")
+    assert topics.is_known(f"{BASE}/incoming/lab/tune")
+    assert not topics.is_known(f"{BASE}/incoming/lab/set")
+
+
+@pytest.mark.parametrize("metric", ["mcu/spy-1/fast", "lab/fast", "anywhere/else"])
+def test_a_private_value_before_its_manifest_is_dropped(topics: PrivateTopics, metric: str) -> None:
+    assert passed(topics, value(metric, "fast")) == []
+    assert passed(topics, described()) == ["mcu/spy-1/describe"]
+    assert passed(topics, value(metric, "fast")) == []
+
+
+@pytest.mark.parametrize("more", [{"retain": True}, {"retain_requested": True}])
+def test_a_retained_value_waits_for_its_manifest(topics: PrivateTopics, more: dict[str, bool]) -> None:
+    """Retained messages arrive in any order, and later subscribers need the state of a socket."""
+    for metric, interface in (("mcu/spy-1/slow", "slow"), ("lab/slow", "slow"), ("lab/secret", "secret")):
+        assert passed(topics, value(metric, interface, **more)) == []
+    assert passed(topics, described()) == ["mcu/spy-1/describe", "mcu/spy-1/slow", "lab/slow"]
+    assert passed(topics, described()) == ["mcu/spy-1/describe"]
+
+
+def test_a_cleared_retained_value_is_not_forwarded_later(topics: PrivateTopics) -> None:
+    for metric in ("mcu/spy-1/slow", "lab/slow"):
+        assert passed(topics, value(metric, "slow", retain=True)) == []
+        assert passed(topics, Message(f"{OUT}/{metric}", b"", retain_requested=True)) == [metric]
+    assert passed(topics, described()) == ["mcu/spy-1/describe"]
+
+
+@pytest.mark.parametrize("first", ["the manifest", "the value"])
+def test_values_published_while_private_stay_private_after_new_firmware_is_public(
+    topics: PrivateTopics, first: str
+) -> None:
+    secret = value("mcu/spy-1/secret", "secret", retain_requested=True)
+    for message in (described(), secret) if first == "the manifest" else (secret, described()):
+        topics.admit(message)
+    opened = SPY.but(interfaces=tuple(I(**{**vars(one), "flags": wire.RETAIN}) for one in SPY.interfaces))
+    assert passed(topics, described(opened)) == ["mcu/spy-1/describe"]
+    assert passed(topics, secret) == ["mcu/spy-1/secret"]
+
+
+def test_uid_queries_do_not_leave_the_robot(topics: PrivateTopics) -> None:
+    assert topics.is_known(f"{BASE}/incoming/mcu/spy-1/describe")
+    assert not topics.is_known(f"{BASE}/incoming/mcu/spy-1/set")
+    assert not topics.is_known(f"{BASE}/outgoing/mcu/spy-1/describe")
+
+
+def test_new_firmware_may_hide_what_was_public(topics: PrivateTopics) -> None:
+    passed(topics, described())
+    hidden = SPY.but(interfaces=(SPY.interfaces[0], I(**{**vars(SPY.interfaces[1]), "flags": wire.LOCAL_ONLY})))
+    assert passed(topics, Message(f"{OUT}/mcu/spy-1/describe", b"", retain_requested=True)) == ["mcu/spy-1/describe"]
+    assert passed(topics, value("lab/slow", "slow")) == []
+    passed(topics, described(hidden))
+    assert passed(topics, value("lab/slow", "slow")) == []
+
+
+def test_retracting_always_passes_unless_it_is_private(topics: PrivateTopics) -> None:
+    passed(topics, described())
+    assert passed(topics, Message(f"{OUT}/mcu/spy-1/slow", b"", retain_requested=True)) == ["mcu/spy-1/slow"]
+    assert passed(topics, Message(f"{OUT}/mcu/spy-1/secret", b"", retain_requested=True)) == []
+
+
+@pytest.mark.parametrize("payload", [b"", b"{", b'{"device_uid": 5}', b'["device_uid"]', b"\xff\xfe", sample("slow")])
+def test_nonsense_is_neither_an_error_nor_held_back(topics: PrivateTopics, payload: bytes) -> None:
+    passed(topics, described())
+    assert passed(topics, Message(f"{OUT}/strange", payload)) == ["strange"]
+    assert passed(topics, value("lab/slow", "slow")) == ["lab/slow"]
+
+
+def test_others_are_not_concerned(topics: PrivateTopics) -> None:
+    for topic in (f"{OUT}/charging-level", f"{BASE}/incoming/drive-values", "elsewhere/entirely"):
+        assert topics.admit(Message(topic, b'{"value": 1}')) == [Message(topic, b'{"value": 1}')]
+
+
+def test_memory_is_bounded(topics: PrivateTopics) -> None:
+    for number in range(1000):
+        topics.admit(Message(f"{OUT}/mcu/u{number}/x", b"{}", retain_requested=True))
+        topics.admit(described(SPY, f"d{number}"))
+    assert len(topics._waiting) <= 256
+    assert len(topics._devices) <= 256
+
+
+# -- manifests that are only partly readable
+
+PLAIN: dict[str, Any] = json.loads(manifest())
+#: Replacements for any value of a manifest; ``...`` removes the key.
+ODD = (..., None, 5, -0.5, True, "", "nonsense", "a/b", "+", "x" * 5000, [], {}, [None], {"a": 1})
+#: The generic topic and the alias of each interface.
+TOPICS = {
+    one["name"]: [f"{way}/mcu/spy-1/{one['name']}", f"{way}/{one['channel']}"]
+    for one in PLAIN["interfaces"]
+    for way in ["incoming" if one["dir"] == "in" else "outgoing"]
+}
+HIDDEN = {name for name in TOPICS if next(one for one in PLAIN["interfaces"] if one["name"] == name).get("local_only")}
+
+
+def without_holes(plain: dict[str, Any]) -> dict[str, Any]:
+    return {key: given for key, given in plain.items() if given is not ...}
+
+
+def announced(raw: bytes | dict[str, Any]) -> Message:
+    payload = raw if isinstance(raw, bytes) else json.dumps(without_holes(raw)).encode()
+    return Message(f"{OUT}/mcu/spy-1/describe", payload, retain_requested=True)
+
+
+def with_interface(which: str, entry: object) -> dict[str, Any]:
+    return {**PLAIN, "interfaces": [entry if one["name"] == which else one for one in PLAIN["interfaces"]]}
+
+
+def opened() -> Message:
+    """Return a manifest of the same MCU with all interfaces public."""
+    return announced({**PLAIN, "interfaces": [{**one, "local_only": False} for one in PLAIN["interfaces"]]})
+
+
+def leaving(topics: PrivateTopics) -> set[str]:
+    """Return the interfaces of which any message passes: with a full, a partial or an unrelated body."""
+    left = set()
+    for name, suffixes in TOPICS.items():
+        bodies = [sample(name), b'{"device_uid": "spy-1", "interface": "%s"}' % name.encode(), b'{"speed": 1}']
+        for suffix, body in itertools.product(suffixes, bodies):
+            left |= {name for _ in topics.admit(Message(f"{BASE}/{suffix}", body))}
+    return left
+
+
+def test_of_a_whole_manifest_only_what_is_public_leaves(topics: PrivateTopics) -> None:
+    topics.admit(opened())
+    assert leaving(topics) == set(TOPICS)
+    topics.admit(announced(PLAIN))
+    assert leaving(topics) == set(TOPICS) - HIDDEN != set(TOPICS)
+
+
+@pytest.mark.parametrize("key", [key for key in PLAIN if key != "interfaces"])
+def test_the_rest_of_a_manifest_may_be_missing_or_odd(topics: PrivateTopics, key: str) -> None:
+    for odd in ODD:
+        topics.admit(opened())
+        topics.admit(announced({**PLAIN, key: odd}))
+        assert leaving(topics) == set(TOPICS) - HIDDEN, odd
+
+
+def test_interfaces_alone_are_enough(topics: PrivateTopics) -> None:
+    topics.admit(opened())
+    assert passed(topics, announced({"interfaces": PLAIN["interfaces"]})) == ["mcu/spy-1/describe"]
+    assert leaving(topics) == set(TOPICS) - HIDDEN
+
+
+#: Replacements that are valid: other names.
+MEANT = {"name": ("nonsense",), "channel": ("", "nonsense", "a/b")}
+
+
+@pytest.mark.parametrize("key", sorted({key for one in PLAIN["interfaces"] for key in one} - {"local_only"}))
+def test_the_rest_of_an_interface_may_be_missing_or_odd(topics: PrivateTopics, key: str) -> None:
+    unreadable = [odd for odd in ODD if odd not in MEANT.get(key, ())]
+    for which, odd in itertools.product(sorted(HIDDEN), unreadable):
+        one = next(one for one in PLAIN["interfaces"] if one["name"] == which)
+        topics.admit(opened())
+        topics.admit(announced(with_interface(which, without_holes({**one, key: odd}))))
+        assert leaving(topics) == set(TOPICS) - HIDDEN, (which, odd)
+
+
+@pytest.mark.parametrize("odd", [odd for odd in ODD if odd is not ...])
+def test_only_false_makes_an_interface_public(topics: PrivateTopics, odd: object) -> None:
+    for which in TOPICS:
+        one = next(one for one in PLAIN["interfaces"] if one["name"] == which)
+        topics.admit(announced(with_interface(which, {**one, "local_only": odd})))
+        assert leaving(topics) == set(TOPICS) - HIDDEN - {which}
+
+
+@pytest.mark.parametrize("odd", [odd for odd in ODD if odd is not ...])
+def test_an_interface_that_cannot_be_read_stays_and_the_others_do_not(topics: PrivateTopics, odd: object) -> None:
+    for which in TOPICS:
+        topics.admit(opened())
+        topics.admit(announced(with_interface(which, odd)))
+        assert leaving(topics) == set(TOPICS) - HIDDEN - {which}
+        assert {name for name in TOPICS if topics.is_known(f"{BASE}/{TOPICS[name][1]}")} == HIDDEN | {which}
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        *({**PLAIN, "interfaces": odd} for odd in ODD if odd != []),
+        *(json.dumps(odd).encode() for odd in ODD if odd is not ...),
+        b"nonsense",
+        manifest()[:-1],
+        manifest().replace(b"spy-1", b"\xff"),
+        b'{"a": ' + b"[" * 50 + b"]" * 50 + b"," + manifest()[1:],
+    ],
+)
+def test_without_interfaces_nothing_of_the_mcu_leaves(topics: PrivateTopics, raw: bytes | dict[str, Any]) -> None:
+    assert passed(topics, announced(raw)) == []
+    assert [suffix for suffixes in TOPICS.values() for suffix in suffixes[:1]
+            if topics.admit(Message(f"{BASE}/{suffix}", b"1"))] == []  # fmt: skip
+    topics.admit(opened())
+    assert passed(topics, announced(raw)) == []
+    assert leaving(topics) == set()
+    assert all(topics.is_known(f"{BASE}/{suffix}") for suffixes in TOPICS.values() for suffix in suffixes)
+    topics.admit(announced(PLAIN))
+    assert leaving(topics) == set(TOPICS) - HIDDEN
+
+
+def test_a_manifest_that_cannot_be_read_concerns_no_other_mcu(topics: PrivateTopics) -> None:
+    topics.admit(described(SPY, "spy-2"))
+    topics.admit(announced(b"nonsense"))
+    assert passed(topics, Message(f"{OUT}/mcu/spy-2/slow", b"1")) == ["mcu/spy-2/slow"]
+
+
+_json = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+_interface = st.fixed_dictionaries(
+    {},
+    optional={
+        "name": st.sampled_from(sorted(TOPICS)) | _json,
+        "dir": st.sampled_from(["in", "out"]) | _json,
+        "channel": st.sampled_from(sorted(suffixes[1].partition("/")[2] for suffixes in TOPICS.values())) | _json,
+        "local_only": st.booleans() | _json,
+        "encoding": _json,
+    },
+)
+_manifest = st.fixed_dictionaries(
+    {}, optional={"interfaces": st.lists(_interface | _json, max_size=5) | _json, "schema_version": _json, "x": _json}
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.lists(_manifest | _json, min_size=1, max_size=3))
+def test_all_readable_parts_of_any_manifest_are_retained(manifests: list[Any]) -> None:
+    topics = PrivateTopics(BASE)
+    topics.admit(opened())
+    for plain in manifests:
+        topics.admit(announced(json.dumps(plain).encode()))
+    entries = [one for one in as_list(as_dict(plain).get("interfaces")) if isinstance(one, dict)]
+    private = {
+        (way, str(one.get(key)))
+        for one in entries
+        for key, way in itertools.product(("name", "channel"), ways(one))
+        if one.get("local_only", False) is not False
+    }
+    public = {
+        str(one.get("name")) for one in entries if one.get("local_only", False) is False and "outgoing" in ways(one)
+    }
+    messages = {
+        (name, suffix): Message(f"{BASE}/{suffix}", body)
+        for name, suffixes in TOPICS.items()
+        for suffix, body in zip(suffixes, (b"1", sample(name)), strict=True)
+    }
+    left = {place for place, message in messages.items() if topics.admit(message)}
+    assert {name for name, suffix in left if suffix.startswith("outgoing/")} <= public
+    assert {(suffix.partition("/")[0], name) for name, suffix in left} & private == set()
+    raw = {suffix for _, suffix in messages if topics.admit(Message(f"{BASE}/{suffix}", b"1"))}
+    assert {(suffix.partition("/")[0], suffix.partition("/")[2]) for suffix in raw} & private == set()
+
+
+def as_dict(plain: object) -> dict[str, Any]:
+    return plain if isinstance(plain, dict) else {}
+
+
+def as_list(plain: object) -> list[Any]:
+    return plain if isinstance(plain, list) else []
+
+
+def ways(one: dict[str, Any]) -> tuple[str, ...]:
+    """Return the directions of an interface; both if its direction is not readable."""
+    given_ = one.get("dir")
+    return ("incoming",) if given_ == "in" else ("outgoing",) if given_ == "out" else ("incoming", "outgoing")
+
+
+# -- with real bridges
+
+
+@pytest.fixture(params=["mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig(request.param, tmp_path)
+    yield rig
+    rig.close()
+
+
+class World:
+    """A remote broker, an operator that subscribes to everything there, and a bridge that can be restarted."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.broker = Broker(rig.folder)
+        self.operator = Listener(create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=self.broker.port)))
+        self.bridge: Running | None = None
+
+    def start(self) -> None:
+        section = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": self.broker.port}}
+        config = self.rig.network.config(self.rig.folder, {}, mqtt_bridge=section)
+        service = MqttBridge(config, self.rig.network.robots_transport(config, "local-bridge", as_published=True))
+        self.bridge = Running(service)
+        assert until(lambda: gate_of(service) is Gate.OPEN)
+
+    def stop(self) -> None:
+        if self.bridge is not None:
+            self.bridge.stop()
+            self.bridge = None
+
+    def close(self) -> None:
+        self.stop()
+        self.operator.transport.close()
+        self.broker.stop()
+
+
+@pytest.fixture
+def world(rig: Rig) -> Iterator[World]:
+    world = World(rig)
+    yield world
+    world.close()
+
+
+def test_nothing_private_leaves_the_robot_in_any_start_order(rig: Rig, world: World) -> None:
+    world.start()  # the first time before the MCU is known
+    mcu = rig.mcu(SPY)
+    line = rig.bridge()
+    assert wait_for_payload(rig.world, "mcu/spy-1/describe")
+    mcu.stream(300, b"\1")
+    assert wait_for_payload(rig.world, "lab/fast")
+    for round_ in range(4):  # then while the MCU sends values
+        world.stop()
+        mcu.send(wire.frame(wire.STATE, bytes([round_]), 2), wire.frame(wire.STATE, bytes([round_]), 3))
+        mcu.send(wire.frame(wire.SAMPLE, motion(), 6), wire.frame(wire.STATE, b"\0" * 18, 7))
+        world.start()
+        mcu.send(wire.frame(wire.STATE, bytes([round_ + 100]), 2), wire.frame(wire.SAMPLE, motion(), 6))
+        assert until(
+            lambda r=round_: r + 100 in [body["value"]["v"] for body in world.operator.payloads("lab/slow")], 5
+        )
+    mcu.unplug()
+    assert until(lambda: world.operator.retained("mcu/spy-1/describe") == [])
+    mcu.plug()
+    assert until(lambda: world.operator.retained("mcu/spy-1/describe"))
+    time.sleep(0.5)
+    line.stop()
+    assert until(lambda: world.operator.retained("lab/slow") == [])
+    received = {message.topic.removeprefix(f"{OUT}/") for message in world.operator.received}
+    assert {metric for metric in PRIVATE if rig.world.on(metric)} == set(PRIVATE), "they were published locally"
+    assert received & set(PRIVATE) == set()
+    assert {"mcu/spy-1/slow", "lab/slow", "mcu/spy-1/describe"} <= received
+
+
+def test_a_late_operator_receives_the_retained_state_of_a_public_interface(rig: Rig, world: World) -> None:
+    mcu = rig.mcu(SPY)
+    rig.bridge()
+    assert wait_for_payload(rig.world, "mcu/spy-1/describe")
+    assert rig.claimed()
+    mcu.send(wire.frame(wire.STATE, b"\7", 2), wire.frame(wire.STATE, b"\7", 3))
+    assert wait_for_payload(rig.world, "lab/secret")
+    world.start()
+    assert until(lambda: world.operator.payloads("lab/slow") and world.operator.payloads("mcu/spy-1/slow"))
+    assert world.operator.on("lab/secret") == []
+
+
+def test_private_commands_are_for_the_robot_only(rig: Rig, world: World) -> None:
+    mcu = rig.mcu(SPY)
+    rig.bridge()
+    world.start()
+    assert wait_for_payload(world.operator, "mcu/spy-1/describe")
+    assert rig.claimed()
+
+    def received(value: int) -> list[int]:
+        return [command.interface for command in mcu.commands() if command.payload == bytes([value])]
+
+    def samples_under_alias() -> list[int]:
+        """Send a command to the alias: its start is not announced, so the test tries until one arrives."""
+        world.operator.command("lab/set", {"v": 3})
+        return received(3)
+
+    assert until(samples_under_alias, step=0.2)
+    for metric in ("mcu/spy-1/tune", "lab/tune", "mcu/spy-1/set", "lab/set"):
+        world.operator.command(metric, {"v": 1})
+    assert until(lambda: len(received(1)) == 2)
+    rig.world.command("lab/tune", {"v": 2})
+    assert until(lambda: received(2))
+    assert (received(1), received(2)) == ([4, 4], [5])
+
+
+def test_the_inertial_sensor_of_the_original(rig: Rig, world: World) -> None:
+    mcu = rig.mcu(IMU)
+    rig.bridge()
+    world.start()
+    mcu.stream(100, motion())
+    assert wait_for_payload(rig.world, "sensors/imu-fast")
+    assert wait_for_payload(world.operator, "mcu/goob-imu-nano/describe")
+    assert rig.claimed()
+    assert world.operator.on("sensors/imu-fast") == []
+    assert world.operator.on("mcu/goob-imu-nano/imu_fast") == []

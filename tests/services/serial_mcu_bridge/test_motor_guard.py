@@ -1,0 +1,263 @@
+"""The guard of a Linux robot's motors: what it publishes, saves and refuses. The rules themselves: tests/motion."""
+
+import json
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from msgspec import structs
+
+from pebble.contract.payloads import Drive, EstopCommand, EstopReset, EstopState
+from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
+from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
+from pebble.transports.counters import Counters
+from tests.support import until
+
+A, B = "00000000000000aa", "00000000000000bb"
+SCRIPT = Drive(z=0.5, source="autonomy", run=7)
+
+
+class Rig:
+    """A guard on a clock that the test moves; writes end when the test waits for them."""
+
+    def __init__(self, path: Path) -> None:
+        self.now = 100.0
+        self.states: list[EstopState] = []
+        self.counters = Counters()
+        self._results: list[tuple[int, bool]] = []
+        self.file = StateFile(path, lambda number, succeeded: self._results.append((number, succeeded)))
+        self.barred_file = StateFile(path.with_name("barred.json"))
+        self.guard = MotorGuard(
+            self.file, self.barred_file, self.states.append, self.counters, watchdog_s=0.75, now=self.now
+        )
+        self.guard.begin(self.now)
+
+    def stop(self, name: str = A, **texts: str) -> None:
+        self.guard.stop(EstopCommand(stop=name, **texts), self.now)
+
+    def reset(self, state: EstopState, age_s: float = 0.0) -> None:
+        self.guard.reset(EstopReset(boot=state.boot, count=state.count), age_s, self.now)
+
+    def written(self) -> bool:
+        """Wait until the file's thread has written, and pass the result on."""
+        assert until(lambda: self._results)
+        succeeded = self._results[-1][1]
+        self.guard.on_saved(*self._results.pop(), self.now)
+        self._results.clear()
+        return succeeded
+
+    def advance(self, seconds: float) -> None:
+        self.now += seconds
+        self.guard.tick(self.now)
+
+    def close(self) -> None:
+        self.file.close()
+        self.barred_file.close()
+
+    @property
+    def state(self) -> EstopState:
+        return self.guard.state()
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "state" / "estop-serial.json"
+
+
+@pytest.fixture
+def rig(path: Path) -> Iterator[Rig]:
+    rig = Rig(path)
+    rig.advance(3)
+    yield rig
+    rig.close()
+
+
+def test_it_begins_free_and_publishes_that(rig: Rig) -> None:
+    (first,) = rig.states
+    assert (first.latched, first.count, first.recent, first.persisted) == (False, 0, [], True)
+    assert len(first.boot) == 8
+    assert rig.guard.judge(Drive(z=1), rig.now) == 0.75
+
+
+def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: Path) -> None:
+    rig.stop(A, by="eve", why="a test")
+    assert (rig.states[-1].latched, rig.states[-1].recent, rig.states[-1].persisted) == (True, [A], False)
+    assert rig.written()
+    assert (rig.states[-1].latched, rig.states[-1].persisted, rig.states[-1].by) == (True, True, "eve")
+    assert json.loads(path.read_text())["latched"] is True
+    assert rig.guard.judge(Drive(z=1), rig.now) is None
+    assert rig.counters["latched"] == 1
+
+
+def test_a_stop_without_a_name_gets_one(rig: Rig) -> None:
+    rig.guard.stop(EstopCommand(), rig.now)
+    rig.guard.stop(EstopCommand(), rig.now)
+    assert len(set(rig.state.recent)) == rig.state.count == 2
+
+
+def test_at_most_four_states_a_second_and_the_last_one_is_published(rig: Rig) -> None:
+    before = len(rig.states)
+    for number in range(90):
+        rig.stop(f"{number:016x}")
+        rig.advance(0.01)
+    assert len(rig.states) - before == 4
+    assert rig.guard.due is not None
+    rig.advance(1)
+    assert rig.states[-1].count == 90
+    assert rig.states[-1].recent[0] == f"{89:016x}"
+
+
+def test_repetitions_do_not_delay_the_state_that_confirms_a_stop(rig: Rig) -> None:
+    for _ in range(10):
+        rig.stop(A)
+        rig.advance(0.01)
+    assert rig.written()
+    assert (rig.states[-1].recent, rig.states[-1].persisted) == ([A], True)
+
+
+def test_a_later_repetition_gets_the_state_again(rig: Rig) -> None:
+    rig.stop(A)
+    assert rig.written()
+    before = len(rig.states)
+    rig.advance(0.5)
+    rig.stop(A)
+    assert rig.states[before:] == [rig.state]
+
+
+def test_a_restart_begins_as_it_was(rig: Rig, path: Path) -> None:
+    rig.stop(A, by="eve", why="a test")
+    assert rig.written()
+    again = Rig(path)
+    assert (again.state.latched, again.state.recent, again.state.by, again.state.why) == (True, [A], "eve", "a test")
+    assert again.state.boot != rig.state.boot
+    assert again.state.persisted is False  # written again: who wrote it may have been killed before it was durable
+    assert again.written()
+    assert again.states[-1].persisted is True
+    again.reset(rig.state)
+    assert (again.state.latched, again.state.reset_refused) == (True, "boot")
+    again.reset(again.state)
+    assert not again.state.latched
+    assert again.written()
+    free = Rig(path)
+    assert (free.state.latched, free.state.recent) == (False, [A])
+    free.stop(A)
+    assert not free.state.latched  # a repetition of the stop that was reset
+    again.file.close()
+
+
+@pytest.mark.parametrize("content", ["", "null", "[]", '{"latched": 1, "recent": []}', '{"latched": false}'])
+def test_a_file_that_is_none_of_ours_counts_as_a_stop(path: Path, content: str) -> None:
+    path.parent.mkdir()
+    path.write_text(content)
+    rig = Rig(path)
+    assert rig.state.latched
+
+
+def test_where_nothing_can_be_saved_persisted_is_null(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    rig = Rig(tmp_path / "file" / "estop.json")
+    rig.stop()
+    assert (rig.states[-1].latched, rig.states[-1].persisted) == (True, None)
+
+
+def test_a_failed_write_is_published_and_repeated(rig: Rig, path: Path) -> None:
+    path.mkdir(parents=True)
+    rig.stop()
+    assert not rig.written()
+    assert rig.states[-1].persisted is False
+    path.rmdir()
+    rig.guard.save_again()
+    rig.advance(1)
+    assert rig.written()
+    assert rig.states[-1].persisted is True
+    rig.guard.save_again()
+    assert rig.guard.persisted
+
+
+def test_a_write_that_takes_long_is_not_repeated_until_it_has_ended(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a disk that takes longer than the pause between two attempts would never have the newest state."""
+    may_end = threading.Event()
+    sync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda file: may_end.wait(10) and sync(file))
+    rig.stop()
+    for _ in range(3):
+        rig.guard.save_again()
+    may_end.set()
+    assert rig.written()
+    assert rig.state.persisted is True
+
+
+def test_a_reset_is_obeyed_only_for_the_newest_state_and_if_it_is_fresh(rig: Rig) -> None:
+    rig.stop(A)
+    seen = rig.state
+    rig.stop(B)
+    rig.reset(seen)
+    assert (rig.state.latched, rig.state.reset_refused) == (True, "count")
+    rig.reset(rig.state, age_s=1.0)
+    assert (rig.state.latched, rig.state.reset_refused) == (True, "old")
+    rig.reset(rig.state, age_s=0.9)
+    assert (rig.state.latched, rig.state.reset_refused) == (False, None)
+
+
+def test_a_barred_run_is_published(rig: Rig) -> None:
+    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
+    assert rig.state.barred == 6
+    assert rig.guard.judge(Drive(), rig.now) == 0
+    assert rig.states[-1].barred == 7
+    assert rig.guard.judge(SCRIPT, rig.now + 10) is None
+    assert rig.counters["overruled"] == 1
+
+
+def test_a_run_stays_barred_when_the_process_is_killed_and_starts_again(rig: Rig, path: Path) -> None:
+    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
+    assert rig.guard.judge(Drive(), rig.now) == 0
+    rig.close()
+    again = Rig(path)
+    assert again.state.barred == 7
+    again.advance(10)
+    assert again.guard.judge(SCRIPT, again.now) is None
+    assert again.guard.judge(structs.replace(SCRIPT, run=8), again.now) == 0.75
+    again.close()
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "-1", "true", "1.5", "1073741824"])
+def test_a_file_of_barred_runs_that_is_none_of_ours_bars_nothing(path: Path, content: str) -> None:
+    path.parent.mkdir()
+    path.with_name("barred.json").write_text(content)
+    rig = Rig(path)
+    rig.advance(3)
+    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
+    rig.close()
+
+
+def test_a_person_who_was_lost_bars_the_run_at_the_end_of_the_hold_without_any_further_command(rig: Rig) -> None:
+    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
+    assert rig.guard.judge(Drive(z=1, valid_ms=400), rig.now) == 0.4
+    assert rig.guard.due is not None
+    rig.advance(1.9)
+    assert rig.state.barred == 6
+    rig.advance(0.2)
+    rig.advance(1)
+    assert rig.states[-1].barred == 7
+    assert rig.guard.due is None
+
+
+def test_the_largest_state_has_400_bytes_at_most(rig: Rig) -> None:
+    rig.guard.judge(Drive(source="autonomy", run=(1 << 30) - 1), rig.now)
+    for number in range(1000):
+        rig.stop(f"{number:016x}", by="b" * 32, why="w" * 40)
+    rig.reset(EstopState(latched=True, boot="", count=1000, recent=[], by="", why="", since=0), 0.0)
+    rig.guard.reset(EstopReset(boot=rig.state.boot, count=7), 0.0, rig.now)
+    assert len(msgspec.json.encode(rig.state)) <= 400
+
+
+def test_a_state_can_be_repeated_for_brokers_that_have_an_older_one(rig: Rig) -> None:
+    rig.stop()
+    assert rig.written()
+    rig.advance(5)
+    before = len(rig.states)
+    rig.guard.repeat_state(rig.now)
+    assert rig.states[before:] == [rig.state]

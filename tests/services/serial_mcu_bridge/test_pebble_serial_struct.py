@@ -1,0 +1,147 @@
+"""struct_v1, encoded and decoded: every type, scaled or not, and values that a field cannot hold."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pebble.errors import PayloadError
+from pebble.services.serial_mcu_bridge.pebble_serial_v1 import struct_v1
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import Field, FieldType, pack, size, unpack
+
+INTEGERS = {
+    FieldType.U8: ("B", 0, 2**8 - 1),
+    FieldType.I8: ("b", -(2**7), 2**7 - 1),
+    FieldType.U16: ("H", 0, 2**16 - 1),
+    FieldType.I16: ("h", -(2**15), 2**15 - 1),
+    FieldType.U32: ("I", 0, 2**32 - 1),
+    FieldType.I32: ("i", -(2**31), 2**31 - 1),
+}
+f32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
+scales = st.sampled_from([1.0, 0.001, 0.01, 0.1, 0.5, 2.0, 10.0, -1.0, -0.25, 100.0])
+offsets = st.sampled_from([0.0, 1.0, -40.0, 0.5, 273.15])
+
+
+@pytest.mark.parametrize(("kind", "code", "low", "high"), [(kind, *rest) for kind, rest in INTEGERS.items()])
+def test_integers_stay_integers(kind: FieldType, code: str, low: int, high: int) -> None:
+    field = (Field("v", kind),)
+    for number in (low, high, 0, 1, high // 2):
+        raw = struct.pack("<" + code, number)
+        assert unpack(field, raw) == {"v": number}
+        assert type(unpack(field, raw)["v"]) is int
+        assert pack(field, {"v": number}) == raw
+    for number in (low - 1, high + 1, 10**400, -(10**400)):
+        with pytest.raises(PayloadError, match="v is"):
+            pack(field, {"v": number})
+
+
+@given(st.sampled_from(sorted(INTEGERS)), scales, offsets, st.data())
+def test_scaled_integers_there_and_back(kind: FieldType, scale: float, offset: float, data: st.DataObject) -> None:
+    code, low, high = INTEGERS[kind]
+    raw = struct.pack("<" + code, data.draw(st.integers(low, high)))
+    fields = (Field("v", kind, scale, offset),)
+    assert pack(fields, unpack(fields, raw)) == raw
+
+
+@given(f32, scales, offsets)
+def test_f32_there_and_back(value: float, scale: float, offset: float) -> None:
+    plain = (Field("v", FieldType.F32),)
+    raw = struct.pack("<f", value)
+    assert pack(plain, unpack(plain, raw)) == raw
+    scaled = (Field("v", FieldType.F32, scale, offset),)
+    try:
+        back = pack(scaled, unpack(scaled, raw))
+    except PayloadError:  # at the edge of what an f32 can hold
+        assert abs(value) > 3e38
+    else:
+        (again,) = struct.unpack("<f", back)
+        assert again == pytest.approx(value, rel=1e-5, abs=1e-4)
+
+
+def test_f32_commands_are_scaled_as_readings_are() -> None:
+    """The original Pebble applies the scale when it decodes, not when it encodes."""
+    scaled, plain = (Field("v", FieldType.F32, 0.5, 1.0),), (Field("v", FieldType.F32),)
+    assert pack(scaled, {"v": 3.0}) == struct.pack("<f", 4.0)
+    assert pack(plain, {"v": 3.0}) == struct.pack("<f", 3.0), "without a scale both agree"
+
+
+def test_values_have_no_binary_rounding_errors() -> None:
+    fields = (Field("a", FieldType.U8, struct_v1.shortest(struct.unpack("<f", struct.pack("<f", 0.1))[0])),)
+    assert unpack(fields, b"\x03") == {"a": 0.3}
+    assert unpack((Field("a", FieldType.F32),), struct.pack("<f", 0.1)) == {"a": 0.1}
+    assert unpack((Field("a", FieldType.U32, 0.1),), b"\xff\xff\xff\xff") == {"a": 429496729.5}
+
+
+@given(f32)
+def test_the_shortest_decimal_is_the_same_f32(value: float) -> None:
+    short = struct_v1.shortest(struct.unpack("<f", struct.pack("<f", value))[0])
+    assert struct.pack("<f", short) == struct.pack("<f", value)
+
+
+@pytest.mark.parametrize(("raw", "value"), [(b"\0", False), (b"\1", True), (b"\7", True)])
+def test_booleans_are_booleans(raw: bytes, value: bool) -> None:
+    assert unpack((Field("on", FieldType.BOOL),), raw) == {"on": value}
+    assert pack((Field("on", FieldType.BOOL),), {"on": value}) == bytes([value])
+
+
+@pytest.mark.parametrize("value", ["false", "true", 0, 1, 0.0, None, [], {}])
+def test_only_true_and_false_switch_anything(value: Any) -> None:
+    """In the original Pebble the text "false" switches on. Numbers are refused, too, as on every control."""
+    with pytest.raises(PayloadError, match="on is a boolean: true or false"):
+        pack((Field("on", FieldType.BOOL),), {"on": value})
+
+
+@pytest.mark.parametrize("value", ["1", None, True, [1], {"v": 1}, math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("kind", [FieldType.U8, FieldType.F32])
+def test_what_is_no_number_is_refused(kind: FieldType, value: Any) -> None:
+    with pytest.raises(PayloadError, match="v is not a number"):
+        pack((Field("v", kind),), {"v": value})
+
+
+def test_missing_fields_are_named_and_others_ignored() -> None:
+    fields = (Field("a", FieldType.U8), Field("b", FieldType.U16))
+    with pytest.raises(PayloadError, match="b is missing"):
+        pack(fields, {"a": 1})
+    assert pack(fields, {"b": 2, "a": 1, "t": 17}) == b"\1\2\0"
+
+
+def test_the_range_is_reported_in_the_unit_of_the_field() -> None:
+    with pytest.raises(PayloadError, match=r"angle is out of range: -12\.8 to 12\.7 deg"):
+        pack((Field("angle", FieldType.I8, 0.1, unit="deg"),), {"angle": 13})
+    with pytest.raises(PayloadError, match=r"out of range: -127\.0 to 128\.0"):
+        pack((Field("angle", FieldType.I8, -1.0),), {"angle": 500})
+    with pytest.raises(PayloadError, match="too large"):
+        pack((Field("v", FieldType.F32),), {"v": 1e39})
+    for kind in (FieldType.I8, FieldType.F32):
+        with pytest.raises(PayloadError):
+            pack((Field("v", kind, 1e-30),), {"v": 1e300})
+
+
+def test_numbers_are_rounded_to_the_next_step() -> None:
+    field = (Field("v", FieldType.U8, 0.1),)
+    assert pack(field, {"v": 1.26}) == b"\x0d"
+    assert pack((Field("v", FieldType.U8),), {"v": 2.6}) == b"\x03"
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 4, 300])
+def test_the_length_must_be_exact(length: int) -> None:
+    fields = (Field("a", FieldType.U8), Field("b", FieldType.U16))
+    assert size(fields) == 3
+    with pytest.raises(PayloadError, match=f"{length} bytes, not the 3"):
+        unpack(fields, bytes(length))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_reading_that_is_no_number_is_refused(value: float) -> None:
+    with pytest.raises(PayloadError, match="v is not a finite number"):
+        unpack((Field("v", FieldType.F32),), struct.pack("<f", value))
+
+
+def test_an_interface_without_fields() -> None:
+    assert unpack((), b"") == {}
+    assert pack((), {"anything": 1}) == b""

@@ -1,0 +1,170 @@
+"""The motor bridge at a broker that refuses some of its subscriptions."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.runtime.parent import NOTIFY_FD
+from pebble.transports import Message, MqttSettings, State, create
+from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, Bench, reset, state, stopped
+from tests.support import RefusingBroker, until
+
+ESTOP, ESTOP_RESET, DRIVE = (f"{BASE}/incoming/{metric}" for metric in ("estop", "estop-reset", "drive-values"))
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[RefusingBroker]:
+    broker = RefusingBroker(tmp_path)
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def start(broker: RefusingBroker, tmp_path: Path) -> Iterator[Callable[[], Bench]]:
+    """Its commands are valid for longer than the tests take."""
+    made: list[Bench] = []
+
+    def make() -> Bench:
+        made.append(Bench(tmp_path, "goob", broker=broker, safety={"drive_timeout_seconds": 5}))
+        assert until(lambda: made[0].service.transport.state is State.CONNECTED)
+        return made[0]
+
+    yield make
+    for bench in made:
+        bench.close()
+
+
+def refuse(broker: RefusingBroker, bench: Bench, *filters: str) -> None:
+    clients = (bench.operator, bench.service.transport)
+    before = [client.counters["connected"] for client in clients]
+    broker.refuse(*filters)
+    assert until(lambda: all(client.counters["connected"] > n for client, n in zip(clients, before, strict=True)))
+
+
+def retained(broker: RefusingBroker) -> list[Any]:
+    """The states that a new client receives."""
+    found: list[Message] = []
+    with create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)) as client:
+        client.subscribe(f"{BASE}/outgoing/estop/+", found.append, direct=True)
+    return [json.loads(message.payload) for message in found]
+
+
+def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+
+
+@pytest.mark.parametrize("refused", [(ESTOP,), (ESTOP_RESET,), (ESTOP, ESTOP_RESET)])
+def test_without_both_subscriptions_there_is_no_emergency_stop(
+    broker: RefusingBroker, start: Callable[[], Bench], caplog: pytest.LogCaptureFixture, refused: tuple[str, ...]
+) -> None:
+    broker.refuse(*refused)
+    bench = start()
+    assert until(lambda: errors(caplog))
+    assert until(lambda: retained(broker) == [])
+    assert f"refuses the subscription to {' and '.join(refused)}: this robot has no emergency stop" in errors(caplog)[0]
+    assert f"to subscribe to both {ESTOP} and {ESTOP_RESET}" in errors(caplog)[0]
+    bench.send("incoming/drive-values", {"z": 0.5})
+    assert bench.line("M 0.500 0.500")
+    refuse(broker, bench, *refused)
+    assert until(lambda: retained(broker) == [])
+    assert len(errors(caplog)) == 1, "one line, not one for each connection"
+
+
+def test_a_stop_that_could_not_be_reset_is_a_final_zero(broker: RefusingBroker, start: Callable[[], Bench]) -> None:
+    broker.refuse(ESTOP_RESET)
+    bench = start()
+    bench.send("incoming/drive-values", {"z": 0.125, "source": "autonomy", "run": 7})
+    bench.send("incoming/drive-values", {"z": 0.5})
+    assert bench.line("M 0.500 0.500")
+    bench.send("incoming/estop", STOP)
+    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000")
+    bench.send("incoming/drive-values", {"z": 0.25})
+    assert bench.line("M 0.250 0.250")
+    refuse(broker, bench)
+    assert until(lambda: retained(broker))
+    (granted,) = retained(broker)
+    assert (granted["latched"], granted["count"], granted["recent"], granted["barred"]) == (False, 0, [], 7)
+
+
+def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(
+    broker: RefusingBroker, start: Callable[[], Bench]
+) -> None:
+    broker.refuse(ESTOP_RESET)
+    bench, busy = start(), threading.Event()
+    waited: list[bool] = []
+    bench.service.post(lambda: waited.append(busy.wait(5)))
+    received = bench.service.transport.counters["received"]
+    bench.send("incoming/drive-values", {"z": 0.25})
+    bench.send("incoming/estop", STOP)
+    bench.send("incoming/drive-values", {"z": 0.5})
+    assert until(lambda: bench.service.transport.counters["received"] == received + 3)
+    busy.set()
+    bench.send("incoming/lights-solid", {"r": 1})
+    assert bench.line("L 0.000 0.000 1.000")
+    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+
+
+def test_a_stop_from_before_the_refusal_stays_and_is_back_when_all_is_granted(
+    broker: RefusingBroker, start: Callable[[], Bench], caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = start()
+    bench.send("incoming/estop", STOP)
+    assert stopped(bench)
+    before = state(bench)
+    refuse(broker, bench, ESTOP)
+    assert until(lambda: errors(caplog))
+    assert "it stays stopped now" in errors(caplog)[0]
+    assert until(lambda: retained(broker) == [])
+    bench.send("incoming/drive-values", {"z": 0.25})
+    assert until(lambda: bench.service.counters["latched"] == 1)
+    assert "M 0.250 0.250" not in bench.mcu.trace.lines()
+    refuse(broker, bench)
+    assert until(lambda: retained(broker) == [before])
+    assert reset(bench)
+    bench.send("incoming/drive-values", {})
+    bench.send("incoming/drive-values", {"z": 0.125})
+    assert bench.line("M 0.125 0.125")
+
+
+def test_the_launcher_is_notified_however_busy_it_is(
+    broker: RefusingBroker, start: Callable[[], Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes, end = os.pipe()
+    monkeypatch.setenv(NOTIFY_FD, str(end))
+    os.set_blocking(end, False)
+    os.set_blocking(notes, False)
+    filled = os.write(end, b"." * 1_000_000)
+    broker.refuse(ESTOP)
+    bench = start()
+    assert until(lambda: not bench.service._announced)
+    assert os.read(notes, filled) == b"." * filled
+    assert until(lambda: readable(notes) == b"LACKS estop\n")
+    refuse(broker, bench)
+    assert until(lambda: readable(notes) == b"HAS estop\n")
+    for descriptor in (notes, end):
+        os.close(descriptor)
+
+
+def readable(descriptor: int) -> bytes:
+    try:
+        return os.read(descriptor, 100)
+    except BlockingIOError:
+        return b""
+
+
+def test_a_refused_drive_topic_ends_the_process_with_what_to_change(
+    broker: RefusingBroker, start: Callable[[], Bench]
+) -> None:
+    bench = start()
+    broker.refuse(DRIVE)
+    assert until(lambda: bench.failure)
+    assert f"refuses the subscription to {DRIVE}: nothing can drive this robot" in str(bench.failure)
+    assert "local_mqtt" in str(bench.failure)

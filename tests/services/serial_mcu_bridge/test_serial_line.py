@@ -1,0 +1,334 @@
+"""The serial line against a real pty: the stop first and last, newest lines, unplugged ports, blocked readers."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import pytest
+
+from pebble.errors import DeviceError
+from pebble.services.serial_mcu_bridge.line.port import Port
+from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
+from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line
+from pebble.simulation.pty import PtyMcu
+from tests.support import until
+
+STOPPED = "M 0.000 0.000"
+
+
+class Host:
+    """A SerialLine, the bytes that it received and its states."""
+
+    def __init__(self, path: Path, boot_s: float = 0.1, baud: int = 460800) -> None:
+        self.received = bytearray()
+        self.states: list[LineState] = []
+        self.line = SerialLine(
+            str(path),
+            baud,
+            stop=STOP,
+            on_bytes=self.received.extend,
+            on_state=lambda state, _problem: self.states.append(state),
+            boot_s=boot_s,
+        )
+        self.line.open()
+
+    def is_ready(self) -> bool:
+        return self.line.state is LineState.READY
+
+
+Connect = Callable[..., Host]
+
+
+@pytest.fixture
+def mcu(tmp_path: Path) -> Iterator[PtyMcu]:
+    with PtyMcu("goob", tmp_path / "port") as mcu:
+        yield mcu
+
+
+@pytest.fixture
+def connect() -> Iterator[Connect]:
+    """Open lines, and close them after the test: the next test's pty may have the same number."""
+    with ExitStack() as ends:
+
+        def connect(path: Path, boot_s: float = 0.1, baud: int = 460800) -> Host:
+            host = Host(path, boot_s, baud)
+            ends.callback(host.line.close)
+            return host
+
+        yield connect
+
+
+@pytest.fixture
+def host(mcu: PtyMcu, connect: Connect) -> Host:
+    host = connect(mcu.symlink)
+    assert until(host.is_ready)
+    return host
+
+
+def traced(mcu: PtyMcu, line: str) -> bool:
+    return until(lambda: line in mcu.trace.lines())
+
+
+def test_the_stop_is_sent_at_open_and_again_after_boot(mcu: PtyMcu, connect: Connect) -> None:
+    host = connect(mcu.symlink, boot_s=0.5)
+    assert until(host.is_ready)
+    assert until(lambda: mcu.trace.lines() == [STOPPED] * 2)
+    first, second = (entry.ns for entry in mcu.trace.entries() if entry.event == "line")
+    assert second - first >= 0.49e9
+    host.line.close()
+    assert host.states == [LineState.BOOTING, LineState.READY, LineState.CLOSED]
+
+
+@pytest.mark.parametrize("half", ["M 0.900", "M 0.400 0."])
+def test_half_a_line_of_a_killed_host_does_not_damage_the_stop(mcu: PtyMcu, connect: Connect, half: str) -> None:
+    killed = Port(str(mcu.symlink), 460800)
+    killed.write(half.encode())
+    assert until(lambda: mcu.host)
+    killed.close()
+    assert until(lambda: mcu.trace.entries()[-1].event == "closed")  # the MCU has read everything
+    connect(mcu.symlink)
+    assert until(lambda: len(mcu.trace.lines()) >= 2)
+    assert mcu.trace.lines()[:2] == [half, STOPPED]
+
+
+def test_input_from_before_and_during_boot_is_thrown_away(mcu: PtyMcu, connect: Connect) -> None:
+    host = connect(mcu.symlink, boot_s=0.2)
+    assert until(lambda: mcu.host)
+    mcu.reset()
+    assert until(host.is_ready)
+    assert until(lambda: host.received.count(b"T a0=") > 3)
+    assert b"Done!" not in host.received
+
+
+def test_a_command_waits_for_the_boot_and_comes_after_the_stop(mcu: PtyMcu, connect: Connect) -> None:
+    host = connect(mcu.symlink, boot_s=0.3)
+    assert until(lambda: host.line.drive(drive_line(0.5, 0.5)))
+    assert traced(mcu, "M 0.500 0.500")
+    assert mcu.trace.lines() == [STOPPED, STOPPED, "M 0.500 0.500"]
+
+
+def test_a_command_too_old_after_the_boot_is_a_stop(mcu: PtyMcu, connect: Connect) -> None:
+    host = connect(mcu.symlink, boot_s=1.0)
+    assert until(lambda: host.line.drive(drive_line(0.5, 0.5)))
+    assert until(host.is_ready)
+    assert until(lambda: len(mcu.trace.lines()) == 3)
+    assert mcu.trace.lines() == [STOPPED] * 3
+    assert host.line.outbox.expired == 1
+
+
+def test_lines_go_down_and_answers_come_up(mcu: PtyMcu, host: Host) -> None:
+    assert host.line.drive(drive_line(1.0, -1.0))
+    assert host.line.send("lights", lights_line(1, 0, 0))
+    assert traced(mcu, "M 1.000 -1.000")
+    assert traced(mcu, "L 1.000 0.000 0.000")
+    assert until(lambda: b"OK L\r\n" in host.received)
+    assert mcu.state().drive == (1.0, -1.0)
+
+
+def test_of_a_burst_the_last_command_is_sent_and_few_before_it(mcu: PtyMcu, host: Host) -> None:
+    for number in range(1000):
+        host.line.drive(drive_line(number / 1000, 0.5))
+    assert traced(mcu, "M 0.999 0.500")
+    sent = [line for line in mcu.trace.lines() if line.endswith(" 0.500")]
+    assert sent[-1] == "M 0.999 0.500"
+    assert sent == sorted(sent)
+    assert len(sent) < 500
+    assert host.line.outbox.superseded == 1000 - len(sent)
+
+
+def test_a_burst_that_ends_in_a_stop_ends_stopped(mcu: PtyMcu, host: Host) -> None:
+    for number in range(500):
+        host.line.drive(drive_line(number / 1000, 1.0))
+    host.line.halt()
+    assert until(lambda: mcu.trace.lines()[-1] == STOPPED and mcu.state().drive == (0.0, 0.0))
+
+
+def test_the_stop_is_the_last_line_even_while_others_still_drive(mcu: PtyMcu, host: Host) -> None:
+    driver = threading.Thread(target=lambda: until(lambda: not host.line.drive(drive_line(1.0, 1.0)), step=0.0))
+    driver.start()
+    assert traced(mcu, "M 1.000 1.000")
+    host.line.close()
+    driver.join(10)
+    assert not driver.is_alive()
+    assert until(lambda: not mcu.host)
+    assert mcu.trace.lines()[-1] == STOPPED
+    assert mcu.state().drive == (0.0, 0.0)
+    assert host.line.refused >= 1
+
+
+def test_a_burst_cut_off_by_the_end_ends_with_the_stop(mcu: PtyMcu, connect: Connect) -> None:
+    for round_ in range(1, 21):
+        host = connect(mcu.symlink, boot_s=0.0, baud=4_000_000)
+        assert until(host.is_ready, step=0.0005)
+        for number in range(50):
+            host.line.drive(drive_line(number / 1000, 1.0))
+        host.line.close()
+        assert until(lambda n=round_: [entry.event for entry in mcu.trace.entries()].count("closed") == n)  # type: ignore[misc]
+        assert mcu.trace.lines()[-1] == STOPPED
+
+
+def test_closing_twice_and_closing_what_never_opened(mcu: PtyMcu, host: Host, tmp_path: Path) -> None:
+    host.line.close()
+    host.line.close()
+    assert not host.line.drive(drive_line(1, 1))
+    SerialLine(str(tmp_path / "none"), 115200, stop=STOP, on_bytes=lambda _chunk: None).close()
+
+
+def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host) -> None:
+    host.line.drive(drive_line(0.7, 0.7))
+    assert traced(mcu, "M 0.700 0.700")
+    mcu.unplug()
+    assert until(lambda: host.line.state is LineState.ABSENT)
+    assert "gone" in host.line.problem
+    assert not host.line.drive(drive_line(0.8, 0.8))
+    assert not host.line.halt()
+    mcu.replug()
+    assert until(host.is_ready)
+    assert host.line.problem == ""
+    assert until(lambda: host.line.drive(drive_line(0.9, 0.9)))
+    assert traced(mcu, "M 0.900 0.900")
+    entries = mcu.trace.entries()
+    replug = max(index for index, entry in enumerate(entries) if entry.event == "plugged")
+    assert [entry.line for entry in entries[replug:] if entry.event == "line"] == [STOPPED, STOPPED, "M 0.900 0.900"]
+    assert host.line.opened == 2
+
+
+def test_a_port_that_comes_late_is_found(mcu: PtyMcu, connect: Connect) -> None:
+    mcu.unplug()
+    host = connect(mcu.symlink)
+    assert until(lambda: host.line.state is LineState.ABSENT)
+    assert "No such file" in host.line.problem
+    mcu.replug()
+    assert until(host.is_ready)
+
+
+def test_a_path_that_leads_to_another_device_is_followed(tmp_path: Path, connect: Connect) -> None:
+    with PtyMcu("goob", tmp_path / "old") as old, PtyMcu("goob", tmp_path / "new") as new:
+        link = tmp_path / "by-id"
+        link.symlink_to(old.symlink.readlink())
+        host = connect(link)
+        assert until(host.is_ready)
+        again = tmp_path / "again"
+        again.symlink_to(new.symlink.readlink())
+        again.replace(link)
+        assert until(lambda: new.trace.lines() == [STOPPED] * 2)
+
+
+def test_a_port_in_use_is_refused_until_it_is_free(mcu: PtyMcu, connect: Connect) -> None:
+    other = Port(str(mcu.symlink), 460800)
+    host = connect(mcu.symlink)
+    assert until(lambda: "another program has it open" in host.line.problem)
+    other.close()
+    assert until(host.is_ready)
+
+
+def test_what_is_no_serial_port_is_a_device_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", tmp_path / "nothing", tmp_path):
+        with pytest.raises(DeviceError, match=str(path)):
+            Port(str(path), 115200)
+
+
+class StuckDevice:
+    """A pty whose other side reads only on request. Of 16 KB in the kernel, a flush cannot remove 4 KB."""
+
+    def __init__(self) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self.master, False)
+        self.path = Path(os.ttyname(slave))
+        self._slave = slave
+        self._seen = bytearray()
+
+    def seen(self) -> bytes:
+        """Read the available bytes, and return everything read so far."""
+        with suppress(BlockingIOError):
+            while chunk := os.read(self.master, 65_536):
+                self._seen += chunk
+        return bytes(self._seen)
+
+    def close(self) -> None:
+        os.close(self.master)
+        os.close(self._slave)
+
+
+@pytest.fixture
+def stuck() -> Iterator[StuckDevice]:
+    device = StuckDevice()
+    yield device
+    device.close()
+
+
+def fill(host: Host) -> float:
+    """Send drive lines until the kernel's buffer is full; return the duration of the longest call in seconds."""
+    longest = 0.0
+    while until(lambda: not host.line.outbox, 0.2, step=0.0002):
+        before = time.monotonic()
+        host.line.drive(drive_line(0.3, 0.3))
+        longest = max(longest, time.monotonic() - before)
+    return longest
+
+
+def test_a_stuck_reader_does_not_block_and_finds_no_old_commands_later(stuck: StuckDevice, connect: Connect) -> None:
+    host = connect(stuck.path, boot_s=0.05)
+    assert until(host.is_ready)
+    assert fill(host) < 0.5
+    assert until(lambda: LineState.ABSENT in host.states, step=0.001)
+    assert len(stuck.seen()) < 5000
+    assert until(lambda: host.states.count(LineState.READY) == 2)
+    assert until(lambda: stuck.seen().endswith(b"\n" + STOP + STOP))
+    assert len(stuck.seen()) < 5000
+    host.line.drive(drive_line(0.4, 0.4))
+    assert until(lambda: stuck.seen().endswith(STOP + drive_line(0.4, 0.4)))
+
+
+def test_a_stuck_reader_does_not_delay_the_end_and_finds_the_stop(stuck: StuckDevice, connect: Connect) -> None:
+    host = connect(stuck.path, boot_s=0.05)
+    assert until(host.is_ready)
+    fill(host)
+    before = time.monotonic()
+    host.line.close()
+    assert time.monotonic() - before < 2.0
+    assert host.line.state is LineState.CLOSED
+    assert stuck.seen().endswith(b"\n" + STOP)
+    assert len(stuck.seen()) < 5000
+
+
+PROGRAM = """
+import signal, sys, time
+from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line
+from pebble.services.serial_mcu_bridge.line.serial_line import SerialLine
+
+ended = []
+signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
+line = SerialLine(sys.argv[1], 460800, stop=STOP, on_bytes=lambda _chunk: None, boot_s=0.05)
+line.open()
+while not ended:
+    line.drive(drive_line(0.6, 0.6))
+    time.sleep(0.01)
+line.close()
+"""
+
+
+def test_a_terminated_program_stops_and_a_killed_one_is_stopped_by_its_successor(mcu: PtyMcu, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", PROGRAM, str(mcu.symlink)]
+    with subprocess.Popen(command) as killed:
+        assert traced(mcu, "M 0.600 0.600")
+        killed.send_signal(signal.SIGKILL)
+    assert until(lambda: not mcu.host)
+    assert mcu.trace.lines()[-1] == "M 0.600 0.600"
+    before = len(mcu.trace.lines())
+    with subprocess.Popen(command) as terminated:
+        assert until(lambda: "M 0.600 0.600" in mcu.trace.lines()[before:])
+        terminated.send_signal(signal.SIGTERM)
+    assert until(lambda: not mcu.host)
+    assert mcu.trace.lines()[before : before + 3] == [STOPPED, STOPPED, "M 0.600 0.600"]
+    assert mcu.trace.lines()[-1] == STOPPED
+    assert terminated.returncode == 0

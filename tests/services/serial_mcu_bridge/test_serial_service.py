@@ -1,0 +1,266 @@
+"""The motor bridge on the memory transport and a real pty: commands become lines, reports become messages."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.config import parse
+from pebble.contract import DRIVE, ESTOP, ESTOP_RESET
+from pebble.contract.payloads import Drive
+from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, Bench, reset, state, stopped
+from tests.support import until
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
+    kind, section = getattr(request, "param", ("goob", {}))
+    bench = Bench(tmp_path, kind, **section)
+    yield bench
+    bench.close()
+
+
+FRED = ("fred", {"telemetry": {"publish_touch_sensors": True}})
+RENAMED = (
+    "fred",
+    {
+        "telemetry": {"publish_touch_sensors": True},
+        "topics": {
+            "drive_values": "elsewhere/drive",
+            "lights_solid": "elsewhere/solid",
+            "lights_flash": "elsewhere/flash",
+            "touch_sensors": f"{BASE}/outgoing/feelers",
+            "charging_status": f"{BASE}/outgoing/dock",
+        },
+    },
+)
+
+
+def test_the_first_and_the_last_line_are_the_stop(bench: Bench) -> None:
+    bench.send("incoming/drive-values", {"z": 0.5})
+    assert bench.line("M 0.500 0.500")
+    bench.service.quit()
+    assert until(lambda: bench.mcu.trace.entries()[-1].event == "closed", 5)
+    lines = bench.mcu.trace.lines()
+    assert lines[0] == lines[1] == lines[-1] == "M 0.000 0.000"
+
+
+@pytest.mark.parametrize("bench", [("goob", {"safety": {"drive_timeout_seconds": 0.2}})], indirect=True)
+def test_the_configured_watchdog_stops_once(bench: Bench) -> None:
+    bench.send("incoming/drive-values", {"z": 0.5})
+    assert bench.line("M 0.500 0.500")
+    moved = next(entry for entry in bench.mcu.trace.entries() if entry.line == "M 0.500 0.500")
+    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000", 2)
+    stopped = bench.mcu.trace.entries()[-1]
+    assert 0.18 <= (stopped.ns - moved.ns) / 1e9 <= 0.3
+    time.sleep(0.5)  # two more timeouts: the stop is not repeated
+    assert bench.mcu.trace.entries()[-1] == stopped
+
+
+def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(bench: Bench) -> None:
+    """As after SIGSTOP and SIGCONT: the watchdog is overdue, and a command is handled first."""
+    bench.send("incoming/drive-values", {"z": 0.5})
+    assert bench.line("M 0.500 0.500")
+
+    def pause() -> None:
+        time.sleep(0.9)
+        bench.service.receive_drive(Drive(x=0.0, z=0.25))
+        bench.service._judge()
+
+    bench.service.post(pause)
+    assert bench.line("M 0.250 0.250")
+    assert bench.mcu.trace.lines()[-3:] == ["M 0.500 0.500", "M 0.000 0.000", "M 0.250 0.250"]
+
+
+@pytest.mark.parametrize("bench", [FRED], indirect=True)
+def test_every_field_of_a_line_is_published(bench: Bench) -> None:
+    assert until(lambda: bench.payloads("touch-sensors") and bench.payloads("charging-status"), 5)
+    assert set(bench.payloads("touch-sensors")[0]["value"]) == {"a0", "a1", "a2"}
+    assert bench.payloads("charging-status") == [{"value": False}]
+    bench.mcu.charge(True)
+    assert until(lambda: bench.payloads("charging-status")[-1] == {"value": True}, 5)
+    assert len(bench.payloads("charging-status")) == 2  # only changes are published
+
+
+def test_voltage_is_published_and_touch_only_if_configured(bench: Bench) -> None:
+    bench.mcu.reset()
+    assert until(lambda: bench.payloads("charging-level"), 8)
+    assert bench.payloads("charging-level")[0]["unit"] == "v"
+    assert bench.payloads("touch-sensors") == []
+
+
+@pytest.mark.parametrize("bench", [RENAMED], indirect=True)
+def test_every_topic_can_be_renamed(bench: Bench) -> None:
+    bench.operator.publish("elsewhere/drive", b'{"z": 0.25}')
+    bench.operator.publish("elsewhere/solid", b'{"r": 0.5}')
+    assert bench.line("M 0.250 0.250")
+    assert bench.line("L 0.000 0.000 0.500")
+    bench.operator.publish("elsewhere/flash", b'{"g": 0.5}')
+    assert bench.line("F 0.000 0.500 0.000 2.000")
+    assert until(lambda: bench.payloads("feelers") and bench.payloads("dock"), 5)
+    bench.send("incoming/drive-values", {"z": 1})
+    bench.operator.publish("elsewhere/solid", b'{"b": 1}')
+    assert bench.line("L 1.000 0.000 0.000")
+    assert "M 1.000 1.000" not in bench.mcu.trace.lines()
+
+
+def test_malformed_commands_are_counted(bench: Bench) -> None:
+    for _ in range(50):
+        bench.operator.publish(f"{BASE}/incoming/drive-values", b'{"z": NaN}')
+    bench.send("incoming/lights-solid", {"r": 1})
+    assert bench.line("L 0.000 0.000 1.000")
+    assert bench.service.counters["refused"] == 50
+    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+
+
+# -- emergency stops and scripts
+
+
+def test_after_a_stop_nothing_moves_until_the_reset_also_after_a_restart(bench: Bench) -> None:
+    bench.send("incoming/drive-values", {"z": 0.5})
+    assert bench.line("M 0.500 0.500")
+    bench.send("incoming/estop", STOP)
+    assert stopped(bench)
+    lines = bench.mcu.trace.lines()
+    assert lines[-1] == "M 0.000 0.000"
+    for _ in range(3):
+        bench.send("incoming/drive-values", {"z": 0.25})
+    bench.send("incoming/lights-solid", {"r": 1})
+    assert bench.line("L 0.000 0.000 1.000")  # only motors are stopped
+    boot = state(bench)["boot"]
+    bench.stop()
+    bench.start()
+    assert until(lambda: state(bench)["boot"] != boot, 5)
+    assert (state(bench)["latched"], state(bench)["count"]) == (True, 0)
+    assert state(bench)["recent"] == [STOP["stop"]]
+    bench.send("incoming/drive-values", {"z": 0.25})
+    bench.send("incoming/lights-solid", {"g": 1})
+    assert bench.line("L 0.000 1.000 0.000")
+    assert set(bench.mcu.trace.lines()) & {"M 0.250 0.250"} == set()
+    assert reset(bench)
+    bench.send("incoming/drive-values", {})
+    bench.send("incoming/drive-values", {"z": 0.125})
+    assert bench.line("M 0.125 0.125")
+
+
+def test_after_a_reset_a_person_lets_go_first(bench: Bench) -> None:
+    bench.send("incoming/estop", STOP)
+    assert stopped(bench)
+    assert reset(bench)
+    bench.send("incoming/drive-values", {"z": 0.25})
+    assert until(lambda: bench.service.counters["overruled"] == 1)
+    bench.send("incoming/drive-values", {"z": 0})
+    bench.send("incoming/drive-values", {"z": 0.125})
+    assert bench.line("M 0.125 0.125")
+    assert "M 0.250 0.250" not in bench.mcu.trace.lines()
+
+
+def test_a_retained_stop_and_a_retained_reset_do_nothing(bench: Bench) -> None:
+    bench.operator.publish(f"{BASE}/incoming/estop", json.dumps(STOP).encode(), retain=True)
+    assert stopped(bench)  # asked to be retained, but live
+    assert reset(bench)
+    bench.stop()
+    bench.start()
+    assert until(lambda: bench.service.counters["stale"] == 1)
+    assert not state(bench)["latched"]
+
+
+def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(bench: Bench) -> None:
+    """The service is busy while a drive command, a stop and another drive command arrive."""
+    busy = threading.Event()
+    bench.service.post(lambda: busy.wait(5))
+    bench.send("incoming/drive-values", {"z": 0.25})
+    bench.send("incoming/estop", STOP)
+    bench.send("incoming/drive-values", {"z": 0.5})
+    busy.set()
+    assert stopped(bench)
+    bench.send("incoming/lights-solid", {"r": 1})
+    assert bench.line("L 0.000 0.000 1.000")
+    assert set(bench.mcu.trace.lines()) == {"M 0.000 0.000", "L 0.000 0.000 1.000"}
+
+
+def test_a_stop_does_not_wait_behind_a_full_inbox(bench: Bench) -> None:
+    busy = threading.Event()
+    bench.service.post(lambda: busy.wait(5))
+    for _ in range(2000):
+        bench.service.post(lambda: time.sleep(0.001))
+    bench.send("incoming/estop", STOP)
+    began = time.monotonic()
+    busy.set()
+    assert stopped(bench)
+    assert time.monotonic() - began < 5
+    assert state(bench)["count"] == 1
+
+
+def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
+    bench.send("incoming/drive-values", {"z": 0.5, "valid_ms": 100})
+    assert bench.line("M 0.500 0.500")
+    moved = next(entry for entry in bench.mcu.trace.entries() if entry.line == "M 0.500 0.500")
+    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000", 2)
+    assert 0.08 <= (bench.mcu.trace.entries()[-1].ns - moved.ns) / 1e9 <= 0.3
+    bench.send("incoming/drive-values", {"z": 0.25, "valid_ms": 5000})  # never longer than the watchdog
+    bench.send("incoming/drive-values", {"z": 0.375, "valid_ms": 50})  # a later command may end earlier
+    assert bench.line("M 0.375 0.375")
+    assert until(lambda: bench.mcu.trace.lines()[-1] == "M 0.000 0.000", 2)
+
+
+def test_people_go_before_scripts(bench: Bench) -> None:
+    script = {"z": 0.25, "source": "autonomy", "run": 7}
+    bench.send("incoming/drive-values", script)
+    assert until(lambda: bench.service.counters["overruled"] == 1)  # the owner has just started
+    time.sleep(2)
+    bench.send("incoming/drive-values", script)
+    assert bench.line("M 0.250 0.250")
+    bench.send("incoming/drive-values", {"z": 0.5})
+    bench.send("incoming/drive-values", {**script, "z": 0.75})
+    assert bench.line("M 0.500 0.500")
+    bench.send("incoming/drive-values", {"z": 0, "valid_ms": 0})
+    assert until(lambda: state(bench).get("barred") == 7, 5)
+    time.sleep(2.1)
+    bench.send("incoming/drive-values", {**script, "z": 0.75})
+    bench.send("incoming/drive-values", {**script, "z": 1, "run": 8})
+    assert bench.line("M 1.000 1.000")
+    assert "M 0.750 0.750" not in bench.mcu.trace.lines()
+
+
+def test_a_script_that_a_person_ended_does_not_move_the_motors_after_a_restart(bench: Bench) -> None:
+    script = {"z": 0.25, "source": "autonomy", "run": 7}
+    time.sleep(2)
+    bench.send("incoming/drive-values", script)
+    assert bench.line("M 0.250 0.250")
+    bench.send("incoming/drive-values", {"z": 0, "valid_ms": 0})
+    assert until(lambda: state(bench).get("barred") == 7, 5)
+    bench.stop()
+    bench.start()
+    before = len(bench.mcu.trace.lines())
+    end = time.monotonic() + 2.5
+    while time.monotonic() < end:
+        bench.send("incoming/drive-values", script)
+        time.sleep(0.05)
+    bench.send("incoming/drive-values", {**script, "run": 8, "z": 0.5})
+    assert bench.line("M 0.500 0.500")
+    assert "M 0.250 0.250" not in bench.mcu.trace.lines()[before:]
+
+
+def test_stops_are_subscribed_to_before_drive_commands() -> None:
+    assert MotorBridge.handles()[:3] == (ESTOP, ESTOP_RESET, DRIVE)
+
+
+def test_robots_with_one_state_directory_do_not_share_a_stop(tmp_path: Path) -> None:
+    def bridge(robot: str) -> MotorBridge:
+        serial = {"enabled": True, "serial": {"port": "/dev/null"}}
+        transport = {"kind": "mqtt", "state_dir": str(tmp_path)}
+        raw = {"robot": {"id": robot}, "transport": transport, "services": {"serial_mcu_bridge": serial}}
+        return MotorBridge(parse(raw, folder=tmp_path, env={}), MemoryTransport(robot, MemoryHub()))
+
+    stopped, other = bridge("rover"), bridge("other")
+    stopped._file.save({"latched": True})
+    stopped._file.close()
+    assert (stopped._file.load(), other._file.load()) == ({"latched": True}, None)

@@ -1,0 +1,229 @@
+"""TCP proxies on loopback that fail as networks do: one goes silent or resets connections, one has a limited rate."""
+
+from __future__ import annotations
+
+import select
+import socket
+import struct
+import threading
+import time
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+from tests.support import free_port
+
+_STEP_S = 0.02  # how soon a change of mode is noticed
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
+_SLOW_PIECE = 512  # bytes that go at once: the connections take turns
+_SEGMENT = 1400  # bytes; the loopback device has packets of 64 KB, which no radio has
+_BUFFER = 4096  # bytes that the far end's kernel confirms before they have gone through
+
+
+class TcpProxy:
+    """Listens on ``port`` and passes everything on to ``target``, a port of this machine.
+
+    `blackhole` stops passing data and closes nothing, as a radio link does that loses its signal: the kernel accepts
+    new connections, and they receive nothing. `resume` ends that: held data is passed on late, or the connection is
+    reset if one end has closed it meanwhile. `cut` resets all connections and refuses new ones until `mend`. `drop`
+    only resets the present ones.
+    """
+
+    def __init__(self, target: int, *, delay_s: float = 0.0, piece: int = 65536) -> None:
+        self.port = free_port()
+        self.delay_s = delay_s  # added to every piece in either direction
+        self.piece = piece  # bytes at most; small ones split what was sent together
+        self._target = target
+        self._lock = threading.Lock()
+        self._pairs: list[_Pair] = []
+        self._passing = threading.Event()
+        self._passing.set()
+        self._listener: socket.socket | None = None
+        self._thread: threading.Thread | None = None
+        self.mend()
+
+    def blackhole(self) -> None:
+        self._passing.clear()
+
+    def resume(self) -> None:
+        with self._lock:
+            for pair in self._pairs:
+                pair.reset_if_given_up()
+        self._passing.set()
+
+    def cut(self) -> None:
+        listener, self._listener = self._listener, None
+        if listener is not None and self._thread is not None:
+            listener.close()
+            self._thread.join(5)
+        self.drop()
+
+    def mend(self) -> None:
+        listener = socket.socket()
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(("127.0.0.1", self.port))
+        listener.listen(64)
+        listener.settimeout(_STEP_S)
+        self._listener = listener
+        self._thread = threading.Thread(target=self._accept, args=(listener,), daemon=True)
+        self._thread.start()
+
+    def lead_to(self, target: int) -> None:
+        """Whoever connects from now on finds another port behind it."""
+        self._target = target
+        self.drop()
+
+    def drop(self) -> None:
+        with self._lock:
+            pairs, self._pairs = self._pairs, []
+        for pair in pairs:
+            pair.reset()
+        for pair in pairs:
+            pair.join()
+
+    def stop(self) -> None:
+        self.cut()
+        self._passing.set()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.stop()
+
+    def _accept(self, listener: socket.socket) -> None:
+        while listener is self._listener:
+            if not self._passing.is_set():
+                time.sleep(_STEP_S)  # a black hole accepts nothing
+                continue
+            with suppress(TimeoutError, OSError):
+                near, _ = listener.accept()
+                self._join_to_target(near)
+
+    def _join_to_target(self, near: socket.socket) -> None:
+        try:
+            far = socket.create_connection(("127.0.0.1", self._target), 2)
+        except OSError:
+            near.close()
+            return
+        for end in (near, far):
+            end.settimeout(None)
+            end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with self._lock:
+            self._pairs = [pair for pair in self._pairs if not pair.gone]
+            self._pairs.append(_Pair(self, near, far))
+
+    def wait_until_passing(self) -> bool:
+        """True at once while data passes; False after a moment in a black hole."""
+        return self._passing.wait(_STEP_S)
+
+
+class _Pair:
+    """The two connections that make one connection through a proxy."""
+
+    def __init__(self, proxy: TcpProxy, near: socket.socket, far: socket.socket) -> None:
+        self._proxy, self._ends = proxy, (near, far)
+        self.gone = False
+        self._threads = [
+            threading.Thread(target=self._carry, args=(source, sink), daemon=True)
+            for source, sink in ((near, far), (far, near))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def reset_if_given_up(self) -> None:
+        poll = select.poll()
+        for end in self._ends:
+            if end.fileno() >= 0:
+                poll.register(end, select.POLLRDHUP)
+        if poll.poll(0):
+            self.reset()
+
+    def reset(self) -> None:
+        self.gone = True
+        for end in self._ends:
+            with suppress(OSError):
+                end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+            end.close()
+
+    def join(self) -> None:
+        for thread in self._threads:
+            thread.join(5)
+
+    def _carry(self, source: socket.socket, sink: socket.socket) -> None:
+        with suppress(OSError, ValueError):  # an end was closed
+            while not self.gone:
+                if not self._proxy.wait_until_passing() or not select.select([source], [], [], _STEP_S)[0]:
+                    continue
+                data = source.recv(self._proxy.piece)
+                if not data:
+                    break
+                time.sleep(self._proxy.delay_s)
+                self._send(sink, data)
+        self.reset()
+
+    def _send(self, sink: socket.socket, data: bytes) -> None:
+        while data and not self.gone:
+            if self._proxy.wait_until_passing() and select.select([], [sink], [], _STEP_S)[1]:
+                data = data[sink.send(data, socket.MSG_DONTWAIT) :]
+
+
+class SlowTcpProxy:
+    """Listens on ``port`` and passes on to ``target``: at most ``kbits`` per second there, and unlimited back."""
+
+    def __init__(self, target: int, kbits: float) -> None:
+        self.port, self.kbits = free_port(), kbits
+        self.passed = 0  # bytes to the target
+        self._target = target
+        self._turn = threading.Lock()
+        self._free_at = 0.0
+        self._sockets: list[socket.socket] = []
+        self._listener = socket.socket()
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        self._listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, _SEGMENT)
+        self._listener.bind(("127.0.0.1", self.port))
+        self._listener.listen(16)
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def stop(self) -> None:
+        for end in (self._listener, *self._sockets):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.stop()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listener.accept()
+                far = socket.create_connection(("127.0.0.1", self._target), 2)
+                far.settimeout(None)
+                self._sockets += [near, far]
+                for source, sink, slow in ((near, far, True), (far, near, False)):
+                    sink.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    threading.Thread(target=self._carry, args=(source, sink, slow), daemon=True).start()
+
+    def _carry(self, source: socket.socket, sink: socket.socket, slow: bool) -> None:
+        with suppress(OSError):
+            while data := source.recv(_SLOW_PIECE if slow else 65536):
+                if slow:
+                    self._wait(len(data))
+                sink.sendall(data)
+        for end in (source, sink):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def _wait(self, size: int) -> None:
+        """Wait until the line has sent ``size`` bytes; callers take turns in the order of their calls."""
+        with self._turn:
+            now = time.monotonic()
+            self._free_at = max(self._free_at, now) + size * 8 / (self.kbits * 1000)
+            self.passed += size
+            wait = self._free_at - now
+        time.sleep(wait)

@@ -1,0 +1,138 @@
+"""Starts, asks, stops and kills the processes of `frames_peer`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from pebble.transports.segments import SHM
+from tests.support import ROOT, Child, until
+from tests.transports.frames.frames_peer import Options
+
+
+class Peer:
+    """One process; `ask` for its numbers."""
+
+    def __init__(self, role: str, folder: Path, options: Options) -> None:
+        self._process = Child(
+            [
+                sys.executable,
+                "-m",
+                "tests.transports.frames.frames_peer",
+                role,
+                str(folder),
+                msgspec.json.encode(options),
+            ],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        assert self._line() == "up"
+
+    def ask(self) -> dict[str, Any]:
+        assert self._process.stdin is not None
+        self._process.stdin.write("?\n")
+        self._process.stdin.flush()
+        answer: dict[str, Any] = json.loads(self._line())
+        return answer
+
+    def reaches(self, condition: Callable[[dict[str, Any]], object], timeout: float = 10.0) -> dict[str, Any]:
+        """Ask until ``condition`` is true for an answer, and return that."""
+        answers: list[dict[str, Any]] = [{}]
+
+        def asked() -> object:
+            answers.append(self.ask())
+            return condition(answers[-1])
+
+        assert until(asked, timeout, step=0.02), answers[-1]
+        return answers[-1]
+
+    def has(self, **least: int) -> dict[str, Any]:
+        """Ask until every number is at least as given."""
+        return self.reaches(lambda answer: all(answer.get(name, 0) >= number for name, number in least.items()))
+
+    def signal(self, number: int) -> None:
+        os.kill(self._process.pid, number)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def close(self) -> int:
+        """Its exit code after a polite end."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        return self._end()
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._end()
+
+    def _end(self) -> int:
+        try:
+            return self._process.wait(10)
+        finally:
+            for pipe in (self._process.stdin, self._process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(BrokenPipeError):
+                        pipe.close()
+
+    def _line(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+
+class FramesNet:
+    """A run directory and its peers; `close` ends them all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(mode=0o700, exist_ok=True)
+        self._peers: list[Peer] = []
+        self.segments: set[str] = set()  # every segment a peer was seen with
+
+    def writer(self, **options: Any) -> Peer:
+        return self._start("writer", Options(**options))
+
+    def reader(self, **options: Any) -> Peer:
+        return self._start("reader", Options(**options))
+
+    def _start(self, role: str, options: Options) -> Peer:
+        peer = Peer(role, self.folder, options)
+        self._peers.append(peer)
+        return peer
+
+    def note_segments(self) -> None:
+        for peer in self._peers:
+            if peer.running:
+                maps = Path(f"/proc/{peer.pid}/maps").read_text().splitlines()
+                self.segments |= {line.split()[5] for line in maps if ".zenoh" in line}
+
+    def left(self) -> set[str]:
+        """Those of our segments that are still in shared memory."""
+        return {name for name in self.segments if (SHM / Path(name).name).exists()}
+
+    def written(self) -> int:
+        """Frames that all writers together have sent, killed ones too."""
+        return sum(int.from_bytes(tally.read_bytes(), "little") for tally in self.folder.glob("tally-*"))
+
+    def close(self) -> None:
+        for peer in self._peers:
+            if peer.running:
+                peer.signal(signal.SIGCONT)
+                peer.kill()

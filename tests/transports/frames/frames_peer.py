@@ -1,0 +1,192 @@
+"""Processes that write or read frames: `python -m tests.transports.frames.frames_peer ROLE FOLDER JSON`.
+
+Each says `up` when it is ready, answers a line on stdin with what it knows as a line of JSON, and ends with stdin.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import mmap
+import os
+import resource
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from pebble.runtime.parent import end_with_parent as die_with_parent
+from pebble.transports import segments
+from pebble.transports.frames import Frame, FrameInfo, FrameReader, FrameWriter, views
+
+FORMAT = "bgr24"
+_PR_SET_DUMPABLE = 4
+
+
+class Options(msgspec.Struct, kw_only=True):
+    size: int = 3 * 64 * 48  # of a frame, bytes
+    rate: float = 100.0  # Hz
+    limit: int = 0  # frames; 0: until it is ended
+    slots: int = 6
+    born: bool = True  # frames are born in the segment, if that works; else copied into it
+    views: bool = False
+    depth: int = 1
+    work_s: float = 0.0  # how long a reader looks at a frame
+    without_views: bool = False  # as if zenoh had changed
+    memlock: int | None = None  # RLIMIT_MEMLOCK, bytes, as the user below
+    user: int | None = None  # become this user, which takes root
+
+
+def main(role: str, folder: str, options: str) -> None:
+    chosen = msgspec.json.decode(options, type=Options)
+    if chosen.without_views:
+        views.KNOWN_VERSIONS = frozenset({"0.0.0"})
+    if chosen.memlock is not None:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (chosen.memlock, chosen.memlock))
+    if chosen.user not in (None, os.geteuid()):
+        become(chosen.user)
+    peer = {"writer": Writer, "reader": Reader}[role](Path(folder), chosen)
+    worker = threading.Thread(target=peer.run, daemon=True)
+    worker.start()
+    report("up")
+    for _ in sys.stdin:
+        report(json.dumps(peer.report() | _memory()))
+    peer.stop()
+    worker.join(5)
+
+
+def become(user: int) -> None:
+    """Only now that everything is imported: that user may have no access to the folder where we lie."""
+    version = views._version()
+    views._version = lambda: version
+    os.setgid(user)
+    os.setuid(user)
+    ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 1)  # else /proc/self is root's
+    die_with_parent()  # forgotten with the change of user
+
+
+def report(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def stamp(array: np.ndarray[Any, Any], number: int) -> None:
+    """Fill a frame with its number, so that a torn one shows."""
+    array[:] = number % 251
+    array[:8].view("<u8")[0] = array[-8:].view("<u8")[0] = number
+
+
+def intact(array: np.ndarray[Any, Any]) -> bool:
+    number = int(array[:8].copy().view("<u8")[0])
+    return number == int(array[-8:].copy().view("<u8")[0]) and bool((array[8:-8] == number % 251).all())
+
+
+class Writer:
+    def __init__(self, folder: Path, options: Options) -> None:
+        self._options = options
+        self._ended = threading.Event()
+        self._frame = np.zeros(options.size, np.uint8)
+        self._tally = Tally(folder / f"tally-{os.getpid()}")
+        self._writer = FrameWriter(folder, "camera", capacity=options.size, slots=options.slots).open()
+
+    def run(self) -> None:
+        number, due = 0, time.monotonic()
+        while not self._ended.is_set() and not 0 < self._options.limit <= number:
+            number += self._write(number + 1)
+            self._tally.note(number)
+            due += 1 / self._options.rate
+            if (pause := due - time.monotonic()) > 0:
+                time.sleep(pause)
+            else:
+                due = time.monotonic()
+
+    def _write(self, number: int) -> bool:
+        slot = self._writer.slot(self._options.size) if self._options.born else None
+        array = self._frame if slot is None else slot.array
+        stamp(array, number)
+        info = FrameInfo(captured_ns=time.monotonic_ns(), format=FORMAT, width=self._options.size // 3, height=1)
+        return self._writer.write(array, info) if slot is None else slot.send(info)
+
+    def report(self) -> dict[str, Any]:
+        writer = self._writer
+        return writer.counters.snapshot() | {
+            "wanted": writer.wanted,
+            "readers": writer.readers,
+            "sharing": writer.shared,
+            "problem": writer.problem,
+        }
+
+    def stop(self) -> None:
+        self._ended.set()
+        self._writer.close()
+
+
+class Reader:
+    def __init__(self, folder: Path, options: Options) -> None:
+        self._options = options
+        self.frames = self.wrong = self.invalid = 0
+        self.backwards = 0
+        self._last = (0, 0)
+        self._reader = FrameReader(folder, "camera", views=options.views, depth=options.depth).open()
+
+    def run(self) -> None:
+        for frame in self._reader:
+            self._check(frame)
+
+    def _check(self, frame: Frame) -> None:
+        if self._options.work_s:
+            time.sleep(self._options.work_s)
+        good = intact(frame.data)
+        if not frame.valid():
+            self.invalid += 1
+            return
+        self.frames += 1
+        self.wrong += not good
+        self.backwards += frame.info.writer == self._last[0] and frame.info.sequence <= self._last[1]
+        self._last = (frame.info.writer, frame.info.sequence)
+
+    def report(self) -> dict[str, Any]:
+        reader = self._reader
+        return reader.counters.snapshot() | {
+            "frames": self.frames,
+            "wrong": self.wrong,
+            "invalid": self.invalid,
+            "backwards": self.backwards,
+            "last": self._last[1],
+            "sharing": reader.shared,
+            "problem": reader.problem,
+            "views": views.why_unavailable(),
+        }
+
+    def stop(self) -> None:
+        self._reader.close()
+
+
+class Tally:
+    """A number in a file that outlives a SIGKILL."""
+
+    def __init__(self, path: Path) -> None:
+        path.write_bytes(bytes(8))
+        with path.open("r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), 8)
+
+    def note(self, number: int) -> None:
+        ctypes.c_uint64.from_buffer(self._memory).value = number
+
+
+def _memory() -> dict[str, Any]:
+    """kB, as in /proc; the shared memory that is mapped."""
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return {
+        "rss": int(status["VmRSS"].split()[0]),
+        "locked": int(status["VmLck"].split()[0]),
+        "mapped": segments.mapped() >> 10,
+    }
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

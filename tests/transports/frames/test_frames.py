@@ -1,0 +1,303 @@
+"""Frames between real processes: readers get the newest, and no process disturbs another."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pebble.errors import TransportError
+from pebble.transports import segments
+from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
+from pebble.transports.frames.frame import encode
+from tests.support import until
+from tests.transports.frames.frames_net import FramesNet
+
+VGA = 640 * 480 * 3
+QVGA = 320 * 240 * 3  # a pool of these fits into the 8 MiB that users may usually lock
+UNPRIVILEGED_USER = (
+    65534 if os.geteuid() == 0 else os.geteuid()
+)  # root may lock what it likes; for others the limits count
+
+
+@pytest.fixture
+def net(tmp_path: Path) -> Iterator[FramesNet]:
+    net = FramesNet(tmp_path / "run")
+    yield net
+    net.close()
+
+
+@pytest.mark.parametrize("views", [False, True])
+@pytest.mark.parametrize("born", [False, True])
+def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet, born: bool, views: bool) -> None:
+    readers = [net.reader(views=views) for _ in range(3)]
+    writer = net.writer(size=VGA, rate=60, born=born)
+    for reader in readers:
+        seen = reader.has(frames=30)
+        assert (seen["wrong"], seen["backwards"], seen.get("copied", 0)) == (0, 0, 0)
+    printed = writer.ask()
+    assert printed["readers"] == 3
+    assert printed["shared"] == printed["written"]
+    assert writer.close() == 0
+    assert [reader.close() for reader in readers] == [0, 0, 0]
+
+
+def test_without_views_frames_are_copied_twice_and_are_the_same(net: FramesNet) -> None:
+    reader = net.reader(views=True, without_views=True)
+    net.writer(size=VGA, rate=60, without_views=True)
+    seen = reader.has(frames=20, shared=20)
+    assert "0.0.0" in seen["views"]
+    assert seen["wrong"] == 0
+
+
+def test_a_slow_reader_gets_the_newest(net: FramesNet) -> None:
+    writer = net.writer(rate=200)
+    reader = net.reader(work_s=0.1)
+    seen = reader.has(frames=5, skipped=20)
+    assert seen["backwards"] == 0
+    assert writer.ask()["written"] - seen["last"] < 100  # half a second, generously
+
+
+def test_a_deep_reader_gets_them_all_in_order(net: FramesNet) -> None:
+    reader = net.reader(depth=100)
+    net.writer(rate=200, limit=100, size=640)
+    seen = reader.has(frames=100)
+    assert (seen.get("skipped", 0), seen.get("missed", 0), seen["backwards"]) == (0, 0, 0)
+
+
+def test_small_frames_travel_as_bytes_and_nothing_is_wrong_with_that(net: FramesNet) -> None:
+    reader = net.reader()
+    writer = net.writer(size=640)
+    assert reader.has(frames=10, copied=10)["problem"] == ""
+    printed = writer.ask()
+    assert (printed["sharing"], printed["problem"], printed.get("fallbacks", 0)) == (False, "", 0)
+
+
+def test_a_writer_sends_nothing_without_readers(net: FramesNet) -> None:
+    writer = net.writer()
+    resting = writer.has(unwanted=10)
+    assert (resting["wanted"], resting.get("written", 0)) == (False, 0)
+    reader = net.reader()
+    assert reader.has(frames=10)["last"] >= 10
+    reader.kill()
+    writer.reaches(lambda printed: not printed["wanted"])
+
+
+@pytest.mark.parametrize("how", ["kill", "close"])
+def test_living_readers_find_a_restarted_writer_within_a_second(net: FramesNet, how: str) -> None:
+    readers = [net.reader(), net.reader(views=True)]
+    for life in (1, 2, 3):
+        writer = net.writer(size=VGA)
+        for reader in readers:
+            before = reader.ask().get("frames", 0)
+            reader.reaches(lambda seen, before=before: seen["frames"] > before, 3)
+            assert reader.ask()["writers"] == life
+        getattr(writer, how)()
+
+
+def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=1000):
+        with pytest.raises(TransportError, match=r"frames-camera\.sock"):
+            FrameWriter(tmp_path, "camera", capacity=1000).open()
+        with FrameWriter(tmp_path, "microphone", capacity=1000):
+            pass
+    with FrameWriter(tmp_path, "camera", capacity=1000):
+        pass
+
+
+def test_a_stopped_reader_does_not_starve_the_others(net: FramesNet) -> None:
+    writer = net.writer(size=VGA, rate=60)
+    stopped, other = net.reader(views=True), net.reader(views=True)
+    stopped.has(frames=5)
+    other.has(frames=5)
+    stopped.signal(signal.SIGSTOP)
+    printed = writer.has(fallbacks=1, reclaimed=1)
+    before = other.ask()
+    seen = other.has(frames=before["frames"] + 100)
+    assert seen.get("missed", 0) + seen.get("torn", 0) + seen["invalid"] <= 0.05 * seen["last"]
+    assert seen["wrong"] == 0
+    stopped.signal(signal.SIGCONT)
+    back = stopped.ask()
+    assert stopped.has(frames=back["frames"] + 20)["wrong"] == 0
+    assert printed["readers"] >= 1
+
+
+@pytest.fixture
+def unprivileged_net() -> Iterator[FramesNet]:
+    """A run directory of a user whose limits count."""
+    folder = Path(tempfile.mkdtemp(prefix="pebble-frames-"))  # pytest's own folders are closed to others
+    os.chown(folder, UNPRIVILEGED_USER, -1)
+    net = FramesNet(folder)
+    yield net
+    net.close()
+    shutil.rmtree(folder)
+
+
+def test_a_reader_without_shared_memory_gets_bytes_and_reports_it(unprivileged_net: FramesNet) -> None:
+    poor = unprivileged_net.reader(memlock=64 << 10, user=UNPRIVILEGED_USER)
+    rich = unprivileged_net.reader(user=UNPRIVILEGED_USER)
+    writer = unprivileged_net.writer(size=QVGA, user=UNPRIVILEGED_USER)
+    seen = poor.has(frames=20, copied=20)
+    assert "LimitMEMLOCK=" in seen["problem"]
+    assert (seen["wrong"], seen.get("shared", 0)) == (0, 0)
+    seen = rich.has(frames=20, shared=20)
+    assert (seen["wrong"], seen["problem"]) == (0, "")
+    assert writer.ask()["sharing"]
+
+
+def test_with_too_little_to_lock_both_sides_use_bytes_and_report_it(unprivileged_net: FramesNet) -> None:
+    reader = unprivileged_net.reader(memlock=64 << 10, user=UNPRIVILEGED_USER)
+    writer = unprivileged_net.writer(size=QVGA, memlock=64 << 10, user=UNPRIVILEGED_USER)
+    seen = reader.has(frames=20, copied=20)
+    printed = writer.has(written=20)
+    assert (seen["wrong"], printed["sharing"]) == (0, False)
+    for text in (seen["problem"], printed["problem"]):
+        assert "64 KiB" in text
+        assert "LimitMEMLOCK=" in text
+
+
+def test_a_reader_that_may_lock_too_little_for_this_writer_changes_over(unprivileged_net: FramesNet) -> None:
+    reader = unprivileged_net.reader(memlock=3 << 20, user=UNPRIVILEGED_USER)  # enough for Zenoh itself
+    unprivileged_net.writer(size=QVGA, user=UNPRIVILEGED_USER)
+    seen = reader.has(frames=20, copied=20, reopened=1)
+    assert "LimitMEMLOCK=" in seen["problem"]
+    assert seen["wrong"] == 0
+
+
+def test_a_process_that_ends_with_an_open_writer_or_reader_ends(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from pebble.transports.frames import *\n"
+        "folder = Path(sys.argv[1]); w = FrameWriter(folder, 'camera', capacity=1 << 20).open()\n"
+        "r = FrameReader(folder, 'camera').open(); r.read(0.2); raise SystemExit(3)"
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], timeout=20, check=False).returncode == 3
+
+
+def test_a_fork_of_a_writer_or_reader_may_not_use_it(tmp_path: Path) -> None:
+    program = (
+        "import os, sys; from pathlib import Path; from pebble.errors import TransportError\n"
+        "from pebble.transports.frames import *\n"
+        "folder = Path(sys.argv[1]); w = FrameWriter(folder, 'camera', capacity=1 << 20).open()\n"
+        "r = FrameReader(folder, 'camera').open()\n"
+        "if os.fork():\n"
+        "    sys.exit(os.waitstatus_to_exitcode(os.wait()[1]))\n"
+        "refused = 0\n"
+        "for use in (lambda: w.write(b'x', FrameInfo()), lambda: r.read(0.1), FrameReader(folder, 'camera').open):\n"
+        "    try: use()\n"
+        "    except TransportError: refused += 1\n"
+        "w.close(); r.close(); os._exit(refused)"
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], timeout=20, check=False).returncode == 3
+
+
+def test_both_can_be_opened_again(tmp_path: Path) -> None:
+    writer, reader = FrameWriter(tmp_path, "camera", capacity=50_000), FrameReader(tmp_path, "camera")
+    for number in (1, 2, 3):
+        with writer, reader:
+            assert until(lambda: writer.wanted)
+            assert writer.write(b"x" * 50_000, FrameInfo())
+            frame = reader.read(5)
+            assert frame is not None
+            assert (frame.info.sequence, frame.shared, reader.counters["writers"]) == (1, True, number)
+        assert not writer.wanted
+        assert not writer.write(b"x", FrameInfo())
+        assert reader.read() is None
+        reader.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_closed_reader_stops_reading(tmp_path: Path) -> None:
+    reader = FrameReader(tmp_path, "camera").open()
+    frames: list[object] = []
+    thread = threading.Thread(target=lambda: frames.extend(reader))
+    thread.start()
+    assert reader.read(0.01) is None
+    reader.close()
+    thread.join(5)
+    assert not thread.is_alive()
+    assert frames == []
+    assert reader.read() is None
+
+
+def test_what_is_not_a_frame_is_refused(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=100) as writer, FrameReader(tmp_path, "camera") as reader:
+        assert until(lambda: writer.wanted)
+        assert writer._publisher is not None
+        for attachment in (None, b"", b"\xc1garbage", b"\x91\xa3abc"):
+            writer._publisher.put(b"x" * 50, attachment=attachment)
+        assert writer.write(b"\x01\x02", FrameInfo(format="s16le", rate=16000, channels=1))
+        frame = reader.read(5)
+        assert frame is not None
+        assert frame.data.tolist() == [1, 2]
+        assert frame.info.rate == 16000
+        assert reader.counters["refused"] == 4
+
+
+def test_a_shared_frame_of_a_life_that_is_over_is_not_shown(tmp_path: Path) -> None:
+    """Its memory may have been reclaimed meanwhile, and may be all zeros."""
+    with FrameWriter(tmp_path, "camera", capacity=100_000) as writer, FrameReader(tmp_path, "camera") as reader:
+        assert until(lambda: writer.wanted and reader.writers == 1)
+        reader._writers.clear()  # as when the writer's token is gone
+        assert writer.write(b"\1" * 100_000, FrameInfo())
+        assert reader.read(0.5) is None
+        assert reader.counters["torn"] == 1
+
+
+def test_late_frames_of_a_replaced_writer_are_ignored(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=100) as writer, FrameReader(tmp_path, "camera", depth=9) as reader:
+        assert until(lambda: writer.wanted)
+        assert writer._publisher is not None
+        for life, number in ((7, 5), (8, 1), (7, 6), (8, 1), (8, 2)):
+            writer._publisher.put(bytes([number]), attachment=encode(FrameInfo(sequence=number, writer=life)))
+        frames = [reader.read(5) for _ in range(3)]
+        assert [(frame.info.writer, frame.info.sequence) for frame in frames if frame] == [(7, 5), (8, 1), (8, 2)]
+        assert reader.read(0.2) is None
+
+
+def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
+    picture = np.arange(3 * 100 * 200, dtype=np.uint8).reshape(100, 200, 3)
+    flat = picture.tobytes()
+    whole = np.zeros((100, 400, 3), np.uint8)
+    whole[:, ::2] = picture
+    with FrameWriter(tmp_path, "camera", capacity=60_000) as writer, FrameReader(tmp_path, "camera") as reader:
+        assert until(lambda: writer.wanted)
+        for data in (picture, whole[:, ::2], flat, bytearray(flat), memoryview(flat), np.frombuffer(flat, "<u2")):
+            assert writer.write(data, FrameInfo(format="bgr24", width=200, height=100))
+            frame = reader.read(5)
+            assert frame is not None
+            assert frame.shared
+            assert frame.data.tobytes() == flat
+            frame.data[0] = 7  # it is ours
+            assert frame.picture().shape == (100, 200, 3)
+        assert writer.write(b"x" * 1_000_000, FrameInfo())  # no slot is that large
+        big = reader.read(5)
+        assert big is not None
+        assert (big.data.size, big.shared) == (1_000_000, False)
+        assert writer.counters["fallbacks"] == 1
+
+
+def test_segments_of_killed_processes_are_swept(net: FramesNet) -> None:
+    reader, writer = net.reader(views=True), net.writer(size=VGA)
+    reader.has(frames=5)
+    net.note_segments()
+    assert len(net.left()) >= 2
+    writer.kill()
+    reader.kill()
+    assert until(lambda: segments.sweep() >= 0 and not net.left(), 5)
+
+
+def test_the_name_of_a_stream_is_part_of_a_path(tmp_path: Path) -> None:
+    for name in ("", "..", "a/b", "Camera", "a*", "x" * 40):
+        with pytest.raises(TransportError):
+            FrameReader(tmp_path, name)
+    with pytest.raises(TransportError, match="too long"):
+        FrameWriter(tmp_path / ("x" * 100), "camera", capacity=1).open()

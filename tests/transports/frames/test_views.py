@@ -1,0 +1,255 @@
+"""Views look into shared memory; they are certain about it, or they are not used."""
+
+from __future__ import annotations
+
+import gc
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+import zenoh.shm
+
+from pebble.errors import TransportError
+from pebble.runtime.parent import tied_to_parent
+from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, views
+from tests.support import ROOT, Child, until
+
+LARGE = 500_000  # bytes: the allocator's margin holds no such frame
+
+
+@pytest.fixture(autouse=True)
+def untested() -> Iterator[None]:
+    """Every test begins like a new process, and leaves it so."""
+    views._views = views._Views()
+    yield
+    views._views = views._Views()
+
+
+def test_what_a_view_writes_is_in_the_buffer_and_the_other_way_round() -> None:
+    assert views.why_unavailable() == ""
+    pool = zenoh.shm.ShmProvider.default_backend(1 << 22)
+    for size in (1, 7, 4096, 65_537, 3_000_001):
+        buffer = pool.alloc(size, policy=zenoh.shm.GarbageCollect())
+        view = views.array(buffer, size, writable=True, owner=pool)
+        assert view is not None
+        view[:] = 7
+        view[-1] = 9
+        assert bytes(buffer) == b"\7" * (size - 1) + b"\x09"
+        buffer[:] = bytes(size)
+        assert not view.any()
+
+
+def test_a_readers_view_cannot_be_made_writable() -> None:
+    pool = zenoh.shm.ShmProvider.default_backend(1 << 20)
+    buffer = pool.alloc(100)
+    buffer[:] = bytes(range(100))
+    view = views.array(zenoh.ZBytes(buffer).as_shm(), 100)
+    assert view is not None
+    assert view.tobytes() == bytes(range(100))
+    with pytest.raises(ValueError, match="read-only"):
+        view[0] = 1
+    with pytest.raises(ValueError, match="WRITEABLE"):
+        view.flags.writeable = True
+
+
+def test_an_array_keeps_its_memory() -> None:
+    pool = zenoh.shm.ShmProvider.default_backend(1 << 20)
+    buffer = pool.alloc(500_000)
+    buffer[:] = b"x" * 500_000
+    view = views.array(zenoh.ZBytes(buffer).as_shm(), 500_000)
+    assert view is not None
+    corner = view.reshape(500, 1000)[400:, ::3]
+    del view, buffer
+    gc.collect()
+    with pytest.raises(zenoh.ZError):
+        pool.alloc(600_000, policy=zenoh.shm.GarbageCollect())
+    assert corner.tobytes() == b"x" * corner.size
+    del corner
+    pool.garbage_collect()
+    assert pool.alloc(600_000)
+
+
+def _unprintable(buffer: object) -> int:
+    raise views._UnexpectedLayoutError("ZShmMut does not print its address")
+
+
+MISMATCHES = {
+    "another version": ("KNOWN_VERSIONS", frozenset({"1.9.0"}), "1.9.0"),
+    "no version": ("_version", lambda: "", "unknown version"),
+    "the address is nowhere": ("_printed", lambda _: 1, "none of its words"),
+    "nothing is printed": ("_printed", _unprintable, "does not print"),
+    "it is a word further": ("_only", lambda found: min(found[0]) + 8, "has moved"),
+    "buffers are smaller": ("_only", lambda _: 4096, "too small"),
+}
+
+
+@pytest.mark.parametrize(("name", "value", "reason"), MISMATCHES.values(), ids=MISMATCHES)
+def test_on_any_mismatch_it_reports_why_and_frames_are_copied(
+    name: str,
+    value: object,
+    reason: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(views, name, value)
+    assert reason in views.why_unavailable()
+    assert reason in caplog.text
+    assert views.array(object(), 100) is None
+    with (
+        FrameWriter(tmp_path, "camera", capacity=50_000) as writer,
+        FrameReader(tmp_path, "camera", views=True) as reader,
+    ):
+        assert until(lambda: writer.wanted)
+        assert writer.slot(50_000) is None
+        assert writer.write(np.full(50_000, 3, np.uint8), FrameInfo())
+        frame = reader.read(5)
+        assert frame is not None
+        assert frame.shared
+        assert frame.valid()
+        frame.data[0] = 4  # a copy of our own
+        assert frame.data.tobytes() == b"\4" + b"\3" * 49_999
+
+
+def test_a_released_frame_is_not_to_be_used_and_what_was_taken_from_it_stays(tmp_path: Path) -> None:
+    with (
+        FrameWriter(tmp_path, "camera", capacity=50_000) as writer,
+        FrameReader(tmp_path, "camera", views=True) as reader,
+    ):
+        assert until(lambda: writer.wanted)
+        slot = writer.slot(30_000)
+        assert slot is not None
+        retained = slot.array
+        retained[:] = 5
+        assert slot.send(FrameInfo(format="bgr24", width=100, height=100))
+        with pytest.raises(TransportError, match="sent or dropped"):
+            _ = slot.array
+        with pytest.raises(TransportError, match="sent or dropped"):
+            slot.send(FrameInfo())
+        slot.drop()
+        frame = reader.read(5)
+        assert frame is not None
+        picture = frame.picture()
+        assert np.shares_memory(picture, frame.data)
+        frame.release()
+        frame.release()
+        assert not frame.valid()
+        with pytest.raises(TransportError, match="released"):
+            _ = frame.data
+        assert picture.min() == picture.max() == 5
+    assert picture.sum() == 5 * 30_000  # both ends are closed, and it is still there
+    retained[:] = 6  # forbidden, and harmless
+    assert picture.sum() == 6 * 30_000
+
+
+def test_slots_that_are_dropped_or_forgotten_are_free_again(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=50_000) as writer, FrameReader(tmp_path, "camera"):
+        assert until(lambda: writer.wanted)
+        for _ in range(50):
+            slot = writer.slot(50_000)
+            assert slot is not None
+            slot.array[:] = 1
+            slot.drop()
+        assert [writer.slot(50_000) is not None for _ in range(20)] == [True] * 20
+
+
+HOLDER = """
+import sys; from pathlib import Path; from pebble.transports.frames import *
+with FrameReader(Path(sys.argv[1]), "camera", views=True) as reader:
+    frame = reader.read(10); data = frame.data
+    print(frame.valid(), set(data.tolist()), flush=True); sys.stdin.readline()
+    print(frame.valid(), set(data.tolist()), flush=True)
+"""
+
+
+def test_a_frame_that_was_held_too_long_is_invalid(tmp_path: Path) -> None:
+    """Its process is stopped, so that the writer takes the memory back; afterwards it looks at its frame again."""
+    with FrameWriter(tmp_path, "camera", capacity=LARGE, slots=2) as writer:
+        holder = Child(
+            [sys.executable, "-X", "dev", "-c", HOLDER, str(tmp_path)],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert until(lambda: writer.wanted)
+            assert writer.write(b"\1" * LARGE, FrameInfo())
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == "True {1}\n"
+            holder.send_signal(signal.SIGSTOP)
+            with FrameReader(tmp_path, "camera") as reader:
+                assert until(
+                    lambda: writer.write(b"\2" * LARGE, FrameInfo()) and writer.counters["reclaimed"], step=0.02
+                )
+                assert until(
+                    lambda: (
+                        writer.write(b"\2" * LARGE, FrameInfo()) and reader.read(1) and reader.counters["shared"] > 3
+                    ),
+                    step=0.02,
+                )
+            holder.send_signal(signal.SIGCONT)
+            valid, found = holder.communicate("\n", timeout=10)[0].split(maxsplit=1)
+            assert (valid, "2" in found) == ("False", True)
+        finally:
+            holder.kill()
+            holder.wait()
+
+
+SOAK = """
+import sys; from pathlib import Path; import numpy as np
+from pebble.transports.frames import *
+from pebble.transports.frames import views
+folder, frames = Path(sys.argv[1]), int(sys.argv[2])
+status = Path("/proc/self/status")
+def rss(): return int(next(line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmRSS")))
+assert views.why_unavailable() == "", views.why_unavailable()
+with FrameWriter(folder, "camera", capacity=20_000, slots=16) as writer:
+    with FrameReader(folder, "camera", views=True, depth=5) as reader:
+        while not writer.wanted: pass
+        held, wrong, warm, info, spare = [], 0, 0, FrameInfo(format="bgr24"), np.zeros(17_000, np.uint8)
+        for number in range(0, frames, 5):
+            for step in range(5):
+                slot = writer.slot(17_000)
+                array = spare if slot is None else slot.array
+                array[0] = array[-1] = (number + step) % 251
+                writer.write(spare, info) if slot is None else slot.send(info)
+            for step in range(5):
+                frame = reader.read(0.01)
+                if frame is None:  # Zenoh drops a few of 10,000 in bursts
+                    continue
+                good = frame.data[0] == frame.data[-1] == (frame.info.sequence - 1) % 251
+                wrong += not (good and frame.valid())
+                held = held[-2:] + [frame.data[5:]]  # arrays that outlive their frames
+            if number == frames // 10: warm = rss()
+        print(wrong, reader.counters["missed"], rss() - warm, flush=True)
+"""
+
+
+def soak(folder: Path, frames: int, *options: str) -> tuple[int, int, int]:
+    """Writer and reader with views in one process; returns wrong frames, lost ones, and growth in kB."""
+    command = tied_to_parent([sys.executable, *options, "-c", SOAK, str(folder), str(frames)])
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100_000, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    wrong, lost, growth = map(int, done.stdout.split())
+    return wrong, lost, growth
+
+
+@pytest.mark.parametrize(("frames", "options"), [(100_000, ()), (5_000, ("-X", "dev"))])
+def test_a_soak(tmp_path: Path, frames: int, options: tuple[str, ...]) -> None:
+    wrong, lost, growth = soak(tmp_path, frames, *options)
+    assert wrong == 0
+    assert lost <= frames / 100  # a reader that stood still for a moment; usually none
+    assert growth < 5_000
+
+
+if __name__ == "__main__":  # python -m tests.transports.frames.test_views FOLDER FRAMES [-X dev]
+    began = time.monotonic()
+    result = soak(Path(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:])
+    sys.stdout.write(f"wrong, lost, growth in kB: {result} in {time.monotonic() - began:.0f} s\n")

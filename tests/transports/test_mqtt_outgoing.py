@@ -1,0 +1,133 @@
+"""The backlog is bounded and keeps the newest; a retained message counts as lost until the broker confirms it."""
+
+from __future__ import annotations
+
+from pebble.transports import Message, QoS
+from pebble.transports.mqtt.outgoing import BACKLOG_BYTES, BACKLOG_MESSAGES, Backlog, InFlightTable, PendingAck
+
+
+def drain(backlog: Backlog) -> list[bytes]:
+    taken = []
+    while backlog:
+        taken.append(backlog.take().payload)
+    return taken
+
+
+def test_the_oldest_gives_way() -> None:
+    backlog = Backlog()
+    dropped = sum(backlog.put(Message("a", b"%d" % number)) for number in range(BACKLOG_MESSAGES + 10))
+    assert dropped == 10
+    assert drain(backlog) == [b"%d" % number for number in range(10, BACKLOG_MESSAGES + 10)]
+
+
+def test_bytes_are_bounded_but_one_message_may_always_wait() -> None:
+    backlog = Backlog()
+    assert backlog.put(Message("a", b"1" * BACKLOG_BYTES * 3)) == 0
+    assert backlog.put(Message("a", b"2" * (BACKLOG_BYTES - 1))) == 1
+    assert backlog.put(Message("a", b"3")) == 0
+    assert [payload[:1] for payload in drain(backlog)] == [b"2", b"3"]
+
+
+def test_a_retained_message_is_replaced_only_by_a_newer_one_of_its_topic() -> None:
+    backlog = Backlog()
+    backlog.put(Message("state", b"old", retain=True))
+    backlog.put(Message("other", b"other", retain=True))
+    for _ in range(BACKLOG_MESSAGES * 2):
+        backlog.put(Message("a", b"x"))
+    assert backlog.put(Message("state", b"new", retain=True)) == 1
+    taken = drain(backlog)
+    assert taken[0] == b"other"
+    assert taken[-1] == b"new"
+    assert len(taken) == BACKLOG_MESSAGES + 2
+
+
+def test_a_delivered_message_makes_what_waits_on_its_topic_stale() -> None:
+    backlog = Backlog()
+    for message in (Message("a", b"1"), Message("b", b"2"), Message("a", b"3", retain=True)):
+        backlog.put(message)
+    assert backlog.supersede(Message("a", b"4")) == 1
+    assert backlog.supersede(Message("a", b"5", retain=True)) == 1
+    assert drain(backlog) == [b"2"]
+    assert not backlog
+
+
+def retained(topic: str, payload: bytes = b"1", qos: QoS = QoS.DELIVERED) -> Message:
+    return Message(topic, payload, qos, retain=True)
+
+
+def send(in_flight: InFlightTable, message: Message, mid: int) -> Message:
+    in_flight.accept(message)
+    in_flight.sent(message, mid)
+    return message
+
+
+def test_an_acknowledgement_proves_the_message_it_names() -> None:
+    in_flight = InFlightTable()
+    send(in_flight, Message("event", b"", QoS.DELIVERED), 1)
+    send(in_flight, retained("a"), 2)
+    newer = send(in_flight, retained("a", b"2"), 3)
+    assert in_flight.unacked == 3
+    assert in_flight.acknowledge(2)
+    assert in_flight.unconfirmed_retained() == [newer]
+    assert in_flight.acknowledge(3)
+    assert in_flight.unconfirmed_retained() == []
+    assert not in_flight.acknowledge(3)
+    assert in_flight.unacked == 1
+
+
+def test_an_answered_ping_proves_what_was_sent_before_it() -> None:
+    in_flight = InFlightTable()
+    send(in_flight, retained("before", qos=QoS.LATEST), 1)
+    in_flight.ping(0.0, None)
+    after = send(in_flight, retained("after", qos=QoS.LATEST), 2)
+    in_flight.accept(waiting := retained("waiting", qos=QoS.LATEST))
+    in_flight.pong(0.1)
+    assert in_flight.unconfirmed_retained() == [after, waiting]
+    in_flight.ping(0.2, None)
+    in_flight.pong(0.3)
+    assert in_flight.unconfirmed_retained() == [waiting]
+
+
+def test_unproven_messages_come_oldest_first() -> None:
+    in_flight = InFlightTable()
+    for number, topic in enumerate(["a", "b", "a"]):
+        send(in_flight, retained(topic), number)
+    assert [message.topic for message in in_flight.unconfirmed_retained()] == ["b", "a"]
+
+
+def test_the_shortest_round_trip_of_late_counts() -> None:
+    in_flight = InFlightTable()
+    assert in_flight.round_trip_s == 0.0
+    for round_trip in (0.5, 2.0, 0.5):
+        in_flight.ping(10.0, None)
+        in_flight.pong(10.0 + round_trip)
+    assert in_flight.round_trip_s == 0.5
+    for _ in range(8):
+        in_flight.measured(1.0)
+    assert in_flight.round_trip_s == 1.0
+
+
+def test_the_end_ends_every_wait() -> None:
+    in_flight, request, ping = InFlightTable(), PendingAck(), PendingAck()
+    in_flight.ask(1, request)
+    in_flight.ping(0.0, ping)
+    assert not request.done
+    in_flight.end()
+    assert request.done
+    assert ping.done
+
+
+def test_answers_complete_their_request_only() -> None:
+    in_flight, first, second, ping = InFlightTable(), PendingAck(), PendingAck(), PendingAck()
+    in_flight.ask(1, first)
+    in_flight.ask(2, second)
+    in_flight.ping(0.0, ping)
+    in_flight.answer(2)
+    in_flight.answer(7)
+    assert not second.done, "not before what came before the answer has been delivered"
+    in_flight.complete()
+    assert (first.done, second.done, ping.done) == (False, True, False)
+    in_flight.pong(1.0)
+    in_flight.complete()
+    assert ping.done
+    in_flight.pong(1.0)  # one more than there were pings

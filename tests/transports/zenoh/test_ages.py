@@ -1,0 +1,63 @@
+"""The age of messages from other machines, whose clocks started some other time."""
+
+from __future__ import annotations
+
+import pytest
+
+from pebble.transports.zenoh.ages import MessageAges
+
+HERE, THERE = 1, 2
+LATE_S = 2.0
+
+
+class Robot:
+    """Its clock shows ``now``; the operator's is ``offset`` behind, and counts ``rate`` seconds per second."""
+
+    def __init__(self, offset: float = 5000.0, rate: float = 1.0) -> None:
+        self.ages = MessageAges(HERE, LATE_S)
+        self._offset, self._rate = offset, rate
+
+    def receives(self, now: float, journey: float = 0.01) -> float:
+        return self.ages.age_s(THERE, (now - journey) * self._rate - self._offset, now)
+
+
+@pytest.mark.parametrize("offset", [5000.0, -5000.0])
+def test_what_piled_up_is_as_old_as_it_is(offset: float) -> None:
+    robot = Robot(offset)
+    assert [robot.receives(now / 10) for now in range(10)] == pytest.approx([0.0] * 10, abs=0.01)
+    piled_up = [robot.receives(7.0, journey=journey) for journey in (6.0, 4.0, 2.5, 1.0, 0.01)]
+    assert piled_up == pytest.approx([6.0, 4.0, 2.5, 1.0, 0.0], abs=0.02)
+
+
+def test_the_own_clock_needs_no_comparison() -> None:
+    assert MessageAges(HERE, LATE_S).age_s(HERE, 10.0, 16.0) == 6.0
+
+
+@pytest.mark.parametrize("rate", [1.0005, 0.9995])
+def test_drifting_clocks_stay_comparable(rate: float) -> None:
+    robot = Robot(rate=rate)
+    assert max(robot.receives(10.0 * turn) for turn in range(10_000)) < 0.1
+    assert robot.receives(100_010.0, journey=5.0) == pytest.approx(5.0, abs=0.1)
+
+
+def test_standing_still_twice_is_no_reason_to_believe_old_messages() -> None:
+    robot = Robot()
+    robot.receives(0.0)
+    for now in (10.0, 20.0, 30.0):
+        assert robot.receives(now, journey=4.0) > LATE_S
+
+
+def test_a_clock_that_stood_still_is_believed_again_soon() -> None:
+    """A virtual machine was paused: all its messages seem late from then on, for ever."""
+    robot = Robot()
+    robot.receives(0.0)
+    seemed = [robot.receives(100.0 + turn / 10, journey=60.0) for turn in range(100)]
+    assert seemed[0] > LATE_S
+    assert seemed[-1] == pytest.approx(0.0, abs=0.01)
+
+
+def test_many_machines_take_no_memory() -> None:
+    ages = MessageAges(HERE, LATE_S)
+    for boot in range(10, 1000):
+        ages.age_s(boot, 0.0, 0.0)
+    assert len(ages._clocks) <= 64

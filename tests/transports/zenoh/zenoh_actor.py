@@ -1,0 +1,136 @@
+"""Processes of a robot that do one thing each: `python -m tests.transports.zenoh.zenoh_actor ROLE RUN_DIR`.
+
+Each prints `up` when it is ready; a line on stdin ends it, and asks for its result where it has one.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+
+from pebble.errors import TransportError
+from pebble.transports import Message, QoS, Transport, ZenohSettings, create
+
+DELIVERED = QoS.DELIVERED
+
+
+def main(role: str, run_dir: str) -> None:
+    patience = 0.3 if role == "shot" else 5.0  # there is no hub for that one to wait for
+    client = create("zenoh", role, ZenohSettings(run_dir=Path(run_dir))).open(patience)
+    globals()[role](client)
+
+
+def report(text: object) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def talker(client: Transport) -> None:
+    """Numbers its messages at 200 Hz; reports how many."""
+    _count_until_stopped(client, "talk", 0.005, retain=False)
+
+
+def retainer(client: Transport) -> None:
+    """Counts in five retained topics at 100 Hz; reports the last number."""
+    _count_until_stopped(client, "kept/{}", 0.01, retain=True)
+
+
+def _count_until_stopped(client: Transport, topic: str, pause: float, *, retain: bool) -> None:
+    stop_requested, number = threading.Event(), 0
+    threading.Thread(target=_wait_to_be, args=(stop_requested,), daemon=True).start()
+    report("up")
+    while not stop_requested.wait(pause):
+        number += 1
+        client.publish(topic.format(number % 5), b"%d" % number, qos=DELIVERED, retain=retain)
+    report(number)
+    sys.stdin.readline()
+    client.close()
+
+
+def _wait_to_be(stop_requested: threading.Event) -> None:
+    sys.stdin.readline()
+    stop_requested.set()
+
+
+def shot(client: Transport) -> None:
+    """Publishes once, right after it opened, and is gone."""
+    client.publish("shot", b"x", qos=DELIVERED)
+    client.close()
+    report("up")
+
+
+def pinger(client: Transport) -> None:
+    """Publishes at once on each topic that it reads from stdin."""
+    report("up")
+    for topic in sys.stdin:
+        client.publish(topic.strip(), b"x", qos=DELIVERED)
+        report("")
+    client.close()
+
+
+def listener(client: Transport) -> None:
+    """Reports how many messages it has received and the last one, for each line on stdin."""
+    received: list[Message] = []
+    client.subscribe("#", received.append)
+    report("up")
+    for _ in sys.stdin:
+        report(f"{len(received)} {received[-1].payload.decode() if received else ''}")
+    client.close()
+
+
+def killed(client: Transport) -> None:
+    """Waits to be killed, with a will stored under the name of `client`."""
+    client.close()
+    with_will = create("zenoh", "killed", client._settings, will=Message("will", b"dead", DELIVERED, True))  # type: ignore[attr-defined]
+    with_will.open(5)
+    report("up")
+    sys.stdin.readline()
+
+
+def returns(client: Transport) -> None:
+    client.subscribe("#", lambda _: None)
+    report("up")
+
+
+def raises(client: Transport) -> None:
+    returns(client)
+    raise RuntimeError("nobody caught this")
+
+
+def exits(client: Transport) -> None:
+    returns(client)
+    sys.exit(3)
+
+
+def forks(client: Transport) -> None:
+    """The child may neither use its parent's session nor open one."""
+    report("up")
+    child = os.fork()
+    if child == 0:
+        os._exit(_refusals(client))
+    _, status = os.waitpid(child, 0)
+    report(os.waitstatus_to_exitcode(status))
+    client.close()
+
+
+def _refusals(client: Transport) -> int:
+    attempts = (
+        lambda: client.publish("from/child", b""),
+        lambda: client.subscribe("to/child", print),
+        lambda: create("zenoh", "child", client._settings).open(1),  # type: ignore[attr-defined]
+    )
+    return sum(_is_refused(attempt) for attempt in attempts)
+
+
+def _is_refused(attempt: object) -> bool:
+    try:
+        attempt()  # type: ignore[operator]
+    except TransportError as error:
+        return "spawn" in str(error)
+    return False
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,80 @@
+"""Finds identifiers with a retired word, and names the standard term: ``python tools/retired_names.py``.
+
+It checks each word of the identifiers in tracked Python files, but no comments and no strings.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import subprocess
+import sys
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+#: A word of an identifier (a regular expression, in lower case), and the term to use instead.
+RETIRED = {
+    "kept": "retained",
+    "fabric": "local_transport, network",
+    "bells?": "wakeup",
+    "news": "announcer_pipe, messages",
+    "roster": "peer_registry",
+    "seats?": "presence_lock",
+    "ledger": "in_flight",
+    "tickets?": "pending_ack",
+    "onlookers?|witness|observers?": "subscriber",
+    "sightings?": "discovered_robot",
+    "verdicts?": "result, assessment",
+    "thrift": "rate_control",
+    "clerk": "worker",
+    "keepers?": "supervisor",
+    "agreement": "reconciliation",
+    "neighbours?": "peers",
+    "chatter": "device_log",
+    "parked": "pending",
+    "unwant": "release",
+    "told|tells?|telling": "notified, notify",
+    "hears?|heard|hearing": "received, receive",
+    "says?|said|saying": "published, publish, report, log, message",
+    "beats?|hearts?": "heartbeat",
+    "fares?": "health, status",
+    "settles?|settled|settling": "the one meant: acknowledged, synchronised, ready, quiet",
+    "echoes": "loopback_filter, own messages",
+    "whoever|somebody|nobody|anybody": "a name of what it is",
+}
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_PATTERNS = {re.compile(pattern): instead for pattern, instead in RETIRED.items()}
+
+
+def retired(identifier: str) -> str | None:
+    """The replacement for the retired word in ``identifier``; None if it has none."""
+    for word in _WORDS.findall(identifier):
+        for pattern, instead in _PATTERNS.items():
+            if pattern.fullmatch(word.lower()):
+                return instead
+    return None
+
+
+def identifiers(source: str) -> Iterator[tuple[int, str]]:
+    """Line number and text of every name in a Python source."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.NAME:
+            yield token.start[0], token.string
+
+
+def main() -> int:
+    files = subprocess.run(["git", "ls-files", "*.py"], capture_output=True, text=True, check=True).stdout.splitlines()
+    found = 0
+    for path in map(Path, files):
+        if path.is_symlink() or not path.is_file():
+            continue
+        for line, name in identifiers(path.read_text()):
+            if instead := retired(name):
+                found += 1
+                print(f"{path}:{line}: {name} is retired; use {instead}")
+    return int(found > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

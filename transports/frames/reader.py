@@ -1,0 +1,310 @@
+"""Reads the newest frames of a stream; older ones are skipped."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Generic, Self, TypeVar
+
+import numpy as np
+import zenoh
+
+from pebble.errors import TransportError
+from pebble.transports import segments
+from pebble.transports.counters import Counters
+from pebble.transports.frames import reclaim, shared_memory, views
+from pebble.transports.frames.frame import Frame, FrameInfo, decode
+from pebble.transports.frames.reclaim import WriterMemory
+from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_reading
+from pebble.transports.wakeup import Wakeup
+from pebble.transports.zenoh.session import check_process, close_at_exit
+
+log = logging.getLogger(__name__)
+
+#: Bytes of shared memory that a reader may have mapped besides that of the current writer. Memory of dead writers is
+#: reclaimed where possible; beyond this limit the reader receives frames as bytes, and `problem` explains it.
+LEFT_MAPPED_LIMIT = 256 << 20
+
+_T = TypeVar("_T")
+
+
+class FrameReader:
+    """One reader of a stream. It may open before the writer, and survives any number of writers.
+
+    ``views``: frames are views of the writer's memory instead of copies. ``depth``: how many frames wait at most, for
+    sound; it must be below the writer's number of slots. One thread reads; any may close.
+
+    Counters: received; missed (gaps in the numbers: lost, or overtaken by a newer one); skipped (replaced by a newer
+    one before it was read); of those that were read shared (through shared memory), copied (as bytes) and torn
+    (overwritten while they were copied); refused (not frames); writers (how many were seen; a restarted one counts
+    again); reopened (stopped using shared memory).
+    """
+
+    def __init__(self, folder: Path, stream: str, *, views: bool = False, depth: int = 1) -> None:
+        if depth < 1:
+            raise TransportError(f"a reader of {stream} with {depth} frames would never get one")
+        self._folder = folder
+        self._stream = stream
+        self._names = StreamNames(folder, stream)
+        self._views = views
+        self.counters = Counters()
+        self.problem = ""
+        self._latest: _LatestFrames[_Arrival] = _LatestFrames(depth)
+        self._writers: dict[int, WriterMemory] = {}  # the running ones, and their memory
+        self._seen_writer_ids: set[int] = set()  # that were counted
+        self._last: tuple[int, int] = (0, 0)  # writer and number of the newest frame that arrived
+        self._previous_writer = -1  # the writer before that
+        self._sharing_ended = threading.Event()
+        self._changing = threading.Lock()
+        self._closed = True
+        self._pid = 0
+        self._session: zenoh.Session | None = None
+        self._declared: list[Any] = []
+
+    # -- opening and closing
+
+    def open(self) -> Self:
+        """Raises TransportError in a folder that cannot contain a socket."""
+        with self._changing:
+            self._closed = False
+            self._latest.reopen()
+            self.problem = "" if shared_memory.lockable(needed := 2 * METADATA) else self._memlock_problem(needed)
+            self._start()
+        close_at_exit(self)
+        return self
+
+    def _start(self) -> None:
+        if self.problem:
+            log.warning("%s", self.problem)
+        session = self._session = self._open_session()
+        self._pid = os.getpid()
+        if self.shared and self._views:
+            # The self-test takes milliseconds: better now than at the first frame. It takes memory, too, so readers of
+            # sound skip it: that is sent as bytes.
+            views.why_unavailable()
+        liveliness = session.liveliness()
+        # Called on Zenoh's receiving thread: these must be quick.
+        on_writer = zenoh.handlers.Callback(self._on_writer, indirect=False)
+        on_frame = zenoh.handlers.Callback(self._on_frame, indirect=False)
+        self._declared = [
+            liveliness.declare_subscriber(self._names.writers, on_writer, history=True),
+            session.declare_subscriber(self._names.data, on_frame),
+            liveliness.declare_token(self._names.reader(os.urandom(6).hex())),
+        ]
+
+    def _open_session(self) -> zenoh.Session:
+        if not self.problem:
+            try:
+                return open_reading(self._folder, self._names, shared=True)
+            except SharingError as error:
+                self.problem = f"{error}; the frames are sent as bytes"
+        return open_reading(self._folder, self._names, shared=False)
+
+    def _stop(self) -> None:
+        if self._session is None or self._pid != os.getpid():  # a forked session cannot even be closed
+            return
+        session, self._session = self._session, None
+        self._declared.clear()
+        self._writers.clear()
+        session.close()  # type: ignore[no-untyped-call]
+
+    def close(self) -> None:
+        with self._changing:
+            self._closed = True
+            self._latest.close()
+            self._stop()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- reading
+
+    @property
+    def closed(self) -> bool:
+        return self._closed
+
+    @property
+    def shared(self) -> bool:
+        """False: frames are sent to this reader as bytes; `problem` explains why."""
+        return not self.problem
+
+    @property
+    def writers(self) -> int:
+        """How many writers the stream has now: 0 or 1, and 2 for a moment when one replaces another."""
+        return len(self._writers)
+
+    def read(self, timeout: float | None = None) -> Frame | None:
+        """The newest frame not yet returned (with ``depth``: the oldest of those waiting).
+
+        None after ``timeout`` seconds without one, and when the reader is closed.
+        """
+        end = None if timeout is None else time.monotonic() + timeout
+        while not self._closed:
+            check_process(self._pid)
+            if self._sharing_ended.is_set():
+                self._reopen()
+            reclaim.reclaim()
+            arrival = self._latest.take(end)
+            frame = None if arrival is None or self._sharing_ended.is_set() else self._frame(arrival)
+            if frame is not None:
+                return frame
+            if arrival is None and end is not None and time.monotonic() >= end:
+                return None
+        return None
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Until the reader is closed."""
+        while not self._closed:
+            frame = self.read()
+            if frame is not None:
+                yield frame
+
+    def _frame(self, arrival: _Arrival) -> Frame | None:
+        info, payload, memory = arrival
+        buffer = payload.as_shm()
+        self.counters.add("copied" if buffer is None else "shared")
+        if buffer is None:
+            return Frame(info, _copy(bytes(payload)), shared=False)
+        memory = memory or self._writers.get(info.writer)  # its first frame may come before its token
+        if memory is None or reclaim.is_reclaimed(memory):
+            self.counters.add("torn")  # of a writer that has ended: its memory may have been reclaimed
+            return None
+        view = views.array(buffer, len(payload), owner=memory)
+        if self._views and view is not None:
+            return Frame(info, view, shared=True, buffer=buffer)
+        own = _copy(bytes(buffer)) if view is None else view.copy()
+        if buffer.is_valid():
+            return Frame(info, own, shared=True)
+        self.counters.add("torn")
+        return None
+
+    # -- on Zenoh's thread
+
+    def _on_frame(self, sample: zenoh.Sample) -> None:
+        info = None if sample.attachment is None else decode(bytes(sample.attachment))
+        if info is None:
+            self.counters.add("refused")
+            return
+        writer, number = self._last
+        if info.writer == writer:
+            if info.sequence <= number:
+                return  # sent as bytes and overtaken by a shared frame: counted as missed then
+            if info.sequence > number + 1:
+                self.counters.add("missed", info.sequence - number - 1)
+        elif info.writer == self._previous_writer:
+            return  # a late frame of a writer that was replaced
+        else:
+            self._previous_writer = writer
+        self._last = (info.writer, info.sequence)
+        self.counters.add("received")
+        if skipped := self._latest.put((info, sample.payload, self._writers.get(info.writer))):
+            self.counters.add("skipped", skipped)
+
+    def _on_writer(self, sample: zenoh.Sample) -> None:
+        try:
+            writer_id, memory = self._names.writer_of(str(sample.key_expr))
+        except ValueError:
+            self.counters.add("refused")
+            return
+        if sample.kind != zenoh.SampleKind.PUT:
+            self._writers.pop(writer_id, None)
+            return
+        if writer_id not in self._seen_writer_ids:
+            self._seen_writer_ids.add(writer_id)
+            self.counters.add("writers")
+        self._writers[writer_id] = memory
+        if memory.size and self.shared and (problem := self._why_not_map(memory)):
+            self._stop_sharing(problem)
+
+    def _why_not_map(self, memory: WriterMemory) -> str:
+        if reclaim.is_reclaimed(memory):
+            return f"the writer of {self._stream} was taken for dead: its frames come as bytes until a restart"
+        if memory.file and any(file.endswith(memory.file) for _, _, file in segments.mappings()):
+            return ""  # as before: only the connection was lost
+        left = reclaim.unclaimed_bytes()
+        if left > LEFT_MAPPED_LIMIT:
+            return (
+                f"writers of {self._stream} were restarted so often that {left >> 20} MiB of their memory are lost "
+                "until this process is restarted: from now on it gets frames as bytes"
+            )
+        needed = memory.size + METADATA
+        return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
+
+    def _stop_sharing(self, problem: str) -> None:
+        """Have the next `read` reopen the session without sharing: it cannot be closed on this thread."""
+        self.problem = problem
+        self._sharing_ended.set()
+        self._latest.wake()
+
+    def _reopen(self) -> None:
+        with self._changing:
+            self._sharing_ended.clear()
+            if self._closed:
+                return
+            self.counters.add("reopened")
+            self._stop()
+            self._start()
+
+    def _memlock_problem(self, size: int) -> str:
+        return shared_memory.memlock_problem(size, f"a reader of {self._stream}")
+
+
+_Arrival = tuple[FrameInfo, zenoh.ZBytes, WriterMemory | None]
+
+
+class _LatestFrames(Generic[_T]):
+    """A queue of the newest few items, in order, from any thread to one."""
+
+    def __init__(self, depth: int) -> None:
+        self._depth = depth
+        self.reopen()
+
+    def reopen(self) -> None:
+        self._items: deque[_T | None] = deque()
+        self._wakeup = Wakeup()
+
+    def put(self, item: _T) -> int:
+        """Append; return how many older items were dropped."""
+        items, thrown = self._items, 0
+        items.append(item)
+        while len(items) > self._depth:
+            try:
+                thrown += items.popleft() is not None
+            except IndexError:  # taken in that moment
+                break
+        self._wakeup.set()
+        return thrown
+
+    def take(self, end: float | None) -> _T | None:
+        """The oldest item; None at ``end`` (monotonic seconds) or when woken."""
+        items, wakeup = self._items, self._wakeup
+        while True:
+            try:
+                return items.popleft()
+            except IndexError:
+                if not wakeup.wait(end):
+                    return None
+
+    def wake(self) -> None:
+        if not self._items:  # else it is awake already
+            self._items.append(None)
+            self._wakeup.set()
+
+    def close(self) -> None:
+        """Drop waiting items: they pin the writer's memory."""
+        self._items.clear()
+        self._items.append(None)
+        self._wakeup.set()
+
+
+def _copy(data: bytes) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A writable copy."""
+    return np.frombuffer(data, np.uint8).copy()

@@ -1,0 +1,105 @@
+"""The shared memory of a frame writer, and the limit on locked memory that readers and writers are subject to."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import mmap
+import re
+import resource
+from typing import Any
+
+import numpy as np
+import zenoh
+import zenoh.shm
+
+from pebble.errors import TransportError
+from pebble.transports.frames import views
+
+Bytes = np.ndarray[Any, np.dtype[np.uint8]]
+
+MARGIN = 64 << 10  # bytes in addition to the frames: the allocator's own, and rounding
+_MLOCK_ONFAULT = 1  # checks the permission without touching the pages (Linux 4.4)
+_libc = ctypes.CDLL(None, use_errno=True)
+_segment = re.compile(r"\bsegment: (\d+),").search
+
+
+class SharedPool:
+    """One segment of shared memory that frames are allocated from. Raises ZError if it cannot be created."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._provider = zenoh.shm.ShmProvider.default_backend(size)
+        self._policy = zenoh.shm.GarbageCollect()
+
+    def segment(self) -> str:
+        """The name of its file in /dev/shm; "" if Zenoh does not report it."""
+        found = _segment(repr(self._provider.alloc(1, policy=self._policy)))
+        return f"{found[1]}.zenoh" if found else ""
+
+    def allocate(self, size: int) -> Chunk | None:
+        """Memory for one frame of ``size`` bytes; None if no slot is free."""
+        for _ in range(2):  # Zenoh fails if no single collected chunk is large enough; joined ones may be, next time
+            with contextlib.suppress(zenoh.ZError):
+                return Chunk(self._provider.alloc(size, policy=self._policy), size, self._provider)
+        return None
+
+    def reclaim(self) -> None:
+        """Free the chunks that no running reader has confirmed for a tenth of a second."""
+        self._provider.garbage_collect_unsafe()
+
+
+class Chunk:
+    """The memory of one frame: filled as an array, then sent as a Zenoh buffer."""
+
+    def __init__(self, buffer: Any, size: int, provider: Any) -> None:
+        self._buffer = buffer
+        self._size = size
+        self._provider = provider
+        self._view: Bytes | None = None
+
+    def view(self) -> Bytes:
+        """The memory as an array; it keeps the provider alive, so that the memory stays mapped after sending."""
+        if self._view is None:
+            self._view = views.array(self._buffer, self._size, writable=True, owner=self._provider)
+            if self._view is None:
+                raise TransportError(f"no view into shared memory: {views.why_unavailable()}")
+        return self._view
+
+    def fill(self, data: Bytes) -> None:
+        if views.why_unavailable():
+            self._buffer[:] = data.tobytes()
+        else:
+            self.view()[:] = data
+
+    def take(self) -> Any:
+        return self._buffer
+
+
+def lockable(size: int) -> bool:
+    """Whether this process may lock ``size`` bytes in addition to those it has locked already.
+
+    Zenoh locks what it shares; a reader that may not lock loses every shared frame without an error.
+    """
+    if not hasattr(_libc, "mlock2"):
+        return _unlimited()
+    with mmap.mmap(-1, size) as memory:
+        probe = ctypes.c_char.from_buffer(memory)
+        address = ctypes.c_void_p(ctypes.addressof(probe))
+        allowed = _libc.mlock2(address, ctypes.c_size_t(size), _MLOCK_ONFAULT) == 0
+        _libc.munlock(address, ctypes.c_size_t(size))
+        del probe
+    return bool(allowed)
+
+
+def memlock_problem(size: int, what: str) -> str:
+    """The error text for when ``lockable(size)`` is false: ``what`` cannot share memory, and which limit to raise."""
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    return (
+        f"{what} cannot use shared memory, frames are sent as bytes: this process may lock {limit >> 10} KiB "
+        f"and needs {size >> 10} KiB more; set LimitMEMLOCK=infinity in its systemd unit, or `ulimit -l unlimited`"
+    )
+
+
+def _unlimited() -> bool:
+    return resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY

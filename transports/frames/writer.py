@@ -1,0 +1,286 @@
+"""Writes frames to the readers of a stream, through shared memory; sends nothing while there are no readers."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import threading
+import time
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+import zenoh
+
+from pebble.errors import TransportError
+from pebble.transports import segments
+from pebble.transports.counters import Counters
+from pebble.transports.frames import shared_memory, views
+from pebble.transports.frames.frame import FrameInfo, encode
+from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_writing
+from pebble.transports.frames.shared_memory import MARGIN, Chunk, SharedPool
+from pebble.transports.peers import FileLock, prepare_run_dir
+from pebble.transports.zenoh.session import check_process, close_at_exit
+
+log = logging.getLogger(__name__)
+
+Bytes = np.ndarray[Any, np.dtype[np.uint8]]
+Data = bytes | bytearray | memoryview | np.ndarray[Any, Any]
+
+SMALL = 16 << 10  # bytes: frames up to this size are sent as bytes, which is as fast and pins no memory
+STARVED_S = 1.0  # after this long without a free slot, slots of dead or stopped readers are reclaimed
+#: What happens to a frame when a reader accepts nothing; neither blocks the writer. DROP: it is dropped after a
+#: millisecond, which is right for small messages: sound, and the reference to a picture in shared memory.
+#: A picture sent as bytes takes longer than that: BLOCK_FIRST lets one wait and drops those after it.
+_DROP, _BLOCK_FIRST = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK_FIRST
+
+
+class FrameWriter:
+    """The one writer of a stream. One thread at a time may write; `wanted`, `readers` and `close` work on any thread.
+
+    ``capacity`` is the size of the largest frame in bytes, ``slots`` how many of them the shared memory holds: two in
+    use by the writer and on their way, and one for every reader that holds a frame while it works. A frame without a
+    free slot is sent as bytes, so that a slow, stopped or dead reader costs the others nothing but time.
+
+    Counters: written; of these shared and fallbacks (no room); unwanted (no readers); reclaimed (how often slots had
+    to be reclaimed from readers that died or stopped).
+    """
+
+    def __init__(self, folder: Path, stream: str, *, capacity: int, slots: int = 6) -> None:
+        if capacity <= 0 or slots < 2:
+            raise TransportError(f"frames of {stream}: {slots} slots of {capacity} bytes are no pool")
+        self._folder = folder
+        self._stream = stream
+        self._names = StreamNames(folder, stream)
+        self._pool_size = 0 if capacity <= SMALL else slots * capacity + MARGIN
+        self.counters = Counters()
+        self.problem = ""
+        self._writer_id = 0
+        self._pid = 0
+        self._sequence = 0
+        self._starved_since: float | None = None
+        self._closing = threading.Lock()
+        self._session: zenoh.Session | None = None
+        self._publisher: zenoh.Publisher | None = None  # of small messages
+        self._bulk: zenoh.Publisher | None = None  # of pictures sent as bytes
+        self._pool: SharedPool | None = None
+        self._lock: FileLock | None = None
+        self._tokens: list[Any] = []
+        self._readers: set[str] = set()
+
+    # -- opening and closing
+
+    def open(self) -> Self:
+        """Raises TransportError if it cannot listen in that folder, for example because another writer does."""
+        prepare_run_dir(self._folder)
+        self._sweep()
+        self.problem = self._why_not_shared()
+        self._writer_id = random.SystemRandom().getrandbits(63) | 1
+        self._sequence = 0
+        session = self._session = self._open_session()
+        self._pid = os.getpid()
+        self._lock = FileLock.wait(self._names.lock_path(self._writer_id))  # another writer may be checking it
+        close_at_exit(self)
+        self._pool = self._make_pool()
+        if self.problem:
+            log.warning("%s", self.problem)
+        self._publisher = self._declare_publisher(session, _DROP)
+        self._bulk = self._declare_publisher(session, _BLOCK_FIRST) if self._pool_size else self._publisher
+        follow = zenoh.handlers.Callback(self._on_reader, indirect=False)
+        liveliness = session.liveliness()
+        size, segment = (0, "") if self._pool is None else (self._pool.size, self._pool.segment())
+        self._tokens = [
+            liveliness.declare_subscriber(self._names.readers, follow, history=True),
+            liveliness.declare_token(self._names.writer(self._writer_id, size, segment)),
+        ]
+        return self
+
+    def _declare_publisher(self, session: zenoh.Session, when_full: zenoh.CongestionControl) -> zenoh.Publisher:
+        return session.declare_publisher(
+            self._names.data, congestion_control=when_full, priority=zenoh.Priority.DATA_LOW
+        )
+
+    def _open_session(self) -> zenoh.Session:
+        if self._pool_size and not self.problem:
+            try:
+                return open_writing(self._folder, self._names, shared=True)
+            except SharingError as error:
+                self.problem = f"{error}; the frames are sent as bytes"
+        return open_writing(self._folder, self._names, shared=False)
+
+    def _sweep(self) -> None:
+        """Remove the segments and lock files of dead writers."""
+        segments.sweep()
+        for lock_path in self._names.lock_paths():
+            if (lock := FileLock.take(lock_path)) is not None:
+                lock.release()
+
+    def _why_not_shared(self) -> str:
+        if self._pool_size == 0 or shared_memory.lockable(needed := self._pool_size + 2 * METADATA):
+            return ""
+        return shared_memory.memlock_problem(needed, f"the writer of {self._stream}")
+
+    def _make_pool(self) -> SharedPool | None:
+        if self._pool_size == 0 or self.problem:
+            return None
+        try:
+            views.why_unavailable()  # the self-test takes milliseconds: better now than at the first frame
+            return SharedPool(self._pool_size)
+        except zenoh.ZError as error:
+            self.problem = f"the writer of {self._stream} cannot share memory, frames are sent as bytes: {error}"
+            return None
+
+    def close(self) -> None:
+        """Close. Readers stay open, and find the next writer by themselves."""
+        with self._closing:
+            if self._session is None or self._pid != os.getpid():  # a forked session cannot even be closed
+                return
+            session, self._session = self._session, None
+            self._publisher = self._bulk = self._pool = None
+            session.close()  # type: ignore[no-untyped-call]
+            self._tokens.clear()
+            self._readers.clear()
+            lock, self._lock = self._lock, None
+            if lock is not None:
+                lock.release()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- readers
+
+    @property
+    def shared(self) -> bool:
+        """False: frames are sent as bytes; `problem` explains why, unless they are small."""
+        return self._pool is not None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there are readers."""
+        return bool(self._readers)
+
+    @property
+    def readers(self) -> int:
+        """How many readers there are. A stopped one counts until its connection is closed, two seconds later."""
+        return len(self._readers)
+
+    def _on_reader(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._readers.add(str(sample.key_expr))
+        else:
+            self._readers.discard(str(sample.key_expr))
+
+    # -- writing
+
+    def write(self, data: Data, info: FrameInfo) -> bool:
+        """Send a copy of ``data``; False if there are no readers. Never waits for a reader."""
+        if not self._is_wanted():
+            return False
+        flat = _flat(data)
+        slot = self._allocate(flat.size)
+        if slot is None:
+            return self._put(flat.tobytes(), info)
+        slot.fill(flat)
+        return self._put(slot.take(), info, shared=True)
+
+    def slot(self, size: int) -> Slot | None:
+        """Shared memory to build a frame in, without a copy. None: use `write`.
+
+        It contains data of earlier frames: fill it completely.
+        """
+        if self._pool is None or not self.wanted or views.why_unavailable():
+            return None
+        chunk = self._allocate(size)
+        return None if chunk is None else Slot(self, chunk)
+
+    def _is_wanted(self) -> bool:
+        if self._publisher is None:
+            return False
+        check_process(self._pid)
+        if not self._readers:
+            self.counters.add("unwanted")
+            return False
+        return True
+
+    def _allocate(self, size: int) -> Chunk | None:
+        pool = self._pool
+        if pool is None or size <= 0:
+            return None
+        chunk = pool.allocate(size)
+        if chunk is None and self._starving():
+            pool.reclaim()
+            self.counters.add("reclaimed")
+            chunk = pool.allocate(size)
+        if chunk is not None:
+            self._starved_since = None
+        return chunk
+
+    def _starving(self) -> bool:
+        """Whether no slot was free for STARVED_S; then the time starts again."""
+        now = time.monotonic()
+        if self._starved_since is None:
+            self._starved_since = now
+        if now - self._starved_since < STARVED_S:
+            return False
+        self._starved_since = now
+        return True
+
+    def _put(self, payload: Any, info: FrameInfo, *, shared: bool = False) -> bool:
+        publisher = self._publisher if shared else self._bulk
+        if publisher is None:
+            return False
+        sequence = self._sequence + 1
+        stamped = msgspec.structs.replace(info, sequence=sequence, writer=self._writer_id)
+        try:
+            publisher.put(payload, attachment=encode(stamped))
+        except zenoh.ZError as error:  # closed meanwhile
+            log.debug("a frame of %s was not sent: %s", self._stream, error)
+            return False
+        self._sequence = sequence
+        self.counters.add("written")
+        if shared:
+            self.counters.add("shared")
+        elif self._pool is not None:
+            self.counters.add("fallbacks")
+        return True
+
+
+class Slot:
+    """Memory for one frame: fill `array`, then `send` or `drop`. After that its array must not be written to."""
+
+    def __init__(self, writer: FrameWriter, chunk: Chunk) -> None:
+        self._writer = writer
+        self._chunk: Chunk | None = chunk
+
+    @property
+    def array(self) -> Bytes:
+        """One-dimensional, writable, not zeroed. Raises TransportError when the slot was sent or dropped."""
+        return self._take(keep=True).view()
+
+    def send(self, info: FrameInfo) -> bool:
+        """False if there are no readers any more."""
+        buffer = self._take().take()
+        return self._writer._is_wanted() and self._writer._put(buffer, info, shared=True)
+
+    def drop(self) -> None:
+        self._chunk = None
+
+    def _take(self, *, keep: bool = False) -> Chunk:
+        chunk = self._chunk
+        if chunk is None:
+            raise TransportError("this slot has been sent or dropped")
+        if not keep:
+            self._chunk = None
+        return chunk
+
+
+def _flat(data: Data) -> Bytes:
+    """The same bytes as a one-dimensional array; a copy only if they are not contiguous."""
+    if isinstance(data, np.ndarray):
+        return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+    return np.frombuffer(data, np.uint8)

@@ -1,0 +1,473 @@
+"""One connection to an MQTT broker, from CONNECT to its loss.
+
+It is discarded as a whole, so that nothing in a client library's queue can outlive a disconnect (T4, T19). paho has no
+thread of its own here: one network thread calls `pump`, any thread calls `publish`. One lock guards paho, which does
+not support two writing threads (nor does OpenSSL support reading and writing at once). It is not held while a handler
+runs.
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+import socket
+import ssl
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from math import ceil, inf
+from typing import Any, cast
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from pebble.transports.base import Message, Outgoing, QoS
+from pebble.transports.counters import Counters
+from pebble.transports.mqtt.outgoing import Backlog, InFlightTable, PendingAck, shortest_round_trip_s, unconfirmed_bytes
+from pebble.transports.settings import MqttSettings
+
+log = logging.getLogger(__name__)
+
+CONNECT_TIMEOUT_S = 2.0  # for TCP and TLS, and again for the broker's CONNACK (T12)
+_HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
+UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused
+SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
+_LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
+_BATCH = 64  # messages read in a row before they are delivered
+_QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
+_ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
+
+
+class Lost(Exception):  # noqa: N818  (an event, not a mistake)
+    """The connection was lost, or could not be made. Its text explains why."""
+
+
+class Silent(Lost):
+    """The other side does not answer."""
+
+
+class Refused(Lost):
+    """The broker refused our CONNECT, or closed the connection instead of answering."""
+
+
+def ignore(_messages: list[Message]) -> None:
+    """Discard messages: for :meth:`Connection.pump` before a connection is accepted, and at its end."""
+
+
+class _Client(paho.Client):
+    """paho, with pings of our own (its keepalive is too slow for T19) and the size of what it has not written."""
+
+    on_pong: Callable[[], None]
+
+    @property
+    def unwritten(self) -> int:
+        """Bytes that the kernel has not accepted yet."""
+        return sum(packet["to_process"] for packet in self._out_packet)
+
+    def ping(self) -> None:
+        self._send_pingreq()
+
+    def _handle_pingresp(self) -> MQTTErrorCode:
+        self.on_pong()
+        return super()._handle_pingresp()
+
+
+class Connection:
+    """One connection: a paho client, the backlog of its socket, and the acknowledgements that the broker owes.
+
+    `as_published` uses bridge mode on 3.1.1, and noLocal and retain-as-published on 5 (T7, T16). `on_answers` is called
+    on the network thread with the filters that the broker has answered, and whether it refused each (T21).
+    """
+
+    def __init__(
+        self,
+        client_id: str,
+        settings: MqttSettings,
+        context: ssl.SSLContext | None,
+        will: Message | None,
+        counters: Counters,
+        *,
+        as_published: bool,
+        on_answers: Callable[[Mapping[str, bool]], None],
+    ) -> None:
+        self.as_published = as_published
+        self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
+        self.hesitated = False  # the broker took so long to accept us that it may have been suspended
+        self.where = f"broker {settings.host}:{settings.port}"
+        self._settings, self._counters = settings, counters
+        self._modern = settings.protocol == "5"
+        self._lock = threading.RLock()
+        self._inbox: list[Message] = []
+        self._on_answers = on_answers
+        self._asked: dict[int, list[str]] = {}  # the filters of each SUBSCRIBE without an answer, by message id
+        self._answers: dict[str, bool] = {}  # filters answered since the last `on_answers`: refused?
+        self._backlog = Backlog()
+        self._in_flight = InFlightTable()
+        self._answered_at = time.monotonic()
+        self._packets = 0  # received so far
+        self._more = False  # a batch ended before the socket was empty
+        self._accepted = False
+        self._refusal = self._disconnect_reason = ""
+        self._wake_read, self._wake_write = socket.socketpair()
+        self._wake_read.setblocking(False)
+        self._wake_write.setblocking(False)
+        self._client = self._make_client(client_id, context, will)
+
+    # -- opening and closing
+
+    def connect(self, stopping: threading.Event) -> None:
+        """Connect and wait for the broker's CONNACK, or for ``stopping``; raises Lost."""
+        try:
+            self._client.connect(self._settings.host, self._settings.port, self._settings.keepalive_s)
+        except (OSError, ValueError) as error:
+            raise Lost(f"{self.where} cannot be reached: {error}") from None
+        self.dialling = False
+        self._answered_at = time.monotonic()
+        deadline = time.monotonic() + CONNECT_TIMEOUT_S
+        try:
+            while not self._accepted:
+                if stopping.is_set():
+                    raise Lost("closed")
+                if time.monotonic() > deadline:
+                    raise Silent(f"{self.where} accepts connections but does not speak MQTT in time")
+                self.pump(deadline - time.monotonic(), ignore)
+        except Refused:
+            raise
+        except Lost as lost:
+            if self._socket() is None:
+                raise Refused(f"{self.where} hung up on our CONNECT") from None
+            raise lost from None
+
+    def discard(self) -> None:
+        """Reset the connection without DISCONNECT; all queued data is lost, in the kernel too."""
+        with self._lock:
+            sock = self._socket()
+            if sock is not None:
+                with suppress(OSError):  # it may be closed already
+                    sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _ABORT)
+                sock.close()
+            self._wake_read.close()
+            self._wake_write.close()
+            self._in_flight.end()
+
+    def disconnect(self) -> None:
+        """Send DISCONNECT: the broker then discards our will."""
+        with self._lock:
+            self._client.disconnect()
+            self._client.loop_write()
+
+    def wake(self) -> None:
+        """Make `pump` return; for other threads."""
+        with suppress(OSError):  # full of wake-ups already, or discarded
+            self._wake_write.send(b"\0")
+
+    # -- the network thread
+
+    def pump(self, timeout: float, receive: Callable[[list[Message]], None]) -> None:
+        """Wait up to ``timeout`` seconds for the socket, read and write, and deliver what was received. Raises Lost.
+
+        A `PendingAck` is completed after ``receive`` was given the messages that came before the answer: a retained
+        message is never delivered later than the confirmation of its subscription. Whether a subscription is refused is
+        known before both.
+        """
+        readable = self._wait(timeout)
+        with self._lock:
+            # Before reading: messages queued during a silence must not arrive as if they were fresh (T19).
+            self._check_silence()
+            if readable or self._more:
+                self._read()
+            self._write()
+            if self._accepted and self._ping_due_in() <= 0:
+                self._ping()
+            self._quick_ack()
+            messages, self._inbox = self._inbox, []
+            answers, self._answers = self._answers, {}
+        if answers:
+            self._on_answers(answers)
+        receive(messages)
+        self._in_flight.complete()
+
+    def _wait(self, timeout: float) -> bool:
+        with self._lock:
+            sock = self._socket()
+            if sock is None:
+                raise Lost(self._disconnect_reason or f"{self.where} closed the connection")
+            blocked = self._client.want_write()
+            poll = select.poll()
+            poll.register(sock.fileno(), select.POLLIN | (select.POLLOUT if blocked else 0))
+            poll.register(self._wake_read.fileno(), select.POLLIN)
+            wait = 0.0 if self._more else min(timeout, self._ping_due_in())
+        events = dict(poll.poll(ceil(max(wait, 0.0) * 1000)))
+        if events.pop(self._wake_read.fileno(), 0):
+            self._wake_read.recv(4096)
+        seen = next(iter(events.values()), 0)
+        if blocked and seen & select.POLLOUT:
+            self._answered_at = time.monotonic()  # the other side's TCP accepted some: slow, but alive
+        return bool(seen & ~select.POLLOUT)
+
+    def _check_silence(self) -> None:
+        if not self._accepted:
+            return  # `connect` has its own deadline, and gives the first round trip
+        limit = max(self._settings.silence_s, 4 * _LEAST_PING_S, 4 * self._in_flight.round_trip_s)
+        if time.monotonic() - self._answered_at > limit:
+            self._counters.add("silences")
+            raise Silent(f"{self.where} has not answered for {limit:.1f} s")
+
+    def _read(self) -> None:
+        received = before = self._packets
+        while True:
+            self._read_some()
+            if self._packets == before or len(self._inbox) >= _BATCH:
+                break
+            before = self._packets
+        if self._packets == received:
+            self._answered_at = time.monotonic()  # a piece of a long message: alive
+        sock = self._socket()
+        buffered = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
+        self._more = buffered or len(self._inbox) >= _BATCH
+
+    def _read_some(self) -> None:
+        failed = self._client.loop_read()
+        if self._refusal:
+            raise Refused(self._refusal)
+        if failed is MQTTErrorCode.MQTT_ERR_PROTOCOL and not self._accepted:
+            raise Refused(f"{self.where} refused us: unacceptable protocol version")
+        if failed:
+            raise Lost(f"{self.where} closed the connection")
+
+    def _write(self) -> None:
+        if self._client.want_write():
+            self._client.loop_write()
+        while self._backlog and self._socket() is not None and not self._client.want_write():
+            self._write_publish(self._backlog.take(), None)
+
+    def _socket(self) -> socket.socket | None:
+        return cast("socket.socket | None", self._client.socket())
+
+    def _quick_ack(self) -> None:
+        """Send TCP's ACKs at once: a broker with Nagle's algorithm delays its next message until then (up to 40 ms).
+
+        The kernel falls back to delayed ACKs whenever we send, so this is called after every read and write.
+        """
+        sock = self._socket()
+        if _QUICKACK is not None and sock is not None:
+            with suppress(OSError):  # the other side has just gone
+                sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, 1)
+
+    # -- ping
+
+    def ping(self) -> PendingAck:
+        """Send a ping: its answer proves that the broker has processed everything sent before."""
+        ack = PendingAck()
+        with self._lock:
+            self._ping(ack)
+        return ack
+
+    def _ping(self, ack: PendingAck | None = None) -> None:
+        self._in_flight.ping(time.monotonic(), ack)
+        self._client.ping()
+        self._client.loop_write()
+
+    def _ping_due_in(self) -> float:
+        newest = self._in_flight.pinged_at
+        keepalive_s = self._settings.keepalive_s or inf  # 0: none
+        interval = max(_LEAST_PING_S, min(self._settings.silence_s, keepalive_s) / 4)
+        return (self._answered_at if newest is None else newest) + interval - time.monotonic()
+
+    def _on_pong(self) -> None:
+        self._note_answer()
+        self._in_flight.pong(self._answered_at)
+
+    # -- any thread
+
+    def publish(self, message: Message, *, expires_s: int | None = None) -> bool:
+        """Send a message; False if that is impossible. A LATEST one may wait, and be dropped for a newer one."""
+        with self._lock:
+            if self._socket() is None:
+                return False
+            if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT:
+                return False
+            self._in_flight.accept(message)
+            if message.qos is QoS.LATEST and self._client.want_write():
+                self._counters.add("dropped", self._backlog.put(message))
+            else:
+                if self._backlog:
+                    self._counters.add("dropped", self._backlog.supersede(message))
+                self._write_publish(message, expires_s)
+                self._quick_ack()
+            blocked = self._socket() is None or self._client.want_write()
+        if blocked:
+            self.wake()
+        return True
+
+    def _write_publish(self, message: Message, expires_s: int | None) -> None:
+        properties = None
+        if self._modern and expires_s is not None:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties.MessageExpiryInterval = expires_s
+        sent = self._client.publish(message.topic, message.payload, int(message.qos), message.retain, properties)
+        self._in_flight.sent(message, sent.mid)
+        self._client.loop_write()
+
+    def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
+        """Subscribe to filters, each with its noLocal option (MQTT 5 only)."""
+        topics: list[Any]
+        asked = list(filters)
+        if self._modern:
+            topics = [
+                (filter_, SubscribeOptions(qos=int(qos), noLocal=no_local, retainAsPublished=self.as_published))
+                for filter_, no_local in asked
+            ]
+        else:
+            topics = [(filter_, int(qos)) for filter_, _ in asked]
+        return self._request(self._client.subscribe, topics, [filter_ for filter_, _ in asked])
+
+    def unsubscribe(self, filters: list[str]) -> PendingAck:
+        return self._request(self._client.unsubscribe, filters, [])
+
+    def _request(
+        self, send: Callable[[Any], tuple[MQTTErrorCode, int | None]], topics: list[Any], asked: list[str]
+    ) -> PendingAck:
+        ack = PendingAck()
+        if not topics:
+            ack.complete()
+            return ack
+        with self._lock:
+            failed, mid = send(topics)
+            if failed or mid is None:
+                ack.complete()
+            else:
+                self._in_flight.ask(mid, ack)
+                self._asked[mid] = asked
+                self._client.loop_write()
+        self.wake()
+        return ack
+
+    # -- state
+
+    @property
+    def has_room(self) -> bool:
+        return self._in_flight.unacked < UNACKED_LIMIT // 2
+
+    @property
+    def drained(self) -> bool:
+        """Whether everything accepted is written, and acknowledged where that is due."""
+        with self._lock:
+            return not (self._in_flight.unacked or self._backlog or self._client.want_write())
+
+    @property
+    def unacked(self) -> int:
+        return self._in_flight.unacked
+
+    @property
+    def outgoing(self) -> Outgoing:
+        with self._lock:
+            sock = self._socket()
+            if sock is None:
+                return Outgoing()
+            waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
+            return Outgoing(waiting, shortest_round_trip_s(sock))
+
+    def unconfirmed_retained(self) -> list[Message]:
+        """Retained messages that the broker may not have received, oldest first."""
+        with self._lock:
+            return self._in_flight.unconfirmed_retained()
+
+    # -- paho's callbacks: on the network thread, with the lock held
+
+    def _make_client(self, client_id: str, context: ssl.SSLContext | None, will: Message | None) -> _Client:
+        protocol = MQTTProtocolVersion.MQTTv5 if self._modern else MQTTProtocolVersion.MQTTv311
+        client = _Client(
+            CallbackAPIVersion.VERSION2, client_id=client_id, protocol=protocol, reconnect_on_failure=False
+        )
+        client.connect_timeout = CONNECT_TIMEOUT_S
+        if not self._modern:
+            client.max_inflight_messages_set(UNACKED_LIMIT)  # on 5 the broker's Receive Maximum may be paho's 20
+            if self.as_published:
+                client.enable_bridge_mode()
+        if self._settings.username is not None:
+            client.username_pw_set(self._settings.username, self._settings.password)
+        if context is not None:
+            client.tls_set_context(context)
+        if will is not None:
+            client.will_set(will.topic, will.payload, int(will.qos), will.retain)
+        client.on_pong = self._on_pong
+        client.on_socket_open = self._on_socket_open
+        client.on_socket_register_write = self._on_register_write
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_unsubscribe = self._on_unsubscribe
+        client.on_publish = self._on_publish
+        client.on_message = self._on_message
+        return client
+
+    def _note_answer(self) -> None:
+        self._packets += 1
+        self._answered_at = time.monotonic()
+
+    def _on_socket_open(self, _client: Any, _data: Any, sock: Any) -> None:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+
+    def _on_register_write(self, _client: Any, _data: Any, _sock: Any) -> None:
+        """If this is set, paho does not write by itself; we write after every call that queues something."""
+
+    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
+        started = self._answered_at
+        self._note_answer()
+        self._in_flight.measured(self._answered_at - started)
+        self.hesitated = self._answered_at - started > _HESITATION_S
+        if reason.is_failure:
+            self._refusal = f"{self.where} refused us: {_explain(reason)}"
+        else:
+            self._accepted = True
+
+    def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: ReasonCode, _properties: Any) -> None:
+        if flags.is_disconnect_packet_from_server:
+            self._disconnect_reason = f"{self.where} closed the connection: {reason.getName().lower()}"
+
+    def _on_subscribe(self, _client: Any, _data: Any, mid: int, reasons: list[ReasonCode], _properties: Any) -> None:
+        answers = list(zip(self._asked.get(mid, ()), reasons, strict=False))
+        self._answers.update((filter_, reason.is_failure) for filter_, reason in answers)
+        refused = [f"{filter_} ({reason})" for filter_, reason in answers if reason.is_failure]
+        if refused:
+            self._counters.add("subscriptions_refused")
+            log.warning("%s refused to subscribe us to %s", self.where, ", ".join(refused))
+        self._on_request_answered(mid)
+
+    def _on_unsubscribe(self, _client: Any, _data: Any, mid: int, _reasons: Any, _properties: Any) -> None:
+        self._on_request_answered(mid)
+
+    def _on_request_answered(self, mid: int) -> None:
+        self._note_answer()
+        self._asked.pop(mid, None)
+        self._in_flight.answer(mid)
+
+    def _on_publish(self, _client: Any, _data: Any, mid: int, _reason: Any, _properties: Any) -> None:
+        if self._in_flight.acknowledge(mid):  # paho also reports QoS 0 messages, which are only written
+            self._note_answer()
+
+    def _on_message(self, _client: Any, _data: Any, raw: paho.MQTTMessage) -> None:
+        self._packets += 1
+        try:
+            topic = raw.topic
+        except UnicodeDecodeError:
+            self._counters.add("malformed")
+            return
+        retain = bool(raw.retain)
+        retain_requested = retain if self.as_published else (True if retain else None)
+        self._inbox.append(Message(topic, bytes(raw.payload), QoS(min(raw.qos, 1)), retain, retain_requested))
+
+
+def _explain(reason: ReasonCode) -> str:
+    name = reason.getName()
+    if name == "Not authorized":  # mosquitto's answer to a wrong password on 3.1.1
+        return "not authorized (bad user name or password?)"
+    return str(name[:1].lower() + name[1:])

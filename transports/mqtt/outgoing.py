@@ -1,0 +1,242 @@
+"""What one MQTT connection has accepted and not finished sending: the backlog before its socket, and what is in flight.
+
+Neither class is locked: their connection is.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import socket
+import struct
+import sys
+import termios
+import threading
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass
+
+from pebble.transports.base import Message, QoS
+
+BACKLOG_MESSAGES = 64  # that are not retained
+BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
+ROUND_TRIPS = 8  # answer times that are remembered
+
+_TCP_INFO = getattr(socket, "TCP_INFO", None)  # Linux only
+_MIN_RTT = struct.Struct("@I")  # of struct tcp_info (linux/tcp.h, since 4.5): tcpi_min_rtt, microseconds
+_MIN_RTT_AT = 148
+_NEVER = 0xFFFFFFFF  # no round trip was measured yet
+
+
+class Backlog:
+    """LATEST messages for a socket that accepts no more, in order (T4).
+
+    A new message replaces the oldest one when there are too many; a retained one is only replaced by a newer one of its
+    topic.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[str | int, Message] = {}  # retained ones by topic, the others by number
+        self._numbers = itertools.count()
+        self._live_bytes = 0
+        self._live = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all payloads that wait."""
+        return sum(len(message.payload) for message in self._waiting.values())
+
+    def __contains__(self, topic: str) -> bool:
+        return topic in self._waiting
+
+    def put(self, message: Message) -> int:
+        """Append ``message``; return how many messages were dropped for it."""
+        if message.retain:
+            replaced = self._waiting.pop(message.topic, None) is not None
+            self._waiting[message.topic] = message
+            return int(replaced)
+        self._waiting[next(self._numbers)] = message
+        self._live += 1
+        self._live_bytes += len(message.payload)
+        dropped = 0
+        while self._live > 1 and (self._live > BACKLOG_MESSAGES or self._live_bytes > BACKLOG_BYTES):
+            self._remove(next(key for key in self._waiting if isinstance(key, int)))
+            dropped += 1
+        return dropped
+
+    def take(self) -> Message:
+        """Remove and return the oldest message."""
+        return self._remove(next(iter(self._waiting)))
+
+    def supersede(self, newer: Message) -> int:
+        """Drop what waits on the topic of a DELIVERED message that is sent ahead: it is stale (T8). Return how many."""
+        stale = [
+            key
+            for key, message in self._waiting.items()
+            if message.topic == newer.topic and (newer.retain or not message.retain)
+        ]
+        for key in stale:
+            self._remove(key)
+        return len(stale)
+
+    def _remove(self, key: str | int) -> Message:
+        message = self._waiting.pop(key)
+        if isinstance(key, int):
+            self._live -= 1
+            self._live_bytes -= len(message.payload)
+        return message
+
+
+class PendingAck:
+    """The answer to a request, to wait for. The loss of the connection completes it, too."""
+
+    def __init__(self) -> None:
+        self._answered = threading.Event()
+
+    @property
+    def done(self) -> bool:
+        return self._answered.is_set()
+
+    def wait(self, timeout: float) -> bool:
+        return self._answered.wait(timeout)
+
+    def complete(self) -> None:
+        self._answered.set()
+
+
+@dataclass(slots=True)
+class _Unconfirmed:
+    """A retained message the broker may not have. A PUBACK, or the answer to a later ping, confirms that it has."""
+
+    message: Message
+    mid: int | None = None
+    ping: int | None = None
+
+
+class InFlightTable:
+    """The acknowledgements and answers the broker owes. Message ids are MQTT's, times are seconds of one clock."""
+
+    def __init__(self) -> None:
+        self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
+        self._unacked: dict[int, str | None] = {}  # by message id: the topic, if retained
+        self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
+        self._requests: dict[int, PendingAck] = {}
+        self._answered: list[PendingAck] = []  # not completed yet
+        self._pings: deque[tuple[float, PendingAck | None]] = deque()  # unanswered: when sent, and what waits for it
+        self._ping_number = self._pong_number = 0
+
+    # -- messages
+
+    @property
+    def unacked(self) -> int:
+        """How many DELIVERED messages the broker has not acknowledged."""
+        return len(self._unacked)
+
+    def unconfirmed_retained(self) -> list[Message]:
+        """Retained messages the broker may not have, oldest first."""
+        return [entry.message for entry in self._unconfirmed.values()]
+
+    def accept(self, message: Message) -> None:
+        """Track ``message``, which is about to be sent or to wait in the backlog."""
+        if message.retain:
+            self._unconfirmed.pop(message.topic, None)
+            self._unconfirmed[message.topic] = _Unconfirmed(message)
+
+    def sent(self, message: Message, mid: int) -> None:
+        """Note that ``message`` went out under the id ``mid``."""
+        if message.qos is QoS.DELIVERED:
+            self._unacked[mid] = message.topic if message.retain else None
+        if message.retain:
+            entry = self._unconfirmed[message.topic]
+            if message.qos is QoS.DELIVERED:
+                entry.mid = mid
+            else:
+                entry.ping = self._ping_number + 1
+
+    def acknowledge(self, mid: int) -> bool:
+        """Process a PUBACK; False if it belongs to no known message."""
+        if mid not in self._unacked:
+            return False
+        topic = self._unacked.pop(mid)
+        if topic is not None and topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
+            del self._unconfirmed[topic]
+        return True
+
+    # -- requests and pings
+
+    def ask(self, mid: int, ack: PendingAck) -> None:
+        """Track a SUBSCRIBE or UNSUBSCRIBE."""
+        self._requests[mid] = ack
+
+    def answer(self, mid: int) -> None:
+        """Process a SUBACK or UNSUBACK."""
+        if mid in self._requests:
+            self._answered.append(self._requests.pop(mid))
+
+    def complete(self) -> None:
+        """Complete the answered requests, once the messages received before the answers have been delivered."""
+        answered, self._answered = self._answered, []
+        for ack in answered:
+            ack.complete()
+
+    def ping(self, now: float, ack: PendingAck | None) -> None:
+        """Track a PINGREQ."""
+        self._pings.append((now, ack))
+        self._ping_number += 1
+
+    def pong(self, now: float) -> None:
+        """Process a PINGRESP."""
+        if not self._pings:
+            return
+        sent_at, ack = self._pings.popleft()
+        self._pong_number += 1
+        self.measured(now - sent_at)
+        for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
+            del self._unconfirmed[topic]
+        if ack is not None:
+            self._answered.append(ack)
+
+    def measured(self, round_trip_s: float) -> None:
+        self._round_trips.append(round_trip_s)
+
+    @property
+    def round_trip_s(self) -> float:
+        """The shortest recent one: an answer that a stalled connection delayed gives the next stall no extra time."""
+        return min(self._round_trips, default=0.0)
+
+    @property
+    def pinged_at(self) -> float | None:
+        """When the newest unanswered ping was sent."""
+        return self._pings[-1][0] if self._pings else None
+
+    def end(self) -> None:
+        """Complete everything: no answer can come any more."""
+        self.complete()
+        for ack in [*self._requests.values(), *(ack for _, ack in self._pings if ack)]:
+            ack.complete()
+        self._requests.clear()
+        self._pings.clear()
+
+
+def unconfirmed_bytes(sock: socket.socket) -> int:
+    """Bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ)."""
+    size = bytearray(4)
+    with suppress(OSError, ValueError):  # closed, or no TCP
+        fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, size)
+    return int.from_bytes(size, sys.byteorder)
+
+
+def shortest_round_trip_s(sock: socket.socket) -> float:
+    """The kernel's own measurement over the last minutes; 0 where it has none."""
+    if _TCP_INFO is None:
+        return 0.0
+    info = b""
+    with suppress(OSError, ValueError):
+        info = sock.getsockopt(socket.IPPROTO_TCP, _TCP_INFO, _MIN_RTT_AT + _MIN_RTT.size)
+    if len(info) < _MIN_RTT_AT + _MIN_RTT.size:
+        return 0.0
+    (microseconds,) = _MIN_RTT.unpack_from(info, _MIN_RTT_AT)
+    return 0.0 if microseconds == _NEVER else microseconds / 1e6

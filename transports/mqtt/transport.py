@@ -1,0 +1,298 @@
+"""The MQTT transport: one client of a broker, 3.1.1 or 5, with one thread that keeps it connected."""
+
+from __future__ import annotations
+
+import logging
+import random
+import secrets
+import ssl
+import threading
+import time
+from collections.abc import Callable, Mapping
+from math import ceil
+
+from pebble.errors import TransportError
+from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
+from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
+from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
+from pebble.transports.mqtt.outgoing import PendingAck
+from pebble.transports.mqtt.tls import make_context
+from pebble.transports.settings import MqttSettings
+
+log = logging.getLogger(__name__)
+
+_ANSWER_S = 2.0  # longest wait for a SUBACK, and for the retained messages after it
+_CLOSING_S = 1.0  # longest wait for unacknowledged messages when closing
+_DIALLING_S = 0.2  # longest wait for a thread that may be in connect(2)
+_RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_max_s
+_CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
+_STEADY_S = 2.0  # after a connection this long the first retry is immediate
+_REPEAT_LOG_S = 30.0  # between two equal log lines
+_IDLE_S = 60.0  # the connection wakes up earlier, for its pings
+_REFUSALS = 2  # of bridge mode in a row, after which the broker counts as not supporting it
+
+
+class MqttTransport(Transport):
+    """docs/transports.md explains how it implements each promise."""
+
+    def __init__(self, client_id: str, settings: MqttSettings, *, will: Message | None = None) -> None:
+        super().__init__(client_id, will=will)
+        if settings.protocol not in ("3.1.1", "5"):
+            raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
+        self.settings = settings
+        # A broker closes the connection of a client when another connects with its id (MQTT-3.1.4-2), so ours cannot be
+        # guessed. It stays the same over reconnects: the broker closes our own half-dead connection at once.
+        self._mqtt_client_id = f"{client_id}-{secrets.token_hex(8)}"
+        self.as_published = settings.as_published
+        self.exact_echo = settings.as_published or settings.protocol == "5"
+        self._context: ssl.SSLContext | None = None
+        self._attempt: Connection | None = None  # the newest connection, in any state
+        self._connection: Connection | None = None  # the same, once it can be used
+        self._routing = threading.RLock()  # guards the broker's filters, and the connection they belong to
+        self._filters = BrokerFilters()
+        self._stopping = threading.Event()
+        self._will_on_close: Message | None = None
+        self._thread: threading.Thread | None = None
+        self._refusals = 0
+        self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
+        self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
+        self._own_message_filter = OwnMessageFilter()
+
+    @property
+    def outgoing(self) -> Outgoing:
+        connection = self._connection
+        return Outgoing() if connection is None else connection.outgoing
+
+    # -- the interface to base
+
+    def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
+        if self.settings.tls is not None:
+            self._context = make_context(self.settings.tls)
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_ANSWER_S)  # closed while it was dialling
+        self._will_on_close = None
+        self._stopping = stopping = threading.Event()
+        self._thread = threading.Thread(
+            target=self._run, args=(stopping,), name=f"pebble-mqtt {self.client_id}", daemon=True
+        )
+        self._thread.start()
+
+    def _close(self, will: Message | None) -> None:
+        """Do not wait for a thread that is connecting: it ends by itself, within CONNECT_TIMEOUT_S."""
+        self._will_on_close = will
+        self._stopping.set()
+        attempt = self._attempt
+        if attempt is not None:
+            attempt.wake()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_DIALLING_S if attempt is None or attempt.dialling else _CLOSING_S + _ANSWER_S)
+
+    def _send(self, message: Message, urgent: bool) -> bool:
+        connection = self._connection
+        if connection is None or not (self._state is State.CONNECTED or self._syncing):
+            return False
+        expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
+        if message.retain:
+            self._own_message_filter.note_own(message)
+        return connection.publish(message, expires_s=expires_s)
+
+    def _declare(self, subscription: Subscription) -> None:
+        with self._routing:
+            filter_, replaced = self._filters.add(subscription.filter)
+            connection = self._connection
+            if connection is None:
+                return  # the next connection subscribes to it
+            self._own_message_filter.subscribe_again(filter_)
+            asked = connection.subscribe([(filter_, self._no_local(filter_))])
+            # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
+            acks = [asked, connection.unsubscribe(replaced), connection.ping()]
+        if threading.current_thread() is not self._thread:
+            deadline = time.monotonic() + _ANSWER_S
+            for ack in acks:
+                ack.wait(deadline - time.monotonic())
+
+    def _undeclare(self, subscription: Subscription) -> None:  # noqa: ARG002  (the ones that stay decide)
+        with self._routing:
+            with self._lock:
+                wanted = [other.filter for other in self._subscriptions]
+            idle = self._filters.prune(wanted)
+            if self._connection is not None:
+                self._connection.unsubscribe(idle)
+
+    def _no_local(self, filter_: str) -> bool:
+        """Whether the broker may leave out our own messages for this filter (MQTT 5)."""
+        with self._lock:
+            echo_options = {other.echo for other in self._subscriptions if overlap(other.filter, filter_)}
+        if len(echo_options) == 2 and self.exact_echo:
+            self.exact_echo = False
+            log.warning("%s: subscriptions with and without echo overlap in %s: both echo", self.client_id, filter_)
+        return echo_options == {False}
+
+    # -- the network thread
+
+    def _run(self, stopping: threading.Event) -> None:
+        failures = 0
+        while not stopping.is_set():
+            began = time.monotonic()
+            try:
+                self._run_connection(stopping)
+            except Lost as lost:
+                self._broker_stalled |= isinstance(lost, Silent)
+                if not stopping.is_set():
+                    self._report_problem(str(lost))
+            except Exception:  # any error must lead to a reconnect, never end the thread
+                log.exception("%s: unexpected failure of the connection", self.client_id)
+            if stopping.is_set():
+                return
+            if self._state is State.CONNECTED and time.monotonic() - began > _STEADY_S:
+                failures = 0
+            self._set_state(State.CONNECTING)
+            pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
+            failures = min(failures + 1, 20)
+            stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
+
+    def _run_connection(self, stopping: threading.Event) -> None:
+        """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
+        connection = self._attempt = self._make_connection()
+        try:
+            self._connect(connection, stopping)
+            self._synchronize(connection, stopping)
+            while not stopping.is_set():
+                connection.pump(_IDLE_S, self._deliver_all)
+                if self._pending and connection.has_room:
+                    self._sync_retained(self._own.keys())
+            self._finish(connection)
+        finally:
+            with self._routing:
+                self._connection = None
+            connection.discard()
+            self._keep_unconfirmed(connection)
+
+    def _make_connection(self) -> Connection:
+        as_published = self.settings.as_published and self._refusals < _REFUSALS
+        return Connection(
+            self._mqtt_client_id,
+            self.settings,
+            self._context,
+            self.will,
+            self.counters,
+            as_published=as_published,
+            on_answers=self._note_answers,
+        )
+
+    def _connect(self, connection: Connection, stopping: threading.Event) -> None:
+        try:
+            connection.connect(stopping)
+        except Lost as lost:
+            bridge = connection.as_published and self.settings.protocol == "3.1.1"
+            self._refusals = self._refusals + 1 if bridge and isinstance(lost, Refused) else 0
+            raise
+        if self.settings.as_published:
+            self._refusals = 0
+            if self.as_published and not connection.as_published:
+                log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
+            self.as_published = self.exact_echo = connection.as_published
+
+    def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
+        """Query which of our retained messages the broker has, subscribe, and send what it lacks."""
+        self._renew()
+        self._own_message_filter.begin()
+        if self._broker_stalled or connection.hesitated:
+            self._let_catch_up(connection, stopping)
+        known = self._query_own(connection, stopping)
+        with self._routing:
+            self._connection = connection
+            subscribed = connection.subscribe([(filter_, self._no_local(filter_)) for filter_ in self._filters])
+            copied = connection.ping()
+        self._await(connection, subscribed, stopping, self._deliver_all)
+        self._await(connection, copied, stopping, self._deliver_all)
+        self._initial_sync(known)
+
+    def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
+        """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
+        end = time.monotonic() + _CATCH_UP_S
+        while not stopping.is_set() and (left := end - time.monotonic()) > 0:
+            connection.pump(left, ignore)
+        self._broker_stalled = False
+
+    def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
+        """Own topics the broker has a retained message of. A ping's answer follows these messages (QoS 0)."""
+        with self._publishing:
+            topics = [topic for topic in self._own if topic not in self._pending]
+        if not topics:
+            return set()
+        connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
+        found: dict[str, bytes] = {}
+
+        def note(messages: list[Message]) -> None:
+            found.update((message.topic, message.payload) for message in messages if message.retain)
+
+        self._await(connection, connection.ping(), stopping, note)
+        connection.unsubscribe(topics)
+        if self.will is not None and found.get(self.will.topic) == self.will.payload:
+            del found[self.will.topic]  # our own will, published although we were running
+        return set(found)
+
+    def _await(
+        self,
+        connection: Connection,
+        ack: PendingAck,
+        stopping: threading.Event,
+        receive: Callable[[list[Message]], None],
+    ) -> None:
+        deadline = time.monotonic() + _ANSWER_S
+        while not ack.done:
+            if stopping.is_set():
+                raise Lost("closed")
+            if time.monotonic() > deadline:
+                raise Silent(f"{connection.where} does not answer")
+            connection.pump(deadline - time.monotonic(), receive)
+
+    def _deliver_all(self, messages: list[Message]) -> None:
+        for message in messages:
+            self.counters.add("received")
+            repeat = False
+            if message.retain and self.as_published:
+                if self._own_message_filter.is_echo(message):
+                    self.counters.add("echoes")
+                    continue
+                repeat = self._own_message_filter.is_repeat(message)
+            for subscription in self._matching(message.topic):
+                subscription.offer(message, repeat=repeat)
+
+    def _note_answers(self, refused: Mapping[str, bool]) -> None:
+        if self._connection is None:
+            return  # to the query of our own retained messages
+        with self._lock:
+            for filter_, is_refused in refused.items():
+                for subscription in self._subscriptions:
+                    if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
+                        subscription.refused = is_refused
+
+    def _finish(self, connection: Connection) -> None:
+        """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""
+        if self._will_on_close is not None:
+            connection.publish(self._will_on_close)
+        last = connection.ping()
+        deadline = time.monotonic() + _CLOSING_S
+        while time.monotonic() < deadline and not (last.done and connection.drained):
+            connection.pump(deadline - time.monotonic(), ignore)
+        connection.disconnect()
+
+    def _keep_unconfirmed(self, connection: Connection) -> None:
+        """Mark retained messages that the broker may not have received as pending."""
+        self.counters.add("unconfirmed", connection.unacked)
+        with self._publishing:
+            for message in connection.unconfirmed_retained():
+                if message.topic not in self._pending:
+                    self._remember(message, sent=False)
+
+    def _report_problem(self, problem: str) -> None:
+        self.problem = problem
+        now = time.monotonic()
+        if problem != self._logged[0] or now - self._logged[1] > _REPEAT_LOG_S:
+            self._logged = (problem, now)
+            log.warning("%s: %s", self.client_id, problem)
+
+
+TRANSPORT = MqttTransport

@@ -1,0 +1,166 @@
+"""The processes running in a run directory: one locked file each, so that an exit needs no message and no timeout.
+
+A process holds a lock on its ``<name>.seat`` as long as it runs; the kernel releases it however the process ends. A
+process that finds an unlocked one removes the files of its former owner. The owner writes its name into the file when
+it listens, and is ready from then on: a newcomer waits for all that are ready, and those that become ready later wait
+for the newcomer, so that of any two at least one waits for the other.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+from pebble.errors import TransportError
+
+_SOCKET_PATH_LIMIT = 108  # bytes, sizeof(sun_path): a longer path cannot be bound
+_OWNER_BYTES = 200
+_RESERVED = "?#;"  # these separate the parts of a Zenoh endpoint
+
+
+def fits_socket(path: Path) -> bool:
+    """Whether a unix socket can have this path."""
+    return len(os.fsencode(path)) < _SOCKET_PATH_LIMIT
+
+
+def check_socket_path(path: Path) -> None:
+    """Raise TransportError if ``path`` is too long for a unix socket."""
+    if not fits_socket(path):
+        raise TransportError(
+            f"{path} is too long for a unix socket (limit {_SOCKET_PATH_LIMIT - 1} bytes): "
+            "set transport.run_dir to a shorter path"
+        )
+
+
+def prepare_run_dir(run_dir: Path) -> None:
+    """Make ``run_dir`` for this user alone, if it is missing. Raises TransportError if it cannot contain a socket."""
+    check_socket_path(run_dir / f"{new_name()}.sock")
+    if any(character in str(run_dir) for character in _RESERVED):
+        raise TransportError(f"transport.run_dir {run_dir} must not contain any of {_RESERVED}")
+    try:
+        run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise TransportError(f"transport.run_dir {run_dir} cannot be made: {error.strerror}") from None
+
+
+class FileLock:
+    """An exclusive lock on a file. The kernel releases it when the process ends."""
+
+    def __init__(self, path: Path, descriptor: int) -> None:
+        self.path = path
+        self._descriptor = descriptor
+
+    @classmethod
+    def take(cls, path: Path) -> FileLock | None:
+        """Lock ``path``, made if it is missing; None if another process has locked it."""
+        try:
+            return cls._get(path, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return None
+
+    @classmethod
+    def wait(cls, path: Path) -> FileLock:
+        """Lock a path with a new name: another process locks it only for the moment of checking its owner."""
+        return cls._get(path, fcntl.LOCK_EX)
+
+    @classmethod
+    def _get(cls, path: Path, how: int) -> FileLock:
+        while True:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            try:
+                fcntl.flock(descriptor, how)
+            except BlockingIOError:
+                os.close(descriptor)
+                raise
+            if _is_at(path, descriptor):
+                return cls(path, descriptor)
+            os.close(descriptor)  # removed between open and flock
+
+    def write(self, text: bytes) -> None:
+        """Replace what is in the file."""
+        os.truncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, text, 0)
+
+    def release(self, *, remove: bool = True) -> None:
+        """Release the lock; ``remove`` deletes the file."""
+        if remove:
+            self.path.unlink(missing_ok=True)
+        os.close(self._descriptor)
+
+
+class PresenceLock:
+    """The lock that marks one running process in the run directory, and the path of its socket."""
+
+    def __init__(self, run_dir: Path, name: str, owner: str, lock: FileLock) -> None:
+        self.name, self._owner = name, owner
+        self.socket = run_dir / f"{name}.sock"
+        self._lock = lock
+
+    def ready(self) -> None:
+        """Mark the process as reachable: from now on newcomers wait for its answer."""
+        self._lock.write(self._owner.encode() or b"?")
+
+    def release(self) -> None:
+        _clear_socket(self.socket)
+        self._lock.release()
+
+
+class PeerRegistry:
+    """The presence locks of one run directory."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+
+    def register(self, owner: str) -> PresenceLock:
+        """Add this process under a new name; ``owner`` describes it in logs."""
+        name = new_name()
+        return PresenceLock(self._run_dir, name, owner, FileLock.wait(self._run_dir / f"{name}.seat"))
+
+    def sockets(self, *, but: str = "") -> list[Path]:
+        """The sockets where running processes listen or are about to, without the one called ``but``."""
+        return [self._run_dir / f"{name}.sock" for name in self._running() if name != but]
+
+    def ready(self, *, but: str = "") -> dict[str, str]:
+        """The owners of all processes that are surely reachable, by name, without the one called ``but``."""
+        return {name: owner for name, owner in self._running().items() if owner and name != but}
+
+    def _running(self) -> dict[str, str]:
+        owners = {path.stem: _owner_if_running(path) for path in self._run_dir.glob("*.seat")}
+        return {name: owner for name, owner in owners.items() if owner is not None}
+
+
+def new_name() -> str:
+    """A unique name; short, because it becomes part of a socket's path."""
+    return os.urandom(4).hex()
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def _owner_if_running(path: Path) -> str | None:
+    """What the owner of the lock file wrote; None, and its files removed, if it does not run any more."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return os.pread(descriptor, _OWNER_BYTES, 0).decode(errors="replace")
+    else:
+        if _is_at(path, descriptor):  # else it was removed, and a new process may have the name
+            _clear_socket(path.with_suffix(".sock"))
+            path.unlink(missing_ok=True)
+        return None
+    finally:
+        os.close(descriptor)
+
+
+def _clear_socket(socket: Path) -> None:
+    socket.unlink(missing_ok=True)
+    socket.with_name(socket.name + ".lock").unlink(missing_ok=True)  # Zenoh's own

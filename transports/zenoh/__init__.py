@@ -1,0 +1,1 @@
+"""The Zenoh transport."""

@@ -1,0 +1,288 @@
+"""The hub: the process of a Zenoh robot that connects the others and stores retained messages and wills.
+
+It stores the newest message of every retained topic, and the wills of running clients. Live messages between the
+robot's processes do not pass through it. ``python -m pebble.runtime.hub`` runs one.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zenoh
+
+from pebble.errors import TransportError
+from pebble.transports.base import QoS
+from pebble.transports.counters import Counters
+from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
+from pebble.transports.settings import ZenohSettings
+from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.hub.journal import Journal
+from pebble.transports.zenoh.hub.store import HubStore, Record, Retained, StoredWill
+from pebble.transports.zenoh.keymap import topic_to_key
+from pebble.transports.zenoh.presence import Barrier
+from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, open_session, session_config
+
+log = logging.getLogger(__name__)
+
+QUEUE_LIMIT = 10_000  # events waiting for the hub's thread; beyond it their senders wait
+WILL_DELAY_S = 0.1  # before a dead client's will is published, so that its last messages come first
+RETURN_S = 2.5  # after a restart clients have this long to reconnect before their wills are published
+PATIENCE_S = 0.5  # a query waits this long for retained messages that are known to be on their way
+
+_Task = Callable[[], None]
+
+
+class ZenohHub:
+    """A hub with its Zenoh session and its worker thread."""
+
+    def __init__(self, settings: ZenohSettings) -> None:
+        self.name = new_name()
+        self.counters = Counters()
+        self._settings = settings
+        self._lock: FileLock | None = None
+        self._session: zenoh.Session | None = None
+        self._worker: HubWorker | None = None
+        self._token: zenoh.LivelinessToken | None = None
+
+    def open(self) -> ZenohHub:
+        """Start. Raises TransportError if the run directory has a hub already, or it or the journal cannot be used."""
+        run_dir = self._settings.run_dir
+        prepare_run_dir(run_dir)
+        self._lock = FileLock.take(run_dir / "hub.lock")
+        if self._lock is None:
+            raise TransportError(f"there is a hub for {run_dir} already (it holds {run_dir / 'hub.lock'})")
+        try:
+            self._start(run_dir)
+        except BaseException:
+            self.close()
+            raise
+        close_at_exit(self)
+        return self
+
+    def close(self) -> None:
+        if self._session is not None:
+            self._session.close()  # type: ignore[no-untyped-call]  # no new event from here on
+        if self._worker is not None:
+            self._worker.close()
+        if self._lock is not None:
+            for left in (HUB_SOCKET, HUB_SOCKET + ".lock"):
+                (self._settings.run_dir / left).unlink(missing_ok=True)
+            self._lock.release()
+        self._session = self._worker = self._lock = None
+
+    def _start(self, run_dir: Path) -> None:
+        journal = None if self._settings.journal is None else Journal(self._settings.journal)
+        siblings = PeerRegistry(run_dir).sockets()  # they would connect within 0.5 s; we connect at once
+        self._worker = HubWorker(self.name, journal, self.counters)
+        try:
+            config = session_config(self._settings, "router", listen=[run_dir / HUB_SOCKET], connect=siblings)
+            self._session = open_session(config)
+        except zenoh.ZError as error:
+            raise TransportError(f"the hub cannot open {run_dir / HUB_SOCKET}: {error}") from None
+        Barrier(self._session, self.name, lambda: 0)
+        self._worker.serve(self._session)
+        self._token = self._session.liveliness().declare_token(wire.UP + self.name)
+
+
+class HubWorker:
+    """One thread and one queue for all messages and queries of the hub, so that the order of arrival decides (T8)."""
+
+    def __init__(self, name: str, journal: Journal | None, counters: Counters) -> None:
+        self._name, self._journal, self._counters = name, journal, counters
+        self._store = HubStore()
+        self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
+        self._alive_clients: set[str] = set()
+        self._will_due: dict[str, float] = {}  # when to publish a will, by client
+        self._waiting_queries: list[tuple[float, dict[str, int], zenoh.Query]] = []
+        self._tasks: queue.Queue[_Task | None] = queue.Queue(QUEUE_LIMIT)
+        self._session: zenoh.Session | None = None
+        self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
+        if journal is not None:
+            self._load_journal(journal)
+
+    def serve(self, session: zenoh.Session) -> None:
+        self._session = session
+        session.declare_subscriber(wire.RETAINED + "**", self._queued(self._store_retained))
+        session.declare_queryable(wire.RETAINED + "**", self._queued(self._query), complete=True)
+        session.declare_queryable(wire.HELLO, self._queued(self._on_hello))
+        session.declare_queryable(wire.BYE, self._queued(self._on_bye))
+        session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        if self._thread.is_alive():
+            self._tasks.put(None)
+            self._thread.join(5)
+        for _, _, query in self._waiting_queries:
+            query.drop()  # type: ignore[no-untyped-call]
+        self._waiting_queries.clear()
+        if self._journal is not None:
+            self._journal.close()
+
+    # -- the thread
+
+    def _queued(self, work: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
+        return zenoh.handlers.Callback(lambda event: self._tasks.put(lambda: work(event)), indirect=False)
+
+    def _run(self) -> None:
+        while True:
+            try:
+                task = self._tasks.get(timeout=self._pause())
+                if task is None:
+                    return
+                self._do(task)
+            except queue.Empty:
+                pass
+            self._answer_waiting()
+            self._publish_due_wills()
+
+    def _do(self, task: _Task) -> None:
+        try:
+            task()
+        # What another program or a lost connection can cause:
+        except (ValueError, msgspec.DecodeError, zenoh.ZError) as error:
+            self._counters.add("bad")
+            log.warning("the hub received something it does not understand: %s", error)
+        except Exception:  # no client may end the hub
+            log.exception("the hub failed on one of its tasks")
+
+    def _pause(self) -> float | None:
+        deadlines = [*self._will_due.values(), *(until for until, _, _ in self._waiting_queries)]
+        return max(0.0, min(deadlines) - time.monotonic()) if deadlines else None
+
+    # -- retained messages
+
+    def _store_retained(self, sample: zenoh.Sample) -> None:
+        if sample.attachment is None:
+            raise ValueError(f"{sample.key_expr} has no stamp")
+        stamp = wire.Stamp.unpack(sample.attachment.to_bytes())
+        self._apply(Retained(str(sample.key_expr).removeprefix(wire.RETAINED), sample.payload.to_bytes(), stamp))
+        if stamp.number and stamp.origin in self._received:
+            self._received[stamp.origin] = max(stamp.number, self._received[stamp.origin])
+
+    def _query(self, query: zenoh.Query) -> None:
+        """Queue a subscriber's query, which names the messages that the answer must include."""
+        try:
+            needs = wire.decode_numbers(_payload(query))
+        except (ValueError, msgspec.DecodeError):
+            query.drop()  # type: ignore[no-untyped-call]
+            raise
+        self._waiting_queries.append((time.monotonic() + PATIENCE_S, needs, query))
+
+    def _answer_waiting(self) -> None:
+        if not self._waiting_queries:
+            return
+        now = time.monotonic()
+        waiting, self._waiting_queries = self._waiting_queries, []
+        for until, needs, query in waiting:
+            if now >= until or all(self._received.get(name, -1) >= number for name, number in needs.items()):
+                self._do(lambda query=query: self._answer(query))  # type: ignore[misc]
+            else:
+                self._waiting_queries.append((until, needs, query))
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            for retained in self._selected(query.key_expr):
+                query.reply(wire.RETAINED + retained.key, retained.payload, attachment=retained.stamp.pack())
+
+    def _selected(self, wanted: zenoh.KeyExpr) -> list[Retained]:
+        text = str(wanted)
+        if "*" not in text:
+            retained = self._store.get(text.removeprefix(wire.RETAINED))
+            return [] if retained is None else [retained]
+        return [retained for retained in self._store.retained() if wanted.intersects(wire.RETAINED + retained.key)]
+
+    # -- clients
+
+    def _on_hello(self, query: zenoh.Query) -> None:
+        with query:
+            hello = wire.decode_hello(_payload(query))
+            self._end_predecessor(hello)
+            self._apply(StoredWill(hello.name, hello.will))
+            if hello.name in self._alive_clients:
+                self._will_due.pop(hello.name, None)
+            elif hello.will is not None:
+                # If its token never comes, it has died meanwhile.
+                self._will_due[hello.name] = time.monotonic() + RETURN_S
+            lacking = self._store.lacks(hello)
+            if lacking:
+                self._received.pop(hello.name, None)
+            else:
+                self._received[hello.name] = hello.number
+            query.reply(wire.HELLO, wire.encode(lacking))
+
+    def _end_predecessor(self, hello: wire.Hello) -> None:
+        """Publish the pending will of a restarted client's former session now, unless it has published there since."""
+        if hello.will is None:
+            return
+        for name in self._store.wills() - {hello.name}:
+            will = self._store.will(name)
+            if will is not None and will.client == hello.will.client:
+                self._will_due.pop(name, None)
+                self._apply(StoredWill(name, None))
+                if topic_to_key(will.topic) not in hello.own:
+                    self._publish_will(name, will)
+
+    def _on_bye(self, query: zenoh.Query) -> None:
+        with query:
+            self._apply(StoredWill(wire.decode_name(_payload(query)), None))
+            query.reply(wire.BYE, b"")
+
+    def _on_client(self, sample: zenoh.Sample) -> None:
+        name = str(sample.key_expr).removeprefix(wire.LIVE)
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._alive_clients.add(name)
+            self._will_due.pop(name, None)
+            return
+        self._alive_clients.discard(name)
+        self._received.pop(name, None)
+        if self._store.will(name) is not None:
+            self._will_due[name] = time.monotonic() + WILL_DELAY_S
+
+    def _publish_due_wills(self) -> None:
+        now = time.monotonic()
+        for name in [name for name, due in self._will_due.items() if now >= due]:
+            del self._will_due[name]
+            will = self._store.will(name)
+            if will is not None:
+                self._apply(StoredWill(name, None))
+                self._do(lambda name=name, will=will: self._publish_will(name, will))  # type: ignore[misc]
+
+    def _publish_will(self, name: str, will: wire.Will) -> None:
+        key, qos = topic_to_key(will.topic), QoS(will.qos)
+        if will.retain:
+            self._apply(Retained(key, will.payload, wire.Stamp(qos, 0, name)))
+        if self._session is not None:
+            self._session.put(
+                key, will.payload, attachment=wire.pack_live(qos, retain_requested=will.retain), **wire.BLOCK
+            )
+        self._counters.add("wills")
+
+    # -- store and journal
+
+    def _apply(self, record: Record) -> None:
+        if self._store.apply(record) and self._journal is not None and self._journal.append(wire.encode(record)):
+            self._journal.rewrite(map(wire.encode, self._store.records()))
+
+    def _load_journal(self, journal: Journal) -> None:
+        decode = msgspec.msgpack.Decoder(Record).decode
+        for data in journal.load():
+            try:
+                self._store.apply(decode(data))
+            except msgspec.DecodeError as error:
+                log.warning("journal %s has a record of another kind: %s", journal.path, error)
+        journal.rewrite(map(wire.encode, self._store.records()))
+        self._will_due = dict.fromkeys(self._store.wills(), time.monotonic() + RETURN_S)
+
+
+def _payload(query: zenoh.Query) -> bytes:
+    if query.payload is None:
+        raise ValueError(f"{query.key_expr} without payload")
+    return query.payload.to_bytes()

@@ -1,0 +1,149 @@
+"""Which hubs and peers are there: a watch on what appears and disappears, and a barrier that waits for answers."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+import msgspec
+import zenoh
+
+from pebble.transports.zenoh.wire import SYNC, UP, pack_number, unpack_number
+
+log = logging.getLogger(__name__)
+
+_ASK_AGAIN_S = 0.05  # a sibling that was connected after the query was sent has not received it
+_PAUSE_S = (0.001, 0.02)  # between queries, first and longest
+_LOST_SESSIONS_LIMIT = 1000  # sessions whose return would be noticed
+
+
+class HubView(msgspec.Struct, frozen=True):
+    """``version`` changes with every event, ``connection`` only when a hub appears."""
+
+    version: int
+    connection: int
+    hubs: frozenset[str]
+
+
+class HubWatch:
+    """Watches for hubs and for connections that were down. Level-triggered: a waiter gets the newest view."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._view = HubView(1, 0, frozenset())
+        self._lost_sessions: dict[str, None] = {}
+        self.closed = False
+
+    @property
+    def hubs(self) -> frozenset[str]:
+        return self._view.hubs
+
+    def follow(self, session: zenoh.Session) -> None:
+        """Watch the hubs and connections of ``session``."""
+        tokens = zenoh.handlers.Callback(self._on_hub, indirect=False)
+        connections = zenoh.handlers.Callback(self._on_connection, indirect=False)
+        session.liveliness().declare_subscriber(UP + "*", tokens, history=True)
+        session.info.declare_transport_events_listener(connections, history=True)
+
+    def wait(self, seen: int, timeout: float | None) -> HubView | None:
+        """The view, as soon as its version is not ``seen`` or after ``timeout`` seconds; None once closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._view.version != seen, timeout)
+            return None if self.closed else self._view
+
+    def wait_closed(self, timeout: float) -> None:
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed, timeout)
+
+    def close(self) -> None:
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+    def _on_hub(self, sample: zenoh.Sample) -> None:
+        name = str(sample.key_expr).removeprefix(UP)
+        with self._changed:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._change(hubs=self._view.hubs | {name}, appeared=1)
+            else:
+                self._change(hubs=self._view.hubs - {name})
+
+    def _on_connection(self, event: zenoh.TransportEvent) -> None:
+        """A session that comes back under the same id was running all the time, and we have missed its messages."""
+        session = str(event.transport.zid)
+        with self._changed:
+            if event.kind == zenoh.SampleKind.DELETE:
+                if len(self._lost_sessions) >= _LOST_SESSIONS_LIMIT:
+                    self._lost_sessions.pop(next(iter(self._lost_sessions)))
+                self._lost_sessions[session] = None
+            elif session in self._lost_sessions:
+                del self._lost_sessions[session]
+                self._change(hubs=self._view.hubs)
+
+    def _change(self, hubs: frozenset[str], appeared: int = 0) -> None:
+        self._view = HubView(self._view.version + 1, self._view.connection + appeared, hubs)
+        self._changed.notify_all()
+
+
+class Barrier:
+    """Waits until every sibling knows this session's declarations, and this session theirs (T3).
+
+    A query is answered only after the declarations sent before it on the same connection have been processed, in both
+    directions. So a sibling that has answered ``@sync/<name>`` will send us what we subscribed to, and receive what we
+    publish. The answer carries ``number()``.
+    """
+
+    def __init__(self, session: zenoh.Session, name: str, number: Callable[[], int]) -> None:
+        self._session, self._name, self._number = session, name, number
+        self._silent: set[str] = set()  # hung or stopped: not waited for again until they answer
+        handler = zenoh.handlers.Callback(self._answer, indirect=False)
+        session.declare_queryable(SYNC + name, handler)
+
+    def synchronize(self, expected: Callable[[], dict[str, str]], timeout: float) -> dict[str, int]:
+        """Wait up to ``timeout`` seconds for all ``expected`` siblings (name to a description for logs).
+
+        Returns the numbers they answered, by name.
+        """
+        end = time.monotonic() + timeout
+        pause, longest = _PAUSE_S
+        answers: dict[str, int] = {}
+        while wanted := self._missing(expected(), answers):
+            left = end - time.monotonic()
+            if left <= 0:
+                who = ", ".join(sorted(wanted.values()))
+                log.warning("%s did not answer within %.1f s and will not be waited for again", who, timeout)
+                self._silent |= wanted.keys()
+                break
+            if not self._ask(set(wanted), answers, left):
+                time.sleep(pause)
+                pause = min(2 * pause, longest)
+        self._silent -= set(answers)
+        return answers
+
+    def _missing(self, expected: dict[str, str], answers: dict[str, int]) -> dict[str, str]:
+        return {name: who for name, who in expected.items() if name not in self._silent and name not in answers}
+
+    def _ask(self, wanted: set[str], answers: dict[str, int], left: float) -> bool:
+        done = threading.Event()
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answers[str(reply.ok.key_expr).removeprefix(SYNC)] = unpack_number(reply.ok.payload.to_bytes())
+                if wanted <= set(answers):
+                    done.set()
+
+        self._session.get(
+            SYNC + "*",
+            zenoh.handlers.Callback(take, done.set, indirect=False),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=left,
+        )
+        done.wait(min(left, _ASK_AGAIN_S))
+        return wanted <= set(answers)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            query.reply(SYNC + self._name, pack_number(self._number()))

@@ -1,0 +1,157 @@
+"""Configures, opens and closes the Zenoh sessions of a robot, those of the hub and of its peers alike.
+
+Zenoh's defaults are not used: they listen on all interfaces and join multicast groups. Reasons and measurements are in
+docs/transports.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import weakref
+from pathlib import Path
+from typing import Any, Protocol
+
+import zenoh
+
+from pebble.errors import TransportError
+from pebble.transports.settings import TlsSettings, ZenohSettings
+
+# Zenoh reads this once, before the first session. By default connections are accepted, opened and read on separate
+# runtimes: a received message wakes a thread that only wakes another one. Measured with 1.10.2 (40 B at 200 Hz, round
+# trip, two cores): 9.6 wake-ups instead of 14, and 0.9 of the time. Sending has its own runtime: a callback may send.
+os.environ.setdefault("ZENOH_RUNTIME", "(acc: (handover: rx), net: (handover: rx))")
+
+HUB_SOCKET = "hub.sock"
+
+BLOCK_MS = 300  # a publish waits this long for a receiver that accepts nothing; then its connection is closed
+_CONNECT_TIMEOUT_MS = 2000
+# Zenoh accepts this only as a whole.
+_RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+_SAFE_SCHEMES = ("tls/", "quic/", "unixsock-stream/")
+_LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+def unix_endpoint(socket: Path) -> str:
+    return f"unixsock-stream/{socket}"
+
+
+def session_config(settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path]) -> str:
+    """The configuration of a ``mode`` (router, peer or client) on unix sockets plus the settings' own endpoints.
+
+    Raises TransportError for endpoints or certificates that can never work.
+    """
+    for name, endpoints in (("listen", settings.listen), ("connect", settings.connect)):
+        for endpoint in endpoints:
+            _check_endpoint(name, endpoint, settings.tls)
+    config = json.dumps(_config(settings, mode, listen, connect))
+    try:
+        zenoh.Config.from_json5(config)
+    except zenoh.ZError as error:
+        raise TransportError(f"zenoh refuses its configuration: {error}") from None
+    return config
+
+
+def open_session(config: str) -> zenoh.Session:
+    """Open a session. Raises ZError if that fails now, TransportError in a process forked from one with a session."""
+    _refuse_fork()
+    # Zenoh's threads inherit this. A signal that the kernel gave to one of them would not wake the main thread, which
+    # runs Python's handlers (measured: 5 of 200 hubs on a busy machine did not end).
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    try:
+        return zenoh.open(zenoh.Config.from_json5(config))
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: list[Path]) -> dict[str, Any]:
+    return {
+        "mode": mode,
+        "listen": {"endpoints": [*map(unix_endpoint, listen), *settings.listen]},
+        "connect": {"endpoints": [*map(unix_endpoint, connect), *settings.connect], "retry": _RETRY},
+        # How long a router or peer waits for scouting before open() returns; 500 ms by default.
+        # Gossip would announce our unix sockets to programs connected by TLS: on one machine, one connection between
+        # two robots made all their processes connect to each other, without TLS. Every process connects to every
+        # sibling by itself, so gossip is not needed.
+        "scouting": {"delay": 1, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": False},  # the order of arrival at the hub decides, never a clock
+        "transport": {
+            "unicast": {"open_timeout": _CONNECT_TIMEOUT_MS, "accept_timeout": _CONNECT_TIMEOUT_MS},
+            "shared_memory": {"enabled": False},  # media has its own sessions
+            "link": {
+                "tx": {
+                    "lease": settings.lease_ms,
+                    "queue": {"congestion_control": {"block": {"wait_before_close": BLOCK_MS * 1000}}},
+                },
+                **_tls(settings.tls),
+            },
+        },
+    }
+
+
+def _check_endpoint(name: str, endpoint: str, tls: TlsSettings | None) -> None:
+    if endpoint.startswith(_LOOPBACK):
+        return
+    if not endpoint.startswith(_SAFE_SCHEMES):
+        raise TransportError(f"transport.{name}: {endpoint} leaves this machine unencrypted: use tls/host:port")
+    if not endpoint.startswith("unixsock") and tls is None:
+        raise TransportError(f"transport.{name}: {endpoint} needs transport.tls")
+
+
+def _tls(tls: TlsSettings | None) -> dict[str, Any]:
+    """One certificate for both directions. With a configured CA both sides must present one that it signed."""
+    if tls is None:
+        return {}
+    if tls.ciphers is not None:
+        raise TransportError("transport.tls.ciphers: Zenoh does not support this setting, remove it")
+    link: dict[str, Any] = {"verify_name_on_connect": not tls.insecure}
+    if tls.ca_cert is not None:
+        link["root_ca_certificate"] = str(tls.ca_cert)
+    if tls.client_cert is not None and tls.client_key is not None:
+        own = {"certificate": str(tls.client_cert), "private_key": str(tls.client_key)}
+        link |= {f"{side}_{what}": path for side in ("listen", "connect") for what, path in own.items()}
+        link["enable_mtls"] = tls.ca_cert is not None
+    return {"tls": link}
+
+
+# -- forks and exits
+
+_opened_by: int | None = None
+_open: weakref.WeakSet[_Closable] = weakref.WeakSet()
+_registered = False
+
+
+def _refuse_fork() -> None:
+    """Raise in a forked child: a session is dead there without an error, and opening a new one hangs for ever."""
+    global _opened_by
+    check_process(_opened_by)
+    _opened_by = os.getpid()
+
+
+def check_process(opened_by: int | None) -> None:
+    """Raise TransportError if the session was opened by another process, of which this one is a fork."""
+    if opened_by is not None and opened_by != os.getpid():
+        raise TransportError("Zenoh does not survive a fork: start child processes with spawn or subprocess")
+
+
+def close_at_exit(owner: _Closable) -> None:
+    """Close ``owner`` before the interpreter waits for threads: a live callback would hang the exit for ever (T17).
+
+    ``atexit`` is too late for that, so this uses what concurrent.futures uses.
+    """
+    global _registered
+    _open.add(owner)
+    if not _registered:
+        _registered = True
+        threading._register_atexit(_close_all)  # type: ignore[attr-defined]
+
+
+def _close_all() -> None:
+    for owner in list(_open):
+        owner.close()
