@@ -64,7 +64,7 @@ class Viewer:
         self._encodings[medium] = encoding
         if encoding is None and self._is_running(medium):
             return  # another operator has requested it: change nothing
-        if not self._flags.get(self._topic(medium, "flag_topic", _FLAGS[medium]), False):
+        if not self._flags.get(self.topic(medium, "flag_topic", _FLAGS[medium]), False):
             self._raised.add(medium)
             self._set_flag(medium, up=True)
         self._send_request(medium)
@@ -107,15 +107,16 @@ class Viewer:
         return medium in self._received_at
 
     def _set_flag(self, medium: Medium, *, up: bool) -> None:
-        topic = self._topic(medium, "flag_topic", _FLAGS[medium])
+        topic = self.topic(medium, "flag_topic", _FLAGS[medium])
         self._flags[topic] = up
         self._transport.publish(topic, codec.encode(_FLAGS[medium], up), qos=QoS.DELIVERED, retain=True)
 
     def _send(self, medium: Medium, request: MediaRequest) -> None:
-        topic = self._topic(medium, "command_topic", _CONTROLS[medium])
+        topic = self.topic(medium, "command_topic", _CONTROLS[medium])
         self._transport.publish(topic, codec.encode(_CONTROLS[medium], request), qos=QoS.DELIVERED)
 
-    def _topic(self, medium: Medium, key: str, channel: Channel) -> str:
+    def topic(self, medium: Medium, key: str, channel: Channel) -> str:
+        """The effective topic that capabilities list under ``key``, else the channel's own."""
         topic = self.capabilities.get(medium, {}).get(key)
         return topic if isinstance(topic, str) else channel.topic(self.base)
 
@@ -130,7 +131,7 @@ class Viewer:
         self._has_capabilities.set()
 
     def _subscribe(self, medium: Medium) -> None:
-        flag = self._topic(medium, "flag_topic", _FLAGS[medium])
+        flag = self.topic(medium, "flag_topic", _FLAGS[medium])
 
         def on_flag(message: Message) -> None:
             try:

@@ -18,11 +18,14 @@ import numpy as np
 import typer
 
 from pebble.client.media_receiver import MediaReceiver
+from pebble.client.overlays import Overlays
 from pebble.commands import show
 from pebble.errors import PebbleError
 from pebble.media.sound import ReceivedSound
 
 _PICTURE_EVERY_S = 1.0
+_OUTLINE, _INK, _PAPER = (80, 220, 80), (80, 255, 80), (0, 0, 0)  # BGR
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Screen(ABC):
@@ -65,6 +68,24 @@ def save_picture(picture: np.ndarray[Any, Any], file: Path) -> None:
         raise PebbleError(f"{file} cannot be written")
 
 
+def with_overlays(picture: np.ndarray[Any, Any], overlays: Overlays) -> np.ndarray[Any, Any]:
+    """A copy of a BGR picture with shapes and labels drawn over it."""
+    drawn = picture.copy()
+    height, width = drawn.shape[:2]
+    size = np.array([width - 1, height - 1])
+    thick = max(1, round(height / 240))
+    for shape in overlays.shapes:
+        points = np.round(np.array(shape) * size).astype(np.int32)
+        cv2.polylines(drawn, [points], True, _OUTLINE, thick, cv2.LINE_AA)
+    for label in overlays.labels:
+        (wide, high), _ = cv2.getTextSize(label.text, _FONT, height / 600, thick)
+        wanted = np.array(label.at) * size + (-wide / 2, high / 2)
+        at = np.clip(np.round(wanted), (0, high), size - (wide, 0)).astype(int).tolist()
+        for ink, weight in ((_PAPER, 3 * thick), (_INK, thick)):  # dark around bright: legible on every picture
+            cv2.putText(drawn, label.text, at, _FONT, height / 600, ink, weight, cv2.LINE_AA)
+    return drawn
+
+
 class Files(Screen):
     """Writes a PNG once a second and the sound to a WAV file, with a new file for each change of format."""
 
@@ -89,7 +110,8 @@ class Files(Screen):
         self._due = now + _PICTURE_EVERY_S
         if receiver.newest is not None:
             self._pictures += 1
-            save_picture(receiver.newest.picture, self._folder / f"{self._pictures:04}.png")
+            picture = with_overlays(receiver.newest.picture, receiver.overlays.current(now))
+            save_picture(picture, self._folder / f"{self._pictures:04}.png")
         typer.echo(
             f"video  {receiver.summary('video', now) or 'nothing yet'}   "
             f"audio  {receiver.summary('audio', now) or 'nothing yet'}{_stop(receiver)}"
@@ -138,17 +160,18 @@ class Window(Screen):
         self._loudspeaker = Loudspeaker()
         self.can_play = self._loudspeaker.installed
         self._image: Any = None  # Tk shows it only while it is referenced
-        self._shown: object = None
+        self._shown: tuple[object, Overlays] = (None, Overlays())
         self._count = 0
 
     def show(self, receiver: MediaReceiver) -> None:
         newest, now = receiver.newest, time.monotonic()
+        overlays = receiver.overlays.current(now)
         for received in receiver.take_sounds():
             self._loudspeaker.play(received)
-        if newest is not None and newest is not self._shown:
-            self._shown = newest
-            self._count += 1
-            ok, data = cv2.imencode(".ppm", newest.picture)
+        if newest is not None and (newest is not self._shown[0] or overlays != self._shown[1]):
+            self._count += newest is not self._shown[0]
+            self._shown = newest, overlays
+            ok, data = cv2.imencode(".ppm", with_overlays(newest.picture, overlays))
             if ok:
                 self._image = self._tk.PhotoImage(data=data.tobytes(), format="PPM")
                 self._label.configure(image=self._image)

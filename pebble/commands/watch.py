@@ -47,7 +47,7 @@ def watch(
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
-    """Show a robot's camera and play its microphone, until Ctrl-C.
+    """Show a robot's camera, with what scripts draw over it, and play its microphone, until Ctrl-C.
 
     Opens a window, and plays sound through aplay. Without a screen it writes a picture per second (PNG) and the sound
     (WAV) into a folder.

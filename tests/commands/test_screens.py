@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import wave
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 from pebble.client.media_receiver import MediaReceiver
-from pebble.commands.screens import Files, save_picture
+from pebble.client.overlays import STALE_S, Label, Overlays
+from pebble.commands.screens import Files, save_picture, with_overlays
 from pebble.errors import PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.sound import ReceivedSound
@@ -52,6 +54,31 @@ def test_a_stopped_robot_is_shown(receiver: MediaReceiver, tmp_path: Path, capsy
     files._due = 0.0
     files.show(receiver)
     assert "EMERGENCY STOP: goob is stopped by ann, " in capsys.readouterr().out
+
+
+def test_overlays_are_drawn_over_the_picture_while_they_are_fresh(receiver: MediaReceiver, tmp_path: Path) -> None:
+    receiver.newest = Decoded(np.zeros((48, 64, 3), np.uint8), 0, 1, True, "json")
+    files = Files(tmp_path)
+    for age_s in (0.0, STALE_S + 1):
+        receiver.overlays.receive(b'{"shapes": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}', time.monotonic() - age_s)
+        files._due = 0.0
+        files.show(receiver)
+    fresh, stale = (cv2.imread(str(tmp_path / name)) for name in ("0001.png", "0002.png"))
+    assert fresh[0].any(axis=1).all()  # the upper edge
+    assert fresh[-1].any(axis=1).all()  # the lower edge
+    assert not stale.any()
+
+
+def test_shapes_are_where_their_points_are_and_labels_around_theirs() -> None:
+    picture = np.full((480, 640, 3), 127, np.uint8)
+    shape = ((0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75))
+    drawn = with_overlays(picture, Overlays((shape,), (Label("13", (0.5, 0.5)),)))
+    assert (picture == 127).all()  # other readers have it, too
+    rows, columns = np.nonzero((drawn != 127).any(axis=2))
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == pytest.approx((120, 359, 160, 479), abs=3)
+    inner = (drawn != 127).any(axis=2)[140:340, 180:460]
+    rows, columns = np.nonzero(inner)
+    assert (rows.mean() + 140, columns.mean() + 180) == pytest.approx((239.5, 319.5), abs=3)
 
 
 @pytest.mark.parametrize("name", ["picture.xyz", "no/such/folder/picture.png"])
