@@ -1,4 +1,4 @@
-"""``pebble sim`` and ``pebble demo``: simulated robots; their MCUs run the real firmware on simulated pins."""
+"""``pebble sim`` and ``pebble demo``: simulated robots and devices; MCUs run the real firmware on simulated pins."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ Goob's and Fred's is on a serial port, MiniLAMP's and BenJr's on Wi-Fi.
     pebble sim goob --link /tmp/goob
     pebble sim minilamp --broker mqtt://127.0.0.1
     pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
+
+A loudspeaker that records what is played stands in for aplay.
+
+\b
+    pebble sim loudspeaker --record /tmp/played clip.wav
 """
 _BROKER_HELP = "mqtt://[USER@]HOST[:PORT], mqtts://… or a robot's config file."
 
@@ -111,6 +116,38 @@ def fleet(
     return run(FleetOptions(robots=robots, broker=address, kinds=kind or KINDS, seconds=seconds))
 
 
+def loudspeaker(
+    file: Annotated[str, typer.Argument(help="A WAV file, or - for raw sound from standard input.")],
+    record: Annotated[
+        Path | None, typer.Option(help="For events.jsonl and WAV files of what is played.", metavar="FOLDER")
+    ] = None,
+    exclusive: Annotated[
+        bool, typer.Option("--exclusive", help="Play one sound at a time, as a sound card without a mixer does.")
+    ] = False,
+    file_type: Annotated[str, typer.Option("-t", "--file-type", help="wav, or raw: signed 16-bit samples.")] = "wav",
+    format_: Annotated[str, typer.Option("-f", "--format", help="Of raw sound: S16_LE.")] = "S16_LE",
+    channels: Annotated[int, typer.Option("-c", "--channels", min=1, help="Of raw sound.")] = 1,
+    rate: Annotated[int, typer.Option("-r", "--rate", min=1, help="Of raw sound, in Hz.")] = 8000,
+    device: Annotated[str, typer.Option("-D", "--device", help="Not used.")] = "default",
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Not used.")] = False,
+) -> int:
+    """A loudspeaker that records: takes aplay's place as player_command of a robot without sound.
+
+    It plays in real time. Without --record it prints when a sound begins and ends, as JSON.
+    Robots start it faster as `python -m pebble.simulation.loudspeaker`, with the same options.
+
+    \b
+        pebble sim loudspeaker --record /tmp/played clip.wav
+        pebble sim loudspeaker -t raw -f S16_LE -c 1 -r 16000 - < sound.raw
+    """
+    from pebble.simulation.loudspeaker import main
+
+    del quiet
+    options = [*(["--record", str(record)] if record is not None else []), *(["--exclusive"] if exclusive else [])]
+    raw = ["-t", file_type, "-f", format_, "-c", str(channels), "-r", str(rate), "-D", device]
+    return main([*options, *raw, file])
+
+
 def demo(
     seconds: Annotated[
         float | None,
@@ -191,7 +228,7 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (goob, fred, goob_imu, minilamp, benjr, fleet):
+    for command in (goob, fred, goob_imu, minilamp, benjr, fleet, loudspeaker):
         group.command(command.__name__)(command)
     app.add_typer(group, name="sim")
     app.command("demo")(demo)
