@@ -7,9 +7,9 @@ from msgspec import Meta, field
 from pebble.config.transport import Mqtt
 from pebble.config.types import (
     EMPTY,
-    Command,
     Count,
     File,
+    HandlerTopics,
     Interval,
     LogLevel,
     Port,
@@ -20,32 +20,6 @@ from pebble.config.types import (
     Topic,
     doc,
 )
-
-
-class HandlerTopics(Section, frozen=True, kw_only=True):
-    """Other names for a handler's three topics."""
-
-    command: Annotated[Topic | None, doc("Instead of the contract's incoming command topic.")] = None
-    files: Annotated[Topic | None, doc("Instead of the contract's list of files.")] = None
-    status: Annotated[Topic | None, doc("Instead of the contract's status.")] = None
-
-
-class Playback(Section, frozen=True, kw_only=True):
-    """Where sounds are and what plays them."""
-
-    directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
-    player_command: Annotated[Command, doc("Player; `{file}` stands for the sound, else it comes last.")] = ("aplay",)
-    stop_timeout: Annotated[Seconds, doc("How long the player may take to stop before it is killed.")] = 5.0
-    scan_interval: Annotated[float, Meta(ge=1, le=86_400, description="Seconds between scans of the folder.")] = 10.0
-    cwd: Annotated[File | None, doc("Folder to run the player in.")] = None
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
-
-
-class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):
-    """Plays sounds on the robot."""
-
-    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
-    playback: Annotated[Playback, doc("Sounds and player.")] = Playback()
 
 
 class ScriptArgument(Section, frozen=True, kw_only=True):

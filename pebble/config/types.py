@@ -80,3 +80,11 @@ class ServiceSection(Section, frozen=True, kw_only=True):
     retained_publish_interval_seconds: Annotated[
         Interval, doc("How often retained state is published again; services.defaults' unless set.")
     ] = 3600.0
+
+
+class HandlerTopics(Section, frozen=True, kw_only=True):
+    """Other names for a handler's three topics."""
+
+    command: Annotated[Topic | None, doc("Instead of the contract's incoming command topic.")] = None
+    files: Annotated[Topic | None, doc("Instead of the contract's list of files.")] = None
+    status: Annotated[Topic | None, doc("Instead of the contract's status.")] = None

@@ -103,11 +103,15 @@ class LightsFlash(LightsSolid, frozen=True, kw_only=True):
 
 
 class SoundboardCommand(Payload, frozen=True, kw_only=True):
-    """Play or stop a clip (paper A.8.10); ``action`` wins over ``enabled``."""
+    """Play or stop a clip (paper A.8.10); ``action`` wins over ``enabled``.
+
+    ``repeat`` is how often to play it, or true: until it is stopped. It is not written where it says nothing.
+    """
 
     action: str | None = None
     enabled: bool | None = None
     file: str | None = None
+    repeat: Annotated[int, Meta(ge=0)] | bool | UnsetType | None = UNSET  # 0, false and null: once
 
 
 class AutonomyCommand(Payload, frozen=True, kw_only=True, omit_defaults=True):

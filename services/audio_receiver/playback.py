@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 
 from pebble.media.jitter import JitterBuffer
-from pebble.services.audio_receiver.player import Player
+from pebble.media.player import Player
 
 _IDLE_S = 0.5  # between two checks whether it has been silent for long
 _END_S = 1.5

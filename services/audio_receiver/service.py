@@ -8,11 +8,11 @@ from pebble.contract import AUDIO_STREAM, MEDIA_REPORT
 from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
 from pebble.media.jitter import JitterBuffer
+from pebble.media.player import Player
 from pebble.media.rate_meter import RateMeter
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.service import Service, every
 from pebble.services.audio_receiver.playback import PlaybackThread
-from pebble.services.audio_receiver.player import Player
 from pebble.transports import Message, QoS, State
 
 

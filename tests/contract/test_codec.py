@@ -179,10 +179,30 @@ def test_lights_take_numbers_only(raw: bytes) -> None:
         (b'{"value": {"action": "play"}, "file": "a.wav"}', SoundboardCommand(action="play", file="a.wav")),
         (b'{"value": {"action": "play", "file": "b"}, "file": "a"}', SoundboardCommand(action="play", file="b")),
         (b'{"action": "stop", "timestamp": 1.5e9}', SoundboardCommand(action="stop")),
+        (
+            b'{"action": "play", "file": "a.wav", "repeat": true}',
+            SoundboardCommand(action="play", file="a.wav", repeat=True),
+        ),
+        (
+            b'{"value": {"action": "play", "file": "b", "repeat": 3}}',
+            SoundboardCommand(action="play", file="b", repeat=3),
+        ),
+        (b'{"value": true, "file": "b", "repeat": 3}', SoundboardCommand(enabled=True, file="b", repeat=3)),
+        (b'{"value": {"action": "play"}, "repeat": null}', SoundboardCommand(action="play", repeat=None)),
     ],
 )
 def test_a_soundboard_command_is_a_boolean_or_an_object(raw: bytes, command: SoundboardCommand) -> None:
     assert codec.decode(c.SOUNDBOARD_COMMAND, raw) == command
+
+
+def test_a_soundboard_command_that_does_not_repeat_has_no_such_field() -> None:
+    assert b"repeat" not in codec.encode(c.SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file="a.wav"))
+    assert b'"repeat":2' in codec.encode(c.SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file="a", repeat=2))
+
+
+@pytest.mark.parametrize("repeat", [b"-1", b'"yes"', b"0.5", b"[]"])
+def test_a_sound_is_repeated_by_count_or_without_end(repeat: bytes) -> None:
+    refused(c.SOUNDBOARD_COMMAND, b'{"action": "play", "file": "a.wav", "repeat": ' + repeat + b"}")
 
 
 def test_an_autonomy_command_carries_a_config() -> None:
