@@ -166,22 +166,12 @@ class Service:
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
         """Run until :meth:`quit`. ``ready`` is called once the service has subscribed."""
         try:
-            self.start()
-            self.transport.on_state(self._on_state)
-            self.transport.open(timeout=0.0)
-            for name in _marked(type(self), "channel"):
-                method = getattr(self, name)
-                self._handled[method.channel] = self.listen(method.channel, method, direct=method.direct)
-            self._set_timers()
+            self._set_up()
             ready()
-            self._loop()
+            while self._running:
+                self._turn(self.timers.wait(self.clock()))
         finally:
-            try:
-                with self._on_stop:
-                    self.stop()
-            finally:
-                self._log_totals()
-                self.transport.close()
+            self._tear_down()
 
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
@@ -190,12 +180,30 @@ class Service:
 
     # -- the service's thread
 
-    def _loop(self) -> None:
-        while self._running:
-            job = self._inbox.take(self.timers.wait(self.clock()))
-            if job is not None:
-                job()
-            self.timers.run_due(self.clock())
+    def _set_up(self) -> None:
+        self.start()
+        self.transport.on_state(self._on_state)
+        self.transport.open(timeout=0.0)
+        for name in _marked(type(self), "channel"):
+            method = getattr(self, name)
+            self._handled[method.channel] = self.listen(method.channel, method, direct=method.direct)
+        self._set_timers()
+
+    def _turn(self, timeout: float | None) -> bool:
+        """Do one job, if there is one within ``timeout`` seconds, and what is due; return whether there was one."""
+        job = self._inbox.take(timeout)
+        if job is not None:
+            job()
+        self.timers.run_due(self.clock())
+        return job is not None
+
+    def _tear_down(self) -> None:
+        try:
+            with self._on_stop:
+                self.stop()
+        finally:
+            self._log_totals()
+            self.transport.close()
 
     def _set_timers(self) -> None:
         now = self.clock()

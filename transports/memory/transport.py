@@ -176,14 +176,19 @@ class MemoryTransport(Transport):
                     self._changed.wait()
                 if self._stopping:
                     return
-                changed = self._attached != self._hub.era
-                delivery = None if changed else self._inbox.popleft()
-            if delivery is not None:
-                self._deliver(delivery)
-            elif self._attached is not None:
-                self._on_hub_stopped()
-            else:
-                self._connect()
+            self._work()
+
+    def _work(self) -> None:
+        """React to the hub's start or stop, or deliver what has waited longest."""
+        with self._hub.lock:
+            changed = self._attached != self._hub.era
+            delivery = self._inbox.popleft() if self._inbox and not changed else None
+        if delivery is not None:
+            self._deliver(delivery)
+        elif changed and self._attached is not None:
+            self._on_hub_stopped()
+        elif changed:
+            self._connect()
 
     def _deliver(self, delivery: _Delivery) -> None:
         self.counters.add("received")
