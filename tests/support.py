@@ -45,6 +45,14 @@ def gone(pid: int) -> bool:
         return True
 
 
+def process_name(pid: int) -> str:
+    """The first 15 bytes of a process's name, as the kernel knows it; "" if it has ended, also while it is read."""
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
 class Child(subprocess.Popen[Any]):
     """A child process that the kernel ends when pytest is killed."""
 

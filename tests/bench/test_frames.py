@@ -17,19 +17,11 @@ from pebble.bench.frames_variants import Case, Size, parse_size
 from pebble.bench.results import load
 from pebble.bench.usage import children
 from pebble.errors import PebbleError
-from tests.support import ROOT, until
+from tests.support import ROOT, gone, until
 
 
 def command(*options: str) -> list[str]:
     return [sys.executable, "-m", "pebble.cli", "bench", "frames", *options]
-
-
-def alive(pid: int) -> bool:
-    """Whether it still runs. (A zombie does not.)"""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def segments(pid: int) -> set[Path]:
@@ -90,7 +82,7 @@ def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
     finally:
         bench.kill()
         bench.wait()
-    assert until(lambda: not any(map(alive, started)), 5)
+    assert until(lambda: all(map(gone, started)), 5)
     assert not any(segment.exists() for segment in shared)
     assert list(temporary.iterdir()) == []
 
@@ -106,7 +98,7 @@ def test_workers_end_with_a_killed_bench(temporary: Path) -> None:
     finally:
         bench.kill()
         bench.wait()
-    assert until(lambda: not any(map(alive, started)), 10)
+    assert until(lambda: all(map(gone, started)), 10)
 
 
 def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(

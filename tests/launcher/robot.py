@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.launcher.programs import Stage
-from tests.support import ROOT, gone, until
+from tests.support import ROOT, gone, process_name, until
 
 BASE = "pebble/robots/rover"
 FAKES = ROOT / "tests" / "fakes"
@@ -88,8 +88,8 @@ class Robot:
     def children(self) -> dict[str, int]:
         """The living children, by the names that the kernel has for them."""
         task = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        pids = map(int, task.read_text().split())
-        return {Path(f"/proc/{pid}/comm").read_text().strip(): pid for pid in pids}
+        named = ((process_name(pid), pid) for pid in map(int, task.read_text().split()))
+        return {name: pid for name, pid in named if name}
 
     def services(self) -> dict[str, Any]:
         statuses = self.published("status")

@@ -15,7 +15,7 @@ from typing import Any
 from pebble.bench.usage import children
 from pebble.simulation.trace import Entry, read_trace
 from tests.robot.operator import Operator
-from tests.support import ROOT, Broker, gone, until
+from tests.support import ROOT, Broker, gone, process_name, until
 from tests.tcp_proxy import TcpProxy
 
 BASE = "pebble/robots/rover"
@@ -250,10 +250,7 @@ class Rig:
 
 def _program(pid: int) -> str:
     """What a child of the launcher is; "" if it has just ended. The kernel knows the first 15 bytes of its name."""
-    try:
-        comm = Path(f"/proc/{pid}/comm").read_text().strip()
-    except FileNotFoundError:
-        return ""
+    comm = process_name(pid)
     return next((name for name in PROGRAMS if name[:15] == comm), comm)
 
 

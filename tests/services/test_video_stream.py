@@ -17,7 +17,7 @@ from pebble.contract import MQTT_VIDEO, VIDEO_CONTROL
 from pebble.contract.payloads import MediaRequest
 from pebble.runtime.parent import ProgramRequest
 from pebble.services.mqtt_bridge.media import Media
-from tests.support import Child, until
+from tests.support import Child, gone, until
 
 #: Leaves its number and that of a child of its own, and says something.
 STREAMER = """
@@ -66,20 +66,13 @@ def streaming(tmp_path: Path) -> Iterator[Stream]:
     stream.process.wait()
 
 
-def alive(pid: int) -> bool:
-    try:
-        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except FileNotFoundError:
-        return False
-
-
 def test_the_program_runs_and_ends_with_all_it_started(streaming: Stream) -> None:
     pids = streaming.pids()
-    assert all(alive(pid) for pid in pids)
+    assert not any(gone(pid) for pid in pids)
     streaming.process.terminate()
     code, output = streaming.ended()
     assert (code, "streaming as pit" in output) == (0, True)
-    assert until(lambda: not any(alive(pid) for pid in pids), 5)
+    assert until(lambda: all(gone(pid) for pid in pids), 5)
 
 
 def test_a_program_that_will_not_end_is_killed(tmp_path: Path) -> None:
@@ -88,13 +81,13 @@ def test_a_program_that_will_not_end_is_killed(tmp_path: Path) -> None:
     pids = stream.pids()
     stream.process.terminate()
     assert stream.ended()[0] == 0
-    assert until(lambda: not any(alive(pid) for pid in pids), 5)
+    assert until(lambda: all(gone(pid) for pid in pids), 5)
 
 
 def test_a_killed_service_leaves_no_program(streaming: Stream) -> None:
     program = streaming.pids()[0]
     os.kill(streaming.process.pid, signal.SIGKILL)
-    assert until(lambda: not alive(program), 5)
+    assert until(lambda: gone(program), 5)
     for pid in streaming.pids()[1:]:  # its own children are its own business then
         os.kill(pid, signal.SIGKILL)
 

@@ -23,7 +23,7 @@ from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
 from pebble.services.mqtt_bridge.media import MEDIA, Media
 from pebble.transports import Message, MqttSettings, create
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, Quiet
-from tests.support import ROOT, Broker, until
+from tests.support import ROOT, Broker, process_name, until
 
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 ON, OFF = b'{"enabled": true}', b'{"enabled": false}'
@@ -362,7 +362,7 @@ class Robot:
 
     def bridge_pid(self) -> int:
         children = Path(f"/proc/{self.launcher.pid}/task/{self.launcher.pid}/children").read_text().split()
-        return next(int(pid) for pid in children if Path(f"/proc/{pid}/comm").read_text().strip() == "mqtt_bridge")
+        return next(int(pid) for pid in children if process_name(int(pid)) == "mqtt_bridge")
 
     def close(self) -> None:
         self.launcher.terminate()
