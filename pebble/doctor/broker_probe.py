@@ -9,8 +9,8 @@ import time
 from dataclasses import dataclass
 
 from pebble.errors import TransportError
-from pebble.transports.mqtt.tls import make_context
 from pebble.transports.settings import MqttSettings
+from pebble.transports.tls import make_context
 
 _CLEAN, _PASSWORD, _USER = 0x02, 0x40, 0x80
 _KEEPALIVE_S = 10

@@ -16,8 +16,8 @@ from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, 
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
-from pebble.transports.mqtt.tls import make_context
 from pebble.transports.settings import MqttSettings
+from pebble.transports.tls import make_context
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""Makes the TLS context of an MQTT connection from its settings, with errors that name the file."""
+"""Makes the TLS context of a connection to a broker from its settings, with errors that name the file."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""Runs autonomy scripts, at most one at a time."""

@@ -1,0 +1,70 @@
+"""Writes the config that a script gets: a copy of the robot's, in which the broker is the gate."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from itertools import islice
+from typing import Any
+
+from pebble.config import Config
+from pebble.errors import PebbleError
+
+_SECRET = re.compile("password|secret|token", re.IGNORECASE)
+_LOGIN = re.compile(r"(?<=://)[^/@\s]*(?=@)")  # user:password of a URL
+_MOST_LINKS = 1000
+
+
+class ConfigCopy:
+    """A private folder in the run directory with the copy, and links to what is beside the original."""
+
+    def __init__(self, config: Config) -> None:
+        if config.path is None:
+            raise PebbleError("a script that speaks MQTT needs the robot's config in a file")
+        self._config, self._source = config, config.path
+        self._folder = config.run_dir() / "autonomy"
+        self.path = self._folder / config.path.name
+
+    def write(self, port: int, username: str, password: str) -> None:
+        """Write the copy for a gate on loopback ``port``. Raises PebbleError."""
+        broker = {"host": "127.0.0.1", "port": port, "username": username, "password": password}
+        try:
+            self.remove()
+            self._folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._folder.mkdir(mode=0o700)
+            self._link()
+            self.path.touch(mode=0o600, exist_ok=False)
+            self.path.write_text(json.dumps(self._data(broker), indent=2))
+        except (OSError, ValueError) as error:
+            raise PebbleError(f"the config of scripts, {self.path}, cannot be written: {error}") from None
+
+    def remove(self) -> None:
+        """Delete the folder, not what its links lead to."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _data(self, broker: dict[str, Any]) -> dict[str, Any]:
+        data = _public(json.loads(self._source.read_text(encoding="utf-8-sig")))
+        data["local_mqtt"] = broker
+        data["transport"] = {
+            "kind": "mqtt",
+            "run_dir": str(self._config.run_dir()),
+            "state_dir": str(self._config.state_dir()),
+        }
+        return dict(data)
+
+    def _link(self) -> None:
+        """Scripts of the original look for ``camera_calibration.yaml`` beside their config."""
+        for entry in islice(os.scandir(self._source.parent), _MOST_LINKS):
+            if entry.name != self._source.name:
+                (self._folder / entry.name).symlink_to(entry.path)
+
+
+def _public(value: Any) -> Any:
+    """``value`` without keys that may hold a secret, and without logins in URLs."""
+    if isinstance(value, dict):
+        return {key: _public(item) for key, item in value.items() if not _SECRET.search(key)}
+    if isinstance(value, list):
+        return [_public(item) for item in value]
+    return _LOGIN.sub("***", value) if isinstance(value, str) else value

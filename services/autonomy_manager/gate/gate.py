@@ -1,0 +1,101 @@
+"""A broker for the scripts of one run: opened before they start, closed after they have ended."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+import ssl
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from pebble.config import Config, Mqtt
+from pebble.errors import PebbleError
+from pebble.runtime.connections import tls_settings
+from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Login
+from pebble.services.autonomy_manager.gate.config_copy import ConfigCopy
+from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet
+from pebble.services.autonomy_manager.gate.server import MAX_CONNECTIONS, GateServer
+from pebble.services.autonomy_manager.gate.topics import TopicRules
+from pebble.transports.counters import Counters
+from pebble.transports.tls import make_context
+
+_USER = "script"
+_JOIN_S = 2.0
+
+
+class Gate:
+    """Gives scripts a config (:attr:`config_path`) whose broker signs what they drive with ``run``.
+
+    ``publish(topic, payload)`` sends a signed command on the robot's own transport; a thread of the gate calls it.
+    Everything else that scripts send goes to the robot's broker.
+    """
+
+    def __init__(self, config: Config, publish: Callable[[str, bytes], object], run: int) -> None:
+        """Raises PebbleError if the robot has no broker, or its config no file."""
+        self.counters = Counters()  # signed, refused, stale, halted
+        self._rules = TopicRules.of(config)
+        self._broker = broker_of(config)
+        self._copy = ConfigCopy(config)
+        self._outlet = DriveOutlet(run, publish, self.counters)
+        self._server: GateServer | None = None
+        self._opened = ExitStack()
+
+    @property
+    def config_path(self) -> Path:
+        """The config for the scripts; exists while the gate is open."""
+        return self._copy.path
+
+    def open(self) -> None:
+        """Listen, and write the config. Raises PebbleError."""
+        password = secrets.token_urlsafe(24)
+        with ExitStack() as opened:
+            context = self._context()
+            try:
+                listener = opened.enter_context(socket.create_server(("127.0.0.1", 0), backlog=MAX_CONNECTIONS))
+            except OSError as error:
+                raise PebbleError(f"no port for scripts that speak MQTT: {error.strerror}") from None
+            opened.callback(self._copy.remove)
+            self._copy.write(listener.getsockname()[1], _USER, password)
+            own = Login(_USER.encode(), password.encode())
+            self._serve(listener, context, own, opened)
+            self._opened = opened.pop_all()
+
+    def halt(self) -> None:
+        """Refuse commands that move from now on: the run is being stopped. Zeros still pass."""
+        if self._server is not None:
+            self._server.post(self._outlet.halt)
+
+    def close(self) -> None:
+        """Close all connections, and remove the config. May be called again."""
+        self._opened.close()
+
+    def _serve(self, listener: socket.socket, context: ssl.SSLContext | None, own: Login, opened: ExitStack) -> None:
+        broker = Login(*map(_encoded, (self._broker.username, self._broker.password)))
+        self._server = server = GateServer(
+            listener,
+            (self._broker.host, self._broker.port, context),
+            self._outlet,
+            lambda: ClientFilter(self._rules, own, broker),
+        )
+        thread = threading.Thread(target=server.serve, name="gate", daemon=True)
+        thread.start()
+        opened.callback(thread.join, _JOIN_S)
+        opened.callback(server.stop)
+
+    def _context(self) -> ssl.SSLContext | None:
+        tls = tls_settings(self._broker.tls)
+        return None if tls is None else make_context(tls)
+
+
+def _encoded(text: str | None) -> bytes | None:
+    return None if text is None else text.encode()
+
+
+def broker_of(config: Config) -> Mqtt:
+    """The broker that has the robot's topics. Raises PebbleError if there is none."""
+    broker = config.local_mqtt if config.transport.kind == "mqtt" else config.transport.mqtt_mirror
+    if broker is None:
+        raise PebbleError("it speaks MQTT, and this robot has no broker: set transport.mqtt_mirror")
+    return broker

@@ -1,0 +1,45 @@
+"""Decides when the drive commands of a run are published: at most 50 a second, but a zero at once. Pure."""
+
+from __future__ import annotations
+
+PERIOD_S = 0.02  # between two commands, if the second one moves anything
+
+
+class Pacer:
+    """The newest command waits for its turn. A zero never waits, and what waited before it is dropped.
+
+    Times are seconds on one clock of the caller. ``topic`` is one of a few: a robot has a drive topic per motor owner.
+    """
+
+    def __init__(self) -> None:
+        self.overwritten = 0  # commands that a newer one replaced before their turn
+        self._free_at = float("-inf")
+        self._waiting: dict[str, bytes] = {}
+
+    @property
+    def due(self) -> float | None:
+        """When :meth:`take` has a command; None if none waits."""
+        return self._free_at if self._waiting else None
+
+    def offer(self, topic: str, payload: bytes, moves: bool, now: float) -> bool:
+        """True: publish this command now. False: it waits, or is replaced by a newer one."""
+        if self._waiting.pop(topic, None) is not None:
+            self.overwritten += 1
+        if moves and now < self._free_at:
+            self._waiting[topic] = payload
+            return False
+        self._free_at = max(self._free_at, now + PERIOD_S)
+        return True
+
+    def take(self, now: float) -> tuple[str, bytes] | None:
+        """A waiting command whose turn it is; ask again until there is none."""
+        if not self._waiting or now < self._free_at:
+            return None
+        topic = next(iter(self._waiting))
+        self._free_at = now + PERIOD_S
+        return topic, self._waiting.pop(topic)
+
+    def discard(self) -> None:
+        """Drop what waits."""
+        self.overwritten += len(self._waiting)
+        self._waiting.clear()
