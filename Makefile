@@ -23,9 +23,9 @@ demo: .venv/.ready-demo
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
-	@$(VENV) -m pytest --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone"
+	@$(VENV) tools/run_tests.py --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone"
 	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines"
-	@$(VENV) -m pytest --numprocesses 2 --dist loadscope -m alone tests/robot tests/services tests/test_demo.py
+	@$(VENV) tools/run_tests.py --numprocesses 2 --dist loadscope -m alone tests/robot tests/services tests/test_demo.py
 
 # What violates a rule is described in build/stops; the seed in its name repeats it.
 stops: .venv/.ready-dev

@@ -67,3 +67,44 @@ def test_no_registry_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("cannot fetch http://127.0.0.1:")
     assert done.stderr.count("\n") == 1
+
+
+FLAKY = """
+import pathlib, pytest
+@pytest.mark.parametrize("name", ["a/b [c]", "d e"])
+def test_second_time(name):
+    flag = pathlib.Path(name[0])
+    seen = flag.exists()
+    flag.touch()
+    assert seen
+def test_first_time(): pass
+"""
+
+
+def run_tests(folder: Path, content: str) -> tuple[int, str]:
+    (folder / "test_it.py").write_text(content)
+    command = [sys.executable, str(ROOT / "tools/run_tests.py"), "-q", "--numprocesses", "2", f"--rootdir={folder}"]
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=100, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    return done.returncode, done.stdout
+
+
+def test_few_failed_tests_run_once_more_alone_and_are_named(tmp_path: Path) -> None:
+    code, output = run_tests(tmp_path, FLAKY)
+    assert code == 0
+    assert "UNRELIABLE, passed only the second time" in output
+    assert "test_it.py::test_second_time[a/b [c]]" in output.partition("UNRELIABLE")[2]
+
+
+def test_what_fails_twice_fails(tmp_path: Path) -> None:
+    assert run_tests(tmp_path, FLAKY.replace("assert seen", "assert not name"))[0] == 1
+
+
+def test_many_failures_are_no_coincidence(tmp_path: Path) -> None:
+    code, output = run_tests(tmp_path, FLAKY.replace('["a/b [c]", "d e"]', "list('abcd')"))
+    assert (code, "once more" in output) == (1, False)
+
+
+def test_an_error_in_a_test_file_fails(tmp_path: Path) -> None:
+    assert run_tests(tmp_path, "import nothing_like_this")[0] not in (0, 5)
