@@ -8,12 +8,26 @@ from pebble.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from pebble.cameras import camera as camera
+    from pebble.contract import Channel as Channel
+    from pebble.contract import Kind as Kind
+    from pebble.script import Robot as Robot
+    from pebble.script import Stopped as Stopped
+    from pebble.script import run as run
+
+_FROM = {
+    "camera": "pebble.cameras",
+    "Channel": "pebble.contract",
+    "Kind": "pebble.contract",
+    "Robot": "pebble.script",
+    "Stopped": "pebble.script",
+    "run": "pebble.script",
+}
 
 
 def __getattr__(name: str) -> Any:
     """`from pebble import camera` imports what it needs only when it is used."""
-    if name == "camera":
-        from pebble.cameras import camera
+    if name in _FROM:
+        from importlib import import_module
 
-        return camera
+        return getattr(import_module(_FROM[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

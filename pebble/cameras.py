@@ -77,6 +77,17 @@ class Camera:
                 except PayloadError as error:
                     log.warning("%s", error)
 
+    def newest(self) -> Picture | None:
+        """The newest picture that was not returned before, or None. Does not wait."""
+        frame = self._reader.read(0.0)
+        if frame is None:
+            return None
+        try:
+            return self._picture(frame)
+        except PayloadError as error:
+            log.warning("%s", error)
+            return None
+
     def _picture(self, frame: Frame) -> Picture:
         picture = frame.picture(self._width)
         self.frame = frame

@@ -2,119 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from typing import Any
-
-import msgspec
-
-from pebble.contract import AUTONOMY_COMMAND, CAPABILITIES, DRIVE, ESTOP_RESET, ESTOP_STATE, codec
-from pebble.contract.identity import LEVEL
-from pebble.contract.payloads import EstopReset, EstopState
-from pebble.errors import PayloadError, TransportError
+from pebble.contract import ESTOP_RESET, codec
+from pebble.contract.payloads import EstopReset
 from pebble.motion.latch import stop_of
-from pebble.transports import Message, QoS, Transport
-from pebble.transports.topics import check_topic
-
-MAX_OWNERS = 16  # of one robot; a robot that lists more is never confirmed
-_STATE_BYTES = 1024  # the contract allows 400
-_CAPABILITIES_BYTES = 64 * 1024
-_NAMES = 8  # in ``recent``
-_LATEST_MS = 253_402_300_800_000  # the year 10000
-
-_valid_level = re.compile(LEVEL).search
-
-
-class RobotEstop:
-    """One robot: which motor owners it lists, and the newest state of each.
-
-    ``by`` and ``why`` in the states are short printable ASCII, whatever was received. Names of owners are not: make
-    them printable before they reach a terminal.
-    """
-
-    def __init__(self, base: str) -> None:
-        self.base = base
-        self.has_capabilities = False
-        self.announces = False  # its capabilities have a section about emergency stops
-        self.available = False  # it can be stopped by an emergency stop
-        self.drives = True  # False: its capabilities exclude drive commands. Readers assume what is missing
-        self.drive_topic = DRIVE.topic(base)
-        self.script_topic = AUTONOMY_COMMAND.topic(base)
-        self.owners: tuple[str, ...] = ()  # as its capabilities list them
-        self._states: dict[str, EstopState] = {}
-        self._capabilities_topic = CAPABILITIES.topic(base)
-        self._prefix = ESTOP_STATE.topic(base).removesuffix("{owner}")
-
-    @property
-    def states(self) -> dict[str, EstopState]:
-        """By owner; without capabilities of every owner, else of the listed ones: others are no longer there."""
-        if not self.has_capabilities:
-            return dict(self._states)
-        return {owner: self._states[owner] for owner in self.owners if owner in self._states}
-
-    @property
-    def latched(self) -> dict[str, EstopState]:
-        """The states of the owners that are stopped."""
-        return {owner: state for owner, state in self.states.items() if state.latched}
-
-    @property
-    def stopped_by(self) -> EstopState | None:
-        """The newest stop among the latched owners; None: the robot is not stopped, as far as is known."""
-        return max(self.latched.values(), key=lambda state: state.since, default=None)
-
-    @property
-    def old(self) -> bool:
-        """Whether it is known to have no emergency stop; one that announces it, but cannot receive it, is not old."""
-        return self.has_capabilities and not self.announces
-
-    def subscribe(self, transport: Transport) -> None:
-        """Receive from ``transport`` until that is closed; when this returns, what is retained has arrived."""
-
-        def take(message: Message) -> None:
-            self.receive(message)
-
-        for channel in (ESTOP_STATE, CAPABILITIES):
-            transport.subscribe(channel.filter(self.base), take, direct=True)
-
-    def receive(self, message: Message) -> bool:
-        """Update from one message of this robot; False if it is about something else, or malformed."""
-        if message.topic == self._capabilities_topic:
-            return self._receive_capabilities(message.payload)
-        if message.topic.startswith(self._prefix):
-            return self._receive_state(message.topic.removeprefix(self._prefix), message.payload)
-        return False
-
-    def _receive_capabilities(self, payload: bytes) -> bool:
-        if len(payload) > _CAPABILITIES_BYTES:
-            return False
-        try:
-            value = codec.decode(CAPABILITIES, payload).value
-        except PayloadError:
-            return False
-        estop, drive = _section(value, "estop"), _section(value, "drive")
-        self.announces, self.available = bool(estop), estop.get("available") is True
-        self.owners = _owners(estop.get("owners"))
-        self.drives = drive.get("available") is not False
-        self.drive_topic = _topic(drive.get("topic"), DRIVE.topic(self.base))
-        self.script_topic = _topic(_section(value, "autonomy").get("command_topic"), AUTONOMY_COMMAND.topic(self.base))
-        self.has_capabilities = True  # last: other threads may read meanwhile
-        return True
-
-    def _receive_state(self, owner: str, payload: bytes) -> bool:
-        if not _valid_level(owner) or len(payload) > _STATE_BYTES:
-            return False
-        if not payload:
-            return self._states.pop(owner, None) is not None
-        try:
-            state = codec.decode(ESTOP_STATE, payload)
-        except PayloadError:
-            return False
-        if owner not in self._states and len(self._states) >= MAX_OWNERS:
-            unlisted = next((other for other in self._states if other not in self.owners), None)
-            if unlisted is None:
-                return False
-            del self._states[unlisted]
-        self._states[owner] = _clean(state)
-        return True
+from pebble.runtime.robot_estop import MAX_OWNERS as MAX_OWNERS
+from pebble.runtime.robot_estop import RobotEstop as RobotEstop
+from pebble.transports import Message, QoS
 
 
 class Reset:
@@ -162,31 +55,3 @@ class Reset:
         if now.count != before.count:
             return f"stopped again meanwhile by {now.by or 'unknown'}"
         return "the reset reached it too late" if now.reset_refused == "old" else "no answer"
-
-
-def _section(value: dict[str, Any], name: str) -> dict[str, Any]:
-    section = value.get(name)
-    return section if isinstance(section, dict) else {}
-
-
-def _owners(listed: object) -> tuple[str, ...]:
-    """The owners, without repetitions; none if the list is not valid, so such a robot is never confirmed."""
-    if not isinstance(listed, list) or len(listed) > MAX_OWNERS:
-        return ()
-    if not all(isinstance(owner, str) and _valid_level(owner) for owner in listed):
-        return ()
-    return tuple(dict.fromkeys(listed))
-
-
-def _topic(listed: object, default: str) -> str:
-    try:
-        return check_topic(listed) if isinstance(listed, str) else default
-    except TransportError:
-        return default
-
-
-def _clean(state: EstopState) -> EstopState:
-    """The state with bounded, printable texts."""
-    _, by, why = stop_of({"by": state.by, "why": state.why})
-    since = state.since if 0 <= state.since < _LATEST_MS else 0
-    return msgspec.structs.replace(state, by=by, why=why, since=since, recent=state.recent[:_NAMES])

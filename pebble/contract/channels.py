@@ -51,7 +51,7 @@ class Channel(Struct, frozen=True, kw_only=True):
     metric: str
     kind: Kind
     payload: Any
-    doc: str
+    doc: str = ""
     rate_hz: float = 0.0  # nominal; 0 means on demand
     remote: bool = True
     bridged: bool = True

@@ -1,0 +1,54 @@
+"""Ends a script on a signal, whatever its main thread does: asleep, busy, or blocked in C code."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import threading
+from collections.abc import Callable
+
+END_S = 2.0  # for main to return after a signal; the wheels have stopped by then
+_NUMBERS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
+class Guard:
+    """Calls ``end(number)`` on its own thread when a signal arrives, and ends the process 2 s later.
+
+    The kernel's handler only writes a byte into a pipe, and the thread waits for nothing else: a handler in Python
+    would run on the main thread, perhaps much later, or while that holds a lock. Code that holds Python's global lock
+    for long delays this, too; then the motor owner's deadline stops the wheels, and the kernel ends the process.
+    """
+
+    def __init__(self, end: Callable[[int], None]) -> None:
+        """Only from the main thread."""
+        self._end = end
+        self._reader, self._writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
+        for number in _NUMBERS:
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell does for what runs in the background
+                signal.signal(number, lambda *_: None)
+        os.register_at_fork(after_in_child=self._release)
+        threading.Thread(target=self._run, name="pebble-end", daemon=True).start()
+
+    def _run(self) -> None:
+        number = self._next(None)
+        signal.setitimer(signal.ITIMER_REAL, END_S + 0.5)
+        self._end(number)
+        self._next(END_S)
+        os._exit(128 + number)
+
+    def _next(self, timeout: float | None) -> int:
+        """The next signal that ends; after one, only Ctrl-C again, or 0 after ``timeout`` seconds."""
+        wanted = _NUMBERS if timeout is None else (signal.SIGINT,)
+        while select.select([self._reader], [], [], timeout)[0]:
+            for number in os.read(self._reader, 512):
+                if number in wanted:
+                    return number
+        return 0
+
+    def _release(self) -> None:
+        """A fork ends as any program: a signal to it is none to the script."""
+        signal.set_wakeup_fd(-1)
+        for number in _NUMBERS:
+            signal.signal(number, signal.SIG_DFL)

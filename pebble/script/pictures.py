@@ -1,0 +1,66 @@
+"""The pictures of a robot's camera, for a loop of the script's own or one over them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pebble.cameras import Camera, Picture, camera
+
+
+class Pictures:
+    """Opens the camera when it is first used. One thread reads; any may close."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._changing = threading.Lock()
+        self._cameras: list[Camera] = []
+        self._polled: Camera | None = None
+        self._last: Picture | None = None
+        self._closed = False
+
+    def every(self, **options: Any) -> Iterator[Picture]:
+        """All pictures from now on, the newest each time; see `pebble.camera`."""
+        view = self._open(**options)
+        try:
+            yield from view
+        finally:
+            self._close(view)
+
+    def newest(self, max_age: float) -> Picture | None:
+        """The newest picture, if it was captured within the last ``max_age`` seconds. Does not wait."""
+        if self._polled is None:
+            self._polled = self._open()
+        picture = self._polled.newest()
+        if picture is not None:
+            self._last = picture
+        frame = self._polled.frame
+        if frame is None or time.monotonic_ns() - frame.info.captured_ns > max_age * 1e9:
+            self._last = None
+        return self._last
+
+    def close(self) -> None:
+        """Ends all loops over pictures."""
+        with self._changing:
+            self._closed = True
+            cameras, self._cameras = self._cameras, []
+        for view in cameras:
+            view.close()
+
+    def _open(self, **options: Any) -> Camera:
+        view = camera(self._run_dir, **options)
+        with self._changing:
+            self._cameras.append(view)
+            closed = self._closed
+        if closed:
+            view.close()
+        return view
+
+    def _close(self, view: Camera) -> None:
+        with self._changing:
+            if view in self._cameras:
+                self._cameras.remove(view)
+        view.close()

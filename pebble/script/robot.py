@@ -1,0 +1,208 @@
+"""A robot as its script sees it: pictures, messages, and wheels."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pebble.config import Config
+from pebble.contract import DRIVE, ESTOP_RESET, Channel, Kind, codec
+from pebble.contract.payloads import Drive
+from pebble.errors import PayloadError, PebbleError
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.script.wheels import Wheels
+from pebble.transports import Message, QoS, Transport
+
+if TYPE_CHECKING:
+    from pebble.cameras import Picture
+    from pebble.script.pictures import Pictures
+
+_ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
+_WAITING = 100  # messages of one channel that wait for its handler, before the oldest is dropped
+
+EXIT_ENDED = 3  # of a script whose run was ended: by an operator, an emergency stop or a newer run
+
+
+class Stopped(SystemExit):
+    """The script is to end. Raised by every call on the robot from then on; nothing moves any more."""
+
+
+class _Arrived(NamedTuple):
+    value: Any
+    at: float  # on the monotonic clock
+
+
+class Robot:
+    """The robot of this script. Any thread may call every method; none may be called in a fork of the process.
+
+    Every method raises :class:`Stopped` once the script is to end.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        transport: Transport,
+        number: Callable[[int], int],
+        *,
+        name: str = "script",
+        on_ended: Callable[[str], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``transport`` is open. ``number`` gives the run's number, above the given one."""
+        self.config = config
+        self.log = logging.getLogger(f"pebble.script.{name}")
+        self._quiet_log = RateLimitedLog(self.log)
+        self._transport, self._addresses, self._clock = transport, Addresses(config), clock
+        self._latest: dict[str, _Arrived] = {}
+        self._subscribed: set[str] = set()
+        self._pictures: Pictures | None = None
+        self._opening = threading.Lock()
+        self._stopped = threading.Event()
+        self._exit_code = 0
+        self._pid = os.getpid()
+        self._wheels = Wheels(transport, self._addresses, number, on_ended or self._end_run, clock)
+
+    # -- to see
+
+    def camera(
+        self, *, width: int | None = None, views: bool = False, timeout: float | None = None
+    ) -> Iterator[Picture]:
+        """Iterate over the camera's pictures, always the newest: arrays of (height, width, 3) bytes, blue first.
+
+        See `pebble.camera` for the options, and for what is raised.
+        """
+        for picture in self._seen().every(width=width, views=views, timeout=timeout):
+            self._check()
+            yield picture
+        self._check()
+
+    def picture(self, max_age: float = 0.5) -> Picture | None:
+        """The newest picture captured within the last ``max_age`` seconds, or None. Does not wait."""
+        self._check()
+        return self._seen().newest(max_age)
+
+    def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
+        """The newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None. Does not wait.
+
+        The first call subscribes, and mostly returns None.
+        """
+        self._check()
+        topic = self._addresses[channel].topic
+        if topic not in self._subscribed:
+            self._subscribed.add(topic)
+            self._subscribe(channel, lambda value, **_: self._latest.__setitem__(topic, _Arrived(value, self._clock())))
+        newest = self._latest.get(topic)
+        return None if newest is None or self._clock() - newest.at > max_age else newest.value
+
+    def on(self, channel: Channel, handler: Callable[..., None]) -> None:
+        """Call ``handler`` with each payload of ``channel``, on a thread of its own.
+
+        For a pattern channel, the names in the topic are arguments too. If it is slow, the oldest messages are dropped.
+        """
+        self._check()
+        self._subscribe(channel, handler)
+
+    # -- to act
+
+    def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
+        """Steer by ``x`` (-1..1, positive: right), throttle ``z`` (positive: forward), and ``y``, as the robot has it.
+
+        It moves the robot for 0.75 s at most: repeat it, 5 to 50 times a second. False: it has no effect, because a
+        person drives, the robot is stopped, or there is no connection. At most 50 commands a second are published: of
+        more, the newest; a stop never waits.
+        """
+        self._check()
+        return self._wheels.drive(Drive(x=x, z=z, y=y))
+
+    def stop(self) -> bool:
+        """Stop the wheels: the same as ``drive()``."""
+        return self.drive()
+
+    @property
+    def overridden(self) -> bool:
+        """Whether a person has driven within the last 2 s, so that :meth:`drive` has no effect."""
+        return self._wheels.overridden
+
+    @property
+    def why_refused(self) -> str:
+        """Why :meth:`drive` would have no effect now, in words; empty: it would, as far as is known."""
+        return self._wheels.refusal()
+
+    def publish(self, channel: Channel, value: Any, **names: str) -> bool:
+        """Publish ``value`` on ``channel``; False: it was not accepted. ``names`` fill a pattern channel's levels."""
+        self._check()
+        address = self._addresses[channel]
+        topic = channel.topic(self.config.base, **names) if names else address.topic
+        if channel in (DRIVE, ESTOP_RESET) or topic in (
+            self._addresses[DRIVE].topic,
+            ESTOP_RESET.topic(self.config.base),
+        ):
+            raise PebbleError(
+                f"a script does not publish {channel.metric}: use robot.drive() to move, and let people reset"
+            )
+        return self._transport.publish(topic, codec.encode(channel, value), qos=QoS(address.qos), retain=address.retain)
+
+    def sleep(self, seconds: float) -> None:
+        """Wait; the wheels stop after 0.75 s without a command."""
+        self._check()
+        self._stopped.wait(max(0.0, seconds))
+        self._check()
+
+    # -- its end
+
+    def end(self, why: str, exit_code: int = 0) -> None:
+        """Publish the final stop, close the cameras, and have every further call raise Stopped. From any thread."""
+        if os.getpid() != self._pid:
+            return
+        if not self._stopped.is_set():
+            self._exit_code = exit_code
+        self._stopped.set()
+        self._wheels.end(why)
+        with self._opening:
+            pictures = self._pictures
+        if pictures is not None:
+            pictures.close()
+
+    def close(self) -> None:
+        """End, and disconnect."""
+        if os.getpid() == self._pid:
+            self.end("the script has finished")
+            self._transport.close()
+
+    def _end_run(self, why: str) -> None:
+        self.log.warning("%s", why)
+        self.end(why, EXIT_ENDED)
+
+    def _check(self) -> None:
+        if os.getpid() != self._pid:
+            raise PebbleError("a fork of a script has no robot: use a thread, or start a program with subprocess")
+        if self._stopped.is_set():
+            raise Stopped(self._exit_code)
+
+    def _seen(self) -> Pictures:
+        from pebble.script.pictures import Pictures
+
+        with self._opening:
+            if self._pictures is None:
+                self._pictures = Pictures(self.config.run_dir())
+            return self._pictures
+
+    def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:
+        def receive(message: Message) -> None:
+            if message.retain and channel.kind in _ONE_SHOT:
+                return  # stale
+            names = channel.names(message.topic) if channel.is_pattern else {}
+            try:
+                value = codec.decode(channel, message.payload)
+            except PayloadError as error:
+                self._quiet_log.warning(channel.metric, "refused a message: %s", error)
+                return
+            handler(value, **names)
+
+        topic = self._addresses[channel].topic
+        self._transport.subscribe(topic, receive, qos=QoS(channel.default_qos), limit=_WAITING)
