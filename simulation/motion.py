@@ -53,7 +53,7 @@ def _follow(speed: float, wanted: float, seconds: float) -> tuple[float, float]:
     return (0.0 if wanted == 0.0 and abs(reached) < _STANDSTILL_MM_S else reached), way
 
 
-_MAGNETS = 10  # per wheel
+_MAGNETS = 10  # per wheel, north and south poles in turn
 _REST, _SWING = 0.5, 0.29  # of the ADC's range
 # a lithium cell
 _FULL_V, _START_V, _EMPTY_V = 4.2, 4.05, 3.0
@@ -64,7 +64,7 @@ _SAG_V = 0.075  # under full load
 
 def hall(motion: RobotMotion) -> tuple[float, float, float]:
     """Hall sensors: left wheel, right wheel, and left wheel a quarter wave later, as parts 0..1 of the ADC's range."""
-    waves_per_mm = _MAGNETS / (math.pi * WHEEL_DIAMETER_MM)
+    waves_per_mm = _MAGNETS / 2 / (math.pi * WHEEL_DIAMETER_MM)
     left, right = (math.tau * waves_per_mm * way for way in (motion.left_mm, motion.right_mm))
     return _part(math.sin(left)), _part(math.sin(right)), _part(math.sin(left - math.pi / 2))
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+
 import pytest
 
 from pebble.errors import ConfigError
 from pebble.simulation.bodies import Benjr, Body, Light, Minilamp, body_of
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
-from pebble.simulation.motion import FULL_SPEED_MM_S
+from pebble.simulation.motion import FULL_SPEED_MM_S, WHEEL_DIAMETER_MM, RobotMotion, hall
 
 SERIAL = ("goob", "fred", "goob_imu")  # those with a radio start in test_board_network.py
 
@@ -175,3 +178,14 @@ def test_every_firmware_starts_in_its_body_with_its_motors_off(clock: VirtualClo
 def test_an_unknown_robot_is_refused(clock: VirtualClock) -> None:
     with pytest.raises(ConfigError, match="'pitcam'; known: goob, fred, minilamp, benjr, goob_imu"):
         body_of("pitcam", Board(clock))
+
+
+def test_the_hall_sensors_see_five_waves_in_a_turn_of_a_wheel() -> None:
+    """Ten magnets, whose poles alternate: 10 extremes, 19.16 mm apart."""
+    motion = RobotMotion()
+    levels = []
+    for step in range(2001):
+        motion.left_mm = math.pi * WHEEL_DIAMETER_MM * step / 2000
+        levels.append(hall(motion)[0])
+    falling = [before >= 0.5 > after for before, after in pairwise(levels[:-1])]
+    assert sum(falling) == 5
