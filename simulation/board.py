@@ -14,6 +14,7 @@ from pebble.simulation.bodies import BoardState, Light, Pair, body_of
 from pebble.simulation.micropython.board import UID, Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.micropython.runner import Runner
+from pebble.simulation.motion import RobotMotion
 
 __all__ = ["KINDS", "BoardState", "Light", "Profile", "SimulatedMcu"]
 
@@ -43,8 +44,8 @@ class SimulatedMcu:
     """One board. Pass host data to ``receive``, call ``tick`` often, and send what both return to the host.
 
     ``now`` is a monotonic time in seconds from one clock for all calls. ``failsafe_s`` replaces the firmware's own
-    limit; ``uid`` is the MCU's unique id. ``on_motors(now, (left, right))`` is called at each change of the motors,
-    + = forward.
+    limit; ``uid`` is the MCU's unique id; ``motion`` is where the robot stands, and on what ground.
+    ``on_motors(now, (left, right))`` is called at each change of the motors, + = forward.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class SimulatedMcu:
         failsafe_s: float | None = None,
         charging: bool = False,
         uid: bytes = UID,
+        motion: RobotMotion | None = None,
         on_motors: Callable[[float, Pair], None] | None = None,
     ) -> None:
         if kind not in KINDS:
@@ -65,7 +67,7 @@ class SimulatedMcu:
         self.profile = KINDS[kind]
         self._clock = VirtualClock(now)
         self.board = Board(self._clock, uid=uid)
-        self.body = body_of(kind, self.board)
+        self.body = body_of(kind, self.board, motion)
         self.body.on_motors = on_motors or self.body.on_motors
         self.motion, self.battery = self.body.motion, self.body.battery
         self.battery.charging = charging

@@ -35,12 +35,17 @@ DARK = Light(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class BoardState:
-    """State of a robot: wheel speeds in mm/s, ``drive`` −1..1 as commanded, ``motors`` as the pins drive them."""
+    """State of a robot: wheel speeds in mm/s, and how far the wheels have turned in mm.
+
+    ``drive`` is −1..1 as commanded, ``motors`` as the pins drive them.
+    """
 
     kind: str
     pose: Pose
     left_mm_s: float
     right_mm_s: float
+    left_mm: float
+    right_mm: float
     drive: tuple[float, float]
     motors: tuple[float, float]
     light: Light
@@ -60,11 +65,11 @@ class Body:
     kind: str
     cells = 2
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
         self.board = board
         board.configure_for(self.kind)
         self.pins: Any = board.firmware.module(f"{self.kind}.pins")
-        self.motion = RobotMotion()
+        self.motion = motion or RobotMotion()
         self.battery = Battery(self.cells)
         self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
         self._rolled = self._changed_at = board.clock.now()
@@ -117,6 +122,8 @@ class Body:
             pose=self.motion.pose,
             left_mm_s=self.motion.left_mm_s,
             right_mm_s=self.motion.right_mm_s,
+            left_mm=self.motion.left_mm,
+            right_mm=self.motion.right_mm,
             drive=self._motors if drive is None else drive,
             motors=self.outputs(),
             light=self.light(),
@@ -173,8 +180,8 @@ class Goob(TwoWheeled):
 
     kind = "goob"
 
-    def __init__(self, board: Board) -> None:
-        super().__init__(board)
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
         self.measure_wheels()
         self.measure_battery()
 
@@ -191,8 +198,8 @@ class Fred(TwoWheeled):
 
     kind = "fred"
 
-    def __init__(self, board: Board) -> None:
-        super().__init__(board)
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
         self.measure_wheels()
         board.set_pin(self.pins.CHARGE, lambda: self.battery.charging)
 
@@ -206,8 +213,8 @@ class Minilamp(TwoWheeled):
     kind = "minilamp"
     cells = 1
 
-    def __init__(self, board: Board) -> None:
-        super().__init__(board)
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
         self.measure_battery()
 
     @property
@@ -221,8 +228,8 @@ class Benjr(Body):
     kind = "benjr"
     cells = 1
 
-    def __init__(self, board: Board) -> None:
-        super().__init__(board)
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
         self.shield = MotorShield()
         self.shield.before_change = self.before_output_change
         board.attach_i2c(self.pins.MOTOR_SHIELD, self.shield)
@@ -246,11 +253,14 @@ class GoobImu(Body):
         board.attach_i2c(self.pins.IMU, self.imu)
 
 
-BODIES: Final[dict[str, Callable[[Board], Body]]] = {kind.kind: kind for kind in (Goob, Fred, Minilamp, Benjr, GoobImu)}
+BODIES: Final[dict[str, type[Body]]] = {kind.kind: kind for kind in (Goob, Fred, Minilamp, Benjr, GoobImu)}
 
 
-def body_of(kind: str, board: Board) -> Body:
-    """Make the body of a robot around ``board``, before its firmware is loaded; ConfigError for an unknown kind."""
+def body_of(kind: str, board: Board, motion: RobotMotion | None = None) -> Body:
+    """Make the body of a robot around ``board``, before its firmware is loaded; ConfigError for an unknown kind.
+
+    ``motion``: where it stands, and on what; otherwise at the origin of an empty floor.
+    """
     if kind not in BODIES:
         raise ConfigError(f"unknown simulated robot {kind!r}; known: {', '.join(BODIES)}")
-    return BODIES[kind](board)
+    return BODIES[kind](board, motion)

@@ -71,8 +71,9 @@ def _report(mcu: PtyMcu) -> bool:
     return True
 
 
-def _run_commands(mcu: PtyMcu) -> None:
-    actions: dict[str, Callable[[], None]] = {
+def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
+    """The commands of ``--control``."""
+    return {
         "unplug": mcu.unplug,
         "replug": mcu.replug,
         "reset": mcu.reset,
@@ -81,10 +82,14 @@ def _run_commands(mcu: PtyMcu) -> None:
         "disturb": lambda: mcu.disturb(True),
         "undisturb": lambda: mcu.disturb(False),
     }
+
+
+def _run_commands(mcu: PtyMcu) -> None:
+    known = actions(mcu)
     for line in sys.stdin:
-        action = actions.get(line.strip())
+        action = known.get(line.strip())
         if action is None:
-            sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(actions)}\n")
+            sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(known)}\n")
         else:
             action()
     os.kill(os.getpid(), signal.SIGTERM)

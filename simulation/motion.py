@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 WHEEL_DIAMETER_MM = 61.0  # Goob's geometry; Fred's is not documented
 TRACK_MM = 130.5
@@ -19,13 +20,41 @@ class Pose:
     heading_rad: float = 0.0  # −π..π, counter-clockwise positive
 
 
-class RobotMotion:
-    """Two wheels that follow their commanded speeds with a lag, and the resulting pose."""
+class Ground(Protocol):
+    """What a robot stands on."""
 
-    def __init__(self) -> None:
-        self.pose = Pose()
+    def move(self, start: Pose, end: Pose) -> Pose:
+        """Where a robot is that drives from ``start`` to ``end``: less far, if something is in its way."""
+
+    def place(self, pose: Pose) -> None:
+        """The robot has been lifted, and put down there."""
+
+
+class EmptyGround:
+    """Nothing is in the way."""
+
+    def move(self, start: Pose, end: Pose) -> Pose:  # noqa: ARG002 - of the protocol
+        return end
+
+    def place(self, pose: Pose) -> None:
+        """Every place is free."""
+
+
+class RobotMotion:
+    """Two wheels that follow their commanded speeds with a lag, and the resulting pose.
+
+    Where ``ground`` stops the robot, its wheels slip.
+    """
+
+    def __init__(self, pose: Pose | None = None, ground: Ground | None = None) -> None:
+        self.pose, self.ground = pose or Pose(), ground or EmptyGround()
         self.left_mm_s = self.right_mm_s = 0.0
         self.left_mm = self.right_mm = 0.0  # distance of each wheel; reverse is negative
+
+    def place(self, pose: Pose) -> None:
+        """Lift the robot and put it down at ``pose``; its wheels do not notice."""
+        self.pose = pose
+        self.ground.place(pose)
 
     def advance(self, left: float, right: float, seconds: float) -> None:
         """Drive the motors at ``left`` and ``right`` (−1..1 of full speed) for ``seconds``."""
@@ -38,11 +67,13 @@ class RobotMotion:
         self.right_mm += right_mm
         turn, ahead = (right_mm - left_mm) / TRACK_MM, (left_mm + right_mm) / 2
         middle = self.pose.heading_rad + turn / 2
-        self.pose = Pose(
+        end = Pose(
             self.pose.x_mm + ahead * math.cos(middle),
             self.pose.y_mm + ahead * math.sin(middle),
             math.remainder(self.pose.heading_rad + turn, math.tau),
         )
+        if end != self.pose:
+            self.pose = self.ground.move(self.pose, end)
 
 
 def _follow(speed: float, wanted: float, seconds: float) -> tuple[float, float]:

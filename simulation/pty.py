@@ -22,6 +22,7 @@ from pebble.runtime.lines import LineSplitter
 from pebble.simulation.board import BoardState, SimulatedMcu
 from pebble.simulation.bodies import Pair
 from pebble.simulation.micropython.board import UID
+from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.trace import Entry, Event, Trace, motors_entry
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,8 @@ class PtyMcu:
 
     The symlink's folder must exist; only a symlink is replaced. Unplugging closes the pty but leaves the MCU powered:
     its motors stop by failsafe, as on a robot whose MCU is powered by the battery. Each replug makes a new pty behind
-    the same symlink. With ``trace_output`` the trace also has the MCU's own lines that the host received.
+    the same symlink. ``motion`` is where the robot stands, used by that thread alone. With ``trace_output`` the trace
+    also has the MCU's own lines that the host received.
     """
 
     def __init__(
@@ -52,12 +54,19 @@ class PtyMcu:
         failsafe_s: float | None = None,
         charging: bool = False,
         uid: bytes = UID,
+        motion: RobotMotion | None = None,
     ) -> None:
         self.symlink = symlink
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host received
         self._mcu = SimulatedMcu(
-            kind, time.monotonic(), failsafe_s=failsafe_s, charging=charging, uid=uid, on_motors=self._moved
+            kind,
+            time.monotonic(),
+            failsafe_s=failsafe_s,
+            charging=charging,
+            uid=uid,
+            motion=motion,
+            on_motors=self._moved,
         )
         self._tick_s = self._mcu.profile.tick_s
         is_text = self._mcu.profile.is_text
@@ -117,6 +126,10 @@ class PtyMcu:
     def disturb(self, on: bool) -> None:
         """Make the devices on the board's I2C bus fail, or work again."""
         self._call(lambda: self._mcu.disturb(on))
+
+    def place(self, pose: Pose) -> None:
+        """Lift the robot and put it down at ``pose``."""
+        self._call(lambda: self._mcu.motion.place(pose))
 
     def state(self) -> BoardState:
         return self._call(self._mcu.state)
