@@ -21,6 +21,7 @@ Goob's and Fred's is on a serial port, MiniLAMP's and BenJr's on Wi-Fi.
     pebble sim goob --link /tmp/goob
     pebble sim minilamp --broker mqtt://127.0.0.1
     pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
+    pebble sim world world.json
 
 A loudspeaker that records what is played stands in for aplay.
 
@@ -148,6 +149,28 @@ def loudspeaker(
     return main([*options, *raw, file])
 
 
+def world(
+    file: Annotated[Path, typer.Argument(help="The world file.", metavar="FILE", show_default=False)],
+    folder: Annotated[
+        Path | None,
+        typer.Option("--folder", help="For serial ports and traces. [default: /tmp/pebble-world-…]", metavar="PATH"),
+    ] = None,
+    trace: Annotated[bool, typer.Option("--trace", help="Record what the MCUs receive.")] = False,
+    control: Annotated[bool, typer.Option("--control", help="Read commands from standard input.")] = False,
+) -> int:
+    """Robots in a room with walls and AprilTags, which their cameras see, until Ctrl-C.
+
+    It prints the serial port and the camera of each robot for its config.
+
+    \b
+        pebble sim world world.json
+    """
+    from pebble.simulation.world.program import main
+
+    flags = [*(["--trace"] if trace else []), *(["--control"] if control else [])]
+    return main([str(file), *(["--folder", str(folder)] if folder else []), *flags])
+
+
 def demo(
     seconds: Annotated[
         float | None,
@@ -228,7 +251,7 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (goob, fred, goob_imu, minilamp, benjr, fleet, loudspeaker):
+    for command in (goob, fred, goob_imu, minilamp, benjr, fleet, world, loudspeaker):
         group.command(command.__name__)(command)
     app.add_typer(group, name="sim")
     app.command("demo")(demo)

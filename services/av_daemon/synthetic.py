@@ -38,6 +38,13 @@ class Pacer:
         self._interrupted.wait(max(0.0, self.due(self._turn) - self._clock()))
         return self._turn
 
+    def turn(self) -> int:
+        """The same; raises DeviceError if the wait was interrupted."""
+        turn = self.next()
+        if self.interrupted:
+            raise DeviceError("interrupted")
+        return turn
+
     def due(self, turn: int) -> float:
         return self._start + turn / self._rate
 
@@ -64,7 +71,7 @@ class SyntheticCamera:
         self._pacer = Pacer(video.fps, start=start)
 
     def grab(self) -> Capture:
-        number = _turn(self._pacer)
+        number = self._pacer.turn()
 
         def draw(target: Bytes) -> None:
             self._scene.render(number, target.reshape(self._shape))
@@ -88,7 +95,7 @@ class SyntheticMicrophone:
         self._pacer = Pacer(audio.rate / self._count, behind=_BEHIND, start=start)
 
     def grab(self) -> Capture:
-        turn = _turn(self._pacer)  # a chunk is complete when the next one begins
+        turn = self._pacer.turn()  # a chunk is complete when the next one begins
         samples = self._speech.samples((turn - 1) * self._count, self._count)
         at_ns = int(self._pacer.due(turn) * 1e9)
         return Capture(self._info, samples.nbytes, samples, at_ns=at_ns, skipped=self._pacer.skipped)
@@ -98,10 +105,3 @@ class SyntheticMicrophone:
 
     def interrupt(self) -> None:
         self._pacer.interrupt()
-
-
-def _turn(pacer: Pacer) -> int:
-    turn = pacer.next()
-    if pacer.interrupted:
-        raise DeviceError("interrupted")
-    return turn

@@ -1,0 +1,1 @@
+"""A simulated world as data: its file, where its robots are, and what their cameras see."""

@@ -1,0 +1,48 @@
+"""Where a robot was during the last second, and at any moment in between."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+
+class RobotPose(NamedTuple):
+    """In metres and radians, counter-clockwise."""
+
+    x: float
+    y: float
+    heading: float
+
+
+class Sample(NamedTuple):
+    """A pose and when it was valid, monotonic nanoseconds."""
+
+    ns: int
+    pose: RobotPose
+
+
+class Track:
+    """One robot's samples, oldest first; at least one."""
+
+    def __init__(self, samples: Sequence[Sample]) -> None:
+        self._samples = samples
+
+    @property
+    def newest(self) -> Sample:
+        return self._samples[-1]
+
+    def at(self, ns: int) -> RobotPose:
+        """The pose at ``ns``, interpolated; the oldest or newest one for a time outside the samples."""
+        after = bisect_right(self._samples, ns, key=lambda sample: sample.ns)
+        if after in (0, len(self._samples)):
+            return self._samples[max(0, after - 1)].pose
+        (start, one), (end, two) = self._samples[after - 1], self._samples[after]
+        part = (ns - start) / (end - start)
+        turn = math.remainder(two.heading - one.heading, math.tau)
+        return RobotPose(one.x + part * (two.x - one.x), one.y + part * (two.y - one.y), one.heading + part * turn)
+
+
+def poses_at(tracks: Mapping[str, Track], ns: int) -> dict[str, RobotPose]:
+    return {name: track.at(ns) for name, track in tracks.items()}

@@ -1,0 +1,184 @@
+"""A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+
+from pebble.errors import PebbleError
+from pebble.media.world.pose_page import PERIOD_S, PosePage, page_path
+from pebble.media.world.poses import RobotPose
+from pebble.media.world.world_file import World, read_world
+from pebble.simulation.board import BoardState
+from pebble.simulation.mcu import actions
+from pebble.simulation.motion import Pose, RobotMotion
+from pebble.simulation.pty import PtyMcu
+from pebble.simulation.world.walls import Floor, start_pose
+
+_SAMPLES_PER_REPORT = round(0.1 / PERIOD_S)
+_SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
+
+Mcus = dict[str, PtyMcu]
+
+
+class Snapshot(msgspec.Struct, frozen=True):
+    """A line of ``--report``: one JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
+
+    ns: int
+    robots: dict[str, BoardState]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run until a signal, or with ``--control`` until standard input ends."""
+    options = _parser().parse_args(arguments)
+    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # also in later threads; sigtimedwait below receives them
+    try:
+        return _run(options)
+    except PebbleError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    except OSError as error:
+        sys.stderr.write(f"{error.filename}: {error.strerror}\n")
+        return 1
+
+
+def port_path(folder: Path, robot: str) -> Path:
+    """The serial port of a robot's motor MCU."""
+    return folder / f"{robot}.port"
+
+
+def trace_path(folder: Path, robot: str) -> Path:
+    """What ``--trace`` records of a robot's MCU."""
+    return folder / f"{robot}.trace.jsonl"
+
+
+def _run(options: argparse.Namespace) -> int:
+    path = options.file.absolute()
+    world = read_world(path)
+    folder = options.folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        page = PosePage(page_path(path), world.robots)
+        stack.callback(page.close)
+        mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, folder, options).items()}
+        if not options.report:
+            _write(_introduction(path, mcus))
+        if options.control:
+            threading.Thread(target=_run_commands, args=(mcus,), name="pebble-world control", daemon=True).start()
+        _publish_poses(page, mcus, report=options.report)
+    return 0
+
+
+def _mcus(world: World, folder: Path, options: argparse.Namespace) -> Mcus:
+    floor = Floor(world)
+    return {
+        name: PtyMcu(
+            place.kind,
+            port_path(folder, name),
+            trace=trace_path(folder, name) if options.trace else None,
+            trace_output=options.trace_output,
+            failsafe_s=options.failsafe,
+            motion=RobotMotion(start_pose(world, name), floor.mover(name)),
+        )
+        for name, place in world.robots.items()
+    }
+
+
+def _publish_poses(page: PosePage, mcus: Mcus, *, report: bool) -> None:
+    """Write samples to the page until a signal arrives."""
+    due, count = time.monotonic(), 0
+    while signal.sigtimedwait(_SIGNALS, max(0.0, due - time.monotonic())) is None:
+        due = max(due + PERIOD_S, time.monotonic())
+        states = {name: mcu.state() for name, mcu in mcus.items()}
+        ns = time.monotonic_ns()
+        page.write(ns, [_in_metres(state.pose) for state in states.values()])
+        count += 1
+        if (
+            report
+            and count % _SAMPLES_PER_REPORT == 0
+            and not _write(msgspec.json.encode(Snapshot(ns, states)) + b"\n")
+        ):
+            return
+
+
+def _in_metres(pose: Pose) -> RobotPose:
+    return RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad)
+
+
+def _introduction(path: Path, mcus: Mapping[str, PtyMcu]) -> bytes:
+    """Where the robots are, and what belongs in their configs."""
+    lines = [f"the world of {path} runs; Ctrl-C ends it"]
+    for name, mcu in mcus.items():
+        video = msgspec.json.encode({"backend": "synthetic", "device": f"{path}#{name}"}).decode()
+        port = msgspec.json.encode({"port": str(mcu.symlink)}).decode()
+        lines += [f"{name}, in the services of its config:", f'    "serial_mcu_bridge": {{"serial": {port}}}']
+        lines += [f'    "av_daemon": {{"video": {video}}}']
+    return "\n".join(lines).encode() + b"\n"
+
+
+def _write(text: bytes) -> bool:
+    """False if the reader of standard output has closed it."""
+    try:
+        os.write(sys.stdout.fileno(), text)
+    except BrokenPipeError:
+        return False
+    return True
+
+
+def _run_commands(mcus: Mcus) -> None:
+    for line in sys.stdin:
+        if problem := _command(mcus, line.split()):
+            sys.stderr.write(f"{line.strip()!r}: {problem}\n")
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _command(mcus: Mcus, words: list[str]) -> str:
+    """Execute one line of ``--control``; returns what is wrong with it."""
+    if len(words) < 2 or words[0] not in mcus:
+        return f"begin with a robot ({', '.join(mcus)}) and a command"
+    mcu, command, arguments = mcus[words[0]], words[1], words[2:]
+    known = actions(mcu)
+    if command in known and not arguments:
+        known[command]()
+        return ""
+    if command != "place":
+        return f"known commands: {', '.join(known)}, place X Y DEGREES"
+    try:
+        x, y, degrees = map(float, arguments)
+        mcu.place(Pose(x * 1000, y * 1000, math.remainder(math.radians(degrees), math.tau)))
+    except ValueError:
+        return "place needs three numbers: metres, metres, degrees"
+    return ""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m pebble.simulation.world", description=__doc__)
+    parser.add_argument("file", type=Path, metavar="FILE", help="the world file")
+    parser.add_argument("--folder", type=Path, help="for serial ports and traces; by default a temporary one")
+    parser.add_argument(
+        "--trace", action="store_true", help="record every line that an MCU received, ROBOT.trace.jsonl"
+    )
+    parser.add_argument(
+        "--trace-said", dest="trace_output", action="store_true", help="also the lines of the MCUs that hosts received"
+    )
+    parser.add_argument(
+        "--failsafe", type=float, metavar="S", help="stop after this silence, instead of the firmware's own"
+    )
+    parser.add_argument("--report", action="store_true", help="write all states to standard output at 10 Hz")
+    parser.add_argument(
+        "--control",
+        action="store_true",
+        help="read from standard input: ROBOT and unplug, replug, reset, charge, discharge, or place X Y DEGREES",
+    )
+    return parser
