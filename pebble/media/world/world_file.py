@@ -25,6 +25,7 @@ from pebble.errors import ConfigError, DeviceError
 MOST_ROBOTS: Final = 32
 LONGEST_NAME: Final = 64  # bytes of a robot's name
 LONGEST_LATENCY_MS: Final = 500
+LONGEST_EXPOSURE_MS: Final = 200
 _valid_level = re.compile(LEVEL).search
 _TAGS_OF: Final = {"APRILTAG_16h5": 30, "APRILTAG_25h9": 35, "APRILTAG_36h10": 2320, "APRILTAG_36h11": 587}
 
@@ -42,7 +43,7 @@ class Lens(Section, frozen=True, kw_only=True):
     blur: Annotated[float, Meta(ge=0, le=20, description="Sigma of the lens's blur, pixels.")] = 0.8
     noise: Annotated[float, Meta(ge=0, le=100, description="Sigma of the sensor's noise, of 255.")] = 4.0
     latency_ms: Annotated[float, Meta(ge=0, le=LONGEST_LATENCY_MS, description="Age of a new picture.")] = 0.0
-    motion_blur_ms: Annotated[float, Meta(ge=0, le=200, description="Exposure time.")] = 0.0
+    motion_blur_ms: Annotated[float, Meta(ge=0, le=LONGEST_EXPOSURE_MS, description="Exposure time.")] = 0.0
     jpeg_quality: Annotated[
         Annotated[int, Meta(ge=1, le=100)] | None, doc("Pictures pass through a JPEG of this quality.")
     ] = None
