@@ -7,13 +7,14 @@ from typing import Any
 
 from pebble import contract as c
 from pebble.config import Config, SystemControl
+from pebble.config.types import ServiceSection
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.media import pyav
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
 
-#: Sounds and scripts: their topics are fixed, their services arrive in a later release.
+#: Scripts: their topics are fixed, their service arrives in a later release.
 _LATER = {"available": False, "controls": False}
 
 
@@ -27,7 +28,10 @@ def capabilities(config: Config, addresses: Addresses, lacking: Collection[str] 
         "transport": {"kind": config.transport.kind},
         "video": _video(config, addresses),
         "audio": _audio(config, addresses),
-        "soundboard": _LATER | _topics(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
+        "soundboard": {
+            **_enabled(config.services.soundboard_handler),
+            **_topics(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
+        },
         "autonomy": _LATER | _topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
         "system": _system(config, addresses),
         **_motor(config, addresses, lacking),
@@ -72,6 +76,10 @@ def _offered(config: Config, captured: bool) -> dict[str, bool]:
     """The bridge requests the programs that send it; without a bridge there are no requests."""
     available = config.services.av_daemon.enabled and captured
     return {"available": available, "controls": available and config.services.mqtt_bridge.enabled}
+
+
+def _enabled(section: ServiceSection) -> dict[str, bool]:
+    return {"available": section.enabled, "controls": section.enabled}
 
 
 def _topics(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> dict[str, Any]:

@@ -63,6 +63,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (services.av_daemon.enabled, _av_daemon(config)),
         (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
         (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
+        (services.soundboard_handler.enabled, _service(config, "soundboard_handler", Stage.CONNECTION)),
         *((True, _on_demand(config, name)) for name in config.on_demand_programs()),
     ]
     return tuple(program for enabled, program in table if enabled)

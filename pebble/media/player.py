@@ -12,8 +12,10 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
-from pebble.media.jitter import Chunk
+if TYPE_CHECKING:  # it needs NumPy, which not every program that plays does
+    from pebble.media.jitter import Chunk
 
 log = logging.getLogger(__name__)
 
@@ -69,8 +71,7 @@ class Player:
         self._end(0.0)
 
     def _start(self, chunk: Chunk, now: float) -> subprocess.Popen[bytes] | None:
-        values = {"{rate}": str(chunk.rate), "{channels}": str(chunk.channels), "{device}": self._device}
-        words = [_filled(word, values) for word in self._command]
+        words = filled(self._command, rate=chunk.rate, channels=chunk.channels, device=self._device)
         self._format, self._started_at = (chunk.rate, chunk.channels), now
         source, sink = os.pipe()
         with suppress(OSError):  # costs latency only
@@ -146,7 +147,10 @@ def _exit(process: subprocess.Popen[bytes]) -> str:
     return f"exit code {code}" if code >= 0 else f"signal {-code}"
 
 
-def _filled(word: str, values: dict[str, str]) -> str:
+def filled(command: Sequence[str], *, rate: int, channels: int, device: str) -> list[str]:
+    """The words of a player's command with their places filled in."""
+    values = {"{rate}": str(rate), "{channels}": str(channels), "{device}": device}
+    words = list(command)
     for name, value in values.items():
-        word = word.replace(name, value)
-    return word
+        words = [word.replace(name, value) for word in words]
+    return words

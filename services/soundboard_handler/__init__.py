@@ -1,0 +1,1 @@
+"""Plays sound clips: one at a time, through the robot's player."""

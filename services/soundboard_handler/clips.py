@@ -1,0 +1,91 @@
+"""The folder of clips: which there are, and which one a command names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+from msgspec import Struct
+
+from pebble.media import pyav
+
+_WAV = ".wav"
+_NEED_PYAV = (".mp3", ".ogg", ".flac")
+_MOST = 100_000  # files that a scan looks at: the folder may be / by mistake
+
+
+class Clip(Struct, frozen=True):
+    """A sound file; ``name`` is its path in the folder, with slashes."""
+
+    name: str
+    path: Path
+
+    @property
+    def encoded(self) -> bool:
+        """Whether only PyAV can read it."""
+        return self.path.suffix.lower() != _WAV
+
+
+class Clips:
+    """The clips below ``folder``. ``problem`` is what the last scan could not read; empty if it read everything."""
+
+    def __init__(self, folder: Path) -> None:
+        self.problem = ""
+        self._folder = folder
+        self._endings = (_WAV, *_NEED_PYAV) if pyav.installed() else (_WAV,)
+
+    def scan(self) -> list[str]:
+        """The names of all clips, sorted without regard to case. What lies outside is left out, as ``find`` does."""
+        self.problem = ""
+        root = self._folder.resolve()
+        names = (path[len(str(root)) :].lstrip("/") for path in islice(self._files(root), _MOST) if self._is_clip(path))
+        return sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
+
+    def find(self, name: str) -> Clip | None:
+        """The clip that a command names: relative to the folder, or absolute inside it. None if there is none."""
+        root = self._folder.resolve()
+        try:
+            path = (root / _expanded(name.replace("\\", "/"))).resolve()
+            found = path.is_relative_to(root) and path.suffix.lower() in self._endings and path.is_file()
+        except (OSError, RuntimeError, ValueError):  # too long, links in a circle, no text of a path
+            return None
+        return Clip(path.relative_to(root).as_posix(), path) if found else None
+
+    def _files(self, root: Path) -> Iterator[str]:
+        def failed(error: OSError) -> None:
+            self.problem = self.problem or f"{error.filename} cannot be read: {error.strerror}"
+
+        for folder, _, files in os.walk(root, onerror=failed):
+            for file in files:
+                yield f"{folder}/{file}"
+
+    def _is_clip(self, path: str) -> bool:
+        if not path.lower().endswith(self._endings):
+            return False
+        if os.path.islink(path):  # noqa: PTH114 - there may be thousands
+            return self.find(path) is not None
+        return os.path.isfile(path)  # noqa: PTH113
+
+    def _can_be_named(self, name: str) -> bool:
+        """Commands are UTF-8, and a backslash in them is a slash."""
+        if _is_utf8(name) and "\\" not in name:
+            return True
+        self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"
+        return False
+
+
+def _is_utf8(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _expanded(name: str) -> Path:
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:  # no user of that name: a file whose name begins with ~
+        return Path(name)

@@ -1,0 +1,174 @@
+"""Plays the clips of a folder when commands name them (paper A.8.10)."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+
+from pebble.contract import MEDIA_REPORT, SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
+from pebble.contract.payloads import MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
+from pebble.runtime.service import Service, on
+from pebble.services.soundboard_handler.clips import Clip, Clips
+from pebble.services.soundboard_handler.playback import Playback, Players
+
+_PLAY = ("play", "start", "on", "enable", "enabled")
+_STOP = ("stop", "off", "disable", "disabled")
+_AT_ONCE_S = 1.0  # a player that fails so soon may not have got the device
+_REPORT_AGE_S = 3.0  # of a report that still counts; one comes every second
+_SHORTEST_S = 0.2  # between two starts of a clip that is repeated
+_STOP_S = 2.0  # the launcher kills a service after three
+_LONGEST_NAME = 300  # characters in an error
+
+
+class _Request(Struct):
+    """What to play next, and how often."""
+
+    clip: Clip
+    times: float
+    starts: int = 0
+
+
+class SoundboardHandler(Service):
+    """Plays one clip at a time; the next one starts when the player of the one before has ended."""
+
+    name = "soundboard_handler"
+    publishes = (SOUNDBOARD_FILES, SOUNDBOARD_STATUS)
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._section = self.config.services.soundboard_handler
+        playback, raw = self._section.playback, self.config.services.mqtt_bridge.media.audio_receiver
+        self._clips = Clips(playback.directory or Path("~/sounds").expanduser())
+        self._players = Players(
+            playback.player_command, raw.command, raw.device, playback.volume, playback.cwd, playback.env
+        )
+        self._listed: list[str] | None = None
+        self._scan_problem = ""
+        self._playback: Playback | None = None
+        self._started_at = 0.0
+        self._request: _Request | None = None  # what is played now, or will be when the player has ended
+        self._error: str | None = None
+        self._talk_back_at = -math.inf  # when audio_receiver last reported that it plays
+
+    @property
+    def republish_interval_s(self) -> float:
+        return self._section.retained_publish_interval_seconds
+
+    def start(self) -> None:
+        self.timers.add(self.clock(), self._scan, period=self._section.playback.scan_interval)
+        self._publish_status()
+
+    def stop(self) -> None:
+        playback, self._playback = self._playback, None
+        if playback is not None:
+            playback.stop()
+            playback.wait(min(_STOP_S, self._section.playback.stop_timeout))
+        self._publish_status()
+
+    @on(SOUNDBOARD_COMMAND)
+    def command(self, command: SoundboardCommand) -> None:
+        """Play or stop; ``action`` wins over ``enabled``."""
+        action = (command.action or "").strip().lower()
+        play = True if action in _PLAY else False if action in _STOP else command.enabled
+        if play is None:
+            self.log.warning("ignored a command that neither plays nor stops: %.100r", command.action)
+            return
+        self._error = None
+        if not play:
+            self._replace(None)
+        elif (request := self._requested(command)) is not None:
+            self._replace(request)
+        else:
+            self._publish_status()
+
+    @on(MEDIA_REPORT)
+    def media_report(self, report: MediaReport, program: str) -> None:
+        """Remember when talk-back had the loudspeaker."""
+        if program == "audio_receiver" and report.running and (report.doing or "").startswith("plays"):
+            self._talk_back_at = self.clock()
+
+    # -- which clip
+
+    def _requested(self, command: SoundboardCommand) -> _Request | None:
+        """The clip to play; None, and an error, if there is none."""
+        name = command.file or ""
+        if not name.strip():
+            self._error = "Play command missing file"
+            return None
+        clip = self._clips.find(name) or self._clips.find(name.strip())
+        if clip is None:
+            self._error = f"Sound file not found: {name[:_LONGEST_NAME]}"
+            return None
+        repeat = command.repeat
+        return _Request(clip, math.inf if repeat is True else max(1, repeat or 1))
+
+    def _scan(self) -> None:
+        files = self._clips.scan()
+        if self._clips.problem != self._scan_problem:
+            self._scan_problem = self._clips.problem
+            if self._scan_problem:
+                self.log.warning("clips: %s", self._scan_problem)
+        if files != self._listed:
+            self._listed = files
+            self.publish(SOUNDBOARD_FILES, SoundboardFiles(files=files, timestamp=time.time()))
+
+    # -- playing
+
+    def _replace(self, request: _Request | None) -> None:
+        """Stop the player; play ``request`` when it has ended."""
+        self._request = request
+        playback = self._playback
+        if playback is not None and not playback.stopped:
+            playback.stop()
+            self.call_at(self.clock() + self._section.playback.stop_timeout, playback.kill)
+        if playback is None or playback.ended:
+            self._play_next()
+
+    def _play_next(self) -> None:
+        """Play what is requested, if anything is."""
+        self._playback = None
+        if self._request is not None:
+            self._request.starts += 1
+            self._playback = Playback(self._request.clip, self._players, self.post_first, self._changed)
+            self._playback.start()
+        else:
+            self._publish_status()
+
+    def _changed(self, playback: Playback) -> None:
+        """The player runs, or has ended."""
+        if playback is not self._playback:
+            return
+        request = self._request
+        if not playback.ended:
+            self._started_at = self.clock()
+            if request is not None and request.starts == 1:  # the status of a repeated clip is the same
+                self._publish_status()
+        elif playback.stopped:
+            self._play_next()
+        elif not playback.problem and request is not None and request.starts < request.times:
+            self.call_at(self._started_at + _SHORTEST_S, lambda: self._repeat(playback))
+        else:
+            self._request, self._error = None, self._problem_of(playback)
+            self._play_next()
+
+    def _repeat(self, playback: Playback) -> None:
+        if playback is self._playback and not playback.stopped:
+            self._play_next()
+
+    def _problem_of(self, playback: Playback) -> str | None:
+        now = self.clock()
+        at_once, talk_back = now - self._started_at < _AT_ONCE_S, now - self._talk_back_at < _REPORT_AGE_S
+        if playback.exit_code != 0 and at_once and talk_back:
+            return "the loudspeaker is busy (talk-back plays)"
+        return playback.problem or None
+
+    def _publish_status(self) -> None:
+        playback = self._playback
+        playing = playback is not None and playback.process is not None
+        file = playback.clip.name if playback is not None and playing else None
+        status = SoundboardStatus(playing=playing, timestamp=time.time(), file=file, error=self._error)
+        self.publish(SOUNDBOARD_STATUS, status)

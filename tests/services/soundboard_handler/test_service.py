@@ -1,0 +1,304 @@
+"""The soundboard's wire and processes, with a real player at the other end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pebble.contract import MEDIA_REPORT, codec
+from pebble.contract.payloads import MediaReport
+from pebble.transports import QoS
+from tests.services.soundboard_handler.soundboard_rig import LONG, Soundboard, tone, write_wav
+from tests.support import Broker, gone, until
+
+PLAY, STOP = ["play", "start", "on", "enable", "enabled"], ["stop", "off", "disable", "disabled"]
+
+Make = Callable[..., Soundboard]
+
+
+@pytest.fixture(params=["mqtt", "zenoh"])
+def both(request: pytest.FixtureRequest, local: Broker) -> Iterator[Soundboard]:
+    with Soundboard(request.param, local.port) as board:
+        yield board
+
+
+@pytest.fixture
+def board(local: Broker) -> Iterator[Soundboard]:
+    with Soundboard("mqtt", local.port) as board:
+        yield board
+
+
+@pytest.fixture
+def make(local: Broker) -> Iterator[Make]:
+    """Makes one with other options."""
+    boards: list[Soundboard] = []
+
+    def made(**options: Any) -> Soundboard:
+        boards.append(Soundboard("mqtt", local.port, **options).__enter__())
+        return boards[-1]
+
+    yield made
+    for one in boards:
+        one.__exit__(None, None, None)
+
+
+def test_a_clip_is_listed_played_as_it_is_and_over(
+    both: Soundboard, record_property: Callable[[str, object], None]
+) -> None:
+    path = write_wav(both.sounds / "intro.wav", tone(0.4, 2))
+    write_wav(both.sounds / "warn" / "Alarm.WAV", tone(0.1))
+    (both.sounds / "notes.txt").write_text("no sound")
+    both.start()
+    assert both.files == ["intro.wav", "warn/Alarm.WAV"]
+    assert both.catalogues[-1].keys() == {"files", "controls", "timestamp"}
+    assert both.statuses[-1] | {"timestamp": 0} == {
+        "playing": False, "file": None, "error": None, "controls": True, "timestamp": 0
+    }  # fmt: skip
+    began_ns = time.monotonic_ns()
+    both.play("intro.wav")
+    assert both.became(playing=True, file="intro.wav", error=None)
+    playing_ms = (time.monotonic_ns() - began_ns) / 1e6
+    assert both.became(playing=False, file=None, error=None)
+    (played,) = both.played
+    record_property("ms until playing, until the first sample", (playing_ms, (played.began_ns - began_ns) / 1e6))
+    assert playing_ms < 3000, "0.3 s on a machine that is not busy"
+    assert played.file == str(path), "called with the path, as aplay is"
+    assert np.array_equal(both.samples(), tone(0.4, 2))
+    both.play("warn\\Alarm.WAV")
+    assert both.became(playing=True, file="warn/Alarm.WAV")
+
+
+def test_retained_commands_are_refused_also_after_a_restart(both: Soundboard) -> None:
+    write_wav(both.sounds / "a.wav", tone(0.1))
+    both.send({"action": "play", "file": "a.wav"}, retain=True)
+    both.start()
+    both.process.terminate()
+    both.process.wait(10)
+    both.start()
+    assert both.refused({"action": "play"}) == "Play command missing file", "the commands before it were handled"
+    assert not any(status["playing"] for status in both.statuses)
+    assert both.played == []
+
+
+def test_every_form_of_the_command(make: Make) -> None:
+    board = make(player_command=LONG)
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    plays: list[Any] = [{"action": word.upper(), "file": "a.wav"} for word in PLAY]
+    plays += [{"value": {"action": "Play", "file": "a.wav"}}, {"value": True, "file": "a.wav"}]
+    plays += [{"enabled": True, "file": "a.wav"}, {"action": "unknown", "enabled": True, "file": "a.wav"}]
+    stops: list[Any] = [{"action": word.title(), "enabled": True} for word in STOP]
+    stops += [
+        False,
+        {"value": False},
+        {"enabled": False},
+        {"value": {"action": "stop"}},
+        {"action": "", "enabled": False},
+    ]
+    for number in range(max(len(plays), len(stops))):
+        board.send(plays[number % len(plays)])
+        assert board.became(playing=True, file="a.wav", error=None), plays[number % len(plays)]
+        board.send(stops[number % len(stops)])
+        assert board.became(playing=False, file=None, error=None), stops[number % len(stops)]
+    count = len(board.statuses)
+    board.send({"action": "unknown", "file": "a.wav"})
+    board.send({"file": "a.wav"})
+    assert board.refused(True) == "Play command missing file"
+    assert len(board.statuses) == count + 1, "what neither plays nor stops only is logged"
+
+
+def test_files_that_are_not_there_or_not_inside(board: Soundboard) -> None:
+    write_wav(board.folder / "outside.wav", tone(0.1))
+    write_wav(board.sounds / "inside.wav", tone(0.1))
+    (board.sounds / "out.wav").symlink_to(board.folder / "outside.wav")
+    (board.sounds / "circle.wav").symlink_to("circle.wav")
+    (board.sounds / "elsewhere").symlink_to(board.folder)
+    (board.sounds / "folder.wav").mkdir()
+    (board.sounds / "text.txt").write_text("text")
+    board.start()
+    assert board.files == ["inside.wav"]
+    names = ["../outside.wav", str(board.folder / "outside.wav"), "out.wav", "elsewhere/outside.wav", "..\\outside.wav"]
+    names += ["circle.wav", "folder.wav", "text.txt", "no.wav", "a" * 300 + ".wav", "zero\0.wav", "~nobody/a.wav"]
+    for name in names:
+        assert board.refused({"action": "play", "file": name}) == f"Sound file not found: {name[:300]}"
+    for name in ("", "  ", None):
+        assert board.refused({"action": "play", "file": name}) == "Play command missing file"
+    assert board.played == []
+
+
+@pytest.mark.parametrize("spelt", ["{folder}/a b.wav", "sub/../a b.wav", " a b.wav "])
+def test_other_ways_to_name_a_file_inside(make: Make, spelt: str) -> None:
+    board = make(player_command=LONG)
+    write_wav(board.sounds / "a b.wav", tone(0.1))
+    (board.sounds / "sub").mkdir()
+    board.start()
+    board.play(spelt.format(folder=board.sounds))
+    assert board.became(playing=True, file="a b.wav", error=None)
+
+
+def test_what_goes_wrong_with_a_player_is_reported(make: Make) -> None:
+    board = make()
+    (board.sounds / "bad.wav").write_bytes(b"no sound")
+    board.start()
+    board.play("bad.wav")
+    assert board.became(playing=False, file=None, error="player exited with code 1")
+    write_wav(board.sounds / "good.wav", tone(0.1))
+    board.play("good.wav")
+    assert board.became(playing=True, error=None)
+    assert board.became(playing=False, error=None), "the next command clears the error"
+
+
+def test_a_player_that_is_missing_is_reported(make: Make) -> None:
+    board = make(player_command=["no-such-player"])
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    board.play("a.wav")
+    error = "Failed to start playback: [Errno 2] No such file or directory: 'no-such-player'"
+    assert board.became(playing=False, error=error)
+
+
+def test_the_players_command_folder_and_environment_are_the_configs(make: Make) -> None:
+    board = make(cwd="tools", env={"VOICE": "high"}, player_command=["./play", "--file={file}", "-v"])
+    (board.folder / "tools").mkdir()
+    script = board.folder / "tools" / "play"
+    script.write_text('#!/bin/sh\necho "$VOICE $PWD $*" > called.new; mv called.new called; exec sleep 60\n')
+    script.chmod(0o755)
+    path = write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    board.play("a.wav")
+    assert until((board.folder / "tools" / "called").exists)
+    called = (board.folder / "tools" / "called").read_text()
+    assert called == f"high {board.folder}/tools --file={path} -v\n"
+
+
+def test_a_new_clip_replaces_the_one_before(board: Soundboard) -> None:
+    for name in ("a", "b", "c"):
+        write_wav(board.sounds / f"{name}.wav", tone(30))
+    board.start()
+    board.play("a.wav")
+    assert until(lambda: len(board.played) == 1)
+    board.play("b.wav")
+    board.play("c.wav")
+    assert board.became(playing=True, file="c.wav", error=None)
+    assert until(lambda: len(board.played) >= 2)
+    first, last = board.played[0], board.played[-1]
+    assert first.stopped
+    assert first.ended_ns is not None
+    assert first.ended_ns < board.played[1].began_ns, "never two at a time"
+    assert (Path(last.file).name, last.ended_ns) == ("c.wav", None)
+    assert [status["file"] for status in board.statuses][:2] == [None, "a.wav"]
+    assert [status["playing"] for status in board.statuses].count(False) == 1, "only before the first"
+
+
+def test_how_a_stopped_player_exits_is_no_error(make: Make) -> None:
+    board = make(player_command=["sh", "-c", "trap 'exit 7' TERM; while :; do sleep 0.02; done"])
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    board.play("a.wav")
+    assert board.became(playing=True)
+    board.send({"action": "stop"})
+    assert board.became(playing=False, file=None, error=None)
+    assert board.refused({"action": "stop"}) is None, "there is nothing to stop"
+
+
+def test_a_player_that_ignores_the_stop_is_killed_with_what_it_started(make: Make) -> None:
+    board = make(
+        player_command=["sh", "-c", "trap '' TERM; sleep 60 & echo $! > ../child; while :; do sleep 0.02; done"],
+        stop_timeout=0.2, cwd="sounds",
+    )  # fmt: skip
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    board.play("a.wav")
+    child = board.folder / "child"
+    assert until(lambda: child.exists() and child.read_text().endswith("\n"))
+    board.send(False)
+    assert board.became(playing=False, error=None)
+    assert until(lambda: gone(int(child.read_text())))
+
+
+def test_a_killed_service_leaves_no_player(board: Soundboard) -> None:
+    write_wav(board.sounds / "a.wav", tone(60))
+    board.start()
+    board.play("a.wav")
+    assert until(lambda: len(board.played) == 1)
+    (player,) = board.players()
+    assert player == board.played[0].pid
+    assert os.getpgid(player) == player, "a group of its own"
+    os.kill(board.process.pid, signal.SIGKILL)
+    assert until(lambda: gone(player))
+
+
+def test_a_service_that_ends_stops_its_player_and_reports_it(board: Soundboard) -> None:
+    write_wav(board.sounds / "a.wav", tone(60))
+    board.start()
+    board.play("a.wav")
+    assert until(lambda: len(board.played) == 1)
+    board.process.terminate()
+    assert board.process.wait(10) == 0
+    assert gone(board.played[0].pid)
+    assert board.became(playing=False, file=None, error=None)
+
+
+def test_a_clip_is_repeated(board: Soundboard) -> None:
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    board.play("a.wav", repeat=3)
+    assert board.became(playing=True)
+    assert board.became(playing=False, error=None)
+    assert len(board.played) == 3
+    assert sum(status["playing"] for status in board.statuses) == 1
+    board.play("a.wav", repeat=True)
+    assert until(lambda: len(board.played) >= 5)
+    board.send(False)
+    assert board.became(playing=False, error=None)
+    count = len(board.played)
+    assert board.refused(True) == "Play command missing file"
+    assert len(board.played) == count
+
+
+def test_a_clip_that_fails_is_not_repeated(board: Soundboard) -> None:
+    (board.sounds / "bad.wav").write_bytes(b"no sound")
+    board.start()
+    board.play("bad.wav", repeat=True)
+    assert board.became(playing=False, error="player exited with code 1")
+    assert board.players() == []
+
+
+def test_the_list_follows_the_folder(board: Soundboard) -> None:
+    board.sounds.rmdir()
+    board.start()
+    assert board.files == []
+    write_wav(board.sounds / "new.wav", tone(0.1))
+    assert until(lambda: board.files == ["new.wav"], 15), "after one scan"
+    (board.sounds / "new.wav").unlink()
+    assert until(lambda: board.files == [], 15)
+    assert len({one["timestamp"] for one in board.catalogues}) == 3, "made when it changes"
+
+
+@pytest.mark.parametrize(
+    ("doing", "error"),
+    [
+        ("plays 16 kHz, 1 channel", "the loudspeaker is busy (talk-back plays)"),
+        ("is silent", "player exited with code 1"),
+    ],
+)
+def test_a_loudspeaker_that_talk_back_has_is_busy(make: Make, doing: str, error: str) -> None:
+    board = make(exclusive=True)
+    path = write_wav(board.sounds / "a.wav", tone(60))
+    board.start()
+    talk_back = board.hold_loudspeaker(path)
+    report = codec.encode(MEDIA_REPORT, MediaReport(running=True, doing=doing))
+    board.local.publish(f"{board.base}/outgoing/media-report/audio_receiver", report, qos=QoS.DELIVERED)
+    board.play("a.wav")
+    assert board.became(playing=False, file=None, error=error)
+    talk_back.kill()
+    talk_back.wait(10)
+    board.play("a.wav")
+    assert until(lambda: len(board.played) == 2), "nothing waits for it, and nothing remembers it"
