@@ -59,12 +59,16 @@ class ClientFilter:
         self._rules, self._own, self._broker = rules, own, broker
         self._cutter = PacketCutter()
         self._unreleased: set[int] = set()  # ids of taken QoS 2 packets, until their PUBREL
+        self._begun = False
         self.connected = False  # the broker may be given what follows
 
     def feed(self, data: bytes) -> Output:
         """Handle received bytes. Nothing may be fed after a refusal."""
         output = Output()
         try:
+            if not self._begun and data and data[0] != Kind.CONNECT << 4:
+                raise PacketError("the first packet is no CONNECT")
+            self._begun = self._begun or bool(data)
             for packet in self._cutter.feed(data):
                 if not self.connected:
                     self._connect(packet, output)

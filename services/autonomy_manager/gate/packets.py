@@ -109,10 +109,8 @@ def read_id(packet: bytes) -> int:
 
 def read_connect(packet: bytes) -> Connect:
     """Parse a CONNECT packet. Raises PacketError, or VersionError for other versions of MQTT."""
-    if packet[0] != Kind.CONNECT << 4:
-        raise PacketError("the first packet is no CONNECT")
     fields = _Fields(packet)
-    name, level, flags = fields.text(), fields.byte(), 0
+    name, level = fields.text(), fields.byte()
     if name not in (b"MQTT", b"MQIsdp"):
         raise PacketError("a CONNECT of another protocol")
     if (name, level) != (b"MQTT", LEVEL):

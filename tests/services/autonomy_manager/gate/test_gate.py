@@ -1,0 +1,384 @@
+"""The gate with real scripts, real sockets and a real mosquitto."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as paho
+import pytest
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pebble.config import load
+from pebble.errors import PebbleError
+from pebble.runtime.connections import local_transport
+from pebble.services.autonomy_manager.gate import Gate
+from pebble.transports import QoS
+from tests.services.autonomy_manager.gate.mqtt_bytes import (
+    BASE,
+    CONNACK,
+    DRIVE,
+    PINGREQ,
+    connect,
+    packet,
+    puback,
+    publish,
+    subscribe,
+)
+from tests.support import ROOT, Broker, Child, until
+
+CERTS = ROOT / "tests" / "data" / "tls"
+FOLLOW = ROOT / "tests" / "fakes" / "original_follow.py"
+SUBACK, PINGRESP = b"\x90\x03\x00\x09\x00", b"\xd0\x00"
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("broker"))
+    yield broker
+    broker.stop()
+
+
+class Subscriber:
+    """Receives what arrives on ``filter_`` at the robot's broker."""
+
+    def __init__(self, port: int, filter_: str) -> None:
+        self.messages: list[paho.MQTTMessage] = []
+        subscribed = threading.Event()
+        self._client = paho.Client(CallbackAPIVersion.VERSION2)
+        self._client.on_connect = lambda client, *_: client.subscribe(filter_, 1)
+        self._client.on_subscribe = lambda *_: subscribed.set()
+        self._client.on_message = lambda _client, _data, message: self.messages.append(message)
+        self._client.connect("127.0.0.1", port)
+        self._client.loop_start()
+        assert subscribed.wait(10)
+
+    @property
+    def payloads(self) -> list[Any]:
+        return [json.loads(message.payload) for message in self.messages]
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+
+class Rig:
+    """A robot with a broker, its manager's transport, and an open gate for run 7."""
+
+    def __init__(self, broker: Broker, folder: Path, **changes: Any) -> None:
+        self.file = folder / "goob.json"
+        local = {"port": broker.port, **changes.pop("local_mqtt", {})}
+        transport = {"kind": "mqtt", "run_dir": str(folder / "run"), "state_dir": str(folder / "state")}
+        config = {"robot": {"id": "goob"}, "local_mqtt": local, "transport": transport, **changes}
+        self.file.write_text(json.dumps(config))
+        (folder / "camera_calibration.yaml").write_text("fx: 624")
+        self.config = load(self.file)
+        self.transport = local_transport(self.config, "autonomy_manager")
+        self.transport.open(timeout=10)
+        self.gate = Gate(self.config, self._publish, 7)
+        self.gate.open()
+        self._clients: list[socket.socket] = []
+        self._processes: list[Child] = []
+
+    def _publish(self, topic: str, payload: bytes) -> bool:
+        return self.transport.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
+
+    @property
+    def local_mqtt(self) -> dict[str, Any]:
+        return dict(json.loads(self.gate.config_path.read_text())["local_mqtt"])
+
+    def connect(self) -> socket.socket:
+        """A connection without login."""
+        client = socket.create_connection(("127.0.0.1", self.local_mqtt["port"]), 10)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._clients.append(client)
+        return client
+
+    def log_in(self, **options: Any) -> socket.socket:
+        client = self.connect()
+        client.sendall(connect("script", self.local_mqtt["password"], **options))
+        assert read(client, 4) == CONNACK
+        return client
+
+    def script(self, *options: str) -> Child:
+        command = [sys.executable, str(FOLLOW), "--config", str(self.gate.config_path), *options]
+        self._processes.append(Child(command))
+        return self._processes[-1]
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.kill()
+            process.wait(10)
+        for client in self._clients:
+            client.close()
+        self.gate.close()
+        self.transport.close()
+
+
+@pytest.fixture
+def rig(broker: Broker, tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig(broker, tmp_path)
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def driven(broker: Broker) -> Iterator[Subscriber]:
+    """What arrives on the drive topic."""
+    subscriber = Subscriber(broker.port, DRIVE)
+    yield subscriber
+    subscriber.close()
+
+
+def read(client: socket.socket, size: int) -> bytes:
+    """Exactly so many bytes; fewer if the connection ends."""
+    data = b""
+    while len(data) < size and (more := client.recv(size - len(data))):
+        data += more
+    return data
+
+
+def ended(client: socket.socket) -> bool:
+    """Read until the end; a reset is one, too."""
+    try:
+        while client.recv(65536):
+            pass
+    except ConnectionResetError:
+        pass
+    return True
+
+
+def moves(drive: dict[str, Any]) -> bool:
+    return any(drive.get(axis) for axis in "xyz")
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+def test_all_commands_of_an_unchanged_script_are_signed(rig: Rig, broker: Broker, driven: Subscriber, qos: int) -> None:
+    found = Subscriber(broker.port, f"{BASE}/outgoing/apriltag-data")
+    rig.script("--control-rate-hz", "40", "--qos", str(qos), "--retain")
+    assert until(lambda: len(driven.messages) >= 12)
+    assert {(drive["source"], drive["run"]) for drive in driven.payloads} == {("autonomy", 7)}
+    assert not any(message.retain for message in driven.messages)
+    late = Subscriber(broker.port, DRIVE)
+    assert not any(message.retain for message in late.messages), "nothing is retained"
+    assert found.payloads[0]["detected"] is False, "everything else passes"
+    late.close()
+    found.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_wheels_stop_when_the_scripts_connection_ends(rig: Rig, driven: Subscriber, number: int) -> None:
+    script = rig.script()
+    assert until(lambda: any(map(moves, driven.payloads)))
+    os.kill(script.pid, number)
+    assert until(lambda: not moves(driven.payloads[-1]))
+    assert driven.payloads[-1] == {"x": 0.0, "z": 0.0, "source": "autonomy", "run": 7}
+
+
+def test_a_script_receives_what_the_robot_publishes(rig: Rig, driven: Subscriber) -> None:
+    corners = [[0.45, 0.4], [0.55, 0.4], [0.55, 0.533], [0.45, 0.533]]
+    tag = {"marker_id": 13, "corners_norm": corners, "center_norm": [0.5, 0.4667]}
+    locations = {"detections": [tag], "frame_width": 640, "frame_height": 480}
+    rig.script("--control-rate-hz", "40")
+
+    def follows() -> bool:
+        rig.transport.publish(f"{BASE}/outgoing/apriltag-locations", json.dumps(locations).encode())
+        return any(drive["z"] > 0.5 and drive["x"] == 0 for drive in driven.payloads)
+
+    assert until(follows, step=0.05)
+
+
+def test_a_flood_is_limited_and_no_zero_is_lost(rig: Rig, driven: Subscriber) -> None:
+    client, zeros, began = rig.log_in(), 0, time.monotonic()
+    for number in range(500):
+        client.sendall(publish(DRIVE, json.dumps({"z": 0.0 if number % 50 == 0 else 0.5, "number": number})))
+        zeros += number % 50 == 0
+        time.sleep(max(0.0, began + (number + 1) / 500 - time.monotonic()))
+    assert until(lambda: driven.payloads[-1:] and driven.payloads[-1]["number"] == 499), "the newest one arrives"
+    lasted = time.monotonic() - began
+    moving = [drive for drive in driven.payloads if moves(drive)]
+    assert [drive["number"] for drive in driven.payloads if not moves(drive)] == list(range(0, 500, 50))
+    assert len(moving) <= 50 * lasted + 1
+    numbers = [drive["number"] for drive in driven.payloads]
+    assert numbers == sorted(numbers)
+
+
+def test_fragments_and_batches(rig: Rig, driven: Subscriber) -> None:
+    client = rig.log_in()
+    for sent, answer in ((subscribe("answer"), SUBACK), (publish(DRIVE, '{"x":1}', 1, 5), puback(5))):
+        for byte in sent:
+            client.sendall(bytes((byte,)))
+        assert read(client, len(answer)) == answer
+    client.sendall(b"".join(publish("answer", f"{number}") for number in range(200)) + PINGREQ)
+    expected = b"".join(publish("answer", f"{number}") for number in range(200)) + PINGRESP
+    assert read(client, len(expected)) == expected
+    assert until(lambda: driven.payloads)
+
+
+@pytest.mark.parametrize(
+    "sent", [b"GET / HTTP/1.1\r\n\r\n", b"\x00" * 100, b"\x10\xff\xff\xff\xff\xff", publish(DRIVE, "{}")]
+)
+def test_garbage_instead_of_a_login_ends_the_connection(rig: Rig, driven: Subscriber, sent: bytes) -> None:
+    client = rig.connect()
+    client.sendall(sent)
+    assert ended(client)
+    assert not driven.messages
+
+
+def test_an_oversized_packet_ends_the_connection_and_stops_the_wheels(rig: Rig, driven: Subscriber) -> None:
+    client = rig.log_in()
+    client.sendall(publish(DRIVE, '{"z":1}') + packet(0x30, bytes(256 * 1024))[:100])
+    assert ended(client)
+    assert until(lambda: len(driven.messages) == 2)
+    assert [drive["z"] for drive in driven.payloads] == [1, 0]
+
+
+def test_a_large_packet_passes(rig: Rig) -> None:
+    client = rig.log_in()
+    client.sendall(subscribe("large"))
+    assert read(client, 5) == SUBACK
+    large = publish("large", b"x" * 250_000)
+    client.sendall(large)
+    assert read(client, len(large)) == large
+
+
+def test_a_client_that_does_not_read_delays_no_other(rig: Rig, driven: Subscriber) -> None:
+    slow = rig.log_in()
+    slow.sendall(subscribe("much"))
+    assert read(slow, 5) == SUBACK
+    for _ in range(60):
+        rig.transport.publish("much", b"x" * 200_000)
+    rig.log_in().sendall(publish(DRIVE, '{"z":0,"from":"other"}'))
+    slow.sendall(publish(DRIVE, '{"z":0,"from":"slow"}'))
+    assert until(lambda: {drive["from"] for drive in driven.payloads} == {"other", "slow"})
+
+
+@pytest.mark.parametrize("password", ["wrong", None])
+def test_a_wrong_password_is_refused(rig: Rig, password: str | None) -> None:
+    client = rig.connect()
+    client.sendall(connect("script", password))
+    assert read(client, 100) == b"\x20\x02\x00\x04"
+
+
+def test_a_client_of_mqtt_5_learns_why_it_is_refused(rig: Rig) -> None:
+    reasons: list[Any] = []
+    client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+    client.username_pw_set("script", rig.local_mqtt["password"])
+    client.on_connect = lambda _client, _data, _flags, reason, _properties: reasons.append(reason)
+    client.connect("127.0.0.1", rig.local_mqtt["port"])
+    assert until(lambda: client.loop(0.05) is None or reasons)
+    assert str(reasons[0]) == "Unsupported protocol version"
+
+
+def test_the_17th_connection_is_refused(rig: Rig) -> None:
+    clients = [rig.log_in() for _ in range(16)]
+    assert not _accepted(rig)
+    clients[0].sendall(PINGREQ)
+    assert read(clients[0], 2) == PINGRESP
+    clients[1].close()
+    assert until(lambda: _accepted(rig))
+
+
+def _accepted(rig: Rig) -> bool:
+    client = rig.connect()
+    try:
+        client.sendall(connect("script", rig.local_mqtt["password"]))
+        return read(client, 4) == CONNACK
+    except ConnectionError:
+        return False
+
+
+def test_after_a_restart_of_the_broker_the_script_goes_on(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    rig = Rig(broker, tmp_path)
+    rig.script("--control-rate-hz", "40")
+    before = Subscriber(broker.port, DRIVE)
+    assert until(lambda: before.messages)
+    before.close()
+    broker.kill()
+    refused = rig.connect()
+    refused.sendall(connect("script", rig.local_mqtt["password"]))
+    assert read(refused, 100) == b"\x20\x02\x00\x03", "server unavailable"
+    broker.start()
+    after = Subscriber(broker.port, DRIVE)
+    assert until(lambda: len(after.messages) > 5, 20)
+    assert all(drive["run"] == 7 for drive in after.payloads)
+    after.close()
+    rig.close()
+    broker.stop()
+
+
+def test_a_renamed_drive_topic_is_signed(broker: Broker, tmp_path: Path) -> None:
+    serial = {"enabled": True, "serial": {"port": "/dev/none"}, "topics": {"drive_values": "my/wheels"}}
+    rig, driven = Rig(broker, tmp_path, services={"serial_mcu_bridge": serial}), Subscriber(broker.port, "my/wheels")
+    rig.log_in().sendall(publish("my/wheels", '{"value":{"z":1}}', retain=True))
+    assert until(lambda: driven.payloads)
+    assert driven.payloads == [{"value": {"z": 1, "source": "autonomy", "run": 7}}]
+    assert not driven.messages[0].retain
+    driven.close()
+    rig.close()
+
+
+def test_the_end_of_the_gate_stops_the_wheels_and_removes_the_config(rig: Rig, driven: Subscriber) -> None:
+    client = rig.log_in()
+    client.sendall(publish(DRIVE, '{"z":1}'))
+    assert until(lambda: driven.payloads)
+    rig.gate.close()
+    assert ended(client)
+    assert until(lambda: [drive["z"] for drive in driven.payloads] == [1, 0])
+    assert not rig.gate.config_path.parent.exists()
+    assert (rig.file.parent / "camera_calibration.yaml").exists(), "only links are removed"
+    rig.gate.close()
+
+
+def test_the_scripts_config_has_no_secret_and_its_files_beside_it(broker: Broker, tmp_path: Path) -> None:
+    remote = {"host": "far", "username": "goob", "password": "hunter2", "tls": {"enabled": True}}
+    services = {"mqtt_bridge": {"remote_mqtt": remote, "media": {}}}
+    rig = Rig(broker, tmp_path, services=services, local_mqtt={"username": "robot", "password": "hunter3"})
+    text, path = rig.gate.config_path.read_text(), rig.gate.config_path
+    assert "hunter" not in text
+    assert json.loads(text)["services"]["mqtt_bridge"]["remote_mqtt"]["host"] == "far"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    assert (path.parent / "camera_calibration.yaml").read_text() == "fx: 624"
+    assert load(path).transport.kind == "mqtt"
+    assert rig.local_mqtt.keys() == {"host", "port", "username", "password"}
+    rig.close()
+
+
+def test_the_broker_gets_the_robots_login(tmp_path: Path) -> None:
+    passwords = tmp_path / "passwords"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "robot", "hunter3"], check=True)
+    broker = Broker(tmp_path, "allow_anonymous false", f"password_file {passwords}")
+    rig = Rig(broker, tmp_path, local_mqtt={"username": "robot", "password": "hunter3"})
+    rig.log_in()
+    rig.close()
+    broker.stop()
+
+
+def test_the_robots_broker_may_want_tls(tmp_path: Path) -> None:
+    files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
+    broker = Broker(tmp_path, *files, "require_certificate true")
+    own = {"ca_cert": "ca.crt", "client_cert": "client.crt", "client_key": "client.key"}
+    tls = {"enabled": True, **{key: str(CERTS / name) for key, name in own.items()}}
+    rig = Rig(broker, tmp_path, local_mqtt={"host": "localhost", "tls": tls})
+    rig.log_in().close()
+    rig.close()
+    broker.stop()
+
+
+def test_a_robot_without_a_broker_is_refused_with_what_to_set(tmp_path: Path) -> None:
+    file = tmp_path / "goob.json"
+    file.write_text(json.dumps({"robot": {"id": "goob"}, "transport": {"kind": "zenoh", "run_dir": str(tmp_path)}}))
+    with pytest.raises(PebbleError, match=r"set transport\.mqtt_mirror"):
+        Gate(load(file), lambda *_: True, 7)
