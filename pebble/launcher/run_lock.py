@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Self
 
 from pebble.errors import PebbleError
+from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.transports.peers import FileLock
-
-LOCK_NAME = "launcher.lock"
 
 
 class RunLock:
@@ -21,7 +20,7 @@ class RunLock:
 
     def __init__(self, run_dir: Path, robot: str) -> None:
         self._run_dir, self._robot = run_dir, robot
-        self.path = run_dir / LOCK_NAME
+        self.path = run_dir / LAUNCHER_LOCK
         self._lock: FileLock | None = None
 
     def take(self) -> Self:

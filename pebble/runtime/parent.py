@@ -10,12 +10,14 @@ import shutil
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 NOTIFY_FD = "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, "WANT …", "LACKS …"
 WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predecessor of this process requested
 ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
+LAUNCHER_LOCK = "launcher.lock"  # in the run directory, with the process id of the robot's newest launcher
 ALIVE_PERIOD_S = 1.0
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
 _PR_SET_PDEATHSIG = 1
@@ -53,6 +55,16 @@ def tied_to_parent(command: Sequence[str], number: signal.Signals = signal.SIGKI
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
     return ["setpriv", "--pdeathsig", number.name.removeprefix("SIG"), "--", *command]
+
+
+def launcher_runs(run_dir: Path) -> bool:
+    """Whether the newest launcher of the robot with this run directory is still a running process."""
+    try:
+        pid = int((run_dir / LAUNCHER_LOCK).read_text())
+        os.kill(pid, 0)
+    except (OSError, ValueError, OverflowError):
+        return False
+    return True
 
 
 class ProgramRequest(NamedTuple):

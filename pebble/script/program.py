@@ -17,7 +17,7 @@ from pebble.config import Config, load
 from pebble.contract.payloads import LAST_RUN
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.connections import local_transport
-from pebble.runtime.parent import set_up_logging
+from pebble.runtime.parent import launcher_runs, set_up_logging
 from pebble.runtime.runs import next_run
 from pebble.script.guard import END_S, Guard
 from pebble.script.options import OneLineParser, form, parse
@@ -26,7 +26,7 @@ from pebble.transports import State, Transport
 
 RUN = "PEBBLE_RUN"  # the run's number, from the process that started this one
 CONFIG = "PEBBLE_CONFIG"  # the robot's config file
-_CONNECT_S = 3.0
+_CONNECT_S = 2.0
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ def _arguments(
 ) -> tuple[Path, tuple[msgspec.Struct, ...]]:
     """The robot's config file, and main's further arguments, from the command line."""
     about = inspect.getdoc(main) or inspect.getdoc(inspect.getmodule(main)) or ""
-    parser = OneLineParser(prog=Path(sys.argv[0]).name, description=about or label, allow_abbrev=False)
+    parser = OneLineParser(prog=Path(sys.argv[0]).name, description=about or label)
     parser.add_argument(
         "--config",
         metavar="ROBOT.json",
@@ -147,6 +147,8 @@ def _connected(config: Config, path: Path) -> Transport:
         why = transport.problem or f"no answer within {_CONNECT_S:g} s"
         transport.close()
         raise TransportError(f"{config.identity.id} is not up ({why}): start it with `pebble up {path}`")
+    if RUN not in os.environ and not launcher_runs(config.run_dir()):
+        log.warning("%s is not up, so it does not move: start it with `pebble up %s`", config.identity.id, path)
     return transport
 
 

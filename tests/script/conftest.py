@@ -1,0 +1,24 @@
+"""A robot's local transport of either kind, shared by the tests of a module."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.script.station import Station
+
+
+@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
+def shared(request: pytest.FixtureRequest) -> Iterator[Station]:
+    station = Station(request.param)
+    yield station
+    station.close()
+
+
+@pytest.fixture
+def station(shared: Station) -> Station:
+    """Nothing was received, and the motor owner is free."""
+    shared.publish_state()
+    shared.received.clear()
+    return shared
