@@ -16,6 +16,7 @@ from pebble.config import load
 from pebble.contract import DRIVE, ESTOP_STATE, codec
 from pebble.contract.payloads import Drive, EstopState
 from pebble.runtime.connections import local_transport
+from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.transports import Message, QoS
 from tests.support import Broker, Child, until
 from tests.transports.zenoh_net import HubProcess
@@ -34,6 +35,7 @@ class Station:
         self.folder = Path(self._folder.name)
         self.broker = Broker(self.folder) if kind == "mqtt" else None
         (self.folder / "run").mkdir(mode=0o700)
+        (self.folder / "run" / LAUNCHER_LOCK).write_text(f"{os.getpid()}\n")
         self.hub = HubProcess(self.folder / "run").start() if kind == "zenoh" else None
         self.config_path = self.folder / "goob.json"
         port = 1883 if self.broker is None else self.broker.port

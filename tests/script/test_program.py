@@ -9,6 +9,7 @@ import time
 import pytest
 
 from pebble.contract.payloads import Drive
+from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.script import EXIT_ENDED
 from tests.script.station import Station
 from tests.support import gone, until
@@ -150,7 +151,7 @@ def test_a_person_goes_first(station: Station) -> None:
     assert len(station.received) == before + 1
 
 
-def test_a_script_that_does_not_drive_stops_nobody_else(station: Station) -> None:
+def test_a_script_that_does_not_drive_publishes_no_stop(station: Station) -> None:
     ended(station.start("robot.sleep(0.1)"))
     assert station.received == []
 
@@ -170,6 +171,17 @@ def test_a_robot_that_is_not_up_is_named_in_one_line(station: Station) -> None:
     last = output.splitlines()[-1]
     assert "[ERROR] goob is not up" in last
     assert last.endswith(f"start it with `pebble up {away}`")
+
+
+def test_a_robot_that_is_not_up_beside_a_broker_that_is(station: Station) -> None:
+    lock = station.folder / "run" / LAUNCHER_LOCK
+    held = lock.read_text()
+    lock.write_text("no process\n")
+    try:
+        output = ended(station.start("robot.drive()"))[1]
+    finally:
+        lock.write_text(held)
+    assert f"[WARNING] goob is not up, so it does not move: start it with `pebble up {station.config_path}`" in output
 
 
 def test_a_wrong_run_number_is_named(station: Station) -> None:
