@@ -14,7 +14,7 @@ from pebble.config.transport import Mqtt, Tls
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
 
-_LATER = ("ros1_bridge", "autonomy_manager", "web_handler")
+_LATER = ("ros1_bridge", "web_handler")
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
 
 

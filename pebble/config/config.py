@@ -18,6 +18,7 @@ from pebble.config.reader import Reader
 from pebble.config.tree import Root, SerialBridge, SerialBridges
 from pebble.config.types import Secret, Section
 from pebble.contract.identity import Identity
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
 
 _LOGIN = re.compile(r"(?<=://)[^/@\s]*(?=@)")  # user:password of a URL
@@ -71,6 +72,11 @@ class Config(Root, frozen=True, kw_only=True):
         own = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": own, **own.instances}
         return {name: line for name, line in lines.items() if line.enabled and line.serial.port is not None}
+
+    def motor_lines(self) -> dict[str, SerialBridge]:
+        """Those of the enabled serial lines that drive motors."""
+        lines = self.serial_instances().items()
+        return {name: line for name, line in lines if SERIAL_PROTOCOLS[line.protocol].drives}
 
     def media_programs(self) -> tuple[str, ...]:
         """The on-demand programs for pictures and sound, by the services' names."""

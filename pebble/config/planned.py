@@ -1,6 +1,6 @@
 """The config sections of services that later releases bring: typed and checked now, so that files stay valid."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from msgspec import Meta, field
 
@@ -8,66 +8,15 @@ from pebble.config.transport import Mqtt
 from pebble.config.types import (
     EMPTY,
     Count,
-    File,
-    HandlerTopics,
     Interval,
     LogLevel,
     Port,
     Qos,
-    Seconds,
     Section,
     ServiceSection,
     Topic,
     doc,
 )
-
-
-class ScriptArgument(Section, frozen=True, kw_only=True):
-    """One setting of a script that operators may change."""
-
-    key: Annotated[str, doc("Its name in commands.")]
-    label: Annotated[str | None, doc("Its name for operators; unset: the key.")] = None
-    type: Annotated[Literal["string", "int", "float", "bool", "enum"], doc("What it holds.")] = "string"
-    default: Annotated[str | int | float | bool | None, doc("Its value unless a command sets it.")] = None
-    arg: Annotated[str | None, doc("The option of the script's command line.")] = None
-    arg_false: Annotated[str | None, doc("The option for false.")] = None
-    mode: Annotated[Literal["flag", "value"] | None, doc("Whether the option has a value.")] = None
-    required: Annotated[bool, doc("A command must give it.")] = False
-    min: Annotated[float | None, doc("Smallest value.")] = None
-    max: Annotated[float | None, doc("Largest value.")] = None
-    step: Annotated[float | None, doc("Step of an operator's control.")] = None
-    options: Annotated[tuple[Any, ...], doc("The values of an enum.")] = ()
-
-
-class ScriptDependency(Section, frozen=True, kw_only=True):
-    """Another script that a script needs."""
-
-    file: Annotated[str, doc("Folder of the other script.")]
-    enabled: Annotated[bool, doc("Start it.")] = True
-    config: Annotated[dict[str, Any], doc("Its settings.")] = EMPTY
-
-
-class Script(Section, frozen=True, kw_only=True):
-    """One autonomy script: a folder with an entry point."""
-
-    enabled: Annotated[bool, doc("Offer it.")] = True
-    display_name: Annotated[str | None, doc("Its name for operators; unset: the folder's.")] = None
-    entrypoint: Annotated[str, doc("File to run.")] = "run.py"
-    cwd: Annotated[File | None, doc("Folder to run it in; unset: its own.")] = None
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
-    args: Annotated[tuple[ScriptArgument, ...], doc("Its settings.")] = ()
-    dependencies: Annotated[tuple[ScriptDependency, ...], doc("Scripts that must run too.")] = ()
-
-
-class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
-    """Runs one autonomy script at a time."""
-
-    autonomy_root: Annotated[str, doc("Folder of the scripts.")] = "autonomy"
-    scan_interval_seconds: Annotated[Interval, doc("Seconds between scans of the folder.")] = 5.0
-    stop_timeout_seconds: Annotated[Seconds, doc("How long a script may take to stop before it is killed.")] = 8.0
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
-    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
-    scripts: Annotated[dict[str, Script], doc("Scripts by folder.")] = EMPTY
 
 
 class RosSwitch(Section, frozen=True, kw_only=True):

@@ -4,8 +4,9 @@ from typing import Annotated, ClassVar, Literal
 
 from msgspec import Meta, field
 
+from pebble.config.autonomy import AutonomyManager
 from pebble.config.media import AvDaemon, Media, VideoStream
-from pebble.config.planned import AutonomyManager, Ros1Bridge, WebHandler, WebInterface
+from pebble.config.planned import Ros1Bridge, WebHandler, WebInterface
 from pebble.config.soundboard import SoundboardHandler
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (

@@ -139,7 +139,7 @@ def _unwrap(channel: Channel, plain: Any) -> Any:
 
 
 def _switch(plain: Any) -> Any:
-    """Bare or wrapped, a boolean or an object; ``file`` and ``repeat`` may stay outside the wrapper (paper A.8.10)."""
+    """Bare or wrapped, a boolean or an object; some keys may stay outside the wrapper (paper A.8.10)."""
     if isinstance(plain, bool):
         return {"enabled": plain}
     if isinstance(plain, dict):
@@ -147,7 +147,7 @@ def _switch(plain: Any) -> Any:
         if isinstance(value, bool):
             return {**plain, "enabled": value}
         if isinstance(value, dict):
-            outer = {key: plain[key] for key in ("file", "repeat") if key in plain}
+            outer = {key: plain[key] for key in ("file", "config", "repeat") if key in plain}
             return {**outer, **value}
     return plain
 

@@ -360,8 +360,9 @@ class AutonomyStatus(Payload, frozen=True, kw_only=True):
     pid: int | None = None
     dependencies: list[AutonomyDependency] = field(default_factory=list)
     error: str | None = None
-    config: dict[str, Any] | None = None
+    config: dict[str, Any] | None = None  # the effective settings
     controls: bool = True
+    overridden: bool | UnsetType = UNSET  # true while a person drives, and the script has to wait
 
 
 class WheelOdometry(Payload, frozen=True, kw_only=True):

@@ -14,9 +14,6 @@ from pebble.media import pyav
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
 
-#: Scripts: their topics are fixed, their service arrives in a later release.
-_LATER = {"available": False, "controls": False}
-
 
 def capabilities(config: Config, addresses: Addresses, lacking: Collection[str] = ()) -> dict[str, Any]:
     """The ``value`` of a capabilities message: ``available`` is what exists, ``controls`` what takes commands.
@@ -32,7 +29,10 @@ def capabilities(config: Config, addresses: Addresses, lacking: Collection[str] 
             **_enabled(config.services.soundboard_handler),
             **_topics(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
         },
-        "autonomy": _LATER | _topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
+        "autonomy": {
+            **_enabled(config.services.autonomy_manager),
+            **_topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
+        },
         "system": _system(config, addresses),
         **_motor(config, addresses, lacking),
     }
@@ -106,7 +106,7 @@ def _system(config: Config, addresses: Addresses) -> dict[str, Any]:
 
 def _motor(config: Config, addresses: Addresses, lacking: Collection[str]) -> dict[str, Any]:
     """Drive, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
-    lines = {name: line for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].drives}
+    lines = config.motor_lines()
     present = bool(lines)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
     if name:

@@ -87,13 +87,17 @@ class Launcher:
             RestartPolicy(self._config.services.launcher.restart_delay_seconds),
             self._reactor,
             spawn=self._spawn,
-            on_line=lambda pid, line: self._logs.child_line(
-                program.name, pid, line, published=not program.reads_announcer_pipe
-            ),
+            on_line=lambda pid, line: self._log_line(program, pid, line),
             on_note=lambda line: self._receive_note(program, line),
             on_change=lambda: self._status.changed(),
             on_end=lambda: self._ended(program),
         )
+
+    def _log_line(self, program: Program, pid: int, line: str) -> None:
+        if program.runs_scripts:
+            self._logs.tagged_line(program.name, pid, line)
+        else:
+            self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
 
     def _receive_note(self, program: Program, line: str) -> None:
         if not self._lacking.receive(program.name, line):
@@ -104,7 +108,6 @@ class Launcher:
         self._on_demand.ended(program)
 
     def _spawn(self, program: Program) -> Child:
-        self._logs.child_started(program.name)
         announcer = program.reads_announcer_pipe
         stdin = self._status.connect_announcer() if announcer else os.open(os.devnull, os.O_RDONLY)
         try:

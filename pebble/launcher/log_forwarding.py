@@ -13,6 +13,7 @@ from typing import Self
 
 from pebble.config.tree import LogsSection
 from pebble.contract.payloads import LogRecord
+from pebble.runtime.parent import TAG
 
 LINE_LIMIT = 16_384  # bytes of a child's line; the rest of a longer one is dropped
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
@@ -29,16 +30,24 @@ class LogForwarder:
         self._publish, self._limit = publish, logs.max_message_chars
         self._least = LEVELS.index(logs.min_level)
         self._stderr = NonBlockingWriter(sys.stderr.fileno() if stderr is None else stderr)
-        self._readers: dict[str, LevelReader] = {}
+        self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the pid of the process that it reads
 
     def child_line(self, service: str, pid: int, line: str, *, published: bool = True) -> None:
         """Forward one line of a child. Those of the process that publishes would cause new ones for ever."""
-        level, text = self._readers.setdefault(service, LevelReader()).read(line)
+        last_pid, reader = self._readers.get(service, (pid, None))
+        if reader is None or last_pid != pid:  # the level of the last line belongs to the previous process
+            reader = LevelReader()
+            self._readers[service] = (pid, reader)
+        level, text = reader.read(line)
         self._forward(level, service, pid, text, logger="root", published=published)
 
-    def child_started(self, service: str) -> None:
-        """Forget the level of the last line: it belongs to the previous process."""
-        self._readers.pop(service, None)
+    def tagged_line(self, service: str, pid: int, line: str) -> None:
+        """Forward one line of a child that may be another process's: its tag names that one."""
+        tag = TAG.fullmatch(line)
+        if tag is None:
+            self.child_line(service, pid, line)
+        elif tag[3].strip():
+            self.child_line(f"{service}:{tag[1]}", int(tag[2]), tag[3])
 
     def own_record(self, record: logging.LogRecord, text: str) -> None:
         level = LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]  # others may lie in between

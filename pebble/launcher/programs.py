@@ -42,6 +42,7 @@ class Program(Struct, frozen=True):
     arguments: tuple[str, ...]
     stage: Stage
     reads_announcer_pipe: bool = False  # on its stdin; the others' stdin is empty
+    runs_scripts: bool = False  # lines of its output may be a script's
     may_request: bool = False  # may request on-demand programs
     on_demand: bool = False  # runs only while it is requested
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
@@ -61,6 +62,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (True, _announcer(config)),
         *((True, _service(config, "serial_mcu_bridge", Stage.DEVICE, line)) for line in config.serial_instances()),
         (services.av_daemon.enabled, _av_daemon(config)),
+        (services.autonomy_manager.enabled, _service(config, "autonomy_manager", Stage.CONNECTION, runs_scripts=True)),
         (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
         (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
         (services.soundboard_handler.enabled, _service(config, "soundboard_handler", Stage.CONNECTION)),

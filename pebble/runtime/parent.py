@@ -6,6 +6,7 @@ import ctypes
 import errno
 import logging
 import os
+import re
 import shutil
 import signal
 import sys
@@ -20,6 +21,7 @@ LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 LAUNCHER_LOCK = "launcher.lock"  # in the run directory, with the process id of the robot's newest launcher
 ALIVE_PERIOD_S = 1.0
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
+TAG = re.compile(r"\[([^\]]+) (\d+)\] (.*)", re.DOTALL)  # of a line by ``tagged``
 _PR_SET_PDEATHSIG = 1
 
 log = logging.getLogger(__name__)
@@ -28,6 +30,14 @@ log = logging.getLogger(__name__)
 def set_up_logging(level: str) -> None:
     """Write log lines to stderr in the format that the launcher forwards."""
     logging.basicConfig(level=level, format=LOG_FORMAT, datefmt="%H:%M:%S", stream=sys.stderr)
+
+
+def tagged(part: str, pid: int, line: bytes) -> bytes:
+    """A line that a process of this process wrote, for stderr: the launcher logs it under ``part`` and ``pid``.
+
+    ``part`` contains no ``]``.
+    """
+    return f"[{part} {pid}] ".encode() + line + b"\n"
 
 
 def die_with_launcher() -> None:

@@ -172,9 +172,7 @@ class TestOriginal:
 
     def test_services_of_later_releases_are_skipped_with_a_warning_each(self) -> None:
         later = [line for line in load(ORIGINAL, env={}).warnings if "later release" in line]
-        assert [line.partition(":")[0] for line in later] == [
-            f"services.{name}" for name in ("autonomy_manager", "web_handler")
-        ]
+        assert [line.partition(":")[0] for line in later] == ["services.web_handler"]
 
     def test_keys_of_any_ending_can_be_retired(self) -> None:
         config = read(at("services.mqtt_bridge.media.video_publisher", {"source_width": 640, "source_format": "BGR"}))

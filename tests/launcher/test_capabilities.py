@@ -148,15 +148,16 @@ def test_a_system_action_can_be_asked_for_where_a_command_is_set(name: str) -> N
     assert not of(mqtt_bridge={"enabled": False, **control})["system"][name]["controls"]
 
 
-def test_a_later_service_stays_unavailable_even_when_a_config_enables_it() -> None:
-    autonomy = of(autonomy_manager={"enabled": True})["autonomy"]
-    assert (autonomy["available"], autonomy["controls"]) == (False, False)
-
-
 @pytest.mark.parametrize("enabled", [True, False])
 def test_sounds_are_offered_where_the_soundboard_is_enabled(enabled: bool) -> None:
     soundboard = of(soundboard_handler={"enabled": enabled})["soundboard"]
     assert (soundboard["available"], soundboard["controls"]) == (enabled, enabled)
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_scripts_are_there_where_they_are_enabled(enabled: bool) -> None:
+    value = of(autonomy_manager={"enabled": enabled})["autonomy"]
+    assert (value["available"], value["controls"]) == (enabled, enabled)
 
 
 @pytest.mark.parametrize(("section", "device"), [("video", "video"), ("audio", "audio")])

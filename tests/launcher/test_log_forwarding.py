@@ -61,7 +61,6 @@ def test_children_do_not_share_a_traceback(forwarded: Forwarded) -> None:
     forwarded.forwarder.child_line("a", 1, "Traceback (most recent call last):")
     forwarded.forwarder.child_line("b", 2, "fine")
     forwarded.forwarder.child_line("a", 1, "ValueError")
-    forwarded.forwarder.child_started("a")
     forwarded.forwarder.child_line("a", 3, "a fresh start")
     assert [(record.service, record.pid) for record in forwarded.records] == [("a", 1), ("a", 1)]
 

@@ -1,0 +1,65 @@
+"""The config section of autonomy: which scripts a robot offers, and how they run."""
+
+from typing import Annotated, Any, Literal
+
+from pebble.config.types import EMPTY, File, HandlerTopics, Interval, Seconds, Section, ServiceSection, doc
+
+
+class ScriptArgument(Section, frozen=True, kw_only=True):
+    """One setting of a script that operators may change."""
+
+    key: Annotated[str, doc("Its name in commands.")]
+    label: Annotated[str | None, doc("Its name for operators; unset: the key.")] = None
+    type: Annotated[Literal["string", "int", "float", "bool", "enum"], doc("What it holds.")] = "string"
+    default: Annotated[str | int | float | bool | None, doc("Its value unless a command sets it.")] = None
+    arg: Annotated[str | None, doc("The option of the script's command line.")] = None
+    arg_false: Annotated[str | None, doc("The option for false.")] = None
+    mode: Annotated[Literal["flag", "value"] | None, doc("Whether the option has a value.")] = None
+    required: Annotated[bool, doc("A command must give it.")] = False
+    min: Annotated[int | float | None, doc("Smallest value.")] = None
+    max: Annotated[int | float | None, doc("Largest value.")] = None
+    step: Annotated[int | float | None, doc("Step of an operator's control.")] = None
+    options: Annotated[tuple[Any, ...], doc("The values of an enum.")] = ()
+
+
+class ScriptDependency(Section, frozen=True, kw_only=True):
+    """Another script that a script needs."""
+
+    file: Annotated[str, doc("Folder of the other script.")]
+    enabled: Annotated[bool, doc("Start it.")] = True
+    config: Annotated[dict[str, Any], doc("Its settings.")] = EMPTY
+
+
+class Script(Section, frozen=True, kw_only=True):
+    """One autonomy script: a folder with an entry point."""
+
+    enabled: Annotated[bool, doc("Offer it.")] = True
+    display_name: Annotated[str | None, doc("Its name for operators; unset: the folder's.")] = None
+    entrypoint: Annotated[str, doc("File to run.")] = "run.py"
+    python: Annotated[str | None, doc("Interpreter of a Python entry point; unset: the one that runs Pebble.")] = None
+    arbitrate: Annotated[
+        bool,
+        doc("Sign the drive commands of a script that does not sign them itself, so that people go first."),
+    ] = True
+    cwd: Annotated[File | None, doc("Folder to run it in; unset: its own.")] = None
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    args: Annotated[tuple[ScriptArgument, ...], doc("Its settings.")] = ()
+    dependencies: Annotated[tuple[ScriptDependency, ...], doc("Scripts that must run too.")] = ()
+
+
+class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
+    """Runs one autonomy script at a time."""
+
+    autonomy_root: Annotated[
+        str,
+        doc("Folder of the scripts. `autonomy`: the folder of that name beside the config, and the scripts of Pebble."),
+    ] = "autonomy"
+    scan_interval_seconds: Annotated[Interval, doc("Seconds between scans of the folder.")] = 5.0
+    stop_timeout_seconds: Annotated[Seconds, doc("How long a script may take to stop before it is killed.")] = 8.0
+    on_override: Annotated[
+        Literal["resume", "stop"],
+        doc("When a person drives: `resume` lets the script go on once the person has let go, `stop` ends it."),
+    ] = "resume"
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
+    scripts: Annotated[dict[str, Script], doc("Scripts by folder.")] = EMPTY

@@ -1,0 +1,206 @@
+"""Which scripts there are: folders with an entry point, what the config lists, what they publish about themselves."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+
+import msgspec
+from msgspec.structs import asdict, replace
+
+import pebble
+from pebble.config import Config
+from pebble.config.autonomy import Script as ScriptSection
+from pebble.services.autonomy_manager import builtin_forms
+from pebble.services.autonomy_manager.describe import (
+    MANIFEST,
+    Description,
+    Descriptions,
+    ask,
+    is_ours,
+    read_manifest,
+)
+from pebble.services.autonomy_manager.environment import environment
+from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting, form
+from pebble.services.autonomy_manager.script import Dependency, Script
+
+MAX_SCRIPTS = 256
+_LONGEST_NAME = 100
+_LONGEST_FORM = 16 * 1024  # bytes
+_LONGEST_FILES = 256 * 1024  # bytes of all forms together
+_MAX_DEPENDENCIES = 8
+_OWN_SCRIPTS = Path(pebble.__file__).parent / "scripts"
+_DEFAULT_ROOT = "autonomy"
+
+log = logging.getLogger(__name__)
+
+
+def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
+    """The folders of scripts; of two scripts with one name, that in the first folder counts.
+
+    The original starts relative paths at its repository, two folders above its configs.
+    """
+    given = Path(config.services.autonomy_manager.autonomy_root).expanduser()
+    if given.is_absolute():
+        return (given,)
+    beside = [config.folder / given]
+    if config.folder.parts[-2:] == ("control", "configs"):
+        beside.append(config.folder.parent.parent / given)
+    return (*beside, own) if str(given) == _DEFAULT_ROOT else tuple(beside)
+
+
+class Catalogue:
+    """Scans the folders. For one thread, because to ask a script takes up to 20 s."""
+
+    def __init__(self, config: Config) -> None:
+        self._config, self._section = config, config.services.autonomy_manager
+        self._roots = roots(config)
+        self._descriptions = Descriptions()
+        self._complained: set[str] = set()  # names with a warning in the log
+
+    def scan(self, found: Callable[[dict[str, Script]], None]) -> None:
+        """Call ``found`` with the scripts so far whenever one has been asked, and with all at the end."""
+        folders = dict(self._folders())
+        scripts: dict[str, Script] = {}
+        for name, folder in folders.items():
+            script = self._script(name, folder, lambda: found(dict(scripts)))
+            if script is not None:
+                scripts[name] = script
+        self._descriptions.retain_only(set(folders))
+        found(scripts)
+
+    def _folders(self) -> Iterator[tuple[str, Path]]:
+        names: dict[str, Path] = {}
+        for root in reversed(self._roots):
+            names |= {folder.name: folder for folder in _inside(root)}
+        usable = sorted(filter(self._usable, names), key=lambda name: (name.lower(), name))
+        if len(usable) > MAX_SCRIPTS:
+            self._complain("", "%d scripts are too many: only the first %d are offered", len(usable), MAX_SCRIPTS)
+        for name in usable[:MAX_SCRIPTS]:
+            yield name, names[name]
+
+    def _usable(self, name: str) -> bool:
+        if name.startswith((".", "_")):
+            return False
+        if len(name) > _LONGEST_NAME or not name.isprintable() or "]" in name:
+            self._complain(name[:_LONGEST_NAME], "%r is not offered: rename its folder", name)
+            return False
+        return self._section.scripts.get(name, ScriptSection()).enabled
+
+    def _script(self, name: str, folder: Path, before_asking: Callable[[], None]) -> Script | None:
+        section = self._section.scripts.get(name, ScriptSection())
+        entry, manifest = folder / section.entrypoint, folder / MANIFEST
+        described = self._descriptions.get(f"{name}/{MANIFEST}", [manifest], lambda: _manifest(manifest))
+        described = described or Description()
+        if not described.command and not entry.is_file():
+            return None
+        ours = not described.command and is_ours(entry)
+        command = self._command(folder, entry, section, described)
+        variables = environment(self._section.env, section.env)
+        if ours:
+            before_asking()
+            answer = self._descriptions.get(name, [entry], lambda: ask(command, folder, variables))
+            described = _merged(described, answer or Description())
+        settings = self._settings(name, section, described, ours=ours)
+        return Script(
+            file=name,
+            label=(section.display_name or described.label or name)[:_LONGEST_NAME],
+            command=command,
+            folder=section.cwd or folder,
+            settings=settings,
+            dependencies=_dependencies(name, section, described, ours=ours),
+            environment={**self._section.env, **section.env},
+            ours=ours,
+            arbitrate=section.arbitrate,
+        )
+
+    def _command(self, folder: Path, entry: Path, section: ScriptSection, described: Description) -> tuple[str, ...]:
+        if described.command:
+            program, *more = described.command
+            return (str(folder / program) if "/" in program else program, *more)
+        if section.python is not None:
+            python = section.python
+            return (str(self._config.folder / Path(python).expanduser()) if "/" in python else python, str(entry))
+        if entry.suffix != ".py" and os.access(entry, os.X_OK):
+            return (str(entry),)
+        return (sys.executable, str(entry))
+
+    def _settings(
+        self, name: str, section: ScriptSection, described: Description, *, ours: bool
+    ) -> tuple[Setting, ...]:
+        """By key: the config's, then the script's own, then the built-in ones. One of ours knows its options best."""
+        configured = [Setting(**asdict(argument)) for argument in section.args]
+        own = {setting.key: setting for setting in described.configs}
+        if ours and own:
+            unknown = [setting.key for setting in configured if setting.key not in own]
+            if unknown:
+                self._complain(name, "%s has no setting %s: ignored", name, ", ".join(unknown))
+            configured = [_with_option(setting, own[setting.key]) for setting in configured if setting.key in own]
+        merged = {setting.key: setting for setting in configured}
+        known = () if ours else builtin_forms.SETTINGS.get(name, ())
+        for setting in (*own.values(), *known):
+            merged.setdefault(setting.key, setting)
+        settings = tuple(merged.values())
+        size = len(msgspec.json.encode(form(settings)))
+        if len(settings) > MAX_SETTINGS or size > _LONGEST_FORM:
+            self._complain(name, "%s is offered without settings: %d are too many", name, len(settings))
+            return ()
+        return settings
+
+    def _complain(self, name: str, text: str, *values: object) -> None:
+        """Log a warning, once for each script."""
+        if name not in self._complained and len(self._complained) < MAX_SCRIPTS:
+            self._complained.add(name)
+            log.warning(text, *values)
+
+
+def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
+    """The ``files`` of `autonomy-files`; without a form where all would be too long."""
+    entries: list[dict[str, object]] = []
+    left = _LONGEST_FILES
+    for script in scripts:
+        configs = form(script.settings)
+        left -= len(msgspec.json.encode(configs))
+        entries.append({"file": script.file, "label": script.label, "configs": configs if left >= 0 else []})
+    return entries
+
+
+def _inside(root: Path) -> list[Path]:
+    try:
+        return [folder for folder in root.iterdir() if folder.is_dir()]
+    except OSError:  # most often there is none
+        return []
+
+
+def _manifest(path: Path) -> Description:
+    return read_manifest(path) or Description()
+
+
+def _merged(first: Description, second: Description) -> Description:
+    """What ``first`` leaves open is taken from ``second``."""
+    keys = {setting.key for setting in first.configs}
+    return Description(
+        label=first.label or second.label,
+        configs=[*first.configs, *(setting for setting in second.configs if setting.key not in keys)][:MAX_SETTINGS],
+        dependencies=first.dependencies or second.dependencies,
+    )
+
+
+def _with_option(configured: Setting, own: Setting) -> Setting:
+    return replace(configured, arg=own.arg, arg_false=own.arg_false, mode=own.mode)
+
+
+def _dependencies(name: str, section: ScriptSection, described: Description, *, ours: bool) -> tuple[Dependency, ...]:
+    """The config's, else the script's own, else the built-in ones; each script once, and never itself."""
+    chosen: Iterable[tuple[str, Mapping[str, object]]]
+    if section.dependencies:
+        chosen = ((each.file, each.config) for each in section.dependencies if each.enabled)
+    elif described.dependencies:
+        chosen = ((each.file, each.config) for each in described.dependencies)
+    else:
+        chosen = () if ours else builtin_forms.DEPENDENCIES.get(name, ())
+    by_file = {file: Dependency(file, dict(config)) for file, config in chosen if file != name}
+    return tuple(by_file.values())[:_MAX_DEPENDENCIES]

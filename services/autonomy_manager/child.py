@@ -1,0 +1,189 @@
+"""One process of a script: started, read, signalled, and watched to its end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+from msgspec import Struct
+
+from pebble.runtime.parent import tagged, tied_to_parent
+from pebble.services.autonomy_manager.guard import Guard
+from pebble.services.autonomy_manager.output import Output
+
+_READ_BYTES = 65_536
+_LAST_READS = 16  # of what it left in its pipe when it ended
+_FLOOD_PAUSE_S = 0.01
+_TICK_MS = 500
+
+log = logging.getLogger(__name__)
+
+
+class Launch(Struct, frozen=True):
+    """What to start: ``file`` names the script in the log, ``tie`` ends it with this process."""
+
+    file: str
+    command: tuple[str, ...]
+    folder: Path
+    environment: dict[str, str]
+    tie: signal.Signals
+
+
+class Child(Protocol):
+    """A process that was started."""
+
+    pid: int
+
+    @property
+    def running(self) -> bool:
+        """False once its end has been noticed."""
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to its process group, if it still runs."""
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it has ended, at most so long."""
+
+
+#: Starts a process. The function gets its exit code, or minus the signal that ended it, on any thread.
+#: Raises OSError or ValueError.
+Spawn = Callable[[Launch, Callable[[int], None]], Child]
+
+
+class Processes:
+    """Starts real processes. Only on the main thread: the kernel ties a process to the thread that starts it."""
+
+    def __init__(self) -> None:
+        self._guard = Guard()
+
+    def __call__(self, launch: Launch, ended: Callable[[int], None]) -> Child:
+        process = Process(launch)
+
+        def on_end(code: int) -> None:
+            self._guard.remove(process.pid)
+            ended(code)
+
+        try:
+            self._guard.add(process.pid, launch.tie)
+        except OSError:
+            process.signal(signal.SIGKILL)
+            process.watch(self._guard.remove)
+            raise
+        process.watch(on_end)
+        return process
+
+    def close(self) -> None:
+        self._guard.close()
+
+
+class Process:
+    """A child process in a group of its own, and the thread that reads its output and waits for its end."""
+
+    def __init__(self, launch: Launch) -> None:
+        self._pipe, write_end = os.pipe2(os.O_CLOEXEC)
+        try:
+            self._process = subprocess.Popen(
+                tied_to_parent(launch.command, launch.tie),
+                cwd=launch.folder,
+                env=launch.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=write_end,
+                stderr=write_end,
+                start_new_session=True,
+            )
+        except BaseException:
+            os.close(self._pipe)
+            raise
+        finally:
+            os.close(write_end)
+        self.pid = self._process.pid
+        self._file = launch.file
+        self._lock = threading.Lock()  # no signal once it is reaped: its number may be another process's by then
+        self._running = True
+        self._thread: threading.Thread | None = None
+
+    def watch(self, ended: Callable[[int], None]) -> None:
+        """Begin to read its output, and call ``ended`` with its exit code once it has ended."""
+        self._thread = threading.Thread(target=self._watch, args=(ended,), name=f"script {self._file}", daemon=True)
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        return self._running
+
+    def signal(self, number: signal.Signals) -> None:
+        with self._lock:
+            if self._running:
+                with suppress(ProcessLookupError):
+                    os.killpg(self.pid, number)
+
+    def wait(self, timeout_s: float) -> None:
+        if self._thread is not None:
+            self._thread.join(max(0.0, timeout_s))
+
+    # -- on its thread
+
+    def _watch(self, ended: Callable[[int], None]) -> None:
+        try:
+            self._read_until_exit()
+        except OSError:
+            log.exception("the output of %s cannot be read", self._file)
+        os.close(self._pipe)
+        with self._lock:
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.pid, signal.SIGKILL)  # what it started must not go on without it
+            code = self._process.wait()
+            self._running = False
+        ended(code)
+
+    def _read_until_exit(self) -> None:
+        """Return when the process has ended and its output is read; it is not reaped yet."""
+        pipe, output = self._pipe, Output(self._write, self._warn, time.monotonic())
+        os.set_blocking(pipe, False)
+        exited = os.pidfd_open(self.pid)
+        poll = select.poll()
+        poll.register(pipe, select.POLLIN)
+        poll.register(exited, select.POLLIN)
+        try:
+            ready = {}
+            while exited not in ready:
+                ready = dict(poll.poll(_TICK_MS))
+                output.tick(time.monotonic())
+                if pipe in ready and not _read(pipe, output):
+                    poll.unregister(pipe)  # it closed its stdout and stderr
+                if output.flooded:
+                    time.sleep(_FLOOD_PAUSE_S)
+            for _ in range(_LAST_READS):
+                if not _read(pipe, output):
+                    break
+            output.end()
+        finally:
+            os.close(exited)
+
+    def _warn(self, text: str) -> None:
+        self._write(f"{time.strftime('%H:%M:%S')} [WARNING] {text}".encode())
+
+    def _write(self, line: bytes) -> None:
+        sys.stderr.flush()
+        with suppress(OSError):
+            os.write(sys.stderr.fileno(), tagged(self._file, self.pid, line))
+
+
+def _read(pipe: int, output: Output) -> bool:
+    """Read what there is; False: nothing, or the end."""
+    try:
+        data = os.read(pipe, _READ_BYTES)
+    except BlockingIOError:
+        return False
+    output.feed(data, time.monotonic())
+    return bool(data)

@@ -1,0 +1,179 @@
+"""Asks a script what it is: its `script.json`, or the script itself with `--describe` if it is one of ours."""
+
+from __future__ import annotations
+
+import ast
+import logging
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any
+
+import msgspec
+from msgspec import Struct
+
+from pebble.runtime.parent import tied_to_parent
+from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting
+
+MANIFEST = "script.json"
+_LIMIT_S = 20.0
+_LONGEST = 256 * 1024  # bytes of an answer or a manifest
+_LONGEST_SOURCE = 1024 * 1024
+_REASON_BYTES = 2000  # of what a failing script wrote
+_RETRY_S = 60.0  # after a failure: it may have been a busy machine's
+_NICE = "10"  # lower than the robot's own processes
+
+log = logging.getLogger(__name__)
+
+
+class Need(Struct, frozen=True, forbid_unknown_fields=True):
+    """Another script that this one needs."""
+
+    file: str
+    config: dict[str, Any] = {}
+
+
+class Description(Struct, frozen=True):
+    """What a script publishes about itself; ``command`` only in a manifest."""
+
+    label: str | None = None
+    configs: list[Setting] = []
+    dependencies: list[Need] = []
+    command: list[str] = []
+
+    def __post_init__(self) -> None:
+        if len(self.configs) > MAX_SETTINGS:
+            raise ValueError(f"more than {MAX_SETTINGS} settings")
+        keys = [setting.key for setting in self.configs]
+        if len(set(keys)) < len(keys):
+            raise ValueError("two settings have the same key")
+
+
+class DescribeError(Exception):
+    """Why a script has no form."""
+
+
+def is_ours(entry: Path) -> bool:
+    """Whether a Python file imports ``run`` from pebble, or pebble.script. It is read, never run."""
+    if entry.suffix != ".py":
+        return False
+    try:
+        if entry.stat().st_size > _LONGEST_SOURCE:
+            return False
+        tree = ast.parse(entry.read_bytes())
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+        return False
+    return any(map(_imports_ours, ast.walk(tree)))
+
+
+def _imports_ours(node: ast.AST) -> bool:
+    if isinstance(node, ast.Import):
+        return any(alias.name == "pebble.script" for alias in node.names)
+    if isinstance(node, ast.ImportFrom) and node.level == 0:
+        names = {alias.name for alias in node.names}
+        return node.module == "pebble.script" or (node.module == "pebble" and not names.isdisjoint({"run", "script"}))
+    return False
+
+
+def read_manifest(path: Path) -> Description | None:
+    """The description in a `script.json`; None without one. Raises DescribeError."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_LONGEST + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DescribeError(f"{MANIFEST} cannot be read: {error.strerror}") from None
+    return _parse(raw, MANIFEST)
+
+
+def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> Description:
+    """Run ``command --describe`` and return its answer. Raises DescribeError; takes at most 20 s."""
+    limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST}", *command, "--describe"]
+    with TemporaryFile() as output, TemporaryFile() as errors:
+        try:
+            process = subprocess.Popen(
+                tied_to_parent(limited),
+                cwd=folder,
+                env=dict(environment),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=errors,
+                start_new_session=True,  # what it starts ends with it
+            )
+        except (OSError, ValueError) as error:
+            raise DescribeError(f"cannot be asked: {error}") from None
+        try:
+            code = process.wait(_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            raise DescribeError(f"its --describe takes longer than {_LIMIT_S:g} s") from None
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        answer, reason = _content(output), _content(errors)[-_REASON_BYTES:].decode(errors="replace")
+    if code != 0:
+        last = reason.strip().rpartition("\n")[2]
+        raise DescribeError(f"its --describe ended with code {code}{f': {last[:300]}' if last else ''}")
+    return _parse(answer, "its --describe")
+
+
+def _content(file: IO[bytes]) -> bytes:
+    file.seek(0)
+    return file.read(_LONGEST)
+
+
+def _parse(raw: bytes, source: str) -> Description:
+    """Of a script's output the last line counts: modules may print while they are imported."""
+    if len(raw) > _LONGEST:
+        raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
+    text = raw if source == MANIFEST else raw.strip().rpartition(b"\n")[2]
+    try:
+        return msgspec.json.decode(text, type=Description)
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise DescribeError(f"{source}: {error}") from None
+
+
+class Descriptions:
+    """Remembers answers until the script's files change, and failures for a minute. For one thread."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._answers: dict[str, tuple[object, float, Description | DescribeError]] = {}
+
+    def get(self, name: str, files: Sequence[Path], make: Callable[[], Description]) -> Description | None:
+        """``make()``, or what it returned for the same ``files``; None if it fails, which is logged."""
+        stamp = [_stamp(file) for file in files]
+        before = self._answers.get(name)
+        if (
+            before is not None
+            and before[0] == stamp
+            and (isinstance(before[2], Description) or self._clock() < before[1])
+        ):
+            return before[2] if isinstance(before[2], Description) else None
+        result: Description | DescribeError
+        try:
+            result = make()
+        except DescribeError as failure:
+            result = failure
+            if before is None or str(before[2]) != str(failure):
+                log.warning("%s is offered without settings: %s", name, failure)
+        self._answers[name] = (stamp, self._clock() + _RETRY_S, result)
+        return result if isinstance(result, Description) else None
+
+    def retain_only(self, names: set[str]) -> None:
+        """Forget the others."""
+        self._answers = {name: answer for name, answer in self._answers.items() if name in names}
+
+
+def _stamp(file: Path) -> tuple[int, int] | None:
+    try:
+        status = file.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size

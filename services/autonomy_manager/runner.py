@@ -1,0 +1,230 @@
+"""Runs one script at a time with the scripts it needs: start, stop, and what follows when one of them ends."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from pebble.errors import PebbleError
+from pebble.services.autonomy_manager.child import Child, Launch, Spawn
+from pebble.services.autonomy_manager.environment import CONFIG, RUN, environment
+from pebble.services.autonomy_manager.forms import Value
+from pebble.services.autonomy_manager.motor_owners import Baseline
+from pebble.services.autonomy_manager.script import Plan, Script, Step
+
+log = logging.getLogger(__name__)
+
+
+class Surroundings(Protocol):
+    """What a runner needs of its service."""
+
+    def begin_run(self) -> tuple[int, Baseline]:
+        """The number of a new run. Raises PebbleError if none may start now."""
+
+    def config_path(self, script: Script, run: int) -> Path:
+        """The config for this script. Raises PebbleError."""
+
+    def halt(self, run: int) -> None:
+        """Stop the wheels now."""
+
+    def halt_repeatedly(self, run: int) -> None:
+        """Stop the wheels now and again: a command of a dead process may still be in a queue."""
+
+    def end_run(self, run: int) -> None:
+        """All processes of this run have ended."""
+
+    def later(self, seconds: float, job: Callable[[], None]) -> None:
+        """Call ``job`` on the service's thread."""
+
+    def on_thread(self, job: Callable[[], None]) -> None:
+        """Call ``job`` on the service's thread, from any thread."""
+
+    def changed(self) -> None:
+        """What is published has changed."""
+
+
+@dataclass
+class Part:
+    """A process of a run."""
+
+    file: str
+    child: Child
+    ended: bool = False
+
+
+@dataclass
+class Run:
+    """One start of a script, until its last process has ended."""
+
+    number: int
+    plan: Plan
+    baseline: Baseline
+    main: Part | None = None
+    dependencies: list[Part] = field(default_factory=list)
+    ending: bool = False
+
+    @property
+    def parts(self) -> list[Part]:
+        return [*([] if self.main is None else [self.main]), *self.dependencies]
+
+
+class Runner:
+    """All methods belong to the service's thread."""
+
+    def __init__(self, surroundings: Surroundings, spawn: Spawn, stop_timeout_s: float, env: Mapping[str, str]) -> None:
+        self.error: str | None = None
+        self._surroundings, self._spawn, self._stop_timeout_s, self._env = surroundings, spawn, stop_timeout_s, env
+        self._run: Run | None = None
+        self._next: Plan | None = None
+
+    @property
+    def run(self) -> Run | None:
+        """The present run, also while its processes end."""
+        return self._run
+
+    @property
+    def active(self) -> Run | None:
+        """The present run unless it is being ended."""
+        return None if self._run is None or self._run.ending else self._run
+
+    @property
+    def config(self) -> Mapping[str, Value] | None:
+        return None if self._run is None or self._run.main is None or self._run.main.ended else self._run.plan.config
+
+    def refuse(self, error: str) -> None:
+        """A start is not possible; what runs goes on."""
+        log.warning("%s", error)
+        self.error = error
+        self._surroundings.changed()
+
+    def start(self, plan: Plan) -> None:
+        """Start ``plan`` once what runs has ended; only the newest one counts."""
+        self.error, self._next = None, plan
+        self._end()
+        self._go_on()
+
+    def stop(self, error: str | None = None) -> None:
+        """End what runs, because of ``error``; None: on request."""
+        if error is not None:
+            log.warning("%s", error)
+        self.error, self._next = error, None
+        self._end()
+        self._go_on()
+
+    def close(self, wait_s: float) -> None:
+        """End everything, and wait for it: this process ends."""
+        self._next = None
+        run = self._run
+        if run is None:
+            return
+        self._surroundings.halt(run.number)
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            for part in run.parts:
+                part.child.signal(number)
+            for part in run.parts:
+                part.child.wait(wait_s)
+        self._surroundings.halt(run.number)
+        self._run = None
+        self._surroundings.end_run(run.number)
+        self._surroundings.changed()
+
+    # -- starting
+
+    def _go_on(self) -> None:
+        if self._run is None and self._next is not None:
+            wanted, self._next = self._next, None
+            self._begin(wanted)
+        self._surroundings.changed()
+
+    def _begin(self, plan: Plan) -> None:
+        file = plan.main.script.file
+        try:
+            number, baseline = self._surroundings.begin_run()
+            self._run = run = Run(number, plan, baseline)
+            for step in plan.dependencies:
+                run.dependencies.append(self._started(run, step))
+            run.main = self._started(run, plan.main)
+        except (OSError, ValueError, PebbleError) as error:
+            self.error = f"Failed to start {file}: {error}"
+            log.warning("%s", self.error)
+            self._end()
+            return
+        log.info("started %s, run %d, pid %d", file, number, run.main.child.pid)
+
+    def _started(self, run: Run, step: Step) -> Part:
+        script = step.script
+        path = str(self._surroundings.config_path(script, run.number))
+        own = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
+        launch = Launch(
+            file=script.file,
+            command=(*script.command, "--config", path, *step.options),
+            folder=script.folder,
+            environment=environment(self._env, script.environment, own),
+            tie=signal.SIGTERM if script.ours else signal.SIGKILL,
+        )
+        part: Part
+
+        def on_end(code: int) -> None:
+            self._surroundings.on_thread(lambda: self._on_end(run, part, code))
+
+        part = Part(script.file, self._spawn(launch, on_end))
+        return part
+
+    # -- ending
+
+    def _end(self) -> None:
+        """Begin to end what runs: wheels first, then the script, then what it needed."""
+        run = self._run
+        if run is None or run.ending:
+            return
+        run.ending = True
+        self._surroundings.halt(run.number)
+        if run.main is not None and not run.main.ended:
+            self._terminate(run.main)
+        else:
+            self._end_dependencies(run)
+
+    def _end_dependencies(self, run: Run) -> None:
+        for part in reversed(run.dependencies):
+            self._terminate(part)
+        self._forget_if_ended(run)
+
+    def _terminate(self, part: Part) -> None:
+        if part.ended:
+            return
+
+        def kill() -> None:
+            if not part.ended:
+                log.warning("%s did not end within %g s: killed", part.file, self._stop_timeout_s)
+                part.child.signal(signal.SIGKILL)
+
+        part.child.signal(signal.SIGTERM)
+        self._surroundings.later(self._stop_timeout_s, kill)
+
+    def _on_end(self, run: Run, part: Part, code: int) -> None:
+        part.ended = True
+        if run is not self._run:  # of a run that was closed
+            return
+        how = f"exited with code {code}" if code >= 0 else f"was ended by signal {-code}"
+        log.info("%s %s", part.file, how)
+        if part is run.main:
+            self._surroundings.halt_repeatedly(run.number)
+            if not run.ending:
+                run.ending = True
+                self.error = f"{part.file} {how}" if code else None
+            self._end_dependencies(run)
+        else:
+            if not run.ending:
+                self.error = f"dependency {part.file} {how}"
+                self._end()
+            self._forget_if_ended(run)
+        self._go_on()
+
+    def _forget_if_ended(self, run: Run) -> None:
+        if all(part.ended for part in run.parts):
+            self._run = None
+            self._surroundings.end_run(run.number)

@@ -1,0 +1,86 @@
+"""What is known of one script, and how it is started."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+
+from pebble.errors import PebbleError
+from pebble.services.autonomy_manager.forms import Setting, SettingError, Value, arguments, effective
+
+
+class StartError(PebbleError):
+    """A start that is refused; the text is for the person who asked for it."""
+
+
+class Dependency(Struct, frozen=True):
+    """Another script that runs while a script runs, and its settings."""
+
+    file: str
+    config: dict[str, Any] = {}
+
+
+class Script(Struct, frozen=True, kw_only=True):
+    """One script of the catalogue. ``command`` is followed by ``--config PATH`` and the options."""
+
+    file: str  # the name of its folder
+    label: str
+    command: tuple[str, ...]
+    folder: Path  # to run it in
+    settings: tuple[Setting, ...] = ()
+    dependencies: tuple[Dependency, ...] = ()
+    environment: dict[str, str] = {}
+    ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
+    arbitrate: bool = True  # sign the drive commands of one that is not
+
+    @property
+    def needs_gate(self) -> bool:
+        """Whether its drive commands pass a gate, which signs them."""
+        return self.arbitrate and not self.ours
+
+
+class Step(Struct, frozen=True):
+    """One process of a plan."""
+
+    script: Script
+    options: tuple[str, ...]
+
+
+class Plan(Struct, frozen=True):
+    """A start that was checked: the script, what it needs in that order, and its effective settings."""
+
+    main: Step
+    dependencies: tuple[Step, ...]
+    config: dict[str, Value]
+
+
+def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) -> Plan:
+    """Check a start. Raises StartError."""
+    script = scripts.get(file)
+    if script is None:
+        raise StartError(f"Unknown autonomy file: {_shown(file)}")
+    try:
+        values = effective(script.settings, config)
+    except SettingError as error:
+        raise StartError(f"Invalid config for {file}: {error}") from None
+    needed = tuple(_dependency(scripts, file, dependency) for dependency in script.dependencies)
+    return Plan(Step(script, tuple(arguments(script.settings, values))), needed, values)
+
+
+def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency) -> Step:
+    script = scripts.get(dependency.file)
+    if script is None:
+        raise StartError(f"Failed to start {file}: Dependency script not found: {_shown(dependency.file)}")
+    try:
+        values = effective(script.settings, dependency.config)
+    except SettingError as error:
+        raise StartError(f"Failed to start {file}: Invalid config for {dependency.file}: {error}") from None
+    return Step(script, tuple(arguments(script.settings, values)))
+
+
+def _shown(name: str) -> str:
+    """A name from a command, fit for a status and a log."""
+    return "".join(letter if letter.isprintable() else "?" for letter in name[:100])

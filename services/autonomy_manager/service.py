@@ -1,0 +1,236 @@
+"""Offers the robot's scripts to operators, and runs one at a time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace
+
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE, ESTOP_STATE
+from pebble.contract.payloads import (
+    SCRIPT,
+    AutonomyCommand,
+    AutonomyDependency,
+    AutonomyFiles,
+    AutonomyStatus,
+    Drive,
+    EstopState,
+)
+from pebble.errors import PebbleError
+from pebble.motion.arbiter import HOLD_MS
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.process import view_of
+from pebble.runtime.runs import next_run
+from pebble.runtime.service import Service, on
+from pebble.services.autonomy_manager.catalogue import Catalogue, files
+from pebble.services.autonomy_manager.child import Processes, Spawn
+from pebble.services.autonomy_manager.gate.gate import Gate, broker_of
+from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
+from pebble.services.autonomy_manager.runner import Runner
+from pebble.services.autonomy_manager.script import Plan, Script, StartError, plan
+from pebble.transports import QoS
+
+_START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
+_STOP = frozenset(("stop", "disable", "disabled", "off"))
+_HALTS_S = (0.1, 0.3)  # after the first one
+_HOLD_S = HOLD_MS / 1000
+_SHORTEST_SCAN_S = 1.0
+_CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
+
+
+class AutonomyManager(Service):
+    """``spawn`` and ``scripts`` replace processes and folders in tests."""
+
+    name = "autonomy_manager"
+    publishes = (AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE)
+
+    def __init__(
+        self, *arguments: Any, spawn: Spawn | None = None, scripts: Mapping[str, Script] | None = None, **options: Any
+    ) -> None:
+        super().__init__(*arguments, **options)
+        self._section = self.config.services.autonomy_manager
+        motors = self.config.motor_lines()
+        self.addresses = Addresses(view_of(self.config, next(iter(motors), "")))
+        self._owners = MotorOwners([self.config.motor_owner(line) for line in motors])
+        processes = Processes()
+        self.on_stop(processes.close)
+        self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds, self._section.env)
+        self._scripts = dict(scripts or {})
+        self._fixed = scripts is not None
+        self._scan_now = threading.Event()
+        self._overridden_until = float("-inf")
+        self._files: list[dict[str, object]] | None = None
+        self._status: AutonomyStatus | None = None
+        self._connected_before = False
+        self._gate: tuple[int, Gate] | None = None  # of the present run, if one of its scripts needs it
+
+    def start(self) -> None:
+        if self._fixed:
+            self._found(self._scripts)
+        else:
+            threading.Thread(target=self._scan, name="scripts", daemon=True).start()
+            period = max(_SHORTEST_SCAN_S, self._section.scan_interval_seconds)
+            self.timers.add(self.clock(), self._scan_now.set, period=period)
+        self.changed()
+
+    def stop(self) -> None:
+        self._runner.close(_CLOSE_S)
+
+    def on_connected(self) -> None:
+        if not self._connected_before:  # a predecessor may have been killed together with its script
+            self._connected_before = True
+            self.halt(next_run(self.config, self._owners.barred))
+
+    # -- what operators send
+
+    @on(AUTONOMY_COMMAND)
+    def command(self, command: AutonomyCommand) -> None:
+        word = (command.action or "").strip().lower()
+        begin = True if word in _START else False if word in _STOP else command.enabled
+        if begin is None:
+            self._quiet_log.warning("command", "ignored a command that neither starts nor stops a script")
+        elif begin:
+            self._start_script((command.file or "").strip(), command.config or {})
+        else:
+            self._runner.stop()
+
+    def _start_script(self, file: str, config: Mapping[str, Any]) -> None:
+        try:
+            if not file:
+                raise StartError("Start command missing file")
+            wanted = plan(self._scripts, file, config)
+            self._check(wanted)
+        except StartError as error:
+            self._runner.refuse(str(error))
+        else:
+            self._runner.start(wanted)
+
+    def _check(self, wanted: Plan) -> None:
+        """Raise StartError if this robot cannot run ``wanted`` at present."""
+        problem = self._owners.refusal
+        if any(step.script.needs_gate for step in (wanted.main, *wanted.dependencies)):
+            try:
+                broker_of(self.config)
+            except PebbleError as error:
+                problem = str(error)
+        if problem:
+            raise StartError(f"Failed to start {wanted.main.script.file}: {problem}")
+
+    # -- what the motors and people do
+
+    @on(ESTOP_STATE)
+    def motor_owner(self, state: EstopState, owner: str) -> None:
+        self._owners.receive(owner, state)
+        run = self._runner.active
+        if run is not None and (why := self._owners.ending(run.number, run.baseline)):
+            self._runner.stop(why)
+
+    @on(DRIVE, direct=True)
+    def drive(self, drive: Drive) -> None:
+        """On the transport's thread. A person's commands all mean the same here."""
+        if not drive.signed:
+            self.post(self._person_drives, newest_of="person")
+
+    def _person_drives(self) -> None:
+        now = self.clock()
+        if self._runner.active is not None and self._section.on_override == "stop":
+            self._runner.stop(OVERRIDDEN)
+        if now >= self._overridden_until:
+            self.call_at(now + _HOLD_S, self._check_override)
+        self._overridden_until = now + _HOLD_S
+        self.changed()
+
+    def _check_override(self) -> None:
+        if self.clock() < self._overridden_until:
+            self.call_at(self._overridden_until, self._check_override)
+        else:
+            self.changed()
+
+    # -- what a runner needs
+
+    def begin_run(self) -> tuple[int, Baseline]:
+        if refusal := self._owners.refusal:
+            raise StartError(refusal)
+        return next_run(self.config, self._owners.barred), self._owners.baseline()
+
+    def config_path(self, script: Script, run: int) -> Path:
+        if not script.needs_gate:
+            return self.config.path or self.config.folder
+        if self._gate is None:
+            gate = Gate(self.config, self._publish_signed, run)
+            gate.open()
+            self._gate = (run, gate)
+        return self._gate[1].config_path
+
+    def end_run(self, run: int) -> None:
+        if self._gate is not None and self._gate[0] == run:
+            self._gate[1].close()
+            self._gate = None
+
+    def halt(self, run: int) -> None:
+        if self._gate is not None and self._gate[0] == run:
+            self._gate[1].halt()
+        self.publish(DRIVE, Drive(source=SCRIPT, run=run))
+
+    def _publish_signed(self, topic: str, payload: bytes) -> None:
+        """On a thread of the gate."""
+        self.transport.publish(topic, payload, qos=QoS.DELIVERED)
+
+    def halt_repeatedly(self, run: int) -> None:
+        self.halt(run)
+        for seconds in _HALTS_S:
+            self.later(seconds, lambda: self.halt(run))
+
+    def later(self, seconds: float, job: Callable[[], None]) -> None:
+        self.call_at(self.clock() + seconds, job)
+
+    def on_thread(self, job: Callable[[], None]) -> None:
+        self.post_first(job)
+
+    def changed(self) -> None:
+        """Publish the status if it differs from the last one."""
+        status = self._present_status()
+        if status != self._status:
+            self._status = status
+            self.publish(AUTONOMY_STATUS, replace(status, timestamp=time.time()))
+
+    def _present_status(self) -> AutonomyStatus:
+        run = self._runner.run
+        main = None if run is None or run.main is None or run.main.ended else run.main
+        parts = [] if run is None else run.dependencies
+        status = AutonomyStatus(
+            running=main is not None,
+            timestamp=0.0,
+            file=None if main is None else main.file,
+            pid=None if main is None else main.child.pid,
+            dependencies=[
+                AutonomyDependency(file=part.file, pid=part.child.pid, running=not part.ended) for part in parts
+            ],
+            error=self._runner.error,
+            config=None if self._runner.config is None else dict(self._runner.config),
+        )
+        overridden = main is not None and self.clock() < self._overridden_until
+        return replace(status, overridden=True) if overridden else status
+
+    # -- the catalogue
+
+    def _scan(self) -> None:
+        """On a thread of its own: to ask a script what it is takes long."""
+        catalogue = Catalogue(self.config)
+        while self._scan_now.wait():
+            self._scan_now.clear()
+            try:
+                catalogue.scan(lambda scripts: self.post(lambda: self._found(scripts), newest_of="scripts"))
+            except Exception:  # the thread's boundary: the next scan may succeed
+                self.log.exception("the scripts cannot be listed")
+
+    def _found(self, scripts: Mapping[str, Script]) -> None:
+        self._scripts = dict(scripts)
+        found = files(scripts.values())
+        if found != self._files:
+            self._files = found
+            self.publish(AUTONOMY_FILES, AutonomyFiles(files=found, timestamp=time.time()))
