@@ -20,6 +20,7 @@ from pathlib import Path
 from pebble.config import Config, Mqtt
 from pebble.doctor import Finding, Level
 from pebble.doctor.broker_probe import REFUSED_LOGINS, ProbeResult, probe
+from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.peers import fits_socket
@@ -52,6 +53,7 @@ def _robot(config: Config) -> Iterator[Finding]:
     for line in config.serial_instances().values():
         yield serial_port(Path(str(line.serial.port)))
     yield from media(config, Path("/dev"))
+    yield from loudspeaker(config)
     for name, mqtt in _brokers(config):
         yield from broker(name, mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S))
 

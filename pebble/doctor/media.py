@@ -1,4 +1,4 @@
-"""Checks of camera, microphone, loudspeaker and codecs."""
+"""Checks of camera, microphone and codecs."""
 
 from __future__ import annotations
 
@@ -24,11 +24,8 @@ def media(config: Config, devices: Path, which: Which = shutil.which) -> Iterato
         return
     if daemon.video.enabled:
         yield camera(daemon.video.backend, daemon.video.device, devices, which)
-    if daemon.audio.enabled:
-        if daemon.audio.source != "synthetic":
-            yield program("microphone", ("arecord",), "sudo apt install alsa-utils", which)
-        command = config.services.mqtt_bridge.media.audio_receiver.command
-        yield program("loudspeaker", command[:1], "sudo apt install alsa-utils", which, Level.WARN)
+    if daemon.audio.enabled and daemon.audio.source != "synthetic":
+        yield program("microphone", ("arecord",), "sudo apt install alsa-utils", which)
     yield codecs(config, installed=pyav.installed())
 
 
@@ -49,11 +46,11 @@ def camera(backend: str, device: str, devices: Path, which: Which) -> Finding:
     return Finding(Level.OK, "camera", f"{path} readable and writable")
 
 
-def program(what: str, names: tuple[str, ...], fix: str, which: Which, missing: Level = Level.FAIL) -> Finding:
+def program(what: str, names: tuple[str, ...], fix: str, which: Which) -> Finding:
     """One of ``names`` must be installed."""
     found = next((name for name in names if which(name) is not None), None)
     if found is None:
-        return Finding(missing, what, f"{' or '.join(names)} is not installed", fix)
+        return Finding(Level.FAIL, what, f"{' or '.join(names)} is not installed", fix)
     return Finding(Level.OK, what, f"uses {found}")
 
 

@@ -10,9 +10,11 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import IO, Any
 
 from msgspec import Struct
 
+from pebble.config import Config
 from pebble.media.player import filled
 from pebble.runtime.parent import tied_to_parent
 from pebble.services.soundboard_handler.clips import Clip
@@ -31,10 +33,28 @@ class Players(Struct, frozen=True):
     cwd: Path | None
     env: dict[str, str]
 
+    @classmethod
+    def of(cls, config: Config) -> Players:
+        playback, raw = config.services.soundboard_handler.playback, config.services.mqtt_bridge.media.audio_receiver
+        return cls(playback.player_command, raw.command, raw.device, playback.volume, playback.cwd, playback.env)
+
     def command(self, path: Path) -> list[str]:
         """``{file}`` stands for the path; without one it is the last word."""
         words = [word.replace("{file}", str(path)) for word in self.wav]
         return words if words != list(self.wav) else [*words, str(path)]
+
+    def started(self, words: list[str], stdin: int | IO[bytes], **options: Any) -> subprocess.Popen[bytes]:
+        """Start a player in a process group of its own; it ends with the calling thread. Raises OSError, ValueError."""
+        if self.cwd is not None and "/" in words[0]:
+            words = [str(self.cwd / words[0]), *words[1:]]  # as exec would find it
+        return subprocess.Popen(
+            tied_to_parent(words),
+            stdin=stdin,
+            cwd=self.cwd,
+            env={**os.environ, **self.env},
+            start_new_session=True,  # what the player starts is stopped with it
+            **options,
+        )
 
     def raw_command(self, rate: int, channels: int) -> list[str]:
         return filled(self.raw, rate=rate, channels=channels, device=self.device)
@@ -99,17 +119,8 @@ class Playback:
 
     def _start_player(self, words: list[str]) -> None:
         """On this thread, because the player ends with the thread that has started it."""
-        cwd = self._players.cwd
-        if cwd is not None and "/" in words[0]:
-            words[0] = str(cwd / words[0])  # as exec would find it
         try:
-            self.process = subprocess.Popen(
-                tied_to_parent(words),
-                stdin=subprocess.DEVNULL if self._feed is None else subprocess.PIPE,
-                cwd=cwd,
-                env={**os.environ, **self._players.env},
-                start_new_session=True,  # what the player starts is stopped with it
-            )
+            self.process = self._players.started(words, subprocess.DEVNULL if self._feed is None else subprocess.PIPE)
         except (OSError, ValueError) as error:
             self._fail(str(error))
             return

@@ -41,11 +41,8 @@ class SoundboardHandler(Service):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._section = self.config.services.soundboard_handler
-        playback, raw = self._section.playback, self.config.services.mqtt_bridge.media.audio_receiver
-        self._clips = Clips(playback.directory or Path("~/sounds").expanduser())
-        self._players = Players(
-            playback.player_command, raw.command, raw.device, playback.volume, playback.cwd, playback.env
-        )
+        self._clips = Clips(self._section.playback.directory or Path("~/sounds").expanduser())
+        self._players = Players.of(self.config)
         self._listed: list[str] | None = None
         self._scan_problem = ""
         self._playback: Playback | None = None

@@ -1,4 +1,4 @@
-"""Checks of camera, microphone, loudspeaker and codecs."""
+"""Checks of camera, microphone and codecs."""
 
 from __future__ import annotations
 
@@ -34,17 +34,13 @@ def test_everything_there(tmp_path: Path) -> None:
     config = config_of({"enabled": True, "video": {"device": "0"}})
     found = list(media(config, tmp_path, everything))
     assert {finding.level for finding in found} == {Level.OK}
-    assert [finding.what for finding in found] == ["camera", "microphone", "loudspeaker", "codecs"]
+    assert [finding.what for finding in found] == ["camera", "microphone", "codecs"]
 
 
 def test_nothing_there(tmp_path: Path) -> None:
     config = config_of({"enabled": True, "video": {"device": str(tmp_path / "video0")}})
     found = {finding.what: finding for finding in media(config, tmp_path, nothing)}
-    assert [found[what].level for what in ("camera", "microphone", "loudspeaker")] == [
-        Level.FAIL,
-        Level.FAIL,
-        Level.WARN,
-    ]
+    assert [found[what].level for what in ("camera", "microphone")] == [Level.FAIL, Level.FAIL]
     assert "alsa-utils" in found["microphone"].fix
     assert "video0 does not exist" in found["camera"].text
 
