@@ -1,0 +1,136 @@
+"""Drives towards a tag and holds a distance from it, by what the camera shows alone.
+
+A tag outside of a cone ahead is turned to in pulses with pauses between them, because a turning camera sees a blurred
+picture, and a late one. Inside the cone the robot drives and steers. A lost tag is waited for, then searched in the
+direction in which it was last seen. The settings are the original's, by its names.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from pebble.perception.tags import Place
+
+_STEER_PER_RAD = 0.35  # while driving: 2 rad/s per rad on Goob, stable with pictures that are 200 ms late
+_TURN_PER_RAD = 1.2  # of a pulse
+_LEAST_TURN = 0.12
+_ALIGNED_RAD = 0.08  # at the wanted distance
+_LEAST_DRIVE = 0.08
+_ARRIVED = 0.3  # of the threshold: holding begins here, and ends beyond threshold and hysteresis
+_SEARCH_POWER = 1.5  # times the turn power
+_REVERSE_POWER = 0.8
+
+
+class FollowSettings(Struct, frozen=True, kw_only=True):
+    """Distances in m, times in s, powers 0..1."""
+
+    target_distance_m: float = 0.6
+    distance_threshold_m: float = 0.05
+    standoff_hysteresis_m: float = 0.03
+    forward_cone_deg: float = 18.0
+    vision_forward_kp: float = 2.0  # power per m
+    vision_reverse_kp: float = 2.0
+    vision_forward_floor_distance_m: float = 0.2  # beyond threshold and this, at least the minimum power
+    forward_min_power: float = 0.8
+    forward_max_power: float = 1.0
+    turn_power: float = 0.5
+    turn_pulse_s: float = 0.08
+    turn_cooldown_s: float = 0.18
+    search_pause_s: float = 0.35
+    search_reverse_after_s: float = 0.0  # 0: never
+    lost_timeout_s: float = 0.7
+    tag_timeout_s: float = 0.35
+
+
+class Command(NamedTuple):
+    """A drive command, and why."""
+
+    x: float = 0.0
+    z: float = 0.0
+    reason: str = "hold"
+
+
+class Pulses:
+    """Turns for a moment, then pauses."""
+
+    def __init__(self) -> None:
+        self._x = 0.0
+        self._on_until = self._off_until = float("-inf")
+
+    def turn(self, x: float, on_s: float, off_s: float, now: float) -> float:
+        """The ``x`` of now; a new pulse begins when the last one and its pause are over."""
+        if now >= self._off_until:
+            self._x = x
+            self._on_until = now + on_s
+            self._off_until = self._on_until + off_s
+        return self._x if now < self._on_until else 0.0
+
+
+class Follower:
+    """Call ``step`` at a steady rate of about 10 Hz, with where the tag is, or None if it is not in the picture."""
+
+    def __init__(self, settings: FollowSettings) -> None:
+        self.settings = settings
+        self._pulses = Pulses()
+        self._seen_at = self._reversed_at = float("-inf")
+        self._side = 1.0  # on which the tag was seen last: right
+        self._last = Command()
+        self._holding = False
+
+    def step(self, now: float, place: Place | None) -> Command:
+        self._last = self._lost(now) if place is None else self._seen(now, place)
+        return self._last
+
+    def _seen(self, now: float, place: Place) -> Command:
+        self._seen_at = self._reversed_at = now
+        self._side = math.copysign(1.0, place.angle_rad)
+        if abs(place.angle_rad) > math.radians(self.settings.forward_cone_deg):
+            self._holding = False
+            return self._turn(now, place.angle_rad)
+        error = place.distance_m - self.settings.target_distance_m
+        threshold = self.settings.distance_threshold_m
+        band = threshold + self.settings.standoff_hysteresis_m if self._holding else _ARRIVED * threshold
+        self._holding = abs(error) <= band
+        if not self._holding:
+            return self._approach(error, place.angle_rad)
+        return self._turn(now, place.angle_rad) if abs(place.angle_rad) > _ALIGNED_RAD else Command()
+
+    def _turn(self, now: float, angle: float) -> Command:
+        settings = self.settings
+        power = min(settings.turn_power, max(_LEAST_TURN, _TURN_PER_RAD * abs(angle)))
+        x = self._pulses.turn(math.copysign(power, angle), settings.turn_pulse_s, settings.turn_cooldown_s, now)
+        return Command(x, 0.0, "turn")
+
+    def _approach(self, error: float, angle: float) -> Command:
+        """``error`` > 0: too far away."""
+        settings = self.settings
+        x = max(-settings.turn_power, min(settings.turn_power, _STEER_PER_RAD * angle))
+        if error < 0.0:
+            return Command(x, max(-_REVERSE_POWER, min(-_LEAST_DRIVE, settings.vision_reverse_kp * error)), "back")
+        power = settings.vision_forward_kp * error
+        if error >= settings.distance_threshold_m + settings.vision_forward_floor_distance_m:
+            power = max(power, settings.forward_min_power)
+        most = min(settings.forward_max_power, 1.0 - abs(x))  # the rest is for steering
+        return Command(x, min(most, max(_LEAST_DRIVE, power)), "drive")
+
+    def _lost(self, now: float) -> Command:
+        settings, gone_s = self.settings, now - self._seen_at
+        if gone_s <= settings.tag_timeout_s and self._last.reason in ("drive", "back"):
+            return self._last  # one picture more or less
+        self._holding = False
+        if gone_s <= settings.lost_timeout_s:
+            return Command(reason="wait")
+        return self._search(now)
+
+    def _search(self, now: float) -> Command:
+        settings = self.settings
+        reverse_s = settings.search_reverse_after_s
+        if reverse_s > 0.0 and now - self._reversed_at > reverse_s:
+            self._side = -self._side
+            self._reversed_at = now
+        power = min(1.0, _SEARCH_POWER * settings.turn_power)
+        x = self._pulses.turn(self._side * power, settings.turn_pulse_s, settings.search_pause_s, now)
+        return Command(x, 0.0, "search")

@@ -1,0 +1,60 @@
+"""Heading from the inertial sensor: the rate about the vertical axis, without its bias, as long as it is plausible."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+log = logging.getLogger(__name__)
+
+_FRESH_S = 0.3
+_GAP_MS = 100  # samples farther apart are not integrated over
+_LIMIT_DPS = 320.0  # the sensor's protocol ends at 327
+_BIAS_WEIGHT = 0.005  # of a sample at rest, at 100 Hz: 2 s
+_TEST_TURN_RAD = math.pi  # of the wheels, before the sensor is judged
+_LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # sensor to wheels; else it is mounted otherwise than flat, x ahead, z up
+
+
+class GyroHeading:
+    """Collects turns of an inertial sensor that lies flat; + is counter-clockwise."""
+
+    def __init__(self) -> None:
+        self._turn_rad = 0.0  # since it was taken
+        self._bias_dps = 0.0
+        self._at_rest = 0  # samples
+        self._mcu_ms: int | None = None
+        self._at = float("-inf")
+        self._limited = False
+        self._agreed = self._compared = 0.0
+        self._trusted = True
+
+    def sample(self, z_dps: float, mcu_ms: int, now: float, *, at_rest: bool) -> None:
+        """Take a sample; ``at_rest``: no wheel turns, so that what it measures is its bias."""
+        gap_ms = _GAP_MS + 1 if self._mcu_ms is None else mcu_ms - self._mcu_ms
+        self._mcu_ms, self._at = mcu_ms, now
+        if at_rest:
+            self._at_rest += 1
+            self._bias_dps += max(_BIAS_WEIGHT, 1.0 / self._at_rest) * (z_dps - self._bias_dps)
+        elif 0 < gap_ms <= _GAP_MS:
+            self._turn_rad += math.radians(z_dps - self._bias_dps) * gap_ms / 1000
+            self._limited = self._limited or abs(z_dps) >= _LIMIT_DPS
+
+    def take(self, wheels_rad: float, now: float) -> float | None:
+        """The turn since the last call, for a turn of ``wheels_rad`` by the wheels; None: ask the wheels."""
+        turn, self._turn_rad = self._turn_rad, 0.0
+        limited, self._limited = self._limited, False
+        if now - self._at > _FRESH_S or limited or not self._trusted:
+            return None
+        self._compare(turn, wheels_rad)
+        return turn
+
+    def _compare(self, turn: float, wheels_rad: float) -> None:
+        self._agreed += math.copysign(1.0, wheels_rad) * turn if wheels_rad else 0.0
+        self._compared += abs(wheels_rad)
+        if self._compared < _TEST_TURN_RAD:
+            return
+        ratio = self._agreed / self._compared
+        if not _LEAST_RATIO <= ratio <= _MOST_RATIO:
+            log.warning("the inertial sensor shows %.0f %% of the wheels' turns: heading from the wheels", 100 * ratio)
+            self._trusted = False
+        self._agreed = self._compared = 0.0

@@ -1,0 +1,267 @@
+"""The distance of a wheel from a hall sensor beside its ring of magnets: a sine, two half waves per pair of poles.
+
+A step is one half wave. Between steps the arcsine of the level gives the phase, so the distance is exact to about a
+millimetre. A single sensor does not show the direction: that is taken from the drive command. A second sensor a
+quarter of a wave away shows it, and is used if it agrees with the commands.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+_SMALLEST_SWING = 30  # ADC counts between the extremes; less is noise
+_WARM_UP_EXTREMA = 12  # of the sensor's signal, until its range is known
+_WARM_UP_SAMPLES = 400
+_FADE = 0.02  # per extremum: how fast the range follows a signal that becomes smaller
+_CARRY = 0.72  # of its speed a wheel carries over a sample of 20 ms: motors have a lag of about 60 ms
+_FULL_SPEED_RAD = 1.25  # phase per sample at full power, until it is known: Goob's
+_SMOOTH = 0.4  # per sample
+_LEAST_SPEED_RAD = 0.3
+_MOST_SPEED_RAD = 1.5  # beyond a quarter of a wave per sample, waves are missed
+_NOISE_RAD = 0.8  # how far noise moves a phase back, near the extremes of the wave
+_LEARN = 0.05  # per sample: how fast the speed per power is learned
+_SHARE_AGREED = 0.7  # of the motion in which two sensors must agree with the commands
+
+
+class HallSample(NamedTuple):
+    """One sample of a wheel: ADC values, the power of its motor (−1..1), and the direction in which it can turn.
+
+    ``quadrature`` is the second sensor's value, if any. ``direction`` 0 means unknown.
+    """
+
+    value: int
+    quadrature: int | None
+    power: float
+    direction: int
+
+
+class SensorRange:
+    """The extremes of a sensor, which differ from sensor to sensor and drift."""
+
+    def __init__(self) -> None:
+        self.extrema = 0  # so far
+        self.low = self.high = 0.0
+        self._started = False
+        self._rising = True
+        self._pivot = 0.0  # the farthest value since the last extremum
+
+    @property
+    def swings(self) -> bool:
+        return self.high - self.low >= _SMALLEST_SWING
+
+    def update(self, value: float) -> None:
+        if not self._started:
+            self._started = True
+            self.low = self.high = self._pivot = value
+        self.low, self.high = min(self.low, value), max(self.high, value)
+        beyond = value > self._pivot if self._rising else value < self._pivot
+        if beyond:
+            self._pivot = value
+        elif abs(value - self._pivot) > max(_SMALLEST_SWING, 0.3 * (self.high - self.low)):
+            self._end_of_half_wave(value)
+
+    def level(self, value: float) -> float:
+        """−1..1."""
+        middle, swing = (self.low + self.high) / 2, (self.high - self.low) / 2
+        return max(-1.0, min(1.0, (value - middle) / swing))
+
+    def _end_of_half_wave(self, value: float) -> None:
+        self.extrema += 1
+        if self._rising:
+            self.high += _FADE * (self._pivot - self.high)
+        else:
+            self.low += _FADE * (self._pivot - self.low)
+        self._rising = not self._rising
+        self._pivot = value
+
+
+class PhaseTracker:
+    """The phase of one wave, unwrapped, from levels of a sine and the power that moves it.
+
+    The levels alone fit a wheel that turns backwards just as well: which of the two it is comes from the expected
+    speed, and the phase never goes back by more than noise explains.
+    """
+
+    def __init__(self, *, falls: bool = False) -> None:
+        """``falls``: the first level is on the falling half of the wave, as seen by a wheel that turns forward."""
+        self.phase: float | None = None  # None: no sample yet
+        self.surprise = 0.0  # the sum of all differences from the expected phases
+        self.rejected = 0  # samples that fit a turn against the expected one better
+        self._expected = 0.0  # phase per sample
+        self._measured = self._power = 0.0
+        self._per_power = _FULL_SPEED_RAD
+        self._farthest = 0.0  # in the expected direction
+        self._falls = falls
+
+    def update(self, level: float, power: float) -> float:
+        """Return the phase that was added."""
+        base = math.asin(level)
+        if self.phase is None:
+            self.phase = self._farthest = math.pi - base if self._falls else base
+            return 0.0
+        predicted = self.phase + self._predict(power)
+        branches = (base, math.pi - base)
+        phases = [predicted + math.remainder(branch - predicted, math.tau) for branch in branches]
+        nearest = min(phases, key=lambda phase: abs(phase - predicted))
+        possible = [phase for phase in phases if not self._goes_back(phase)]
+        if nearest not in possible:
+            self.rejected += 1
+            turn = math.copysign(math.tau, self._expected)
+            nearest = min(possible or [phase + turn for phase in phases], key=lambda phase: abs(phase - predicted))
+        self.surprise += abs(nearest - predicted)
+        return self._move_to(self.phase, nearest, power)
+
+    def update_pair(self, phase: float, power: float) -> float:
+        """As ``update``, from the phase itself, known but for whole waves."""
+        if self.phase is None:
+            self.phase = self._farthest = phase
+            return 0.0
+        predicted = self.phase + self._predict(power)
+        return self._move_to(self.phase, predicted + math.remainder(phase - predicted, math.tau), power)
+
+    def _predict(self, power: float) -> float:
+        """The phase that this sample is expected to add."""
+        before = self._expected
+        drive = (self._power + power) / 2  # a command comes between two samples
+        self._expected, self._power = _CARRY * before + (1.0 - _CARRY) * self._per_power * drive, power
+        if before * self._expected <= 0.0 and self.phase is not None:
+            self._farthest = self.phase
+        agrees = self._measured * self._expected > 0.0
+        return (self._expected + self._measured) / 2 if agrees else self._expected
+
+    def _goes_back(self, phase: float) -> bool:
+        return (phase - self._farthest) * math.copysign(1.0, self._expected) < -_NOISE_RAD
+
+    def _move_to(self, before: float, phase: float, power: float) -> float:
+        added = phase - before
+        self.phase = phase
+        self._measured += _SMOOTH * (added - self._measured)
+        self._farthest = max(self._farthest, phase) if self._expected >= 0.0 else min(self._farthest, phase)
+        if abs(power) >= 0.1 and abs(self._expected) > 0.9 * self._per_power * abs(power):  # the wheel is up to speed
+            learned = self._per_power + _LEARN * (added / power - self._per_power)
+            self._per_power = max(_LEAST_SPEED_RAD, min(_MOST_SPEED_RAD, learned))
+        return added
+
+
+@dataclass(slots=True)
+class _Counts:
+    rad: float = 0.0
+    rad_in_any_direction: float = 0.0
+    unknown_rad: float = 0.0
+
+
+class HallWheel:
+    """One wheel. ``mm_per_step`` is the distance of half a wave."""
+
+    def __init__(self, mm_per_step: float) -> None:
+        self.mm_per_step = mm_per_step
+        self._counts = _Counts()
+        self._range, self._second = SensorRange(), SensorRange()
+        self._tracker = PhaseTracker()
+        self._second_sign = 0  # −1: the second sensor is ahead; 0: it is not used
+        self._warm_up: list[HallSample] | None = []  # None: the range is known
+
+    @property
+    def ready(self) -> bool:
+        """Whether distances are final, or there is none yet; until then, each new one may correct the last."""
+        return self._warm_up is None or not self._range.swings
+
+    @property
+    def mm(self) -> float:
+        """The distance so far; reverse is negative."""
+        return self._counts.rad / math.pi * self.mm_per_step
+
+    @property
+    def steps(self) -> float:
+        """In any direction."""
+        return self._counts.rad_in_any_direction / math.pi
+
+    @property
+    def unknown(self) -> int:
+        """Steps whose direction was unknown: they are in no distance."""
+        return int(self._counts.unknown_rad / math.pi)
+
+    @property
+    def extrema(self) -> int:
+        return self._range.extrema
+
+    @property
+    def rejected(self) -> int:
+        return self._tracker.rejected
+
+    def update(self, sample: HallSample) -> float:
+        """Return the distance since the last sample, in mm. Until :attr:`ready`, it may correct what was returned."""
+        extrema = self._range.extrema
+        self._range.update(sample.value)
+        if sample.quadrature is not None:
+            self._second.update(sample.quadrature)
+        before = self.mm
+        if self._warm_up is not None:
+            self._warm_up.append(sample)
+            if self._range.extrema > extrema:
+                self._replay(self._warm_up)
+                return self.mm - before
+            self._bound_warm_up(self._warm_up)
+        if self._range.extrema:
+            self._add(sample, self._tracker, self._counts)
+        return self.mm - before
+
+    def _bound_warm_up(self, samples: list[HallSample]) -> None:
+        """Forget the rest before the first motion, and end a slow first motion, whose range is known soon."""
+        if len(samples) < _WARM_UP_SAMPLES:
+            return
+        if self._range.extrema:
+            self._warm_up = None
+        else:
+            del samples[: len(samples) // 2]
+
+    def _replay(self, samples: list[HallSample]) -> None:
+        """Track all samples so far again: the range is better known now, and on which half of a wave they began."""
+        self._second_sign = self._second_sensor(samples)
+        starts = [self._replayed(samples, PhaseTracker(falls=falls)) for falls in (False, True)]
+        self._tracker, self._counts = min(starts, key=lambda start: start[0].surprise)
+        if self._range.extrema >= _WARM_UP_EXTREMA:
+            self._warm_up = None
+
+    def _replayed(self, samples: list[HallSample], tracker: PhaseTracker) -> tuple[PhaseTracker, _Counts]:
+        counts = _Counts()
+        for sample in samples:
+            self._add(sample, tracker, counts)
+        return tracker, counts
+
+    def _add(self, sample: HallSample, tracker: PhaseTracker, counts: _Counts) -> None:
+        level = self._range.level(sample.value)
+        if self._second_sign and sample.quadrature is not None:
+            second = self._second_sign * self._second.level(sample.quadrature)
+            added = tracker.update_pair(math.atan2(level, -second), sample.power)
+        else:
+            added = tracker.update(level, sample.power)
+            if sample.direction == 0:
+                counts.unknown_rad += abs(added)
+                return
+        counts.rad += added
+        counts.rad_in_any_direction += abs(added)
+
+    def _second_sensor(self, samples: list[HallSample]) -> int:
+        """1 or −1 if the second sensor shows the commanded directions, as it is mounted; 0 if it shows nothing."""
+        if not self._second.swings or self._second.extrema < 1:
+            return 0
+        agreed = total = run = 0.0  # run: the motion since the direction changed
+        before: tuple[float, int] | None = None
+        for sample in samples:
+            if sample.quadrature is None:
+                return 0
+            phase = math.atan2(self._range.level(sample.value), -self._second.level(sample.quadrature))
+            if before is None or before[1] != sample.direction:
+                total, run = total + abs(run), 0.0
+            elif sample.direction:
+                moved = math.remainder(phase - before[0], math.tau)
+                run += moved
+                agreed += moved * sample.direction
+            before = phase, sample.direction
+        total += abs(run)
+        if total < math.pi or abs(agreed) < _SHARE_AGREED * total:
+            return 0
+        return 1 if agreed > 0.0 else -1

@@ -1,0 +1,84 @@
+"""Follows a tag, and drives on without seeing it: to where it was, by the wheels' odometry, for a bounded time."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from pebble.perception.follow import Command, Follower, FollowSettings
+from pebble.perception.tags import Place
+
+_BLIND_S = 6.0  # at most, since the tag was seen
+_SLOW_RAD = math.radians(40.0)  # off the goal; the more beyond, the slower
+_LEAST_SHARE = 0.2
+
+
+class OdomFollowSettings(FollowSettings, frozen=True, kw_only=True):
+    """Distances in m, times in s, powers 0..1."""
+
+    min_goal_advance_m: float = 0.10  # nearer goals are not worth the way
+    odom_goal_tolerance_m: float = 0.06
+    goal_hold_s: float = 0.4
+    odom_heading_kp: float = 1.5  # of the turn power per quarter turn
+    odom_distance_kp: float = 1.4  # power per m
+    odom_turn_power: float = 0.6
+    odom_min_drive_power: float = 0.35
+    odom_max_drive_power: float = 0.9
+    odom_brake_distance_m: float = 0.25  # nearer, there is no minimum power
+
+
+class Pose(NamedTuple):
+    """Metres and radians in the odometry's frame; counter-clockwise is positive."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+class OdomFollower:
+    """Call ``step`` at a steady rate of about 10 Hz, with where the tag is, if it is in the picture, and the pose."""
+
+    def __init__(self, settings: OdomFollowSettings) -> None:
+        self.settings = settings
+        self._vision = Follower(settings)
+        self._goal: tuple[float, float] | None = None
+        self._planned_at = self._reached_at = float("-inf")
+
+    def step(self, now: float, place: Place | None, pose: Pose | None) -> Command:
+        if place is not None:
+            self._goal = None if pose is None else self._plan(place, pose)
+            self._planned_at = now
+            return self._vision.step(now, place)
+        seen = self._vision.step(now, None)
+        if now - self._planned_at <= self.settings.tag_timeout_s and seen.reason in ("drive", "back"):
+            return seen
+        blind = None if self._goal is None or pose is None else self._to_goal(now, self._goal, pose)
+        if blind is not None:
+            return blind
+        return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else seen
+
+    def _plan(self, place: Place, pose: Pose) -> tuple[float, float] | None:
+        """The point at the wanted distance from the tag, on the way to it; None: it is near."""
+        settings = self.settings
+        advance = place.distance_m - settings.target_distance_m
+        if advance <= max(settings.distance_threshold_m, settings.min_goal_advance_m):
+            return None
+        bearing = pose.heading_rad - place.angle_rad
+        return pose.x_m + advance * math.cos(bearing), pose.y_m + advance * math.sin(bearing)
+
+    def _to_goal(self, now: float, goal: tuple[float, float], pose: Pose) -> Command | None:
+        """None: it has been reached, or the time is over."""
+        settings = self.settings
+        dx, dy = goal[0] - pose.x_m, goal[1] - pose.y_m
+        distance = math.hypot(dx, dy)
+        if distance <= settings.odom_goal_tolerance_m or now - self._planned_at > _BLIND_S:
+            self._goal, self._reached_at = None, now
+            return None
+        off = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)  # > 0: to the left
+        share = max(-1.0, min(1.0, settings.odom_heading_kp * off / (math.pi / 2)))
+        floor = settings.odom_min_drive_power if distance >= settings.odom_brake_distance_m else 0.0
+        power = min(settings.odom_max_drive_power, max(floor, settings.odom_distance_kp * distance))
+        if abs(off) > _SLOW_RAD:
+            power *= max(_LEAST_SHARE, 1.0 - (abs(off) - _SLOW_RAD) / (math.pi - _SLOW_RAD))
+        x = -share * settings.odom_turn_power
+        return Command(x, min(power, 1.0 - abs(x)), "odometry")

@@ -1,0 +1,180 @@
+"""Where a robot is, by its wheels' hall sensors and the power of its motors: dead reckoning from the pose (0, 0, 0).
+
+Commands and samples are processed in the order of their arrival, because samples carry no time. Distances are good to
+millimetres as long as no wheel slips; heading is good to the difference of both wheels' calibration, and better with
+an inertial sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+
+from pebble.contract.payloads import Drive, EstopState, ImuFast, TouchValues
+from pebble.perception.gyro import GyroHeading
+from pebble.perception.hall import HallSample, HallWheel
+from pebble.perception.motor_power import MotorPower
+
+_MOVING_S = 0.45  # a robot counts as moving so long after its last motion
+_STALL_S = 0.32
+_NOISE_MM = 1.0  # less is no motion
+_UNCHANGED_S = 0.3  # without motion and power the robot is at rest
+
+
+class WheelGeometry(Struct, frozen=True, kw_only=True):
+    """Wheels, magnets of alternating poles, and the ADC channels of their sensors; ``quadrature`` "" means none."""
+
+    diameter_mm: float = 61.0
+    track_mm: float = 130.5
+    magnets: int = 10  # per wheel: one step each
+    left: str = "a0"
+    right: str = "a1"
+    quadrature: str = "a2"  # of the left wheel, a quarter of a wave later
+
+    @property
+    def mm_per_step(self) -> float:
+        return math.pi * self.diameter_mm / self.magnets
+
+
+class WheelPose(NamedTuple):
+    """In the frame of the start: x ahead, y to the left, heading −π..π, counter-clockwise positive."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    heading_rad: float = 0.0
+
+
+@dataclass(slots=True)
+class _Part:
+    """A part of the way, as an arc: one sample, or all of the time in which distances are corrected."""
+
+    ahead_mm: float = 0.0
+    turn_rad: float = 0.0
+
+    def end(self, start: WheelPose) -> WheelPose:
+        half = self.turn_rad / 2
+        chord = self.ahead_mm * (math.sin(half) / half if half else 1.0)
+        middle = start.heading_rad + half
+        return WheelPose(
+            start.x_mm + chord * math.cos(middle),
+            start.y_mm + chord * math.sin(middle),
+            math.remainder(start.heading_rad + self.turn_rad, math.tau),
+        )
+
+
+class _Wheel:
+    """A wheel, when it turned last, and how often it did not although it was commanded to."""
+
+    def __init__(self, mm_per_step: float) -> None:
+        self.hall = HallWheel(mm_per_step)
+        self.turned_at = float("-inf")
+        self.stalls = 0
+        self._turned_mm = 0.0  # where it was then
+        self._idle_since: float | None = None  # with power; None: without, or it turns
+
+    def update(self, sample: HallSample, now: float) -> float:
+        """Return the distance since the last sample, in mm."""
+        distance = self.hall.update(sample)
+        if turned := abs(self.hall.mm - self._turned_mm) > _NOISE_MM:
+            self._turned_mm, self.turned_at = self.hall.mm, now
+        if turned or not sample.power:
+            self._idle_since = None
+        elif self._idle_since is None:
+            self._idle_since = now
+        elif now - self._idle_since > _STALL_S:
+            self.stalls += 1
+            self._idle_since = math.inf
+        return distance
+
+
+class Odometry:
+    """Feed it every command and sample. ``watchdog_s`` is that of the motor owner."""
+
+    def __init__(self, geometry: WheelGeometry, *, watchdog_s: float, now: float) -> None:
+        self.pose = self._base = WheelPose()
+        self.distance_mm = 0.0
+        self._part = _Part()
+        self._was_ready = True
+        self._geometry = geometry
+        self._power = MotorPower(watchdog_s, now)
+        self._left, self._right = _Wheel(geometry.mm_per_step), _Wheel(geometry.mm_per_step)
+        self._gyro = GyroHeading()
+        self._heading_source = "wheels"
+        self._samples = self._published = 0
+        self._powered = False
+
+    def moving(self, now: float) -> bool:
+        return now - max(self._left.turned_at, self._right.turned_at) < _MOVING_S
+
+    def drive(self, drive: Drive, now: float) -> None:
+        """A drive command; those that the motor owner refuses change nothing."""
+        self._power.command(drive, now)
+
+    def owner(self, state: EstopState) -> None:
+        """The motor owner's state."""
+        self._power.owner(state)
+
+    def imu(self, imu: ImuFast, now: float) -> None:
+        """A sample of the inertial sensor."""
+        still_s = now - max(self._left.turned_at, self._right.turned_at)
+        at_rest = still_s > _UNCHANGED_S and not self._powered
+        self._gyro.sample(imu.value.gyro_dps.z, imu.mcu_ms, now, at_rest=at_rest)
+
+    def touch(self, values: TouchValues, now: float) -> None:
+        """A sample of the hall sensors."""
+        self._samples += 1
+        geometry, (left_power, right_power) = self._geometry, self._power.at(now)
+        second = getattr(values, geometry.quadrature) if geometry.quadrature else None
+        left = self._left.update(HallSample(getattr(values, geometry.left), second, *left_power), now)
+        right = self._right.update(HallSample(getattr(values, geometry.right), None, *right_power), now)
+        self._powered = left_power[0] != 0.0 or right_power[0] != 0.0
+        self._move(left, right, now)
+
+    def _move(self, left: float, right: float, now: float) -> None:
+        turn = (right - left) / self._geometry.track_mm
+        measured = self._gyro.take(turn, now)
+        self._heading_source = "wheels" if measured is None else "gyro"
+        part = self._part
+        part.ahead_mm += (left + right) / 2
+        part.turn_rad += turn if measured is None else measured
+        self.pose = part.end(self._base)
+        ready = self._left.hall.ready and self._right.hall.ready
+        if ready:
+            self.distance_mm += abs(part.ahead_mm) if self.moving(now) or not self._was_ready else 0.0
+            self._base, self._part = self.pose, _Part()
+        self._was_ready = ready
+
+    def value(self) -> dict[str, Any]:
+        """The ``value`` of the payload (paper A.8.12), each time with the next ``publish_seq``."""
+        self._published += 1
+        left, right = self._left.hall, self._right.hall
+        value: dict[str, Any] = {
+            "x_mm": round(self.pose.x_mm, 3),
+            "y_mm": round(self.pose.y_mm, 3),
+            "heading_rad": round(self.pose.heading_rad, 6),
+            "heading_deg": round(math.degrees(self.pose.heading_rad), 3),
+            "left_mm": round(left.mm, 3),
+            "right_mm": round(right.mm, 3),
+            "distance_mm": round(self.distance_mm, 3),
+            "left_crossings": int(left.steps),
+            "right_crossings": int(right.steps),
+            "unknown_direction_events": left.unknown + right.unknown,
+            "left_step_total": round(left.steps, 6),
+            "right_step_total": round(right.steps, 6),
+            "left_mm_per_step": round(left.mm_per_step, 6),
+            "right_mm_per_step": round(right.mm_per_step, 6),
+            "left_extrema_events": left.extrema,
+            "right_extrema_events": right.extrema,
+            "left_rejected_sign_flips": left.rejected,
+            "right_rejected_sign_flips": right.rejected,
+            "left_stall_events": self._left.stalls,
+            "right_stall_events": self._right.stalls,
+            "sample_seq": self._samples,
+            "publish_seq": self._published,
+        }
+        if self._heading_source == "gyro":
+            value["heading_source"] = "gyro"
+        return value

@@ -1,0 +1,19 @@
+"""A steady rate made of events that come at another one, such as 10 commands a second from 15 pictures."""
+
+from __future__ import annotations
+
+
+class Rate:
+    """Call ``due`` at every event. What is late is not repeated."""
+
+    def __init__(self, hz: float) -> None:
+        self.hz = hz
+        self._due = float("-inf")
+
+    def due(self, now: float) -> bool:
+        """Whether it is time. Comparing with the time since the last one would lose a part of each period."""
+        self._due = min(self._due, now + 1.0 / self.hz)  # the rate was raised
+        if now < self._due:
+            return False
+        self._due = max(self._due + 1.0 / self.hz, now)
+        return True

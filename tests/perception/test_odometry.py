@@ -1,0 +1,153 @@
+"""Odometry in lockstep with Goob's firmware; the whole table: ``python -m tests.perception.accuracy``."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pebble.contract.payloads import Drive, EstopState
+from tests.perception.accuracy import ONE_SENSOR, square, straight, wander
+from tests.perception.wheels_rig import WheelsRig
+
+FIELDS = [
+    "x_mm",
+    "y_mm",
+    "heading_rad",
+    "heading_deg",
+    "left_mm",
+    "right_mm",
+    "distance_mm",
+    "left_crossings",
+    "right_crossings",
+    "unknown_direction_events",
+    "left_step_total",
+    "right_step_total",
+    "left_mm_per_step",
+    "right_mm_per_step",
+    "left_extrema_events",
+    "right_extrema_events",
+    "left_rejected_sign_flips",
+    "right_rejected_sign_flips",
+    "left_stall_events",
+    "right_stall_events",
+    "sample_seq",
+    "publish_seq",
+]
+
+
+@pytest.mark.parametrize(("power", "start"), [(0.1, 1), (0.4, 3), (0.7, 5), (1.0, 7), (-1.0, 2)])
+@pytest.mark.parametrize("geometry", [None, ONE_SENSOR])
+def test_2_m_straight_are_right_within_10_mm(power: float, start: int, geometry: object) -> None:
+    distance, pose = straight(power, start=start, geometry=geometry)  # type: ignore[arg-type]
+    assert abs(distance) < 3
+    assert pose < 10
+
+
+@pytest.mark.parametrize(("side", "gyro"), [(1, False), (-1, True)])
+def test_a_square_ends_where_it_began(side: int, gyro: bool) -> None:
+    rig = square(side, gyro=gyro)
+    assert rig.error_mm() < 25
+    assert rig.error_deg() < 1.5
+    assert rig.odometry.value().get("heading_source") == {True: "gyro", False: None}[gyro]
+
+
+def test_reversals_without_a_stop_lose_no_step() -> None:
+    for seed in range(3):
+        left, right = wander(seed, noise=3.0)
+        assert abs(left) < 2, "its second sensor shows the direction"
+        assert abs(right) < 10
+
+
+def test_all_fields_of_the_payload() -> None:
+    rig = WheelsRig()
+    rig.drive(1.0, z=0.5)
+    value = rig.odometry.value()
+    assert list(value) == FIELDS
+    assert value["left_mm_per_step"] == pytest.approx(math.pi * 61 / 10, abs=1e-5)
+    assert value["sample_seq"] == 50
+    assert (value["publish_seq"], rig.odometry.value()["publish_seq"]) == (1, 2)
+    assert (value["left_stall_events"], value["unknown_direction_events"]) == (0, 0)
+
+
+def test_moving_is_known_and_ends() -> None:
+    rig = WheelsRig()
+    assert not rig.odometry.moving(rig.now)
+    rig.drive(0.5, z=0.3)
+    assert rig.odometry.moving(rig.now)
+    rig.stop(1.0)
+    assert not rig.odometry.moving(rig.now)
+
+
+def test_standing_adds_no_distance_although_the_sensors_are_noisy() -> None:
+    rig = WheelsRig(noise=3.0)
+    rig.drive(2.0, z=0.5)
+    rig.stop()
+    before = rig.odometry.distance_mm
+    rig.wait(20.0)
+    assert rig.odometry.distance_mm == pytest.approx(before, abs=1)
+
+
+def test_a_wheel_that_is_held_is_a_stall_and_no_distance() -> None:
+    rig = WheelsRig()
+    rig.drive(2.0, z=0.5)
+    rig.stop()
+    before = rig.odometry.distance_mm
+    rig.mcu.body.forward = lambda _left, _right: (0.0, 0.0)  # type: ignore[method-assign]
+    rig.drive(3.0, z=0.5)
+    value = rig.odometry.value()
+    assert (value["left_stall_events"], value["right_stall_events"]) == (1, 1)
+    assert value["distance_mm"] == pytest.approx(before, abs=6)
+
+
+def test_a_push_without_a_command_is_of_unknown_direction() -> None:
+    rig = WheelsRig(geometry=ONE_SENSOR)
+    rig.drive(2.0, z=0.5)
+    rig.stop(2.0)
+    before = rig.odometry.value()
+    for _ in range(60):
+        rig.motion.advance(0.3, 0.3, 0.02)
+        rig.wait(0.02)
+    value = rig.odometry.value()
+    assert value["unknown_direction_events"] > 2
+    assert (value["x_mm"], value["left_mm"]) == (before["x_mm"], before["left_mm"])
+
+
+def test_commands_that_the_robot_refuses_change_no_direction() -> None:
+    rig = WheelsRig(geometry=ONE_SENSOR)
+    person = Drive(z=0.5)
+    for _ in range(20):
+        rig.command(person)
+        rig.odometry.drive(Drive(z=-0.9, source="autonomy", run=3), rig.now)  # a script waits while a person drives
+        rig.wait(0.1)
+    rig.stop()
+    assert rig.error_mm() < 3
+
+
+def test_while_the_robot_is_stopped_no_command_counts() -> None:
+    rig = WheelsRig(geometry=ONE_SENSOR)
+    rig.drive(2.0, z=0.5)
+    rig.stop(1.0)
+    state = EstopState(latched=True, boot="b", count=1, recent=[], by="", why="", since=0, barred=4)
+    rig.odometry.owner(state)
+    rig.odometry.drive(Drive(z=1.0), rig.now)
+    rig.wait(2.0)
+    assert rig.odometry.value()["left_stall_events"] == 0, "nothing was commanded"
+
+
+def test_an_inertial_sensor_that_lies_otherwise_is_not_believed() -> None:
+    rig = WheelsRig(gyro=True, gyro_sign=-1.0)
+    rig.wait(1.0)
+    rig.drive(6.0, x=-0.3)
+    rig.stop()
+    assert "heading_source" not in rig.odometry.value()
+    rig.drive(4.0, x=0.3)
+    assert rig.odometry.moving(rig.now)
+
+
+def test_steps_are_counted_slowly_too() -> None:
+    rig = WheelsRig()
+    rig.drive(20.0, z=0.05)
+    rig.stop()
+    assert rig.error_mm() < 5
+    assert rig.odometry.value()["left_crossings"] == round(rig.motion.left_mm // (math.pi * 6.1))

@@ -1,0 +1,141 @@
+"""Tags in pictures whose geometry is known."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.errors import ConfigError, PebbleError
+from pebble.perception.camera_model import CALIBRATION, CameraModel
+from pebble.perception.tags import TagFinder, TagGeometry
+
+SIZE = (640, 480)
+EDGE_M = 0.25
+CELL = 40  # pixels of the printed tag
+
+
+def picture(
+    number: int,
+    *,
+    ahead_m: float,
+    right_m: float = 0.0,
+    yaw: float = 0.0,
+    camera: CameraModel | None = None,
+    dictionary: int = cv2.aruco.DICT_APRILTAG_25h9,
+) -> tuple[Any, Any]:
+    """A tag on a grey ground, and its true corners in pixels: 4x2, clockwise from its upper left."""
+    tags = cv2.aruco.getPredefinedDictionary(dictionary)
+    cells = tags.markerSize + 2
+    printed = cv2.aruco.generateImageMarker(tags, number, cells * CELL)
+    printed = cv2.copyMakeBorder(printed, CELL, CELL, CELL, CELL, cv2.BORDER_CONSTANT, value=255)
+    matrix = (camera or CameraModel.of_hfov()).matrix(*SIZE)
+    half, rotation = (
+        EDGE_M / 2,
+        np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]]),
+    )
+    square = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])  # y down
+    points = square @ rotation.T + np.array([right_m, 0.0, ahead_m])
+    corners = points @ matrix.T
+    corners = corners[:, :2] / corners[:, 2:]
+    low, high = CELL - 0.5, CELL + cells * CELL - 0.5
+    source = np.array([[low, low], [high, low], [high, high], [low, high]], np.float32)
+    warp = cv2.getPerspectiveTransform(source, corners.astype(np.float32))
+    ground = np.full((SIZE[1], SIZE[0]), 150, np.uint8)
+    cv2.warpPerspective(printed, warp, SIZE, ground, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT)
+    return cv2.cvtColor(ground, cv2.COLOR_GRAY2BGR), corners
+
+
+@pytest.mark.parametrize(
+    ("ahead", "right", "yaw"), [(0.6, 0.0, 0.0), (1.0, -0.3, 0.3), (2.0, 0.8, -0.4), (2.8, 0.0, 0.6)]
+)
+def test_a_tag_is_found_where_it_is(ahead: float, right: float, yaw: float) -> None:
+    image, corners = picture(13, ahead_m=ahead, right_m=right, yaw=yaw)
+    (tag,) = TagFinder(EDGE_M).find(image)
+    assert tag.id == 13
+    assert np.abs(tag.corners - corners).max() < 0.7, "clockwise from the upper left of the tag"
+    assert tag.distance_m == pytest.approx(math.hypot(ahead, right), rel=0.02)
+    assert tag.angle_rad == pytest.approx(math.atan2(right, ahead), abs=0.005)
+
+
+def test_tags_come_in_the_order_of_their_ids_and_grey_pictures_do() -> None:
+    left, _ = picture(20, ahead_m=2.0, right_m=-0.6)
+    right, _ = picture(4, ahead_m=2.0, right_m=0.6)
+    left[:, SIZE[0] // 2 :] = right[:, SIZE[0] // 2 :]
+    assert [tag.id for tag in TagFinder(EDGE_M).find(left)] == [4, 20]
+    assert [tag.id for tag in TagFinder(EDGE_M).find(left[:, :, 0])] == [4, 20]
+
+
+@pytest.mark.parametrize("family", ["APRILTAG_36H11", "apriltag_36h11", "DICT_APRILTAG_36h11"])
+def test_families_are_spelled_as_the_original_does(family: str) -> None:
+    image, _ = picture(7, ahead_m=1.0, dictionary=cv2.aruco.DICT_APRILTAG_36h11)
+    assert [tag.id for tag in TagFinder(EDGE_M, family=family).find(image)] == [7]
+    assert TagFinder(EDGE_M).find(image) == [], "not of the default family"
+
+
+def test_an_unknown_family_is_named_with_the_known_ones() -> None:
+    with pytest.raises(PebbleError, match=r"unknown tag family 'APRILTAG_99H9'; known: .*APRILTAG_25H9"):
+        TagFinder(family="APRILTAG_99H9")
+
+
+def test_without_a_tag_nothing_is_found() -> None:
+    assert TagFinder().find(np.full((480, 640, 3), 90, np.uint8)) == []
+
+
+@pytest.mark.parametrize(
+    "corners", [np.zeros((4, 2)), np.full((4, 2), 0.5), np.array([[0, 0], [9, 9], [0, 0], [9, 9]])]
+)
+def test_corners_of_no_square_have_no_place(corners: Any) -> None:
+    place = TagGeometry(EDGE_M).place(corners, *SIZE)
+    assert place is None or math.isfinite(place.distance_m)
+
+
+def test_opencv_uses_one_thread() -> None:
+    cv2.setNumThreads(2)
+    TagFinder()
+    assert cv2.getNumThreads() == 1
+
+
+CALIBRATED = """%YAML:1.0
+---
+image_width: 320
+image_height: 240
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 250., 0., 150., 0., 250., 120., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ 0., 0., 0., 0., 0. ]
+"""
+
+
+def test_a_calibration_is_read_from_the_first_folder_that_has_one_and_scaled(tmp_path: Path) -> None:
+    folders = [tmp_path / "script", tmp_path / "config"]
+    for folder in folders:
+        folder.mkdir()
+    (folders[1] / CALIBRATION).write_text(CALIBRATED)
+    camera = CameraModel.find(folders)
+    assert camera.matrix(*SIZE)[0] == pytest.approx([500.0, 0.0, 300.5])
+    image, _ = picture(13, ahead_m=1.0, right_m=0.3, camera=camera)
+    (tag,) = TagFinder(EDGE_M, camera).find(image)
+    assert (tag.distance_m, tag.angle_rad) == pytest.approx((math.hypot(1, 0.3), math.atan(0.3)), rel=0.02)
+
+
+def test_without_a_calibration_the_field_of_view_is_the_originals(tmp_path: Path) -> None:
+    focal = CameraModel.find([tmp_path]).matrix(*SIZE)[0, 0]
+    assert focal == pytest.approx(624, abs=1)
+
+
+@pytest.mark.parametrize("text", ["", "nonsense", "%YAML:1.0\n---\nimage_width: 3\n", CALIBRATED.replace("320", "0")])
+def test_a_file_that_is_no_calibration_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / CALIBRATION).write_text(text)
+    with pytest.raises(ConfigError, match=CALIBRATION):
+        CameraModel.find([tmp_path])
