@@ -22,7 +22,7 @@ BASE = "pebble/robots/rover"
 STOP = (0.0, 0.0)
 PROGRAMS = (
     *("zenoh_hub", "announcer", "serial_mcu_bridge", "av_daemon", "mqtt_bridge", "mqtt_mirror"),
-    *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream"),
+    *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream", "autonomy_manager"),
 )
 #: A camera and a microphone for ``av_daemon``.
 DEVICES = {

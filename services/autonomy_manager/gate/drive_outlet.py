@@ -12,7 +12,7 @@ from pebble.services.autonomy_manager.gate.pacer import Pacer
 from pebble.services.autonomy_manager.gate.signature import sign, zero
 from pebble.transports.counters import Counters
 
-Publish = Callable[[str, bytes], object]  # to a topic of the robot
+Publish = Callable[[str, bytes, bool], object]  # topic and payload of a command, and whether it moves anything
 
 
 class DriveOutlet:
@@ -46,12 +46,12 @@ class DriveOutlet:
         else:
             self._moving.pop(command.topic, None)
         if self._pacer.offer(command.topic, signed.payload, signed.moves, now):
-            self._send(command.topic, signed.payload)
+            self._send(command.topic, signed.payload, signed.moves)
 
     def publish_due(self, now: float) -> None:
         """Publish the commands whose turn it is."""
         while (taken := self._pacer.take(now)) is not None:
-            self._send(*taken)
+            self._send(*taken, moves=True)  # a zero never waits
 
     def halt(self) -> None:
         """From now on publish zeros only."""
@@ -64,8 +64,8 @@ class DriveOutlet:
             del self._moving[topic]
             payload = zero(self._run)
             self._pacer.offer(topic, payload, moves=False, now=now)
-            self._send(topic, payload)
+            self._send(topic, payload, moves=False)
 
-    def _send(self, topic: str, payload: bytes) -> None:
-        self._publish(topic, payload)
+    def _send(self, topic: str, payload: bytes, moves: bool) -> None:
+        self._publish(topic, payload, moves)
         self._counters.add("signed")

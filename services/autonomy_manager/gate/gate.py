@@ -28,7 +28,7 @@ _JOIN_S = 2.0
 class Gate:
     """Gives scripts a config (:attr:`config_path`) whose broker signs what they drive with ``run``.
 
-    ``publish(topic, payload)`` sends a signed command on the robot's own transport; a thread of the gate calls it.
+    ``publish(topic, payload)`` sends a signed command on the robot's own transport; the gate calls it on any thread.
     Everything else that scripts send goes to the robot's broker.
     """
 
@@ -38,7 +38,10 @@ class Gate:
         self._rules = TopicRules.of(config)
         self._broker = broker_of(config)
         self._copy = ConfigCopy(config)
-        self._outlet = DriveOutlet(run, publish, self.counters)
+        self._outlet = DriveOutlet(run, self._send, self.counters)
+        self._publish = publish
+        self._halted = False
+        self._sending = threading.Lock()  # orders the commands of scripts and the caller's stop
         self._server: GateServer | None = None
         self._opened = ExitStack()
 
@@ -63,13 +66,20 @@ class Gate:
             self._opened = opened.pop_all()
 
     def halt(self) -> None:
-        """Refuse commands that move from now on: the run is being stopped. Zeros still pass."""
+        """When this returns, no command that moves is published any more: the run is being stopped. Zeros still are."""
+        with self._sending:
+            self._halted = True
         if self._server is not None:
             self._server.post(self._outlet.halt)
 
     def close(self) -> None:
         """Close all connections, and remove the config. May be called again."""
         self._opened.close()
+
+    def _send(self, topic: str, payload: bytes, moves: bool) -> None:
+        with self._sending:
+            if not (moves and self._halted):
+                self._publish(topic, payload)
 
     def _serve(self, listener: socket.socket, context: ssl.SSLContext | None, own: Login, opened: ExitStack) -> None:
         broker = Login(*map(_encoded, (self._broker.username, self._broker.password)))

@@ -200,14 +200,14 @@ def test_a_script_receives_what_the_robot_publishes(rig: Rig, driven: Subscriber
 
 def test_a_flood_is_limited_and_no_zero_is_lost(rig: Rig, driven: Subscriber) -> None:
     client, zeros, began = rig.log_in(), 0, time.monotonic()
-    for number in range(500):
+    for number in range(300):
         client.sendall(publish(DRIVE, json.dumps({"z": 0.0 if number % 50 == 0 else 0.5, "number": number})))
         zeros += number % 50 == 0
         time.sleep(max(0.0, began + (number + 1) / 500 - time.monotonic()))
-    assert until(lambda: driven.payloads[-1:] and driven.payloads[-1]["number"] == 499), "the newest one arrives"
+    assert until(lambda: driven.payloads[-1:] and driven.payloads[-1]["number"] == 299), "the newest one arrives"
     lasted = time.monotonic() - began
     moving = [drive for drive in driven.payloads if moves(drive)]
-    assert [drive["number"] for drive in driven.payloads if not moves(drive)] == list(range(0, 500, 50))
+    assert [drive["number"] for drive in driven.payloads if not moves(drive)] == list(range(0, 300, 50))
     assert len(moving) <= 50 * lasted + 1
     numbers = [drive["number"] for drive in driven.payloads]
     assert numbers == sorted(numbers)
@@ -339,6 +339,27 @@ def test_the_end_of_the_gate_stops_the_wheels_and_removes_the_config(rig: Rig, d
     assert not rig.gate.config_path.parent.exists()
     assert (rig.file.parent / "camera_calibration.yaml").exists(), "only links are removed"
     rig.gate.close()
+
+
+def test_no_command_passes_once_halt_has_returned(rig: Rig, driven: Subscriber) -> None:
+    client, ending = rig.log_in(), threading.Event()
+
+    def flood() -> None:
+        while not ending.wait(0.0005):
+            client.sendall(publish(DRIVE, '{"z":1}'))
+        client.sendall(publish(DRIVE, '{"z":0,"last":true}'))
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    assert until(lambda: len(driven.messages) > 3)
+    rig.gate.halt()
+    rig.transport.publish(DRIVE, b'{"z":0,"halt":true}', qos=QoS.DELIVERED)
+    assert until(lambda: rig.gate.counters["halted"] > 10), "the script goes on"
+    ending.set()
+    thread.join()
+    assert until(lambda: "last" in driven.payloads[-1])
+    assert [drive["z"] for drive in driven.payloads[-2:]] == [0, 0]
+    assert "halt" in driven.payloads[-2]
 
 
 def test_the_scripts_config_has_no_secret_and_its_files_beside_it(broker: Broker, tmp_path: Path) -> None:

@@ -108,7 +108,13 @@ class Sent(list[tuple[str, Any]]):
     def __init__(self) -> None:
         super().__init__()
         self.counters = Counters()
-        self.outlet = DriveOutlet(7, lambda topic, payload: self.append((topic, json.loads(payload))), self.counters)
+        self.outlet = DriveOutlet(
+            7, lambda topic, payload, _moves: self.append((topic, json.loads(payload))), self.counters
+        )
+
+    def _publish(self, topic: str, payload: bytes, moves: bool) -> None:
+        self.append((topic, json.loads(payload)))
+        assert moves is any(self[-1][1].get(axis) for axis in "xyz")
 
     def drive(self, payload: str, connection: str = "a", now: float = 0.0, repeated: bool = False) -> None:
         self.outlet.receive(DriveCommand(DRIVE, payload.encode(), repeated), connection, now)
