@@ -29,3 +29,7 @@ class PayloadError(PebbleError):
 
 class DeviceError(PebbleError):
     """A serial line, camera or other device cannot be opened or stopped answering."""
+
+
+class NotRunningError(DeviceError):
+    """The program that plays a device's part does not run; it may be started later."""

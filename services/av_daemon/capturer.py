@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from pebble.errors import PebbleError
+from pebble.errors import NotRunningError, PebbleError
 from pebble.services.av_daemon.health import Health
 from pebble.services.av_daemon.source import Bytes, Capture, Source
 from pebble.transports.counters import Counters
@@ -94,6 +94,8 @@ class Capturer:
                 continue
             try:
                 self._capture()
+            except NotRunningError as error:
+                self._failed(str(error), expected=True)
             except PebbleError as error:
                 self._failed(str(error))
             except Exception as error:  # of a device's library: this thread must go on
@@ -140,10 +142,10 @@ class Capturer:
             self._scratch = np.empty(capture.size, np.uint8)
         return self._scratch
 
-    def _failed(self, why: str) -> None:
+    def _failed(self, why: str, *, expected: bool = False) -> None:
         if self._ended.is_set():
             return
-        delay = self._health.failed(why)
+        delay = self._health.failed(why, expected=expected)
         log.warning("%s: %s; it is opened again in %g s", self._name, why, delay)
         self._ended.wait(delay)
 

@@ -54,11 +54,12 @@ class Health:
             if now - self._opened_at >= _GOOD_RUN_S:
                 self._failures = 0
 
-    def failed(self, why: str) -> float:
-        """Returns how long to wait before the device is opened again."""
+    def failed(self, why: str, *, expected: bool = False) -> float:
+        """Returns how long to wait before the device is opened again; not longer each time for one that is expected."""
         with self._lock:
-            delay: float = min(self._first_delay_s * 2**self._failures, max(_LONGEST_DELAY_S, self._first_delay_s))
-            self._failures = min(self._failures + 1, 32)
+            doublings = 0 if expected else self._failures
+            delay: float = min(self._first_delay_s * 2**doublings, max(_LONGEST_DELAY_S, self._first_delay_s))
+            self._failures = min(doublings + 1, 32)
             self._last_error = why
             self._no_frames(f"failed, opens it again in {delay:g} s")
             return delay

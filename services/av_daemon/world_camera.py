@@ -6,8 +6,8 @@ import threading
 import time
 
 from pebble.config.media import CameraCapture
-from pebble.errors import DeviceError
-from pebble.media.world.view import NotRunningError, RobotView
+from pebble.errors import DeviceError, NotRunningError
+from pebble.media.world.view import RobotView
 from pebble.services.av_daemon.source import Bytes, Capture
 from pebble.services.av_daemon.synthetic import Pacer
 from pebble.transports.frames import FrameInfo

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import msgspec
 
-from pebble.errors import PebbleError
+from pebble.errors import ConfigError, DeviceError, PebbleError
 from pebble.media.world.pose_page import PERIOD_S, PosePage, page_path
 from pebble.media.world.poses import RobotPose
 from pebble.media.world.world_file import World, read_world
@@ -65,11 +65,11 @@ def trace_path(folder: Path, robot: str) -> Path:
 
 def _run(options: argparse.Namespace) -> int:
     path = options.file.absolute()
-    world = read_world(path)
+    world = _read(path)
     folder = options.folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
     folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        page = PosePage(page_path(path), world.robots)
+        page = _page(path, world)
         stack.callback(page.close)
         mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, folder, options).items()}
         if not options.report:
@@ -78,6 +78,23 @@ def _run(options: argparse.Namespace) -> int:
             threading.Thread(target=_run_commands, args=(mcus,), name="pebble-world control", daemon=True).start()
         _publish_poses(page, mcus, report=options.report)
     return 0
+
+
+def _read(path: Path) -> World:
+    """Every line of an error names the file."""
+    try:
+        return read_world(path)
+    except ConfigError as error:
+        raise ConfigError(
+            [line if line.startswith(str(path)) else f"{path}: {line}" for line in error.problems]
+        ) from None
+
+
+def _page(path: Path, world: World) -> PosePage:
+    try:
+        return PosePage(page_path(path), world.robots)
+    except DeviceError as error:
+        raise DeviceError(f"{path}: {error}") from None
 
 
 def _mcus(world: World, folder: Path, options: argparse.Namespace) -> Mcus:

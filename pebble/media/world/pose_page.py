@@ -12,6 +12,7 @@ import mmap
 import os
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -26,6 +27,7 @@ PERIOD_S: Final = 0.02  # between samples
 _SAMPLES = 64  # per robot: 1.28 s
 _WORDS = 5  # of a sample: ns, x, y, heading, checksum
 _HEADER = 2  # words: magic, start
+_ABANDONED_S = 60.0
 _MAGIC = int.from_bytes(b"PebPose1", "little")
 _SLOT = LONGEST_NAME // 8 + _SAMPLES * _WORDS  # words
 _SIZE = 8 * (_HEADER + MOST_ROBOTS * _SLOT)
@@ -50,6 +52,7 @@ class PosePage:
         try:
             path.parent.mkdir(mode=0o700, exist_ok=True)
             _refuse_foreign(path.parent)
+            _remove_abandoned(path.parent)
             self._file = _lock(path)
             os.ftruncate(self._file, _SIZE)
         except OSError as error:
@@ -136,6 +139,15 @@ def _refuse_foreign(folder: Path) -> None:
     found = folder.lstat()
     if found.st_uid != os.getuid() or found.st_mode & 0o022 or not folder.is_dir():
         raise DeviceError(f"{folder}: is not a folder that only you may write, remove it")
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove the pages of programs that were killed; not the newest, whose programs may be about to lock them."""
+    for path in folder.iterdir():
+        with suppress(OSError), path.open("rb") as file:
+            if time.time() - os.fstat(file.fileno()).st_ctime > _ABANDONED_S:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
 
 
 def _lock(path: Path) -> int:

@@ -27,18 +27,18 @@ class Track:
     """One robot's samples, oldest first; at least one."""
 
     def __init__(self, samples: Sequence[Sample]) -> None:
-        self._samples = samples
+        self.samples = samples
 
     @property
     def newest(self) -> Sample:
-        return self._samples[-1]
+        return self.samples[-1]
 
     def at(self, ns: int) -> RobotPose:
         """The pose at ``ns``, interpolated; the oldest or newest one for a time outside the samples."""
-        after = bisect_right(self._samples, ns, key=lambda sample: sample.ns)
-        if after in (0, len(self._samples)):
-            return self._samples[max(0, after - 1)].pose
-        (start, one), (end, two) = self._samples[after - 1], self._samples[after]
+        after = bisect_right(self.samples, ns, key=lambda sample: sample.ns)
+        if after in (0, len(self.samples)):
+            return self.samples[max(0, after - 1)].pose
+        (start, one), (end, two) = self.samples[after - 1], self.samples[after]
         part = (ns - start) / (end - start)
         turn = math.remainder(two.heading - one.heading, math.tau)
         return RobotPose(one.x + part * (two.x - one.x), one.y + part * (two.y - one.y), one.heading + part * turn)

@@ -42,7 +42,10 @@ class Renderer:
         self._width, self._height = width, height
         self._focal = width / 2 / math.tan(math.radians(world.camera.hfov_deg / 2))
         self._middle = ((width - 1) / 2, (height - 1) / 2)
+        self._horizon = math.floor(self._middle[1]) + 1
         self._floor, self._floor_to_world = _floor(world)
+        self._background = np.full((height, width, 3), _SKY, np.uint8)
+        self._background[self._horizon :] = _GROUND
         self._noise = _noise(width, height, world.camera.noise) if world.camera.noise else None
         self._count = 0
 
@@ -51,11 +54,13 @@ class Renderer:
         cv2, lens = self._cv2, self._lens
         self._expose(tracks, ns, out)
         if lens.blur:
-            cv2.GaussianBlur(out, (0, 0), lens.blur, dst=out)
+            size = 2 * math.ceil(2 * lens.blur) + 1
+            cv2.GaussianBlur(out, (size, size), lens.blur, dst=out)
         if self._noise is not None:
             down, right = self._count * 17 % _NOISES, self._count * 29 % _NOISES
-            grain = self._noise[down : down + self._height, right : right + self._width]
-            cv2.add(out, grain, dst=out, dtype=cv2.CV_8U)
+            lighter, darker = self._noise[:, down : down + self._height, right : right + self._width]
+            cv2.add(out, lighter, dst=out)
+            cv2.subtract(out, darker, dst=out)
         if lens.jpeg_quality is not None:
             _, data = cv2.imencode(".jpg", out, (cv2.IMWRITE_JPEG_QUALITY, lens.jpeg_quality))
             out[:] = cv2.imdecode(data, cv2.IMREAD_COLOR)
@@ -78,7 +83,7 @@ class Renderer:
     def draw(self, poses: Mapping[str, RobotPose], out: Image) -> None:
         """Draw one moment into ``out``, sharp and without noise."""
         me = poses[self._me]
-        out[: math.floor(self._middle[1]) + 1] = _SKY
+        np.copyto(out, self._background)
         self._draw_floor(me, out)
         surfaces = self._scene.surfaces(poses, self._me)
         if not surfaces:
@@ -179,8 +184,6 @@ class Renderer:
         )
 
     def _draw_floor(self, me: RobotPose, out: Image) -> None:
-        horizon = math.floor(self._middle[1]) + 1
-        out[horizon:] = _GROUND
         sine, cosine, height = math.sin(me.heading), math.cos(me.heading), self._lens.height_m
         to_camera = np.array(
             [
@@ -189,7 +192,7 @@ class Renderer:
                 [cosine, sine, -cosine * me.x - sine * me.y],
             ]
         )
-        box = (0, horizon, self._width, self._height)
+        box = (0, self._horizon, self._width, self._height)
         self._warp(self._floor, to_camera @ self._floor_to_world, box, out)
 
 
@@ -247,8 +250,8 @@ def _floor(world: World) -> tuple[Image, _Floats]:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8), to_world
 
 
-def _noise(width: int, height: int, sigma: float) -> NDArray[np.int16]:
-    """Gaussian noise, larger than a picture: each picture gets another part of it."""
+def _noise(width: int, height: int, sigma: float) -> Image:
+    """Gaussian noise, what it adds and what it takes away; larger than a picture, each gets another part of it."""
     shape = (height + _NOISES, width + _NOISES, 3)
-    grain = np.random.default_rng(2).standard_normal(shape, np.float32)
-    return np.asarray(np.round(grain * np.float32(sigma)), np.int16)
+    grain = np.round(np.random.default_rng(2).standard_normal(shape, np.float32) * np.float32(sigma))
+    return np.stack((grain.clip(0, 255), (-grain).clip(0, 255))).astype(np.uint8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 
-from pebble.errors import DeviceError
+from pebble.errors import NotRunningError
 from pebble.media.world.pose_page import PoseReader, page_path
 from pebble.media.world.poses import Track
 from pebble.media.world.renderer import Renderer
@@ -13,10 +13,6 @@ from pebble.media.world.scene import Image
 from pebble.media.world.world_file import open_world, split_device
 
 STALE_S = 1.0  # a world that has written nothing for so long does not run
-
-
-class NotRunningError(DeviceError):
-    """The world's program does not run; it may be started later."""
 
 
 class RobotView:

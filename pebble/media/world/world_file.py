@@ -162,7 +162,7 @@ def open_world(path: Path, robot: str) -> World:
     except ConfigError as error:
         first, *more = error.problems
         where = first if first.startswith(str(path)) else f"{path}: {first}"
-        raise DeviceError(where + (f" (and {len(more)} more mistakes)" if more else "")) from None
+        raise DeviceError(where + (f" (and {len(more)} more)" if more else "")) from None
     if robot not in world.robots:
         raise DeviceError(f"{path}: there is no robot {robot!r}, {nearest(robot, world.robots)}")
     return world

@@ -1,0 +1,142 @@
+"""``pebble sim world``: one process with the MCUs of all robots, and where they are."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+import pebble.simulation.world
+from pebble.media.world.pose_page import PoseReader, page_path
+from pebble.media.world.poses import RobotPose, Track
+from pebble.simulation.trace import read_trace
+from pebble.simulation.world.program import port_path, trace_path
+from tests.support import Child, until
+
+ROOM = Path(pebble.simulation.world.__file__).with_name("room.json")
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    return Path(shutil.copy(ROOM, tmp_path / "room.json"))
+
+
+def command(room: Path, *options: str) -> list[str]:
+    return [sys.executable, "-m", "pebble.simulation.world", str(room), "--folder", str(room.parent / "f"), *options]
+
+
+@contextmanager
+def running(room: Path, *options: str) -> Iterator[Child]:
+    began = time.monotonic_ns()
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with Child(command(room, *options), text=True, **pipes) as child:
+        try:
+            assert until(lambda: any(track.newest.ns > began for track in tracks(room).values()), 30)
+            yield child
+        finally:
+            child.terminate()
+            child.communicate(timeout=30)
+
+
+def tracks(room: Path) -> dict[str, Track]:
+    """Empty while the world does not run."""
+    try:
+        return PoseReader(page_path(room)).tracks()
+    except (OSError, ValueError):
+        return {}
+
+
+def poses(room: Path) -> dict[str, RobotPose]:
+    return {name: track.newest.pose for name, track in tracks(room).items()}
+
+
+def refused(room: Path, *options: str) -> str:
+    ended = subprocess.run(command(room, *options), capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert ended.stdout == ""
+    return ended.stderr
+
+
+def test_its_robots_start_at_their_places_and_drive_by_their_serial_ports(room: Path) -> None:
+    with running(room, "--trace") as world:
+        start = poses(room)
+        assert start["goob"] == pytest.approx((-0.8, 0.4, -0.5236), abs=1e-4)
+        with serial.Serial(str(port_path(room.parent / "f", "goob"))) as port:
+            port.write(b"M 0.5 0.5\n")
+            assert until(lambda: poses(room)["goob"].x > -0.7)
+            assert poses(room)["goob"].y < 0.39
+        assert poses(room)["fred"] == start["fred"]
+        world.terminate()
+        assert world.wait(30) == 0
+    assert "M 0.5 0.5" in [entry.line for entry in read_trace(trace_path(room.parent / "f", "goob"))]
+    assert poses(room) == {}, "nothing is left of a world that has ended"
+
+
+def test_it_prints_what_belongs_in_the_configs(room: Path) -> None:
+    with running(room) as world:
+        world.terminate()
+        printed = world.stdout.read()
+    for name in ("goob", "fred"):
+        assert f'"serial": {{"port":"{port_path(room.parent / "f", name)}"}}' in printed
+        assert f'"device":"{room}#{name}"' in printed
+
+
+def test_robots_are_controlled_and_placed_from_standard_input(room: Path) -> None:
+    with running(room, "--control") as world:
+        world.stdin.write("goob place 1 -0.5 90\nfred unplug\ngoob fly\ntank reset\ngoob place 1 2\n")
+        world.stdin.flush()
+        assert until(lambda: poses(room)["goob"] == pytest.approx((1.0, -0.5, 1.5708), abs=1e-4))
+        assert until(lambda: not port_path(room.parent / "f", "fred").is_symlink())
+        assert "known commands: unplug, replug, reset" in world.stderr.readline()
+        assert "begin with a robot (goob, fred) and a command" in world.stderr.readline()
+        assert "place needs three numbers" in world.stderr.readline()
+        world.stdin.close()
+        assert world.wait(30) == 0, "the end of standard input ends it"
+        world.stdin = None
+
+
+def test_it_reports_the_truth(room: Path) -> None:
+    with running(room, "--report") as world:
+        report = json.loads(world.stdout.readline())
+        assert report["robots"]["goob"]["pose"]["x_mm"] == pytest.approx(-800)
+        assert report["robots"]["fred"]["left_mm"] == 0.0
+
+
+def test_a_world_that_was_killed_starts_again(room: Path) -> None:
+    with running(room) as world:
+        world.kill()
+        world.wait(30)
+    with running(room) as world:
+        assert set(poses(room)) == {"goob", "fred"}
+        world.send_signal(signal.SIGINT)
+        assert world.wait(30) == 0
+
+
+def test_a_second_program_of_the_same_world_is_refused(room: Path) -> None:
+    with running(room):
+        assert refused(room) == f"{room}: this world runs already, end its other program first\n"
+
+
+def test_mistakes_in_the_file_are_printed_all_at_once(room: Path) -> None:
+    room.write_text('{"robots": {"goob": {"x": 0, "y": 0, "kind": "tank"}}, "tag": []}')
+    assert refused(room).splitlines() == [
+        f'{room}: robots.goob.kind: must be "goob" or "fred", not "tank"',
+        f'{room}: tag: unknown key, did you mean "tags"?',
+    ]
+
+
+def test_a_missing_file_and_a_folder_that_cannot_be_made_are_one_line(room: Path) -> None:
+    assert refused(room.with_name("none.json")) == f"{room.with_name('none.json')}: there is no such file\n"
+    (room.parent / "f").touch()
+    assert refused(room) == f"{room.parent / 'f'}: File exists\n"
+    assert not page_path(room).exists()
