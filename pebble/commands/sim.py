@@ -150,7 +150,9 @@ def loudspeaker(
 
 
 def world(
-    file: Annotated[Path, typer.Argument(help="The world file.", metavar="FILE", show_default=False)],
+    file: Annotated[
+        Path | None, typer.Argument(help="The world file. [default: a room with four tags]", metavar="FILE")
+    ] = None,
     folder: Annotated[
         Path | None,
         typer.Option("--folder", help="For serial ports and traces. [default: /tmp/pebble-world-…]", metavar="PATH"),
@@ -163,12 +165,13 @@ def world(
     It prints the serial port and the camera of each robot for its config.
 
     \b
-        pebble sim world world.json
+        pebble sim world
+        pebble sim world world.json --folder /tmp/world
     """
-    from pebble.simulation.world.program import main
+    from pebble.simulation.world.program import ROOM, main
 
     flags = [*(["--trace"] if trace else []), *(["--control"] if control else [])]
-    return main([str(file), *(["--folder", str(folder)] if folder else []), *flags])
+    return main([str(file or ROOM), *(["--folder", str(folder)] if folder else []), *flags])
 
 
 def demo(

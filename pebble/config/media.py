@@ -40,7 +40,10 @@ class CameraCapture(Section, frozen=True, kw_only=True):
         Literal["v4l2", "libcamera", "arducam", "picamera2", "synthetic"],
         doc("How the camera is reached; `synthetic` needs none."),
     ] = "v4l2"
-    device: Annotated[str, doc("Device of a v4l2 camera; or a file or URL instead of a camera.")] = "/dev/video0"
+    device: Annotated[
+        str,
+        doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot."),
+    ] = "/dev/video0"
     capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
     io_mode: Annotated[str | int, doc("Not used: OpenCV chooses by itself.")] = "auto"
     camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None

@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -28,6 +29,8 @@ from pebble.simulation.world.walls import Floor, start_pose
 
 _SAMPLES_PER_REPORT = round(0.1 / PERIOD_S)
 _SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
+
+ROOM: Final = Path(__file__).with_name("room.json")  # 4 m wide, four tags, Goob and Fred
 
 Mcus = dict[str, PtyMcu]
 
@@ -181,7 +184,7 @@ def _command(mcus: Mcus, words: list[str]) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m pebble.simulation.world", description=__doc__)
-    parser.add_argument("file", type=Path, metavar="FILE", help="the world file")
+    parser.add_argument("file", type=Path, nargs="?", default=ROOM, metavar="FILE", help="the world file")
     parser.add_argument("--folder", type=Path, help="for serial ports and traces; by default a temporary one")
     parser.add_argument(
         "--trace", action="store_true", help="record every line that an MCU received, ROBOT.trace.jsonl"
