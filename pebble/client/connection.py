@@ -6,7 +6,7 @@ import os
 import queue
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,19 @@ class Target:
     remote: bool = False
     password_file: Path | None = None
     ca_cert: Path | None = None
+
+
+def target_of(robot: str | None, options: Target) -> Target:
+    """Where to connect: with --url or --config ``robot`` is an id, else a config file. Raises PebbleError."""
+    if options.config is None and options.url is None:
+        if robot is None:
+            raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
+        if not Path(robot).is_file():
+            raise PebbleError(f"{robot} is not a config file: name one, or add --url or --config for the robot {robot}")
+        return replace(options, config=Path(robot))
+    if robot is not None and robot.endswith(".json") and Path(robot).is_file():
+        raise PebbleError(f"{robot} is a config file: leave out --url and --config, or give the robot's id instead")
+    return replace(options, robot=robot)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ COMMANDS = {
     "topics": "topics",
     "topic": "topic",
     "estop": "estop",
+    "script": "script",
     "sim": "sim",
     "demo": "sim",
     "watch": "watch",
@@ -38,6 +39,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble doctor goob.json    check that this machine is ready for the robot
     pebble up goob.json        run the robot
     pebble estop goob.json     stop the robot until it is reset
+    pebble script new follow   write a first program that moves a robot
     pebble watch goob.json     show its camera and play its microphone
     pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine
@@ -57,7 +59,7 @@ def _run(arguments: list[str]) -> int:
     app.callback(help=_HELP)(_options)
     for module in dict.fromkeys(COMMANDS[name] for name in wanted or COMMANDS):
         import_module(f"pebble.commands.{module}").register(app)
-    line = [*arguments, "--help"] if arguments in ([], ["topic"], ["bench"], ["sim"]) else arguments
+    line = [*arguments, "--help"] if arguments in ([], ["topic"], ["bench"], ["sim"], ["script"]) else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:

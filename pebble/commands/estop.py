@@ -10,13 +10,11 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pebble.client.connection import Listener, Target, connected
+from pebble.client.connection import Listener, Target, connected, target_of
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.estop import Progress, RobotStop, StopSender, new_name
 from pebble.client.estop_states import Reset, RobotEstop
@@ -80,7 +78,9 @@ def estop(
         raise typer.BadParameter(f"give either --all or {robot}")
     if robot is None and not all_ and verb != "status":
         raise typer.BadParameter("name the robot" if verb else "nothing was stopped: name the robot, or add --all")
-    target = _target(robot, Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert))
+    target = target_of(
+        robot, Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+    )
     if verb == "reset":
         return _reset(target)
     if verb == "status":
@@ -104,19 +104,6 @@ def _parse(words: list[str]) -> tuple[str, str | None]:
     if robots and robots[0] in _VERBS:
         raise typer.BadParameter(f"a robot called {robots[0]} is given as system/type/id")
     return verb, robots[0] if robots else None
-
-
-def _target(robot: str | None, options: Target) -> Target:
-    """Where to connect: with --url or --config ``robot`` is an id, else a config file."""
-    if options.config is None and options.url is None:
-        if robot is None:
-            raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
-        if not Path(robot).is_file():
-            raise PebbleError(f"{robot} is not a config file: name one, or add --url or --config for the robot {robot}")
-        return replace(options, config=Path(robot))
-    if robot is not None and robot.endswith(".json") and Path(robot).is_file():
-        raise PebbleError(f"{robot} is a config file: leave out --url and --config, or give the robot's id instead")
-    return replace(options, robot=robot)
 
 
 def _me() -> str:

@@ -1,0 +1,108 @@
+"""The scripts of a robot as its autonomy_manager publishes them, and commands that start and stop them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from pebble.client.names import Names
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, codec
+from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
+from pebble.errors import PayloadError, PebbleError
+from pebble.transports import Message, QoS, Transport
+
+_BYTES = 512 * 1024  # of a list of scripts
+
+Entry = dict[str, Any]
+
+
+class RobotScripts:
+    """Which scripts one robot offers, and what runs. Other threads may read while it receives."""
+
+    def __init__(self, names: Names) -> None:
+        self.files: dict[str, Entry] | None = None  # by name; None: the robot has not published any list
+        self.status: AutonomyStatus | None = None
+        self.answers = 0  # statuses that arrived live
+        self._topics = {channel.metric: names.topic(channel.metric) for channel in (AUTONOMY_FILES, AUTONOMY_STATUS)}
+        self._command_topic = names.topic(AUTONOMY_COMMAND.metric)
+
+    def subscribe(self, transport: Transport) -> None:
+        """Receive from ``transport``; when this returns, what is retained has arrived."""
+        for topic in self._topics.values():
+            transport.subscribe(topic, self.receive, direct=True)
+
+    def receive(self, message: Message) -> None:
+        """Update from a message of this robot; what is malformed is ignored."""
+        if len(message.payload) > _BYTES:
+            return
+        try:
+            if message.topic == self._topics[AUTONOMY_FILES.metric]:
+                listed = codec.decode(AUTONOMY_FILES, message.payload).files
+                self.files = {entry["file"]: entry for entry in listed if isinstance(entry.get("file"), str)}
+            elif message.topic == self._topics[AUTONOMY_STATUS.metric]:
+                self.status = codec.decode(AUTONOMY_STATUS, message.payload)
+                self.answers += not message.retain
+        except PayloadError:
+            return
+
+    def start(self, transport: Transport, file: str, words: Sequence[str]) -> bool:
+        """Command a start with the options in ``words``; False: it was not sent. Raises PebbleError."""
+        if self.files is None:
+            raise PebbleError(
+                "the robot has published no scripts: is services.autonomy_manager.enabled true, is it up?"
+            )
+        if file not in self.files:
+            known = ", ".join(self.files) or "none"
+            raise PebbleError(f"there is no script {file}, only: {known}")
+        chosen = settings(self.files[file], words)
+        return self._publish(transport, AutonomyCommand(action="start", file=file, config=chosen))
+
+    def stop(self, transport: Transport) -> bool:
+        return self._publish(transport, AutonomyCommand(action="stop"))
+
+    def _publish(self, transport: Transport, command: AutonomyCommand) -> bool:
+        raw = codec.encode(AUTONOMY_COMMAND, command)
+        return transport.publish(self._command_topic, raw, qos=QoS(AUTONOMY_COMMAND.default_qos), urgent=True)
+
+
+def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
+    """The settings that words such as ``--tag-id 5 --no-search`` select in a script's form. Raises PebbleError."""
+    form = [one for one in entry.get("configs") or () if isinstance(one, dict) and isinstance(one.get("key"), str)]
+    options = {option: (one, value) for one in form for option, value in _options(one)}
+    chosen: dict[str, Any] = {}
+    rest = iter(words)
+    for word in rest:
+        option, given, value = word.partition("=")
+        if option not in options:
+            known = ", ".join(options) or "it has none"
+            raise PebbleError(f"{option} is no option of {entry['file']}: {known}")
+        one, fixed = options[option]
+        if fixed is None and not given:
+            following = next(rest, None)
+            if following is None:
+                raise PebbleError(f"{option} needs a value")
+            value = following
+        chosen[one["key"]] = fixed if fixed is not None else _value(option, str(one.get("type")), value)
+    return chosen
+
+
+def _options(one: Entry) -> list[tuple[str, bool | None]]:
+    """Its options, with the value of those that are flags."""
+    flag = "--" + str(one["key"]).replace("_", "-")
+    if one.get("type") != "bool":
+        return [(flag, None)]
+    return [(flag, True), (f"--no-{flag[2:]}", False)]
+
+
+def _value(option: str, type_: str, text: str) -> Any:
+    try:
+        if type_ == "int":
+            return int(text)
+        if type_ == "float" and math.isfinite(number := float(text)):
+            return number
+    except ValueError:
+        pass
+    if type_ in ("int", "float"):
+        raise PebbleError(f"{option}: {text!r} is not a number")
+    return text

@@ -1,0 +1,196 @@
+"""``pebble script``: writes a new script, and lists, starts and stops those of a robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pebble.client.connection import Target, connected, target_of
+from pebble.client.names import id_of
+from pebble.client.scripts import RobotScripts
+from pebble.commands import show
+from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.contract.payloads import AutonomyStatus
+from pebble.errors import PebbleError, TransportError
+from pebble.transports import Transport
+
+_HELP = """Programs that move a robot by themselves; docs/scripts.md explains them.
+
+\b
+    pebble script new follow            write a first script and its test
+    pebble script list goob.json        what the robot offers
+    pebble script start goob.json follow --tag-id 7
+    pebble script status goob.json
+    pebble script stop goob.json
+"""
+_ANSWER_S = 5.0
+_SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
+
+_Robot = Annotated[
+    str, typer.Argument(help="A robot's config file, or with --url or --config its id.", show_default=False)
+]
+
+
+def new(
+    name: Annotated[str, typer.Argument(help="Of the script and its folder.", show_default=False)],
+    folder: Annotated[Path, typer.Option("--folder", help="Where its folder is made.", metavar="DIR")] = Path(),
+) -> None:
+    """Write a script that follows a tag, a test that runs it in a simulated room, and a robot for that room.
+
+    \b
+        pebble script new follow
+        cd follow
+        python -m pytest
+    """
+    from pebble.commands.script_starter import write
+
+    for path in write(name, folder):
+        typer.echo(path)
+
+
+def list_(
+    robot: _Robot, config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
+    password_file: PasswordFile = None, ca_cert: CaCert = None,
+) -> int:  # fmt: skip
+    """The scripts that a robot offers, and their options."""
+    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+    with _scripts(robot, options) as (_, scripts, name):
+        if scripts.files is None:
+            raise PebbleError(f"{name} has published no scripts: is it up, and services.autonomy_manager.enabled true?")
+        for file, entry in scripts.files.items():
+            label = str(entry.get("label") or file)
+            _print(file if label == file else f"{file}: {label}")
+            for one in entry.get("configs") or ():
+                _print(f"    {_option(one)}")
+    return 0
+
+
+def start(
+    context: typer.Context, robot: _Robot,
+    file: Annotated[str, typer.Argument(help="The script; its own options follow.", show_default=False)],
+    config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
+    password_file: PasswordFile = None, ca_cert: CaCert = None,
+) -> int:  # fmt: skip
+    """Start a script on its robot, and wait until it runs. A script that runs already is stopped first.
+
+    \b
+        pebble script start goob.json follow --tag-id 7 --distance-m 0.5
+    """
+    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+    with _scripts(robot, options) as (transport, scripts, _):
+        before, answers, began = scripts.status, scripts.answers, time.monotonic()
+        _sent(transport, scripts.start(transport, file, context.args))
+        _wait(lambda: scripts.answers > answers and _settled(before, scripts.status, file, time.monotonic() - began))
+        status = scripts.status
+        if scripts.answers == answers or status is None:
+            raise PebbleError(f"no answer within {_ANSWER_S:g} s: is the robot up?")
+        if not _runs(before, status, file):
+            raise PebbleError(show.printable(status.error or f"{file} does not run"))
+        _print_status(status)
+    return 0
+
+
+def stop(
+    robot: _Robot, config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
+    password_file: PasswordFile = None, ca_cert: CaCert = None,
+) -> int:  # fmt: skip
+    """Stop the script that runs. In an emergency: pebble estop."""
+    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+    with _scripts(robot, options) as (transport, scripts, _):
+        _sent(transport, scripts.stop(transport))
+        _wait(lambda: scripts.status is not None and not scripts.status.running)
+        if scripts.status is None or scripts.status.running:
+            raise PebbleError(f"it is not known to have stopped within {_ANSWER_S:g} s: pebble estop stops the robot")
+        _print_status(scripts.status)
+    return 0
+
+
+def status(
+    robot: _Robot, config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
+    password_file: PasswordFile = None, ca_cert: CaCert = None,
+) -> int:  # fmt: skip
+    """What runs, with which settings, and the last error. Exit code 0: a script runs; 1: none."""
+    options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+    with _scripts(robot, options) as (_, scripts, name):
+        if scripts.status is None:
+            raise PebbleError(f"{name} has published nothing about scripts: is it up?")
+        _print_status(scripts.status)
+        return 0 if scripts.status.running else 1
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(help=_HELP, rich_markup_mode=None)
+    group.command("new")(new)
+    group.command("list")(list_)
+    group.command("start", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(start)
+    group.command("stop")(stop)
+    group.command("status")(status)
+    app.add_typer(group, name="script")
+
+
+@contextmanager
+def _scripts(robot: str, options: Target) -> Iterator[tuple[Transport, RobotScripts, str]]:
+    """The connection, what the robot has published about its scripts, and its name."""
+    with connected(target_of(robot, options)) as (transport, names):
+        scripts = RobotScripts(names)
+        scripts.subscribe(transport)
+        _wait(lambda: scripts.files is not None and scripts.status is not None, 1.0)
+        yield transport, scripts, show.printable(id_of(names.base))
+
+
+def _settled(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed: float) -> bool:
+    """Whether this status answers the command."""
+    if now is None or _runs(before, now, file):
+        return now is not None
+    return bool(now.error) and (before is None or now.error != before.error or elapsed > _SAME_ERROR_S)
+
+
+def _runs(before: AutonomyStatus | None, now: AutonomyStatus, file: str) -> bool:
+    """Whether the script runs, as another process than before."""
+    as_before = before is not None and before.running and now.pid == before.pid
+    return now.running and now.file == file and not as_before
+
+
+def _sent(transport: Transport, accepted: bool) -> None:
+    if not accepted:
+        raise TransportError(f"nothing was sent: {transport.problem or 'the connection was lost'}")
+
+
+def _print_status(status: AutonomyStatus) -> None:
+    if status.running:
+        waits = ", but a person drives: it waits" if status.overridden is True else ""
+        _print(f"{status.file} runs (process {status.pid}){waits}")
+        for key, value in (status.config or {}).items():
+            _print(f"    {key}: {value}")
+        for other in status.dependencies:
+            _print(f"    with {other.file}" + (f" (process {other.pid})" if other.running else ", which does not run"))
+    else:
+        _print("no script runs")
+    if status.error:
+        _print(f"error: {status.error}")
+
+
+def _option(one: dict[str, Any]) -> str:
+    """``--tag-id INT  Tag ID (default: 13)``."""
+    flag = f"--{str(one.get('key', '')).replace('_', '-')}"
+    kind = str(one.get("type"))
+    shown = f"[{flag} | --no-{flag[2:]}]" if kind == "bool" else f"{flag} {kind.upper()}"
+    notes = [", ".join(map(str, one["options"]))] if one.get("options") else []
+    notes += [f"{word} {one[word]}" for word in ("min", "max") if word in one]
+    notes.append("required" if one.get("required") else f"default: {one.get('default')}")
+    return f"{shown:32}  {one.get('label')} ({'; '.join(notes)})"
+
+
+def _print(line: str) -> None:
+    typer.echo(show.printable(line))
+
+
+def _wait(condition: Callable[[], bool], seconds: float = _ANSWER_S) -> None:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)

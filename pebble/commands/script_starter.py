@@ -1,0 +1,50 @@
+"""Writes a first script: one that follows a tag, its test, and a robot in a simulated room."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+from pebble.errors import PebbleError
+
+_name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
+
+
+def write(name: str, folder: Path) -> Iterator[Path]:
+    """Make ``folder/name`` with its files, and yield their paths. Raises PebbleError, also if it exists already."""
+    if not _name(name):
+        raise PebbleError(f"{name}: a script's name is letters, digits, - and _, beginning with a letter")
+    target = folder / name
+    try:
+        target.mkdir(parents=True)
+    except FileExistsError:
+        raise PebbleError(f"{target} exists already: choose another name, or another --folder") from None
+    except OSError as error:
+        raise PebbleError(f"{target}: {error.strerror}") from None
+    test = f"test_{name.replace('-', '_')}.py"
+    texts = {
+        "run.py": _text("run.py.txt"),
+        test: _text("test_run.py.txt"),
+        "room.json": _room(),
+        "goob.json": _robot(target),
+    }
+    for file, text in texts.items():
+        (target / file).write_text(text)
+        yield target / file
+
+
+def _text(file: str) -> str:
+    return files("pebble.commands").joinpath("starter", file).read_text()
+
+
+def _room() -> str:
+    return files("pebble.simulation.world").joinpath("room.json").read_text()
+
+
+def _robot(target: Path) -> str:
+    """The config names absolute paths, so that `pebble up` finds them from everywhere."""
+    world = Path(tempfile.gettempdir(), "pebble-world-room")
+    return _text("goob.json").replace("{folder}", str(target.absolute())).replace("{world}", str(world))

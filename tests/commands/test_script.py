@@ -1,0 +1,133 @@
+"""``pebble script`` with a real broker and a robot whose manager is scripted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.client.scripts import settings
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, codec
+from pebble.contract.payloads import AutonomyFiles, AutonomyStatus
+from pebble.errors import PebbleError
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.commands.command_line import GOOB, Run, config_file
+from tests.support import Broker
+
+FORM: list[dict[str, Any]] = [
+    {"key": "tag_id", "label": "Tag ID", "type": "int", "default": 13, "arg": "--tag-id", "min": 0},
+    {"key": "speed", "label": "Speed", "type": "enum", "default": "slow", "arg": "-s", "options": ["slow", "fast"]},
+    {"key": "search", "label": "Search", "type": "bool", "default": True, "arg": "--search", "mode": "flag"},
+    {"key": "size_m", "label": "Size", "type": "float", "default": None, "arg": "--size-m", "required": True},
+]
+ENTRY = {"file": "follow", "label": "Follow a tag", "configs": FORM}
+
+
+class Manager:
+    """Publishes one script; answers each command with the next of its statuses."""
+
+    def __init__(self, port: int) -> None:
+        self.commands: list[dict[str, Any]] = []
+        self.answers: list[AutonomyStatus] = []
+        self._transport = create("mqtt", "manager", MqttSettings(host="127.0.0.1", port=port)).open()
+        self._transport.subscribe(AUTONOMY_COMMAND.topic(GOOB), self._receive)
+        self._publish(AUTONOMY_FILES, AutonomyFiles(files=[ENTRY], timestamp=1.0))
+        self.publish(AutonomyStatus(running=False, timestamp=1.0))
+
+    def publish(self, status: AutonomyStatus) -> None:
+        self._publish(AUTONOMY_STATUS, status)
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def _publish(self, channel: Any, value: Any) -> None:
+        self._transport.publish(channel.topic(GOOB), codec.encode(channel, value), qos=QoS.DELIVERED, retain=True)
+
+    def _receive(self, message: Message) -> None:
+        self.commands.append(json.loads(message.payload))
+        self.publish(self.answers.pop(0))
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("broker"))
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def config(broker: Broker, tmp_path: Path) -> Path:
+    return config_file(tmp_path, local_mqtt={"host": "127.0.0.1", "port": broker.port})
+
+
+@pytest.fixture
+def manager(broker: Broker) -> Iterator[Manager]:
+    manager = Manager(broker.port)
+    yield manager
+    manager.close()
+
+
+def test_it_lists_scripts_and_their_options(run: Run, config: Path, manager: Manager) -> None:
+    assert run("script", "list", config) == 0, run.err
+    assert [line.strip().split("  ")[0] for line in run.out.splitlines()] == [
+        "follow: Follow a tag", "--tag-id INT", "--speed ENUM", "[--search | --no-search]", "--size-m FLOAT"
+    ]  # fmt: skip
+    assert "(min 0; default: 13)" in run.out
+    assert "(slow, fast; default: slow)" in run.out
+
+
+def test_it_starts_a_script_with_options(run: Run, config: Path, manager: Manager) -> None:
+    settled = {"tag_id": 7, "search": False}
+    manager.answers = [AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=42, config=settled)]
+    assert run("script", "start", config, "follow", "--tag-id", "7", "--no-search", "--size-m=0.2") == 0, run.err
+    chosen = {"tag_id": 7, "search": False, "size_m": 0.2}
+    assert manager.commands == [{"action": "start", "file": "follow", "config": chosen}]
+    assert run.out.splitlines() == ["follow runs (process 42)", "    tag_id: 7", "    search: False"]
+
+
+def test_by_url_it_needs_the_robots_id(run: Run, broker: Broker, manager: Manager) -> None:
+    manager.answers = [AutonomyStatus(running=False, timestamp=2.0)]
+    assert run("script", "stop", "goob", "--url", f"mqtt://127.0.0.1:{broker.port}") == 0, run.err
+    assert manager.commands == [{"action": "stop"}]
+    assert run.out == "no script runs\n"
+
+
+def test_a_refused_start_is_an_error_even_if_the_script_runs_already(run: Run, config: Path, manager: Manager) -> None:
+    running = {"running": True, "file": "follow", "pid": 42}
+    manager.publish(AutonomyStatus(timestamp=2.0, **running))
+    error = "Invalid config for follow: tag_id below minimum 0"
+    manager.answers = [AutonomyStatus(timestamp=3.0, error=error, **running)]
+    assert run("script", "start", config, "follow", "--tag-id", "-1") == 1
+    assert run.err == f"pebble: {error}\n"
+
+
+def test_status_exits_1_if_nothing_runs(run: Run, config: Path, manager: Manager) -> None:
+    manager.publish(AutonomyStatus(running=False, timestamp=2.0, error="follow exited with code 3"))
+    assert run("script", "status", config) == 1
+    assert run.out == "no script runs\nerror: follow exited with code 3\n"
+    manager.publish(AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=4, overridden=True))
+    assert run("script", "status", config) == 0
+    assert run.out == "follow runs (process 4), but a person drives: it waits\n"
+
+
+def test_an_unknown_script_is_named(run: Run, config: Path, manager: Manager) -> None:
+    assert run("script", "start", config, "folow") == 1
+    assert run.err == "pebble: there is no script folow, only: follow\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--tagid", "3"], "--tagid is no option of follow: --tag-id, --speed, --search, --no-search, --size-m"),
+        (["--tag-id"], "--tag-id needs a value"),
+        (["--tag-id", "x"], "--tag-id: 'x' is not a number"),
+        (["--size-m", "nan"], "--size-m: 'nan' is not a number"),
+    ],
+)
+def test_wrong_options_are_named(words: list[str], problem: str) -> None:
+    with pytest.raises(PebbleError) as error:
+        settings(ENTRY, words)
+    assert str(error.value) == problem
