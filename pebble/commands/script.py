@@ -85,7 +85,7 @@ def start(
     with _scripts(robot, options) as (transport, scripts, _):
         before, answers, began = scripts.status, scripts.answers, time.monotonic()
         _sent(transport, scripts.start(transport, file, context.args))
-        _wait(lambda: scripts.answers > answers and _settled(before, scripts.status, file, time.monotonic() - began))
+        _wait(lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began))
         status = scripts.status
         if scripts.answers == answers or status is None:
             raise PebbleError(f"no answer within {_ANSWER_S:g} s: is the robot up?")
@@ -143,7 +143,7 @@ def _scripts(robot: str, options: Target) -> Iterator[tuple[Transport, RobotScri
         yield transport, scripts, show.printable(id_of(names.base))
 
 
-def _settled(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed: float) -> bool:
+def _answered(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed: float) -> bool:
     """Whether this status answers the command."""
     if now is None or _runs(before, now, file):
         return now is not None

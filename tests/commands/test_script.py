@@ -80,8 +80,8 @@ def test_it_lists_scripts_and_their_options(run: Run, config: Path, manager: Man
 
 
 def test_it_starts_a_script_with_options(run: Run, config: Path, manager: Manager) -> None:
-    settled = {"tag_id": 7, "search": False}
-    manager.answers = [AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=42, config=settled)]
+    effective = {"tag_id": 7, "search": False}
+    manager.answers = [AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=42, config=effective)]
     assert run("script", "start", config, "follow", "--tag-id", "7", "--no-search", "--size-m=0.2") == 0, run.err
     chosen = {"tag_id": 7, "search": False, "size_m": 0.2}
     assert manager.commands == [{"action": "start", "file": "follow", "config": chosen}]
