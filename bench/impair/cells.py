@@ -10,11 +10,13 @@ from pebble.bench.impair.messages import Record, Window
 from pebble.bench.impair.network_process import Traffic
 from pebble.bench.percentiles import rounded
 from pebble.bench.results import OVER_TIME, Cell, Value
+from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
 
 SOUND, PICTURES, PICTURE_GAP = "audio latency", "video latency", "picture gap"
 HEARTBEAT_GAP, HEARTBEAT_DELAY = "heartbeat gap", "heartbeat delay"
 DRIVE, DRIVE_ALONE, DRIVE_VIDEO, DRIVE_AUDIO = "drive", "drive alone", "drive during video", "drive during audio"
+AFTER_VIDEO, AFTER_AUDIO, CLIP = "heartbeat gap after video", "heartbeat gap after audio", "clip"
 SOUND_OVER_TIME, DRIVE_OVER_TIME = f"audio{OVER_TIME}", f"drive{OVER_TIME}"
 
 
@@ -27,6 +29,7 @@ class Trial:
     record: Record
     entries: Sequence[Entry]  # of the MCU
     traffic: dict[str, tuple[Traffic, Traffic]]
+    playbacks: Sequence[Playback] = ()  # of the robot's loudspeaker, in any trial
 
     @property
     def phases(self) -> dict[str, Window]:
@@ -38,7 +41,7 @@ def cells_of(trials: Iterable[Trial], fps: float) -> list[Cell]:
     return [
         cell
         for trial in trials
-        for cell in (_sound(trial), *_pictures(trial, fps), *_heartbeats(trial), *_drive(trial))
+        for cell in (_sound(trial), *_pictures(trial, fps), *_heartbeats(trial), *_drive(trial), *_afterwards(trial))
     ]
 
 
@@ -164,10 +167,29 @@ def _drive(trial: Trial) -> list[Cell]:
     return cells
 
 
+def _afterwards(trial: Trial) -> list[Cell]:
+    """What is sent and received while nothing is requested any more, and the clip."""
+    record, clip_ms = trial.record, metrics.clip_ms(trial.record.clip, trial.playbacks)
+    playing_ns = record.clip.playing_ns
+    status_ms = None if playing_ns is None else (playing_ns - record.clip.sent_ns) / 1e6
+    return [
+        _after(trial, AFTER_VIDEO, "video off", record.video_off),
+        _after(trial, AFTER_AUDIO, "audio off", record.audio_off),
+        _cell(trial, CLIP, "ms", [] if clip_ms is None else [clip_ms], sent=1, status_ms=status_ms),
+    ]
+
+
+def _after(trial: Trial, measure: str, phase: str, window: Window) -> Cell:
+    arrivals = [heartbeat.arrived_ns for heartbeat in trial.record.heartbeats if window.holds(heartbeat.arrived_ns)]
+    gaps, wire = metrics.gaps_s(arrivals, window), _wire(trial, phase, window)
+    return _cell(trial, measure, "s", gaps, heartbeats=len(arrivals), longest_gap_s=max(gaps), **wire)
+
+
 def _wire(trial: Trial, phase: str, window: Window) -> dict[str, Value]:
     before, after = trial.traffic[phase]
     return {
         "window_s": window.seconds,
+        "bytes_up": after.bytes_up - before.bytes_up,
         "kbit_up": 8e-3 * (after.bytes_up - before.bytes_up) / window.seconds,
         "kbit_down": 8e-3 * (after.bytes_down - before.bytes_down) / window.seconds,
         "dropped_up": after.dropped_up - before.dropped_up,

@@ -13,6 +13,8 @@ class TrialRequest(msgspec.Struct, kw_only=True, tag="trial"):
     alone_s: float  # driving and heartbeat only
     window_s: float  # of video, and then of audio
     grace_s: float  # for sound of the window that is still in flight
+    off_s: float  # after video was switched off, and after audio was
+    clip_s: float  # at most, for a clip to be played to its end
 
 
 class RecoveryRequest(msgspec.Struct, kw_only=True, tag="recover"):
@@ -66,6 +68,13 @@ class Window(msgspec.Struct, frozen=True):
         return self.began_ns <= ns < self.ended_ns
 
 
+class ClipCommand(msgspec.Struct, array_like=True, frozen=True):
+    """The command to play a clip; ``playing_ns`` is when the robot's status arrived, None if it did not in time."""
+
+    sent_ns: int
+    playing_ns: int | None = None
+
+
 class Record(msgspec.Struct, kw_only=True):
     """Everything the operator recorded in one trial."""
 
@@ -76,6 +85,9 @@ class Record(msgspec.Struct, kw_only=True):
     alone: Window
     video: Window
     audio: Window
+    video_off: Window
+    audio_off: Window
+    clip: ClipCommand
     payloads: int  # of video that arrived, decoded or not
 
     @property
@@ -88,6 +100,6 @@ class OperatorReport(msgspec.Struct, kw_only=True, omit_defaults=True):
     """A line from the operator; one of the fields is set."""
 
     ready: bool = False  # the robot is ready, or has recovered
-    phase: str | None = None  # "alone", "video" or "audio" begins now; "": it ended
+    phase: str | None = None  # "alone", "video", "video off", "audio" or "audio off" begins now; "": it ended
     record: Record | None = None
     problem: str | None = None

@@ -10,8 +10,9 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
-from pebble.bench.impair.messages import Command, Heartbeat, Picture, Sound, Window
+from pebble.bench.impair.messages import ClipCommand, Command, Heartbeat, Picture, Sound, Window
 from pebble.client.discovery import Liveness
+from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
 
 ON_TIME_S = 1.0  # older sound is useless in a conversation
@@ -85,6 +86,15 @@ def offline_s(heartbeats: Sequence[Heartbeat], window: Window) -> list[float]:
             since = None
         at += step_ns
     return offline_periods if since is None else [*offline_periods, (window.ended_ns - since) / 1e9]
+
+
+# -- a clip
+
+
+def clip_ms(command: ClipCommand, playbacks: Iterable[Playback]) -> float | None:
+    """From the play command until the first sample was played; None if it was not."""
+    began_ns = min((one.began_ns for one in playbacks if one.began_ns >= command.sent_ns), default=None)
+    return None if began_ns is None else (began_ns - command.sent_ns) / 1e6
 
 
 # -- driving

@@ -1,4 +1,4 @@
-"""The operator of one robot, on the broker's side of the network: drives all the time, and receives video, then audio.
+"""The operator of one robot, on the broker's side of the network: drives, receives video, then audio, and plays a clip.
 
 As a process: ``python -m pebble.bench.impair.operator HOST PORT BASE``. It reports when the robot is ready, then serves
 each request on its standard input (pebble.bench.impair.messages), and ends when its standard input closes.
@@ -16,6 +16,7 @@ import msgspec
 
 from pebble.bench.bridge_operator import wheels
 from pebble.bench.impair.messages import (
+    ClipCommand,
     Command,
     Heartbeat,
     OperatorReport,
@@ -28,13 +29,14 @@ from pebble.bench.impair.messages import (
 )
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
-from pebble.contract import DRIVE, ONLINE, STATUS, codec
-from pebble.contract.payloads import Drive
+from pebble.contract import DRIVE, ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, codec
+from pebble.contract.payloads import Drive, SoundboardCommand
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.sound import ReceivedSound
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 
+CLIP = "clip.wav"  # in the folder of the robot's soundboard
 _PERIOD_S = 0.1  # between two drive commands
 _UP_S, _CONNECT_S, _KNOWN_S = 60.0, 10.0, 5.0
 _FIRST_S = 5.0  # the longest wait for a first picture or sound before the window begins
@@ -76,6 +78,7 @@ class TrialOperator:
         self._commands: list[Command] = []
         self._heartbeats: list[Heartbeat] = []
         self._services: dict[str, str] = {}  # their states
+        self._clip_statuses: list[tuple[int, bool]] = []  # when they arrived, and whether a clip plays
         self._over_at = time.monotonic()
 
     def open(self) -> None:
@@ -89,6 +92,7 @@ class TrialOperator:
             )
         self._controls.subscribe(ONLINE.topic(self._base), self._on_heartbeat)
         self._controls.subscribe(STATUS.topic(self._base), self._on_status)
+        self._controls.subscribe(SOUNDBOARD_STATUS.topic(self._base), self._on_clip_status)
         if not self._wait(self._is_ready, _UP_S):
             raise PebbleError(f"the robot is not ready after {_UP_S:.0f} s: {self._services or 'no status received'}")
 
@@ -112,10 +116,13 @@ class TrialOperator:
         try:
             alone = self._measure_phase("alone", request.alone_s)
             seen, video = self._watch("video", request.video, request.window_s)
+            video_off = self._measure_phase("video off", request.off_s)
             received, audio = self._watch("audio", request.audio, request.window_s, enough, request.grace_s)
         finally:
             enough.set()
             driver.join()
+        audio_off = self._measure_phase("audio off", request.off_s)
+        clip = self._play_clip(request.clip_s)
         self._over_at = time.monotonic()
         return Record(
             commands=list(self._commands),
@@ -125,6 +132,9 @@ class TrialOperator:
             alone=alone,
             video=video,
             audio=audio,
+            video_off=video_off,
+            audio_off=audio_off,
+            clip=clip,
             payloads=seen.pictures.count,
         )
 
@@ -153,6 +163,20 @@ class TrialOperator:
         finally:
             subscriber.close()
         return subscriber, Window(window.began_ns, window.ended_ns, first_s)
+
+    def _play_clip(self, seconds: float) -> ClipCommand:
+        """Commands it, and waits until it was played to its end, as far as the statuses arrive."""
+        self._clip_statuses.clear()
+        sent_ns = time.monotonic_ns()
+        command = SoundboardCommand(action="play", file=CLIP)
+        payload = codec.encode(SOUNDBOARD_COMMAND, command)
+        self._controls.publish(SOUNDBOARD_COMMAND.topic(self._base), payload, qos=QoS.DELIVERED)
+
+        def playing_ns() -> int | None:
+            return next((ns for ns, playing in list(self._clip_statuses) if playing), None)
+
+        self._wait(lambda: playing_ns() is not None and not self._clip_statuses[-1][1], seconds)
+        return ClipCommand(sent_ns, playing_ns())
 
     def _measure_phase(self, phase: str, seconds: float, subscriber: MediaSubscriber | None = None) -> Window:
         write_report(OperatorReport(phase=phase))
@@ -210,6 +234,14 @@ class TrialOperator:
         except PayloadError:
             return
         self._heartbeats.append(Heartbeat(_monotonic_ns(heartbeat.t), now, heartbeat.online is not False))
+
+    def _on_clip_status(self, message: Message) -> None:
+        now = time.monotonic_ns()
+        try:
+            status = codec.decode(SOUNDBOARD_STATUS, message.payload)
+        except PayloadError:
+            return
+        self._clip_statuses.append((now, status.playing))
 
     def _on_status(self, message: Message) -> None:
         try:

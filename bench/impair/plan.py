@@ -90,6 +90,8 @@ class ImpairPlan:
             alone_s=2.0 if self.quick else 3.0,
             window_s=self.window,
             grace_s=1.0 if self.quick else 2.0,
+            off_s=1.0 if self.quick else 2.0,
+            clip_s=5.0,
         )
 
     def command(self) -> list[str]:

@@ -39,7 +39,10 @@ def tables(results: Results, width: int) -> Iterator[Table]:
         if subjects:
             yield _table(results, form, subjects, width >= WIDE)
         if subjects and width >= WIDE:
-            yield _details(results, form, subjects)
+            yield _by_transport(f"details of {_title(results, form)}", _DETAILS, results, subjects)
+        if subjects:
+            title = f"a clip, and {results.options.get('off_s')} s without media, of {_title(results, form)}"
+            yield _by_transport(title, _AFTERWARDS, results, subjects)
 
 
 def _table(results: Results, form: str, subjects: Sequence[Subject], wide: bool) -> Table:
@@ -55,13 +58,12 @@ def _table(results: Results, form: str, subjects: Sequence[Subject], wide: bool)
     return table
 
 
-def _details(results: Results, form: str, subjects: Sequence[Subject]) -> Table:
+def _by_transport(title: str, shown: Sequence[_Column], results: Results, subjects: Sequence[Subject]) -> Table:
     """A row for each transport in each trial."""
-    columns = ["trial", "inside", *(column.name for column in _DETAILS)]
-    table = plain_table(f"details of {_title(results, form)}", columns, left=2)
+    table = plain_table(title, ["trial", "inside", *(column.name for column in shown)], left=2)
     for trial in _all_trials(results.cells):
         for number, one in enumerate(subjects):
-            figures = [column.of(results, one.name, trial) for column in _DETAILS]
+            figures = [column.of(results, one.name, trial) for column in shown]
             table.add_row("" if number else trial, one.transport, *figures)
     return table
 
@@ -128,6 +130,15 @@ _DETAILS = (
     _Column("stopped\ntimes", measures.DRIVE, _number("trips"), whole=True),
     _Column("at rest\ns", measures.DRIVE, _number("rest_s")),
 )
+_AFTERWARDS = (
+    _Column("clip\nms", measures.CLIP, _percentile(100)),
+    _Column("no video\nbytes", measures.AFTER_VIDEO, _number("bytes_up"), whole=True),
+    _Column("heart-\nbeats", measures.AFTER_VIDEO, _number("heartbeats"), whole=True),
+    _Column("gap\ns", measures.AFTER_VIDEO, _number("longest_gap_s")),
+    _Column("no audio\nbytes", measures.AFTER_AUDIO, _number("bytes_up"), whole=True),
+    _Column("heart-\nbeats", measures.AFTER_AUDIO, _number("heartbeats"), whole=True),
+    _Column("gap\ns", measures.AFTER_AUDIO, _number("longest_gap_s")),
+)
 
 
 # -- the assessment
@@ -187,7 +198,7 @@ def assessment(cells: Sequence[Cell]) -> list[str]:
         if (cell := _find(cells, subject, aim.measure, aim.trial)) is not None
     ]
     lines += [line for subject in ours if (line := _media_delay_aim(cells, subject))]
-    return [*lines, *_encodings(cells), _trips(cells), *_transports(cells)]
+    return [*lines, *_encodings(cells), _trips(cells), *_clips(cells), *_transports(cells)]
 
 
 def _media_delay_aim(cells: Sequence[Cell], subject: str) -> str:
@@ -220,6 +231,19 @@ def _encodings(cells: Sequence[Cell]) -> Iterator[str]:
         ]
         if len(shares) > 1:
             yield f"Sound that arrived within a second at {trial}: {', '.join(shares)}."
+
+
+def _clips(cells: Sequence[Cell]) -> Iterator[str]:
+    played = {subject.name: list(_by_trial(cells, subject.name, measures.CLIP).values()) for subject in SUBJECTS}
+    words = [
+        f"{name} {sum(len(cell.samples) for cell in found)} of {len(found)}"
+        + (f" (p50 {_plain(percentile(times, 50))} ms, longest {_plain(max(times))} ms)" if times else "")
+        for name, found in played.items()
+        if found
+        for times in [[sample for cell in found for sample in cell.samples]]
+    ]
+    if words:
+        yield f"Clips that the loudspeaker played when commanded: {', '.join(words)}."
 
 
 def _trips(cells: Sequence[Cell]) -> str:

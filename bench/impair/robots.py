@@ -6,6 +6,7 @@ import json
 import sys
 import tempfile
 import threading
+import wave
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,16 +17,21 @@ import msgspec
 
 from pebble.bench.impair.messages import OperatorReport, RecoveryRequest, TrialRequest
 from pebble.bench.impair.network import ImpairedNetwork, open_network
+from pebble.bench.impair.operator import CLIP
 from pebble.bench.impair.plan import Subject
 from pebble.bench.worker import Worker, end_workers
 from pebble.demo.broker import free_port, mosquitto_command
 from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
+from pebble.media.pcm import to_bytes
+from pebble.media.speech import Speech
+from pebble.simulation.loudspeaker import Playback, playbacks
 from pebble.simulation.trace import Entry, read_trace
 from pebble.transports.segments import sweep
 
 BASE = "pebble/robots/rover"
 WIDTH, HEIGHT, FPS = 640, 480, 15  # as the original is configured
+CLIP_S = 0.5
 _AUDIO_RATE = 16_000
 _MCU_START_S = 15.0
 _ROBOTS_END_S, _REST_END_S = 6.0, 2.0
@@ -42,7 +48,7 @@ class ImpairedRobot:
         self.programs: list[Program] = []
         self._folder = folder
         self._folder.mkdir()
-        self._trace = folder / "trace.jsonl"
+        self._trace, self._played = folder / "trace.jsonl", folder / "played"
         self.network: ImpairedNetwork = open_network(kind, name=subject.name)
         self._port, self._local_port = free_port(), free_port()
 
@@ -97,6 +103,10 @@ class ImpairedRobot:
         """What the MCU received and did after ``since_ns``."""
         return [entry for entry in read_trace(self._trace) if entry.ns >= since_ns]
 
+    def playbacks(self) -> list[Playback]:
+        """All clips that the loudspeaker has played."""
+        return playbacks(self._played)
+
     def _start(self, name: str, command: Sequence[str]) -> Program:
         program = Program(f"{name} of {self.subject.name}", command, self._log(name.replace(" ", "-")))
         self.programs.append(program)
@@ -123,6 +133,9 @@ class ImpairedRobot:
                 "audio": {"source": "synthetic", "rate": _AUDIO_RATE, "channels": 1},
             },
         }
+        loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self._played)]
+        playback = {"directory": str(_write_clip(self._folder / "sounds")), "player_command": loudspeaker}
+        services["soundboard_handler"] = {"enabled": True, "playback": playback}
         folders = {"run_dir": str(self._folder / "run"), "state_dir": str(self._folder / "state")}
         transport = {"kind": self.subject.transport, **folders}
         config: dict[str, Any] = {"robot": {"id": "rover"}, "transport": transport, "services": services}
@@ -166,6 +179,18 @@ class TestBed:
         for robot in self.robots:
             if robot.operator is not None:
                 robot.operator.close_input()
+
+
+def _write_clip(folder: Path) -> Path:
+    """The folder, with the clip that is played at the end of each trial."""
+    folder.mkdir()
+    samples = Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))
+    with wave.open(str(folder / CLIP), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(_AUDIO_RATE)
+        file.writeframes(to_bytes(samples))
+    return folder
 
 
 def _tail(log: Path) -> str:

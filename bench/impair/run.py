@@ -18,7 +18,7 @@ from pebble.bench.impair.network import resolved
 from pebble.bench.impair.network_process import Traffic
 from pebble.bench.impair.plan import ImpairPlan, Subject
 from pebble.bench.impair.report import QUOTED, assessment, tables
-from pebble.bench.impair.robots import FPS, HEIGHT, WIDTH, ImpairedRobot, TestBed
+from pebble.bench.impair.robots import CLIP_S, FPS, HEIGHT, WIDTH, ImpairedRobot, TestBed
 from pebble.bench.output import check_folder, finish
 from pebble.bench.results import Results, Stopwatch, Value
 from pebble.errors import PebbleError
@@ -29,7 +29,7 @@ _T = TypeVar("_T")
 CLEAN = Condition("clean")
 _UP_S, _STARTUP_S, _PHASE_S = 80.0, 30.0, 30.0  # limits for an operator's next report; its own limits are shorter
 _QUIET_S, _QUIET_QUICK_S = 2.0, 1.0  # between two trials of one robot
-_ASIDE_S = 4.0  # of a trial in addition to its phases: starting media, and recovery
+_ASIDE_S = 5.0  # of a trial in addition to its phases: starting media, a clip, and recovery
 _POLL_S = 0.25
 _LINKS = {
     "namespaces": "network namespaces, robot's uplink impaired",
@@ -130,7 +130,9 @@ class _Session:
         while True:
             report = robot.next_report(_PHASE_S + request.window_s)
             if report.record is not None:
-                return Trial(robot.subject.name, name, report.record, robot.entries(began_ns), traffic)
+                return Trial(
+                    robot.subject.name, name, report.record, robot.entries(began_ns), traffic, robot.playbacks()
+                )
             if report.phase:
                 phase, before = report.phase, robot.network.traffic()
             else:
@@ -158,7 +160,7 @@ class _Session:
 
 def _length_s(plan: ImpairPlan, subject: Subject) -> float:
     request = plan.request(subject)
-    return request.alone_s + 2 * request.window_s + request.grace_s
+    return request.alone_s + 2 * request.window_s + request.grace_s + 2 * request.off_s
 
 
 def _options(plan: ImpairPlan, why_proxy: str | None, marks: Sequence[str]) -> dict[str, Value | list[Value]]:
@@ -176,7 +178,8 @@ def _options(plan: ImpairPlan, why_proxy: str | None, marks: Sequence[str]) -> d
         "picture": f"{WIDTH}x{HEIGHT} at {FPS} a second, synthetic, jpeg_quality 10, keyframe_interval 5",
         "sound": "16 kHz mono, chunks of 20 ms, synthetic speech",
         "drive_hz": 10,
-        "soundboard": "not offered by these robots: skipped",
+        "off_s": request.off_s,
+        "soundboard": f"a wav file of {CLIP_S:g} s, played by a simulated loudspeaker",
         "marks": ";".join(marks),
     }
 

@@ -24,7 +24,8 @@ from tests.support import ROOT, until
 
 pytestmark = pytest.mark.alone  # whole robots
 
-SHORT = {"alone_s": 0.3, "window_s": 1.0, "grace_s": 0.2}
+MEASURES = (cells.SOUND, cells.PICTURES, cells.DRIVE, cells.HEARTBEAT_GAP)
+SHORT = {"alone_s": 0.3, "window_s": 1.0, "grace_s": 0.2, "off_s": 0.6, "clip_s": 20.0}
 
 
 @pytest.fixture
@@ -48,9 +49,9 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     plan = ImpairPlan(trials=["512k"], subjects=[subject], network=kind, window_s=1.0, quick=True, output=tmp_path)
     assert run(plan, Console(file=printed, width=120)) == 0
     results = load(tmp_path / "impair.json")
-    sound, video, drive, heartbeat = (
+    sound, video, drive, heartbeat, after_video, after_audio, clip = (
         results.find(subject, measure, trial="512k")
-        for measure in (cells.SOUND, cells.PICTURES, cells.DRIVE, cells.HEARTBEAT_GAP)
+        for measure in (*MEASURES, cells.AFTER_VIDEO, cells.AFTER_AUDIO, cells.CLIP)
     )
     assert sound is not None
     assert sound.samples
@@ -62,6 +63,13 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     assert min(drive.samples) > 0
     assert heartbeat is not None
     assert len(heartbeat.samples) > 1
+    for after in (after_video, after_audio):
+        assert after is not None
+        assert int(str(after.figures["bytes_up"])) > 0
+        assert int(str(after.figures["heartbeats"])) > 0
+    assert clip is not None
+    assert clip.lost == 0
+    assert 0 < clip.samples[0] < 20_000
     assert results.options["link"] == kind
     assert {"namespaces": "network namespaces", "proxy": "loss modelled"}[kind] in printed.getvalue()
     assert "512k@" in str(results.options["marks"])

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import io
 import math
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from pebble.bench.impair import cells, metrics
 from pebble.bench.impair.cells import Trial, cells_of, over_time
-from pebble.bench.impair.messages import Command, Heartbeat, Picture, Record, Sound, Window
+from pebble.bench.impair.messages import ClipCommand, Command, Heartbeat, Picture, Record, Sound, Window
 from pebble.bench.impair.network_process import Traffic
 from pebble.bench.impair.plan import NAMES, QUICK, ImpairPlan
 from pebble.bench.impair.report import assessment, tables
 from pebble.bench.results import Cell, Results
 from pebble.errors import PebbleError
+from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry, motors_entry
 
 S, MS = 1_000_000_000, 1_000_000
@@ -168,13 +170,24 @@ def trial(
         "alone": Window(0, 3 * S),
         "video": video,
         "audio": audio,
+        "video_off": Window(8 * S, 10 * S),
+        "audio_off": Window(18 * S, 20 * S),
+        "clip": ClipCommand(20 * S, 20 * S + 30 * MS),
         "payloads": 70,
     }
     reached = commands if reached is None else commands[reached]
     entries = [line(command.sent_ns + 10 * MS, command.left, command.right) for command in reached]
     entries += [motors_entry(command.sent_ns + 10 * MS, (command.left, command.right)) for command in reached[:1]]
-    traffic = dict.fromkeys(("alone", "video", "audio"), (Traffic(1000, 500), Traffic(126_000, 1750, dropped_up=3)))
-    return Trial(subject, name, Record(**{**record, **more}), entries, traffic)
+    phases = ("alone", "video", "video off", "audio", "audio off")
+    traffic = dict.fromkeys(phases, (Traffic(1000, 500), Traffic(126_000, 1750, dropped_up=3)))
+    played = [playback(0, late_ms), playback(20, 70)]
+    return Trial(subject, name, Record(**{**record, **more}), entries, traffic, played)
+
+
+def playback(at_s: int, late_ms: float) -> Playback:
+    """It began ``late_ms`` after ``at_s``."""
+    began_ns = at_s * S + round(late_ms * MS)
+    return Playback("clip.wav", began_ns, began_ns + S // 2, 0.5, False, 16_000, 1, Path("clip.wav"), 1)
 
 
 def of(found: list[Cell], measure: str) -> Cell:
@@ -184,7 +197,7 @@ def of(found: list[Cell], measure: str) -> Cell:
 
 def test_a_good_trial_has_all_its_cells() -> None:
     found = cells_of([trial()], fps=10)
-    assert len({cell.measure for cell in found}) == len(found) == 9
+    assert len({cell.measure for cell in found}) == len(found) == 12
     sound, video = of(found, cells.SOUND), of(found, cells.PICTURES)
     assert sound.figures["delivered_percent"] == sound.figures["on_time_percent"] == 100
     assert (sound.lost, sound.percentile(95), sound.figures["window_s"]) == (0, 50, 10)
@@ -197,6 +210,28 @@ def test_a_good_trial_has_all_its_cells() -> None:
     assert [len(of(found, name).samples) for name in (cells.DRIVE_ALONE, cells.DRIVE_VIDEO, cells.DRIVE_AUDIO)] == [
         *(30, 70, 100)
     ]
+
+
+def test_what_is_sent_without_media_is_counted() -> None:
+    found = cells_of([trial(heartbeats=[heartbeat(number / 4) for number in range(77)])], fps=10)
+    video, audio = of(found, cells.AFTER_VIDEO), of(found, cells.AFTER_AUDIO)
+    assert (video.figures["heartbeats"], video.figures["longest_gap_s"], video.figures["bytes_up"]) == (
+        8,
+        0.25,
+        125_000,
+    )
+    assert (audio.figures["heartbeats"], audio.figures["longest_gap_s"]) == (5, 1.0)
+
+
+def test_a_clip_is_timed_from_its_command_to_its_first_sample() -> None:
+    clip = of(cells_of([trial()], fps=10), cells.CLIP)
+    assert (clip.samples, clip.lost, clip.figures["status_ms"]) == ([70], 0, 30)
+    never = trial(name="64k", clip=ClipCommand(21 * S))
+    found = cells_of([trial(), never], fps=10)
+    (silent,) = (cell for cell in found if cell.measure == cells.CLIP and cell.params["trial"] == "64k")
+    assert (silent.samples, silent.lost, silent.figures["status_ms"]) == ([], 1, None)
+    line = "Clips that the loudspeaker played when commanded: zenoh h264 opus 1 of 2 (p50 70.0 ms, longest 70.0 ms)."
+    assert line in assessment(found)
 
 
 def test_a_trial_in_which_nothing_arrived_has_metrics_too() -> None:
@@ -258,7 +293,7 @@ def test_transports_are_compared_where_both_were_tried() -> None:
     assert not any("zenoh and mqtt" in sentence for sentence in assessment(cells_of(both[::2], fps=10)))
 
 
-@pytest.mark.parametrize(("width", "number"), [(80, 2), (105, 4), (120, 4)])
+@pytest.mark.parametrize(("width", "number"), [(80, 4), (105, 6), (120, 6)])
 def test_the_tables_fit(width: int, number: int) -> None:
     tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in NAMES]
     results = Results(bench="impair", cells=cells_of(tried, fps=10), options={"link_words": "a proxy", "window_s": 8.0})

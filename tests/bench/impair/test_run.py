@@ -14,7 +14,7 @@ from rich.console import Console
 
 from pebble.bench.impair import run as module
 from pebble.bench.impair.conditions import Condition
-from pebble.bench.impair.messages import OperatorReport, Record, RecoveryRequest, TrialRequest, Window
+from pebble.bench.impair.messages import ClipCommand, OperatorReport, Record, RecoveryRequest, TrialRequest, Window
 from pebble.bench.impair.network_process import Traffic
 from pebble.bench.impair.plan import ImpairPlan, Subject
 from pebble.bench.impair.run import run
@@ -30,11 +30,13 @@ NOTHING = Record(
     alone=Window(0, S),
     video=Window(S, 2 * S),
     audio=Window(2 * S, 3 * S),
+    video_off=Window(2 * S, 3 * S),
+    audio_off=Window(3 * S, 4 * S),
+    clip=ClipCommand(4 * S),
     payloads=0,
 )
-TRIAL = [OperatorReport(phase=phase) for name in ("alone", "video", "audio") for phase in (name, "")] + [
-    OperatorReport(record=NOTHING)
-]
+PHASES = ("alone", "video", "video off", "audio", "audio off")
+TRIAL = [OperatorReport(phase=phase) for name in PHASES for phase in (name, "")] + [OperatorReport(record=NOTHING)]
 
 
 class QuietNetwork:
@@ -70,6 +72,9 @@ class FakeRobot:
         return printed
 
     def entries(self, _since_ns: int) -> list[object]:
+        return []
+
+    def playbacks(self) -> list[object]:
         return []
 
 
