@@ -61,13 +61,21 @@ def test_a_wall_hides_what_is_behind_it() -> None:
     assert tags_in(seen(world_of(tags=[TAG], walls=[WALL]))) == {}
 
 
+def test_a_wall_hides_what_is_nearer_than_its_middle() -> None:
+    tag = {**TAG, "y": 0.5, "size_m": 0.1}
+    away = {"x1": 0.5, "y1": 0.15, "x2": 6.0, "y2": -0.5}
+    assert 13 in tags_in(seen(world_of(tags=[tag])))
+    assert tags_in(seen(world_of(tags=[tag], walls=[away]))) == {}
+
+
 def test_a_low_wall_hides_the_lower_part() -> None:
     world = world_of(tags=[{**TAG, "z": 0.5}], walls=[{**WALL, "height_m": 0.2}])
     assert 13 in tags_in(seen(world))
 
 
-def test_a_tag_on_a_wall_is_in_front_of_it_and_unseen_from_behind() -> None:
-    world = world_of(tags=[{**TAG, "x": 1.0}], walls=[WALL])
+@pytest.mark.parametrize("y", [0.0, 0.3, -0.3])
+def test_a_tag_on_a_wall_is_in_front_of_it_and_unseen_from_behind(y: float) -> None:
+    world = world_of(tags=[{**TAG, "x": 1.0, "y": y}], walls=[WALL])
     assert 13 in tags_in(seen(world))
     assert tags_in(seen(world, goob=(2.0, 0.0, math.pi))) == {}
 
@@ -106,6 +114,11 @@ def test_a_room_has_walls_all_around(heading: float) -> None:
     row = seen(world, goob=(0.05, 0.02, heading))[240]
     assert row.min() >= 170, "the floor is darker than the walls"
     assert row.max() <= 208, "the sky is lighter"
+
+
+def test_the_walls_of_a_room_are_seen_from_inside_only() -> None:
+    world = world_of(room={"x_min": -1.0, "x_max": 3.0, "y_min": -1.0, "y_max": 1.0}, camera=CLEAR)
+    assert seen(world, goob=(-1.5, 0.0, 0.0))[350, 320].max() < 170, "the floor behind the nearest wall"
 
 
 def blurred(picture: Image) -> float:
