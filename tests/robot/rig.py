@@ -22,7 +22,8 @@ BASE = "pebble/robots/rover"
 STOP = (0.0, 0.0)
 PROGRAMS = (
     *("zenoh_hub", "announcer", "serial_mcu_bridge", "av_daemon", "mqtt_bridge", "mqtt_mirror"),
-    *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream", "autonomy_manager"),
+    *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream"),
+    *("soundboard_handler", "autonomy_manager"),
 )
 #: A camera and a microphone for ``av_daemon``.
 DEVICES = {
@@ -32,23 +33,11 @@ DEVICES = {
 }
 
 
-class Mcu:
-    """The simulated motor MCU in its own process, and the trace of what it received."""
+class Motors:
+    """The serial port of a simulated motor MCU, and the trace of what it received and did."""
 
-    def __init__(self, folder: Path, kind: str = "goob") -> None:
-        self.port, self._trace = folder / "tty", folder / "trace.jsonl"
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "pebble.simulation.mcu", "--kind", kind, "--link", str(self.port),
-             "--trace", str(self._trace), "--control"],
-            cwd=ROOT, stdin=subprocess.PIPE,
-        )  # fmt: skip
-        assert until(self.port.exists, 10), "the simulated MCU did not start"
-
-    def command(self, name: str) -> None:
-        """``unplug``, ``replug``, ``charge``, …"""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{name}\n".encode())
-        self._process.stdin.flush()
+    def __init__(self, port: Path, trace: Path) -> None:
+        self.port, self._trace = port, trace
 
     def entries(self, since: float = 0.0) -> list[Entry]:
         """What happened on the line after ``since`` (monotonic seconds)."""
@@ -62,6 +51,36 @@ class Mcu:
         drives = self.drives(since)
         return bool(drives) and drives[-1][1] != STOP
 
+    def motors(self, since: float = 0.0) -> list[tuple[float, tuple[float, float]]]:
+        """Every change of the motors' outputs after ``since`` as (monotonic seconds, (left, right))."""
+        return [(entry.ns / 1e9, entry.motors) for entry in self.entries(since) if entry.motors is not None]
+
+    def turning(self) -> bool:
+        motors = self.motors()
+        return bool(motors) and motors[-1][1] != STOP
+
+    def close(self) -> None:
+        """End its process, if it has one of its own."""
+
+
+class Mcu(Motors):
+    """A simulated motor MCU in its own process."""
+
+    def __init__(self, folder: Path, kind: str = "goob") -> None:
+        super().__init__(folder / "tty", folder / "trace.jsonl")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "pebble.simulation.mcu", "--kind", kind, "--link", str(self.port),
+             "--trace", str(self._trace), "--control"],
+            cwd=ROOT, stdin=subprocess.PIPE,
+        )  # fmt: skip
+        assert until(self.port.exists, 10), "the simulated MCU did not start"
+
+    def command(self, name: str) -> None:
+        """``unplug``, ``replug``, ``charge``, …"""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{name}\n".encode())
+        self._process.stdin.flush()
+
     def close(self) -> None:
         self._process.terminate()
         self._process.wait(10)
@@ -72,15 +91,17 @@ class Rig:
 
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
-    replace its own brokers; ``login`` is the robot's user name there.
+    replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU.
     """
 
     def __init__(
         self,
         kind: str,
         *,
+        name: str = "rover",
         mirror: bool = False,
         mcu: str = "goob",
+        motors: Motors | None = None,
         start: bool = True,
         direct: bool = False,
         remote: Broker | None = None,
@@ -88,7 +109,7 @@ class Rig:
         login: str | None = None,
         **config: Any,
     ) -> None:
-        self.kind, self._extra, self._direct = kind, config, direct
+        self.kind, self.name, self._extra, self._direct = kind, name, config, direct
         self._login = {} if login is None else {"username": login}
         self.charge_later = "charge"  # the MCU command in the middle of a fault
         self._folder = tempfile.TemporaryDirectory(prefix="pbl")
@@ -97,12 +118,12 @@ class Rig:
         self.uplink = TcpProxy(self.remote.port)
         self.local = local or Broker(self.folder) if kind == "mqtt" or mirror else None
         self.mirror = mirror
-        self.mcu = Mcu(self.folder, mcu)
+        self.mcu = motors or Mcu(self.folder, mcu)
         self.config = self.folder / "robot.json"
         self.config.write_text(json.dumps(self._config(), indent=1))
         self.log = self.folder / "robot.log"
         self._robot: subprocess.Popen[bytes] | None = None
-        self.operator = Operator(self.remote.port, BASE)
+        self.operator = Operator(self.remote.port, f"pebble/robots/{name}")
         if start:
             try:
                 self.start()
@@ -216,7 +237,7 @@ class Rig:
         }
         for name, more in self._extra.items():
             services[name] = {**services.get(name, {}), **more}
-        return {"robot": {"id": "rover"}, **self._transport(), "services": services}
+        return {"robot": {"id": self.name}, **self._transport(), "services": services}
 
     def _transport(self) -> dict[str, Any]:
         if self.kind == "zenoh":
