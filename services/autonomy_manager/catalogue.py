@@ -58,18 +58,21 @@ class Catalogue:
     def __init__(self, config: Config) -> None:
         self._config, self._section = config, config.services.autonomy_manager
         self._roots = roots(config)
-        self._descriptions = Descriptions()
+        self._manifests, self._answers = Descriptions(), Descriptions()
+        self._scanned = False
         self._complained: set[str] = set()  # names with a warning in the log
 
-    def scan(self, found: Callable[[dict[str, Script]], None]) -> None:
-        """Call ``found`` with the scripts so far whenever one has been asked, and with all at the end."""
+    def scan(self, found: Callable[[dict[str, Script]], object]) -> None:
+        """Call ``found`` with all scripts; the first time also with those so far, before one is asked."""
         folders = dict(self._folders())
         scripts: dict[str, Script] = {}
         for name, folder in folders.items():
-            script = self._script(name, folder, lambda: found(dict(scripts)))
+            script = self._script(name, folder, lambda: self._scanned or found(dict(scripts)))
             if script is not None:
                 scripts[name] = script
-        self._descriptions.retain_only(set(folders))
+        for descriptions in (self._manifests, self._answers):
+            descriptions.retain_only(set(folders))
+        self._scanned = True
         found(scripts)
 
     def _folders(self) -> Iterator[tuple[str, Path]]:
@@ -90,19 +93,22 @@ class Catalogue:
             return False
         return self._section.scripts.get(name, ScriptSection()).enabled
 
-    def _script(self, name: str, folder: Path, before_asking: Callable[[], None]) -> Script | None:
+    def _script(self, name: str, folder: Path, before_asking: Callable[[], object]) -> Script | None:
         section = self._section.scripts.get(name, ScriptSection())
         entry, manifest = folder / section.entrypoint, folder / MANIFEST
-        described = self._descriptions.get(f"{name}/{MANIFEST}", [manifest], lambda: _manifest(manifest))
-        described = described or Description()
+        described = self._manifests.get(name, [manifest], lambda: _manifest(manifest)) or Description()
         if not described.command and not entry.is_file():
             return None
         ours = not described.command and is_ours(entry)
         command = self._command(folder, entry, section, described)
         variables = environment(self._section.env, section.env)
         if ours:
-            before_asking()
-            answer = self._descriptions.get(name, [entry], lambda: ask(command, folder, variables))
+
+            def question() -> Description:
+                before_asking()
+                return ask(command, folder, variables)
+
+            answer = self._answers.get(name, [entry], question)
             described = _merged(described, answer or Description())
         settings = self._settings(name, section, described, ours=ours)
         return Script(

@@ -94,7 +94,7 @@ def read_manifest(path: Path) -> Description | None:
 
 def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> Description:
     """Run ``command --describe`` and return its answer. Raises DescribeError; takes at most 20 s."""
-    limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST}", *command, "--describe"]
+    limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST + 1}", *command, "--describe"]
     with TemporaryFile() as output, TemporaryFile() as errors:
         try:
             process = subprocess.Popen(
@@ -125,7 +125,7 @@ def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) ->
 
 def _content(file: IO[bytes]) -> bytes:
     file.seek(0)
-    return file.read(_LONGEST)
+    return file.read(_LONGEST + 1)
 
 
 def _parse(raw: bytes, source: str) -> Description:

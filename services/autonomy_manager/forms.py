@@ -13,6 +13,7 @@ from msgspec import Struct
 MAX_SETTINGS = 64  # of one script
 MAX_TEXT = 256  # characters of a value
 
+_SHOWN = 100  # characters of a refused value
 _TRUE = frozenset(("1", "true", "yes", "on", "enabled", "enable"))
 _FALSE = frozenset(("0", "false", "no", "off", "disabled", "disable"))
 _FILE_WORDS = frozenset(("file", "filename", "path", "dir", "directory", "folder"))
@@ -156,7 +157,7 @@ def _in_range(setting: Setting, number: int | float) -> int | float:
 
 def _option(setting: Setting, raw: Any) -> str:
     if str(raw) not in map(str, setting.options):
-        raise SettingError(f"Invalid option '{str(raw)[:MAX_TEXT]}' for {setting.key}")
+        raise SettingError(f"Invalid option '{shown(raw)}' for {setting.key}")
     return str(raw)
 
 
@@ -172,6 +173,11 @@ def _text(key: str, raw: Any) -> str:
     if not text.isprintable():
         raise SettingError(f"{key} must not contain control characters")
     return text
+
+
+def shown(raw: object) -> str:
+    """Text of a command, fit for a status and a log."""
+    return "".join(letter if letter.isprintable() else "?" for letter in str(raw)[:_SHOWN])
 
 
 def _word(value: Value) -> str:

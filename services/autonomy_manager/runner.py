@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,9 +76,9 @@ class Run:
 class Runner:
     """All methods belong to the service's thread."""
 
-    def __init__(self, surroundings: Surroundings, spawn: Spawn, stop_timeout_s: float, env: Mapping[str, str]) -> None:
+    def __init__(self, surroundings: Surroundings, spawn: Spawn, stop_timeout_s: float) -> None:
         self.error: str | None = None
-        self._surroundings, self._spawn, self._stop_timeout_s, self._env = surroundings, spawn, stop_timeout_s, env
+        self._surroundings, self._spawn, self._stop_timeout_s = surroundings, spawn, stop_timeout_s
         self._run: Run | None = None
         self._next: Plan | None = None
 
@@ -92,12 +93,21 @@ class Runner:
         return None if self._run is None or self._run.ending else self._run
 
     @property
+    def switching(self) -> bool:
+        """Whether a start waits for the end of what runs."""
+        return self._next is not None
+
+    @property
+    def unfinished(self) -> Run | None:
+        """The present run, unless it is being ended and no other follows."""
+        return self._run if self._next is not None else self.active
+
+    @property
     def config(self) -> Mapping[str, Value] | None:
         return None if self._run is None or self._run.main is None or self._run.main.ended else self._run.plan.config
 
     def refuse(self, error: str) -> None:
         """A start is not possible; what runs goes on."""
-        log.warning("%s", error)
         self.error = error
         self._surroundings.changed()
 
@@ -123,10 +133,11 @@ class Runner:
             return
         self._surroundings.halt(run.number)
         for number in (signal.SIGTERM, signal.SIGKILL):
+            end = time.monotonic() + wait_s
             for part in run.parts:
                 part.child.signal(number)
             for part in run.parts:
-                part.child.wait(wait_s)
+                part.child.wait(end - time.monotonic())
         self._surroundings.halt(run.number)
         self._run = None
         self._surroundings.end_run(run.number)
@@ -163,7 +174,7 @@ class Runner:
             file=script.file,
             command=(*script.command, "--config", path, *step.options),
             folder=script.folder,
-            environment=environment(self._env, script.environment, own),
+            environment=environment(script.environment, own),
             tie=signal.SIGTERM if script.ours else signal.SIGKILL,
         )
         part: Part

@@ -9,7 +9,7 @@ from typing import Any
 from msgspec import Struct
 
 from pebble.errors import PebbleError
-from pebble.services.autonomy_manager.forms import Setting, SettingError, Value, arguments, effective
+from pebble.services.autonomy_manager.forms import Setting, SettingError, Value, arguments, effective, shown
 
 
 class StartError(PebbleError):
@@ -61,7 +61,7 @@ def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) ->
     """Check a start. Raises StartError."""
     script = scripts.get(file)
     if script is None:
-        raise StartError(f"Unknown autonomy file: {_shown(file)}")
+        raise StartError(f"Unknown autonomy file: {shown(file)}")
     try:
         values = effective(script.settings, config)
     except SettingError as error:
@@ -73,14 +73,9 @@ def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) ->
 def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency) -> Step:
     script = scripts.get(dependency.file)
     if script is None:
-        raise StartError(f"Failed to start {file}: Dependency script not found: {_shown(dependency.file)}")
+        raise StartError(f"Failed to start {file}: Dependency script not found: {shown(dependency.file)}")
     try:
         values = effective(script.settings, dependency.config)
     except SettingError as error:
         raise StartError(f"Failed to start {file}: Invalid config for {dependency.file}: {error}") from None
     return Step(script, tuple(arguments(script.settings, values)))
-
-
-def _shown(name: str) -> str:
-    """A name from a command, fit for a status and a log."""
-    return "".join(letter if letter.isprintable() else "?" for letter in name[:100])

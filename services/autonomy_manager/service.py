@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -58,15 +59,20 @@ class AutonomyManager(Service):
         self._owners = MotorOwners([self.config.motor_owner(line) for line in motors])
         processes = Processes()
         self.on_stop(processes.close)
-        self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds, self._section.env)
+        self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds)
         self._scripts = dict(scripts or {})
         self._fixed = scripts is not None
         self._scan_now = threading.Event()
+        self._stopping = False
         self._overridden_until = float("-inf")
         self._files: list[dict[str, object]] | None = None
         self._status: AutonomyStatus | None = None
         self._connected_before = False
         self._gate: tuple[int, Gate] | None = None  # of the present run, if one of its scripts needs it
+
+    @property
+    def republish_interval_s(self) -> float:
+        return self._section.retained_publish_interval_seconds
 
     def start(self) -> None:
         if self._fixed:
@@ -78,6 +84,8 @@ class AutonomyManager(Service):
         self.changed()
 
     def stop(self) -> None:
+        self._stopping = True
+        self._scan_now.set()
         self._runner.close(_CLOSE_S)
 
     def on_connected(self) -> None:
@@ -105,6 +113,7 @@ class AutonomyManager(Service):
             wanted = plan(self._scripts, file, config)
             self._check(wanted)
         except StartError as error:
+            self._quiet_log.log("refused", logging.WARNING, "%s", error)
             self._runner.refuse(str(error))
         else:
             self._runner.start(wanted)
@@ -125,7 +134,7 @@ class AutonomyManager(Service):
     @on(ESTOP_STATE)
     def motor_owner(self, state: EstopState, owner: str) -> None:
         self._owners.receive(owner, state)
-        run = self._runner.active
+        run = self._runner.unfinished
         if run is not None and (why := self._owners.ending(run.number, run.baseline)):
             self._runner.stop(why)
 
@@ -192,9 +201,10 @@ class AutonomyManager(Service):
         self.post_first(job)
 
     def changed(self) -> None:
-        """Publish the status if it differs from the last one."""
-        status = self._present_status()
-        if status != self._status:
+        """Publish the status if it differs from the last one; only once between two scripts."""
+        status, last = self._present_status(), self._status
+        still_down = last is not None and not (last.running or status.running)
+        if status != last and not (still_down and self._runner.switching):
             self._status = status
             self.publish(AUTONOMY_STATUS, replace(status, timestamp=time.time()))
 
@@ -221,7 +231,7 @@ class AutonomyManager(Service):
     def _scan(self) -> None:
         """On a thread of its own: to ask a script what it is takes long."""
         catalogue = Catalogue(self.config)
-        while self._scan_now.wait():
+        while self._scan_now.wait() and not self._stopping:
             self._scan_now.clear()
             try:
                 catalogue.scan(lambda scripts: self.post(lambda: self._found(scripts), newest_of="scripts"))

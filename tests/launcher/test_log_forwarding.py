@@ -65,6 +65,25 @@ def test_children_do_not_share_a_traceback(forwarded: Forwarded) -> None:
     assert [(record.service, record.pid) for record in forwarded.records] == [("a", 1), ("a", 1)]
 
 
+def test_a_tagged_line_is_logged_under_the_name_in_its_tag(forwarded: Forwarded) -> None:
+    for line in (
+        "[tag-follow 7] 12:00:00 [ERROR] no camera",
+        "[tag-follow 7]   at line 3",
+        "[tag-follow 8] fine",
+        "12:00:00 [WARNING] tag-follow exited with code 3",
+        "[no tag] fine",
+        "[tag-follow 8]  ",
+    ):
+        forwarded.forwarder.tagged_line("autonomy_manager", 42, line)
+    records = [(record.service, record.pid, record.level, record.message) for record in forwarded.records]
+    assert records == [
+        ("autonomy_manager:tag-follow", 7, "ERROR", "[autonomy_manager:tag-follow] no camera"),
+        ("autonomy_manager:tag-follow", 7, "ERROR", "[autonomy_manager:tag-follow]   at line 3"),
+        ("autonomy_manager", 42, "WARNING", "[autonomy_manager] tag-follow exited with code 3"),
+    ]
+    assert "[INFO] [autonomy_manager:tag-follow] fine" in forwarded.written()
+
+
 def test_the_launchers_own_records_go_the_same_way(forwarded: Forwarded) -> None:
     log = logging.getLogger("pebble.launcher.process_supervisor")
     with OwnRecords(forwarded.forwarder, "INFO"):

@@ -2,25 +2,77 @@
 
 from __future__ import annotations
 
+import json
+import signal
+import threading
+import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from tests.services.autonomy_manager.manager_rig import ManagerRig, started
+from tests.services.autonomy_manager.manager_rig import SLEEPER, ManagerRig, alive, started
 from tests.support import gone, until
 
+#: Starts a process of its own, and leaves both numbers.
+PARENT = """
+import os, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)", "grandchild"])
+open("pids.new", "w").write(f"{os.getpid()} {child.pid}")
+os.rename("pids.new", "pids")
+time.sleep(600)
+"""
+DEAF = "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+#: One of ours by its syntax, so that it is asked for its settings; it needs no robot.
+OURS = """
+import sys
+if sys.argv[1:] == ["--describe"]:
+    print('{"label": "Ours", "configs": [{"key": "n", "type": "int", "default": 1, "arg": "--n"}]}')
+    raise SystemExit
+if not sys.argv:
+    from pebble import run
+"""
+SHELL = """#!/bin/sh
+trap 'echo "asked to end"; touch ended; exit 0' TERM
+echo "$@" > arguments
+echo "08:00:00 [ERROR] no camera"
+while :; do sleep 0.1; done
+"""
 
-@pytest.fixture(params=["mqtt", "zenoh"])
-def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ManagerRig]:
-    rig = ManagerRig(request.param, tmp_path)
+
+def rigged(kind: str, folder: Path) -> Iterator[ManagerRig]:
+    rig = ManagerRig(kind, folder)
     yield rig
     rig.close()
 
 
+@pytest.fixture(params=["mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ManagerRig]:
+    yield from rigged(request.param, tmp_path)
+
+
+@pytest.fixture
+def mqtt(tmp_path: Path) -> Iterator[ManagerRig]:
+    yield from rigged("mqtt", tmp_path)
+
+
+def family(folder: Path) -> list[int]:
+    """The numbers of a PARENT and its child."""
+    assert until((folder / "pids").exists)
+    return [int(word) for word in (folder / "pids").read_text().split()]
+
+
 def test_a_script_is_listed_started_and_stopped(rig: ManagerRig) -> None:
     folder = rig.script("walk", args=[{"key": "speed", "type": "float", "default": 0.5, "arg": "--speed", "max": 1}])
+    rig.script("ours", OURS + SLEEPER)
     rig.start()
+    assert rig.newest("autonomy-files")["files"] == [
+        {"file": "ours", "label": "Ours",
+         "configs": [{"key": "n", "label": "n", "type": "int", "default": 1, "arg": "--n"}]},
+        {"file": "walk", "label": "walk",
+         "configs": [{"key": "speed", "label": "speed", "type": "float", "default": 0.5, "arg": "--speed", "max": 1}]},
+    ]  # fmt: skip
     pid = rig.run("walk", speed="0.25")
     assert until(lambda: started(folder))
     assert started(folder) == [(pid, ["--config", str(rig.folder / "rover.json"), "--speed", "0.25"], None)]
@@ -29,3 +81,149 @@ def test_a_script_is_listed_started_and_stopped(rig: ManagerRig) -> None:
     assert until(lambda: rig.status["running"] is False)
     assert gone(pid)
     assert rig.status["error"] is None
+    rig.run("ours")
+    assert until(lambda: started(rig.root / "ours"))
+    ((_, arguments, run),) = started(rig.root / "ours")
+    assert (arguments[2:], rig.drives[-1]["run"] < int(run or 0)) == (["--n", "1"], True)
+
+
+def test_many_starts_never_run_two_scripts_at_once_and_the_last_one_runs(rig: ManagerRig) -> None:
+    for name in ("a", "b", "c", "needs"):
+        rig.script(name, dependencies=[{"file": "c"}] if name == "needs" else [])
+    rig.start()
+    most, ended = [0], threading.Event()
+    mains = [str(rig.root / name / "run.py") for name in ("a", "b", "needs")]
+
+    def watch() -> None:
+        while not ended.wait(0.005):
+            most[0] = max(most[0], sum(len(alive(main)) for main in mains))
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    before = len(rig.world.on("autonomy-status"))
+    for number in range(25):
+        rig.command({"action": "start", "file": ("a", "needs", "b")[number % 3]})
+        time.sleep(0.06)  # 25 of them in about 2 s
+    rig.command({"action": "start", "file": "needs"})
+    assert until(lambda: rig.status["file"] == "needs" and len(alive(mains[2])) == 1 and not alive(mains[0]))
+    ended.set()
+    watcher.join()
+    assert most == [1]
+    running = [status["running"] for status in rig.world.payloads("autonomy-status")[before:]]
+    assert (False, False) not in pairwise(running)
+    assert rig.status["dependencies"][0]["running"] is True
+    assert rig.status["error"] is None
+
+
+@pytest.mark.parametrize("text", [PARENT, DEAF + PARENT, OURS + DEAF + PARENT], ids=["foreign", "deaf", "ours"])
+def test_a_killed_manager_leaves_no_script_and_nothing_it_started(mqtt: ManagerRig, text: str) -> None:
+    folder = mqtt.script("family", text)
+    mqtt.start()
+    mqtt.run("family")
+    pids = family(folder)
+    mqtt.end(signal.SIGKILL)
+    killed = time.monotonic()
+    assert until(lambda: all(map(gone, pids)), 5)
+    assert time.monotonic() - killed < 1.0 + 1.5  # a busy machine's share
+
+
+def test_a_stopped_manager_leaves_none_either_and_publishes_so(rig: ManagerRig) -> None:
+    folder = rig.script("family", PARENT)
+    rig.start()
+    rig.run("family")
+    pids = family(folder)
+    rig.end()
+    assert all(map(gone, pids))
+    assert (rig.status["running"], rig.status["pid"]) == (False, None)
+
+
+def test_a_script_that_will_not_end_is_killed_with_all_it_started(mqtt: ManagerRig) -> None:
+    mqtt.section["stop_timeout_seconds"] = 0.3
+    folder = mqtt.script("family", DEAF + PARENT)
+    mqtt.start()
+    mqtt.run("family")
+    pids = family(folder)
+    mqtt.command({"action": "stop"})
+    assert until(lambda: mqtt.status["running"] is False)
+    assert until(lambda: all(map(gone, pids)))
+    assert mqtt.status["error"] is None
+
+
+def test_what_a_script_leaves_behind_ends_with_it(mqtt: ManagerRig) -> None:
+    folder = mqtt.script("family", PARENT.replace("time.sleep(600)\n", "raise SystemExit(3)\n", 2)[:-1])
+    mqtt.start()
+    mqtt.command({"action": "start", "file": "family"})
+    assert until(lambda: mqtt.status["error"] == "family exited with code 3")
+    assert until(lambda: all(map(gone, family(folder))))
+
+
+def test_a_shell_script_with_a_manifest_is_a_script(mqtt: ManagerRig) -> None:
+    folder = mqtt.script("shell", SHELL, "go.sh")
+    manifest = {"label": "In shell", "command": ["./go.sh"], "configs": [{"key": "n", "type": "int", "arg": "-n"}]}
+    (folder / "script.json").write_text(json.dumps(manifest))
+    mqtt.start()
+    pid = mqtt.run("shell", n=7)
+    assert until(lambda: f"[shell {pid}] 08:00:00 [ERROR] no camera\n" in mqtt.logged())
+    assert (folder / "arguments").read_text() == f"--config {mqtt.folder / 'rover.json'} -n 7\n"
+    mqtt.command(False)
+    assert until(lambda: mqtt.status["running"] is False)
+    assert (folder / "ended").exists()
+    assert until(lambda: f"[shell {pid}] asked to end\n" in mqtt.logged())
+    assert until(lambda: len(mqtt.drives) == 5)  # one at the manager's start, four around the script's end
+    assert {json.dumps(drive | {"run": 0}) for drive in mqtt.drives} == {
+        '{"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": 0}'
+    }
+
+
+def test_a_retained_start_runs_nothing_when_the_manager_starts(rig: ManagerRig) -> None:
+    folder = rig.script("walk")
+    rig.command({"action": "start", "file": "walk"}, retain=True)
+    for _ in range(2):
+        rig.start()
+        rig.end()
+    assert started(folder) == []
+
+
+def test_a_new_manager_stops_the_wheels_with_a_run_above_its_predecessors(mqtt: ManagerRig) -> None:
+    mqtt.script("ours", OURS + SLEEPER)
+    mqtt.start()
+    mqtt.run("ours")
+    assert until(lambda: started(mqtt.root / "ours"))
+    mqtt.end(signal.SIGKILL)
+    before = len(mqtt.drives)
+    mqtt.start()
+    assert until(lambda: len(mqtt.drives) > before)
+    assert mqtt.drives[before]["run"] > int(started(mqtt.root / "ours")[0][2] or 0)
+    assert until(lambda: mqtt.status["running"] is False)
+
+
+def test_a_flood_of_lines_is_bounded(mqtt: ManagerRig) -> None:
+    mqtt.script("flood", "import sys\nfor n in range(50_000):\n    print('line', n)\nprint('x' * 100_000)\nsys.exit(1)")
+    mqtt.start()
+    mqtt.command({"action": "start", "file": "flood"})
+    assert until(lambda: mqtt.status.get("error") == "flood exited with code 1", 20)
+    lines = [line for line in mqtt.logged().splitlines() if line.startswith("[flood ")]
+    assert 200 <= len(lines) <= 2500
+    assert lines[0].endswith("] line 0")
+    assert "lines dropped: only 200 lines per second are logged" in lines[-1]
+    assert max(map(len, lines)) < 3600
+
+
+def test_scripts_inherit_nothing_of_the_launchers(mqtt: ManagerRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PEBBLE_WANTED", "camera_publisher=")
+    monkeypatch.setenv("PEBBLE_RUN", "5")
+    found = "[dict(os.environ), os.getpgid(0) == os.getpid(), sys.stdin.read()]"
+    text = f"import json, os, sys\njson.dump({found}, open('env', 'w'))"
+    folder = mqtt.script("look", text, env={"TEA": "hot"})
+    mqtt.section["env"] = {"TEA": "cold", "CUP": "1"}
+    mqtt.start()
+    mqtt.command({"action": "start", "file": "look"})
+    assert until(lambda: mqtt.status.get("running") is False and (folder / "env").exists() and not alive(str(folder)))
+    variables, leads_group, stdin = json.loads((folder / "env").read_text())
+    assert not variables.keys() & {"PEBBLE_WANTED", "PEBBLE_RUN", "PEBBLE_NOTIFY_FD"}
+    assert (variables["TEA"], variables["CUP"], variables["PEBBLE_CONFIG"]) == (
+        "hot",
+        "1",
+        str(mqtt.folder / "rover.json"),
+    )
+    assert (leads_group, stdin) == (True, "")

@@ -1,0 +1,175 @@
+"""Which scripts are offered, and with which settings."""
+
+from __future__ import annotations
+
+import logging
+import stat
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from pebble.config import Config, parse
+from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
+from pebble.services.autonomy_manager.forms import Setting, form
+from pebble.services.autonomy_manager.script import Script
+
+OURS = """
+import sys
+from pebble.script import run  # found by its syntax; what follows only pretends
+"""
+ANSWER = '{"label": "Walk", "configs": [{"key": "speed", "arg": "--speed"}, {"key": "laps", "arg": "--laps"}]}'
+PRETENDS = f"""
+if 0:
+    from pebble.script import run
+open("asked", "a").write("x")
+print({ANSWER!r})
+"""
+
+
+def config(folder: Path, **section: Any) -> Config:
+    raw = {"robot": {"id": "rover"}, "services": {"autonomy_manager": {"autonomy_root": str(folder), **section}}}
+    return parse(raw, folder=folder, env={})
+
+
+def write(folder: Path, name: str, text: str = "", file: str = "run.py") -> Path:
+    path = folder / name / file
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def scanned(catalogue: Catalogue) -> dict[str, Script]:
+    found: list[dict[str, Script]] = []
+    catalogue.scan(found.append)
+    return found[-1]
+
+
+def scripts(folder: Path, **section: Any) -> dict[str, Script]:
+    return scanned(Catalogue(config(folder, **section)))
+
+
+def test_folders_with_an_entry_point_are_scripts(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("beta", "Alpha", ".hidden", "_draft", "off", "bad]name"):
+        write(tmp_path, name)
+    write(tmp_path, "other", file="main.py")
+    write(tmp_path, "empty", file="README")
+    (tmp_path / "run.py").write_text("")
+    (tmp_path / "elsewhere").symlink_to(tmp_path / "beta")
+    found = scripts(tmp_path, scripts={"off": {"enabled": False}, "other": {"entrypoint": "main.py"}})
+    assert list(found) == ["Alpha", "beta", "elsewhere", "other"]
+    assert found["beta"].command == (sys.executable, str(tmp_path / "beta/run.py"))
+    assert "'bad]name' is not offered: rename its folder" in caplog.text
+
+
+def test_a_missing_folder_has_no_scripts(tmp_path: Path) -> None:
+    assert scripts(tmp_path / "missing") == {}
+
+
+def test_the_default_folder_is_beside_the_config_and_ours_come_last(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+
+    def of(root: str, folder: Path) -> tuple[Path, ...]:
+        raw = {"robot": {"id": "rover"}, "services": {"autonomy_manager": {"autonomy_root": root}}}
+        return roots(parse(raw, folder=folder, env={}), own)
+
+    originals = tmp_path / "control/configs"
+    assert of("autonomy", tmp_path) == (tmp_path / "autonomy", own)
+    assert of("autonomy", originals) == (originals / "autonomy", tmp_path / "autonomy", own)
+    assert of("mine", tmp_path) == (tmp_path / "mine",)
+    assert of("/opt/scripts", tmp_path) == (Path("/opt/scripts"),)
+
+
+def test_of_two_scripts_with_one_name_that_of_the_robot_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    for root in (first, second):
+        root.mkdir()
+        write(root, "both")
+    write(second, "own")
+    monkeypatch.setattr("pebble.services.autonomy_manager.catalogue.roots", lambda _config: (first, second))
+    found = scripts(tmp_path)
+    assert {name: script.folder.parent for name, script in found.items()} == {"both": first, "own": second}
+
+
+def test_one_of_ours_is_asked_once_and_no_other(tmp_path: Path) -> None:
+    write(tmp_path, "walk", PRETENDS)
+    write(tmp_path, "foreign", "open('asked', 'a').write('x')")
+    catalogue = Catalogue(config(tmp_path))
+    partial: list[list[str]] = []
+    catalogue.scan(lambda found: partial.append(list(found)))
+    assert partial == [["foreign"], ["foreign", "walk"]]
+    found = scanned(catalogue)
+    assert (tmp_path / "walk/asked").read_text() == "x"
+    assert not (tmp_path / "foreign/asked").exists()
+    assert (found["walk"].label, found["walk"].ours, found["walk"].needs_gate) == ("Walk", True, False)
+    assert [setting.key for setting in found["walk"].settings] == ["speed", "laps"]
+    assert (found["foreign"].settings, found["foreign"].needs_gate) == ((), True)
+
+
+def test_the_config_comes_first_but_one_of_ours_knows_its_options(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path, "walk", PRETENDS)
+    args = [{"key": "speed", "label": "Pace", "arg": "--velocity", "type": "float"}, {"key": "marker", "arg": "--m"}]
+    section = {"args": args, "display_name": "Wander", "dependencies": [{"file": "eyes"}, {"file": "walk"}]}
+    walk = scripts(tmp_path, scripts={"walk": section})["walk"]
+    assert [(setting.key, setting.label, setting.arg) for setting in walk.settings] == [
+        ("speed", "Pace", "--speed"),
+        ("laps", None, "--laps"),
+    ]
+    assert (walk.label, [dependency.file for dependency in walk.dependencies]) == ("Wander", ["eyes"])
+    assert "walk has no setting marker: ignored" in caplog.text
+
+
+def test_the_originals_scripts_have_forms_that_a_config_completes(tmp_path: Path) -> None:
+    for name in ("apriltag-locations", "apriltag-odom-follow", "wheel-odometry"):
+        write(tmp_path, name, "import argparse")
+    args = [{"key": "width", "type": "int", "default": 640, "arg": "--width"}]
+    found = scripts(tmp_path, scripts={"apriltag-locations": {"args": args}})
+    by_key = {setting.key: setting for setting in found["apriltag-locations"].settings}
+    assert (len(by_key), by_key["width"].default, by_key["width"].min) == (8, 640, None)
+    assert [dependency.file for dependency in found["apriltag-odom-follow"].dependencies] == [
+        "apriltag-locations",
+        "wheel-odometry",
+    ]
+    write(tmp_path, "wheel-odometry", PRETENDS)
+    assert [setting.key for setting in scripts(tmp_path)["wheel-odometry"].settings] == ["speed", "laps"]
+
+
+def test_any_program_with_a_manifest_is_a_script(tmp_path: Path) -> None:
+    write(tmp_path, "shell", "#!/bin/sh", file="go.sh")
+    write(tmp_path, "shell", '{"command": ["./go.sh", "-v"], "configs": [{"key": "n", "arg": "-n"}]}', "script.json")
+    program = write(tmp_path, "plain", "#!/bin/sh", file="start")
+    program.chmod(stat.S_IRWXU)
+    write(tmp_path, "venv", "import pebble.script\nraise SystemExit(1)")
+    section = {"plain": {"entrypoint": "start"}, "venv": {"python": "venv/bin/python"}}
+    found = scripts(tmp_path, scripts=section)
+    assert found["shell"].command == (str(tmp_path / "shell/go.sh"), "-v")
+    assert [setting.key for setting in found["shell"].settings] == ["n"]
+    assert found["plain"].command == (str(program),)
+    assert found["venv"].command == (str(tmp_path / "venv/bin/python"), str(tmp_path / "venv/run.py"))
+
+
+def test_a_script_that_fails_to_answer_is_offered_without_settings(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path, "walk", "import pebble.script\nraise SystemExit('no camera')")
+    with caplog.at_level(logging.WARNING):
+        assert scripts(tmp_path)["walk"].settings == ()
+    assert "walk is offered without settings: its --describe ended with code 1: no camera" in caplog.text
+
+
+def test_the_list_is_bounded(tmp_path: Path) -> None:
+    for number in range(MAX_SCRIPTS + 5):
+        write(tmp_path, f"s{number:03}")
+    many = [{"key": f"k{number}", "label": "x" * 1000} for number in range(30)]
+    found = scripts(tmp_path, scripts={"s000": {"args": many}})
+    assert len(found) == MAX_SCRIPTS
+    assert found["s000"].settings == ()
+    large = tuple(Setting(key=f"k{number}", label="x" * 200) for number in range(60))
+    entries = files(msgspec.structs.replace(script, settings=large) for script in found.values())
+    assert entries[0]["configs"] == form(large)
+    assert entries[-1]["configs"] == []
+    assert len(msgspec.json.encode(entries)) < 300_000

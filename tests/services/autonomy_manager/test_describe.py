@@ -1,0 +1,150 @@
+"""Which files are asked what they are, and what becomes of their answers."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from pebble.services.autonomy_manager import describe
+from pebble.services.autonomy_manager.describe import (
+    DescribeError,
+    Description,
+    Descriptions,
+    ask,
+    is_ours,
+    read_manifest,
+)
+from tests.support import gone, until
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> Path:
+    return tmp_path / "run.py"
+
+
+@pytest.mark.parametrize(
+    ("text", "ours"),
+    [
+        ("from pebble import run", True),
+        ("from pebble import camera, run as go", True),
+        ("from pebble.script import Robot", True),
+        ("import pebble.script", True),
+        ("def main():\n    from pebble import run\n", True),
+        ("from pebble import camera", False),
+        ("import pebble", False),
+        ("'''\nfrom pebble.script import run\n'''", False),
+        ("# from pebble import run", False),
+        ("from .pebble import run", False),
+        ("from pebble.scripts import run", False),
+        ("def broken(:", False),
+        ("x = 1\0", False),
+        ("(" * 5000, False),
+        ("import argparse\nprint(open('asked', 'w'))", False),
+    ],
+)
+def test_only_what_imports_our_script_module_is_ours(entry: Path, text: str, ours: bool) -> None:
+    entry.write_text(text)
+    assert is_ours(entry) is ours
+
+
+def test_no_other_file_is_ours(tmp_path: Path) -> None:
+    shell = tmp_path / "run.sh"
+    shell.write_text("from pebble import run")
+    assert not is_ours(shell)
+    assert not is_ours(tmp_path / "missing.py")
+
+
+def asked(entry: Path, text: str) -> Description:
+    entry.write_text(text)
+    return ask([sys.executable, str(entry)], entry.parent, os.environ)
+
+
+def test_the_last_line_of_the_answer_counts(entry: Path) -> None:
+    answer = {"label": "Walk", "configs": [{"key": "speed", "type": "float", "default": None, "arg": "--speed"}]}
+    found = asked(
+        entry, f"import sys\nassert sys.argv[1:] == ['--describe']\nprint('hi')\nprint({json.dumps(answer)!r})"
+    )
+    assert (found.label, found.configs[0].key, found.dependencies) == ("Walk", "speed", [])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "import no_such_module",
+            "its --describe ended with code 1: ModuleNotFoundError: No module named 'no_such_mod",
+        ),
+        ("raise SystemExit(3)", "its --describe ended with code 3"),
+        ("print('hello')", "its --describe: JSON is malformed"),
+        ('print(\'{"configs": [{"label": 1}]}\')', "its --describe: "),
+        ('print(\'{"configs": [{"key": "a"}, {"key": "a"}]}\')', "two settings have the same key"),
+        ("import sys\nsys.stdout.write('x' * 300_000)", "its --describe is longer than 262144 bytes"),
+    ],
+)
+def test_a_failing_answer_has_a_reason(entry: Path, text: str, reason: str) -> None:
+    with pytest.raises(DescribeError) as caught:
+        asked(entry, text)
+    assert reason in str(caught.value)
+
+
+def test_one_that_hangs_ends_with_all_it_started(entry: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(describe, "_LIMIT_S", 1.0)
+    hang = "import os, subprocess\np = subprocess.Popen(['sleep', '60'])\nopen('pid', 'w').write(str(p.pid))\np.wait()"
+    with pytest.raises(DescribeError, match="takes longer than 1 s"):
+        asked(entry, hang)
+    pid = int((entry.parent / "pid").read_text())
+    assert until(lambda: gone(pid))
+
+
+def test_a_manifest_describes_a_script_of_any_language(tmp_path: Path) -> None:
+    path = tmp_path / "script.json"
+    assert read_manifest(path) is None
+    path.write_text('{"label": "Shell", "command": ["./run.sh"], "dependencies": [{"file": "eyes"}]}')
+    found = read_manifest(path)
+    assert found is not None
+    assert (found.label, found.command, found.dependencies[0].file) == ("Shell", ["./run.sh"], "eyes")
+    path.write_text("x" * 300_000)
+    with pytest.raises(DescribeError, match=r"script\.json is longer than"):
+        read_manifest(path)
+
+
+class Asked:
+    """Counts the questions, and fails while ``error`` is set."""
+
+    def __init__(self) -> None:
+        self.times, self.error = 0, ""
+
+    def __call__(self) -> Description:
+        self.times += 1
+        if self.error:
+            raise DescribeError(self.error)
+        return Description(label=str(self.times))
+
+
+def test_an_answer_holds_until_the_file_changes(entry: Path) -> None:
+    entry.write_text("1")
+    question, known = Asked(), Descriptions(clock=lambda: 0.0)
+    answers = [known.get("a", [entry], question) for _ in range(3)]
+    assert question.times == 1
+    assert {answer.label for answer in answers if answer} == {"1"}
+    entry.write_text("22")
+    known.get("a", [entry], question)
+    known.retain_only(set())
+    known.get("a", [entry], question)
+    assert question.times == 3
+
+
+def test_a_failure_is_logged_once_and_tried_again_after_a_minute(entry: Path, caplog: pytest.LogCaptureFixture) -> None:
+    now = [0.0]
+    question, known = Asked(), Descriptions(clock=lambda: now[0])
+    question.error = "no camera"
+    for now[0] in (0.0, 59.0, 61.0, 70.0):
+        with caplog.at_level(logging.WARNING):
+            assert known.get("walk", [entry], question) is None
+    assert question.times == 2
+    assert [record.getMessage() for record in caplog.records] == ["walk is offered without settings: no camera"]

@@ -1,0 +1,69 @@
+"""What the motor owners' states mean for a script that is to start, or runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pebble.contract.payloads import EstopState
+from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, MotorOwners
+
+
+def state(**fields: Any) -> EstopState:
+    return EstopState(
+        **{"latched": False, "boot": "aa", "count": 0, "recent": [], "by": "", "why": "", "since": 0} | fields
+    )
+
+
+@pytest.fixture
+def owners() -> MotorOwners:
+    owners = MotorOwners(["serial"])
+    owners.receive("serial", state(barred=7))
+    return owners
+
+
+def test_a_free_robot_refuses_nothing(owners: MotorOwners) -> None:
+    assert (owners.refusal, owners.barred) == ("", 7)
+    assert owners.ending(8, owners.baseline()) == ""
+
+
+def test_a_latched_one_refuses_and_names_who(owners: MotorOwners) -> None:
+    owners.receive("serial", state(latched=True, by="ann\x07"))
+    assert owners.refusal == "emergency stop by ann? of motor owner serial: reset it first"
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"latched": True, "count": 1, "barred": 8}, "emergency stop of motor owner serial: reset it first"),
+        ({"count": 1, "barred": 8, "by": "bob"}, "emergency stop by bob of motor owner serial: it was reset since"),
+        ({"barred": 8}, OVERRIDDEN),
+        ({"barred": 9, "boot": "bb"}, OVERRIDDEN),
+        ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
+        ({"barred": 7}, ""),
+    ],
+)
+def test_a_run_ends_with_the_reason(owners: MotorOwners, fields: dict[str, Any], why: str) -> None:
+    baseline = owners.baseline()
+    owners.receive("serial", state(**fields))
+    assert owners.ending(8, baseline) == why
+
+
+def test_an_owner_that_appears_during_a_run_must_not_change_from_then_on() -> None:
+    owners = MotorOwners([])
+    baseline = owners.baseline()
+    owners.receive("esp", state())
+    assert owners.ending(1, baseline) == ""
+    owners.receive("esp", state(boot="cc"))
+    assert owners.ending(1, baseline) == "motor owner esp was restarted: start the script again"
+
+
+def test_states_of_others_count_only_where_no_owner_is_known() -> None:
+    owners = MotorOwners(["serial"])
+    owners.receive("old", state(latched=True))
+    assert owners.refusal == ""
+    unknown = MotorOwners([])
+    for number in range(100):
+        unknown.receive(f"o{number}", state(barred=number))
+    assert unknown.barred == 15
