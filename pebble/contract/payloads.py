@@ -176,7 +176,12 @@ class TouchSensors(Payload, frozen=True, kw_only=True):
 
 
 class Capabilities(Payload, frozen=True, kw_only=True):
-    """What a robot can do, with the effective topics (paper A.8.6)."""
+    """What a robot can do, with the effective topics (paper A.8.6); again whenever it changes.
+
+    Of what comes and goes, ``telemetry.wheel_odometry`` is true while it is being published, and ``outlets`` lists
+    those of self-describing MCUs that are connected: ``available``, ``controls``, ``outlets[]{name, controls,
+    status_topic, command_topic}``.
+    """
 
     t: int  # epoch milliseconds
     value: dict[str, Any]

@@ -15,10 +15,12 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
 
 
-def capabilities(config: Config, addresses: Addresses, lacking: Collection[str] = ()) -> dict[str, Any]:
+def capabilities(
+    config: Config, addresses: Addresses, lacking: Collection[str] = (), found: Collection[str] = ()
+) -> dict[str, Any]:
     """The ``value`` of a capabilities message: ``available`` is what exists, ``controls`` what takes commands.
 
-    ``lacking`` names what its processes cannot provide at present: ``estop``.
+    ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
     """
     return {
         "identity": {"system": config.robot.system, "type": config.robot.type, "id": config.robot.id},
@@ -34,7 +36,8 @@ def capabilities(config: Config, addresses: Addresses, lacking: Collection[str] 
             **_topics(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
         },
         "system": _system(config, addresses),
-        **_motor(config, addresses, lacking),
+        **_motor(config, addresses, lacking, found),
+        "outlets": _outlets(config, found),
     }
 
 
@@ -104,7 +107,7 @@ def _system(config: Config, addresses: Addresses) -> dict[str, Any]:
     }
 
 
-def _motor(config: Config, addresses: Addresses, lacking: Collection[str]) -> dict[str, Any]:
+def _motor(config: Config, addresses: Addresses, lacking: Collection[str], found: Collection[str]) -> dict[str, Any]:
     """Drive, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
     lines = config.motor_lines()
     present = bool(lines)
@@ -131,6 +134,8 @@ def _motor(config: Config, addresses: Addresses, lacking: Collection[str]) -> di
             "touch_topic": addresses[c.TOUCH_SENSORS].topic,
             "charging_topic": addresses[c.CHARGING_STATUS].topic,
             "charging_level_topic": addresses[c.CHARGING_LEVEL].topic,
+            "wheel_odometry": c.WHEEL_ODOMETRY.metric in found,
+            "wheel_odometry_topic": addresses[c.WHEEL_ODOMETRY].topic,
             **_imu(config),
         },
     }
@@ -153,6 +158,18 @@ def _imu(config: Config) -> dict[str, Any]:
     lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].has_imu(name)]
     addresses = Addresses(view_of(config, lines[0]) if lines else config)
     return {"imu": bool(lines), "imu_topic": addresses[c.IMU].topic}
+
+
+def _outlets(config: Config, found: Collection[str]) -> dict[str, Any]:
+    """The outlets of self-describing MCUs that are connected now: what reports its state, and what can be switched."""
+    topics: dict[str, dict[str, str]] = {}
+    for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
+        for feature in sorted(found):
+            if name := channel.names(f"{config.base}/{channel.direction}/{feature}").get("outlet"):
+                topics.setdefault(name, {})[key] = channel.topic(config.base, outlet=name)
+    switched = [name for name, own in topics.items() if "command_topic" in own]
+    outlets = [{"name": name, "controls": name in switched, **own} for name, own in sorted(topics.items())]
+    return {"available": bool(outlets), "controls": bool(switched), "outlets": outlets}
 
 
 def _first(*values: float | None) -> float | None:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pebble.config import Config
 from pebble.errors import ConfigError
 from pebble.launcher.child import Child
-from pebble.launcher.lacking import Lacking
+from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
 from pebble.launcher.process_supervisor import ProcessSupervisor
@@ -43,8 +43,8 @@ class Launcher:
         self._reactor = Reactor()
         self._supervisors = [self._supervise(program) for program in (programs(config) if table is None else table)]
         self._on_demand = OnDemand(self._reactor, self._supervisors)
-        self._lacking = Lacking(lambda: self._status.capabilities_changed())
-        self._status = StatusPublisher(config, self._reactor, self._supervisors, self._lacking)
+        self._features = Features(lambda: self._status.capabilities_changed())
+        self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features)
         self._logs = LogForwarder(self._status.publish_log, config.services.launcher.logs)
         self._signals = StopSignals(self._kill_all)
 
@@ -100,11 +100,11 @@ class Launcher:
             self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
 
     def _receive_note(self, program: Program, line: str) -> None:
-        if not self._lacking.receive(program.name, line):
+        if not self._features.receive(program.name, line):
             self._on_demand.receive(program, line)
 
     def _ended(self, program: Program) -> None:
-        self._lacking.ended(program.name)
+        self._features.ended(program.name)
         self._on_demand.ended(program)
 
     def _spawn(self, program: Program) -> Child:

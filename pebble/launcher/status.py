@@ -12,7 +12,7 @@ from pebble.contract import CAPABILITIES, LOGS, STATUS, Channel, codec
 from pebble.contract.payloads import Capabilities, LogRecord, ServiceState, Status
 from pebble.launcher.announcer_pipe import AnnouncerPipe
 from pebble.launcher.capabilities import capabilities
-from pebble.launcher.lacking import Lacking
+from pebble.launcher.features import Features
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.restart_policy import RestartPolicy
@@ -29,10 +29,10 @@ class StatusPublisher:
     """Turns the states of all supervisors into messages for operators and for systemd."""
 
     def __init__(
-        self, config: Config, reactor: Reactor, supervisors: Sequence[ProcessSupervisor], lacking: Lacking
+        self, config: Config, reactor: Reactor, supervisors: Sequence[ProcessSupervisor], features: Features
     ) -> None:
         self._config, self._addresses = config, Addresses(config)
-        self._reactor, self._supervisors, self._lacking = reactor, supervisors, lacking
+        self._reactor, self._supervisors, self._features = reactor, supervisors, features
         self._pipe = AnnouncerPipe(reactor)
         self._systemd = SystemdNotifier()
         self._status_due = self._capabilities_due = False
@@ -64,7 +64,7 @@ class StatusPublisher:
             self._reactor.after(_STATUS_PAUSE_S, self._publish_status)
 
     def capabilities_changed(self) -> None:
-        """A process lacks something, or has it again: publish soon."""
+        """What the processes report has changed: publish soon."""
         launcher = self._config.services.launcher
         if launcher.enabled and launcher.capabilities.enabled and not self._capabilities_due:
             self._capabilities_due = True
@@ -99,7 +99,7 @@ class StatusPublisher:
 
     def _publish_capabilities(self) -> None:
         self._capabilities_due = False
-        value = capabilities(self._config, self._addresses, self._lacking.features)
+        value = capabilities(self._config, self._addresses, self._features.lacking, self._features.found)
         self._publish_state(CAPABILITIES, Capabilities(t=_now_ms(), value=value))
 
     def _publish_state(self, channel: Channel, value: Any) -> None:

@@ -122,9 +122,9 @@ class Notifier:
         return self._write(f"WANT {program} {int(request.on)} {request.encoding}".rstrip().encode() + b"\n")
 
     def lacks(self, feature: str, lacking: bool) -> bool:
-        """Report that this process cannot provide ``feature``, or can again, until it ends; the capabilities follow.
+        """Report that this process cannot provide ``feature``, or can, until it ends; the capabilities follow.
 
-        False: the launcher was too busy, repeat it.
+        Features are listed in pebble.launcher.features. False: the launcher was too busy, repeat it.
         """
         return self._write(f"{'LACKS' if lacking else 'HAS'} {feature}\n".encode())
 
@@ -137,3 +137,18 @@ class Notifier:
             log.debug("the launcher did not take %s", line)
             return False
         return True
+
+
+class ProvidedFeatures:
+    """What this process provides at present, reported to the launcher: call :meth:`report` regularly."""
+
+    def __init__(self, notifier: Notifier) -> None:
+        self.names: set[str] = set()  # change it at will
+        self._notifier = notifier
+        self._reported: set[str] = set()
+
+    def report(self) -> None:
+        """Report what has changed, also what the launcher was too busy for before."""
+        for name in sorted(self._reported ^ self.names):
+            if self._notifier.lacks(name, name not in self.names):
+                self._reported ^= {name}

@@ -92,9 +92,26 @@ def test_a_robot_without_services_still_lists_everything() -> None:
             "touch_topic": f"{BASE}/outgoing/touch-sensors",
             "charging_topic": f"{BASE}/outgoing/charging-status",
             "charging_level_topic": f"{BASE}/outgoing/charging-level",
+            "wheel_odometry": False,
+            "wheel_odometry_topic": f"{BASE}/outgoing/wheel-odometry",
             "imu": False,
             "imu_topic": f"{BASE}/outgoing/sensors/imu",
         },
+        "outlets": {"available": False, "controls": False, "outlets": []},
+    }
+
+
+def test_what_processes_report_is_listed() -> None:
+    config = parse({"robot": {"id": "rover"}}, folder=Path("/robots"), env={})
+    found = {"wheel-odometry", "outlets/o2/status", "outlets/o1/power", "outlets/o1/status"}
+    value = capabilities(config, Addresses(config), found=found)
+    assert value["telemetry"]["wheel_odometry"]
+    o1 = {"status_topic": f"{BASE}/outgoing/outlets/o1/status", "command_topic": f"{BASE}/incoming/outlets/o1/power"}
+    o2 = {"status_topic": f"{BASE}/outgoing/outlets/o2/status"}
+    assert value["outlets"] == {
+        "available": True,
+        "controls": True,
+        "outlets": [{"name": "o1", "controls": True, **o1}, {"name": "o2", "controls": False, **o2}],
     }
 
 

@@ -34,6 +34,17 @@ def status(rig: Rig) -> dict[str, Any]:
     return {} if seen is None else dict(seen.json)
 
 
+def odometry(rig: Rig) -> bool:
+    seen = rig.operator.last("outgoing/capabilities")
+    return seen is not None and bool(seen.json["value"]["telemetry"]["wheel_odometry"])
+
+
+def published(local: Operator) -> bool:
+    """Publish odometry once, as a program on the robot does."""
+    local.send("outgoing/wheel-odometry", {"value": {"x_mm": 1, "y_mm": 0}, "timestamp": time.time()})
+    return True
+
+
 def started(rig: Rig) -> int:
     """Start the script, and return its pid once it drives."""
     since = time.monotonic()
@@ -51,7 +62,9 @@ def by_person(wheels: tuple[float, float]) -> bool:
 def test_a_person_goes_first_and_every_end_of_the_script_stops_the_wheels(rig: Rig) -> None:
     assert rig.local is not None
     local = Operator(rig.local.port, BASE)
+    assert not odometry(rig)
     pid = started(rig)
+    assert until(lambda: published(local) and odometry(rig), step=0.1), "a program on the robot publishes it"
 
     began = time.monotonic()
     for _ in range(5):

@@ -55,6 +55,11 @@ def claims(manifest: McuManifest, lookup: Lookup = c.channel_of) -> Claims:
     return Claims(granted, refused)
 
 
+def outlet_feature(claim: str) -> set[str]:
+    """What the robot's capabilities list while this claim is in use: the topic of an outlet, or nothing."""
+    return {claim.partition("/")[2]} if c.channel_of(claim) in (c.OUTLET_STATUS, c.OUTLET_COMMAND) else set()
+
+
 def _why_not(claim: str, interface: Mapping[str, Any], lookup: Lookup) -> str:
     """Return why an MCU must not have this channel: it would command or imitate the robot, or be unreadable."""
     direction, family = claim.split("/")[:2]

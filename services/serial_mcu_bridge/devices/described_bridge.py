@@ -11,10 +11,11 @@ from typing import Any
 from pebble.contract import IMU, IMU_FAST, MCU_COMMAND, MCU_DESCRIBE, MCU_VALUE, Channel, Kind, codec
 from pebble.contract.payloads import McuManifest, McuSample
 from pebble.errors import DeviceError, PayloadError
+from pebble.runtime.parent import Notifier, ProvidedFeatures
 from pebble.runtime.service import every, on
 from pebble.runtime.timers import Timer
 from pebble.services.serial_mcu_bridge.devices.alias_use import AliasUse
-from pebble.services.serial_mcu_bridge.devices.aliases import claims
+from pebble.services.serial_mcu_bridge.devices.aliases import claims, outlet_feature
 from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
 from pebble.services.serial_mcu_bridge.devices.imu import FAMILY, MOTION, ImuReports, ImuWatchdog
 from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
@@ -74,6 +75,7 @@ class DescribedBridge(SerialService):
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
         self._generic: list[Subscription] = []  # of the device that was described last, connected or not
         self._aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias)
+        self._features = ProvidedFeatures(Notifier())
         self._timer: Timer | None = None
 
     def start(self) -> None:
@@ -102,6 +104,7 @@ class DescribedBridge(SerialService):
 
     @every(_WATCH_S)
     def watch(self) -> None:
+        self._features.report()
         if self._watchdog.expired(self.clock()):
             raise DeviceError(f"no sample for {self._watchdog.timeout_s:g} s")
 
@@ -283,6 +286,7 @@ class DescribedBridge(SerialService):
     # -- aliases
 
     def _begin_alias(self, device: Device, route: Route, alias: Alias) -> Subscription | None:
+        self._features.names |= outlet_feature(alias.claim)
         if route.interface.direction is Direction.IN:
             return self.listen(alias.channel, partial(self._command, device, route))
         newest = self._published_states.get(route.interface.id)
@@ -291,6 +295,7 @@ class DescribedBridge(SerialService):
         return None
 
     def _end_alias(self, alias: Alias) -> None:
+        self._features.names -= outlet_feature(alias.claim)
         address = self.addresses[alias.channel]
         if alias.channel.kind is Kind.STATE:
             self.retract(alias.channel)

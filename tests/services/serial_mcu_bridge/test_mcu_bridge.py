@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+import os
 import random
 import time
+from contextlib import suppress
 from typing import Any
 
 import pytest
 
+from pebble.runtime.parent import NOTIFY_FD
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
 from pebble.transports import QoS
@@ -19,6 +22,30 @@ from tests.services.serial_mcu_bridge.test_pebble_serial_hostile import ATTACKS
 from tests.support import until
 
 STATE = b"\1\0\1"
+
+
+def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
+    memory: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes, end = os.pipe()
+    monkeypatch.setenv(NOTIFY_FD, str(end))
+    os.set_blocking(notes, False)
+    mcu, written = memory.mcu(STATION), bytearray()
+    memory.bridge()
+    features = sorted(f"outlets/o{number}/{what}" for number in range(1, 5) for what in ("status", "power"))
+
+    def notified(word: str) -> bool:
+        with suppress(BlockingIOError):
+            written.extend(os.read(notes, 10_000))
+        return written.decode().splitlines() == [f"{word} {feature}" for feature in features]
+
+    assert until(lambda: notified("HAS"))
+    written.clear()
+    mcu.unplug()
+    assert until(lambda: notified("LACKS"))
+    memory.close()
+    os.close(notes)
+    os.close(end)
 
 
 @pytest.mark.alone

@@ -1,0 +1,59 @@
+"""What the robot offers at present, as its processes report it: capabilities follow. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+#: A robot has these unless a process reports that it lacks them; all others it has while a process reports them.
+_EXPECTED = frozenset({"estop"})
+_MOST_REPORTS = 256  # of all processes; a self-describing MCU names its own outlets
+
+_report = re.compile(r"(LACKS|HAS) (estop|wheel-odometry|outlets/[^/]{1,64}/(?:status|power))").fullmatch
+
+
+class Features:
+    """Handles ``LACKS <feature>`` and ``HAS <feature>``; ``on_change()`` is called when a property changes.
+
+    ``estop``: the emergency stop. ``wheel-odometry``: it is being published. ``outlets/NAME/status`` and
+    ``outlets/NAME/power``: the contract's topics of an outlet are in use.
+    """
+
+    def __init__(self, on_change: Callable[[], None]) -> None:
+        self._on_change = on_change
+        self._reports: set[tuple[str, str]] = set()  # program, feature: different from what is expected
+
+    @property
+    def lacking(self) -> frozenset[str]:
+        """Expected features that at least one process lacks."""
+        return self._present & _EXPECTED
+
+    @property
+    def found(self) -> frozenset[str]:
+        """Further features that at least one process has."""
+        return self._present - _EXPECTED
+
+    def receive(self, program: str, line: str) -> bool:
+        """Handle a note of ``program``; False if it is none of these."""
+        match = _report(line)
+        if match is None:
+            return False
+        report, differs = {(program, match[2])}, (match[1] == "LACKS") == (match[2] in _EXPECTED)
+        if not differs:
+            self._set(self._reports - report)
+        elif len(self._reports) < _MOST_REPORTS:
+            self._set(self._reports | report)
+        return True
+
+    def ended(self, program: str) -> None:
+        """Forget what a process reported that has ended."""
+        self._set({report for report in self._reports if report[0] != program})
+
+    @property
+    def _present(self) -> frozenset[str]:
+        return frozenset(feature for _, feature in self._reports)
+
+    def _set(self, reports: set[tuple[str, str]]) -> None:
+        before, self._reports = self._present, reports
+        if self._present != before:
+            self._on_change()
