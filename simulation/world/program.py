@@ -13,7 +13,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -61,6 +61,11 @@ def port_path(folder: Path, robot: str) -> Path:
     return folder / f"{robot}.port"
 
 
+def imu_port_path(folder: Path, robot: str) -> Path:
+    """The serial port of its inertial sensor's MCU, if it has one."""
+    return folder / f"{robot}.imu-port"
+
+
 def trace_path(folder: Path, robot: str) -> Path:
     """What ``--trace`` records of a robot's MCU."""
     return folder / f"{robot}.trace.jsonl"
@@ -74,9 +79,11 @@ def _run(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         page = _page(path, world)
         stack.callback(page.close)
-        mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, folder, options).items()}
+        motions = _motions(world)
+        mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, options).items()}
+        imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
         if not options.report:
-            _write(_introduction(path, mcus))
+            _write(_introduction(path, mcus, imus))
         if options.control:
             threading.Thread(target=_run_commands, args=(mcus,), name="pebble-world control", daemon=True).start()
         _publish_poses(page, mcus, report=options.report)
@@ -100,8 +107,12 @@ def _page(path: Path, world: World) -> PosePage:
         raise DeviceError(f"{path}: {error}") from None
 
 
-def _mcus(world: World, folder: Path, options: argparse.Namespace) -> Mcus:
+def _motions(world: World) -> dict[str, RobotMotion]:
     floor = Floor(world)
+    return {name: RobotMotion(start_pose(world, name), floor.mover(name)) for name in world.robots}
+
+
+def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, options: argparse.Namespace) -> Mcus:
     return {
         name: PtyMcu(
             place.kind,
@@ -109,9 +120,18 @@ def _mcus(world: World, folder: Path, options: argparse.Namespace) -> Mcus:
             trace=trace_path(folder, name) if options.trace else None,
             trace_output=options.trace_output,
             failsafe_s=options.failsafe,
-            motion=RobotMotion(start_pose(world, name), floor.mover(name)),
+            motion=motions[name],
         )
         for name, place in world.robots.items()
+    }
+
+
+def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcus:
+    """They only read the motion, which the thread of the motor MCU advances."""
+    return {
+        name: PtyMcu("goob_imu", imu_port_path(folder, name), motion=motions[name])
+        for name, place in world.robots.items()
+        if place.imu
     }
 
 
@@ -136,15 +156,22 @@ def _in_metres(pose: Pose) -> RobotPose:
     return RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad)
 
 
-def _introduction(path: Path, mcus: Mapping[str, PtyMcu]) -> bytes:
+def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> bytes:
     """Where the robots are, and what belongs in their configs."""
     lines = [f"the world of {path} runs; Ctrl-C ends it"]
     for name, mcu in mcus.items():
         video = msgspec.json.encode({"backend": "synthetic", "device": f"{path}#{name}"}).decode()
-        port = msgspec.json.encode({"port": str(mcu.symlink)}).decode()
-        lines += [f"{name}, in the services of its config:", f'    "serial_mcu_bridge": {{"serial": {port}}}']
+        serial = _serial(mcu)
+        if name in imus:
+            serial |= {"instances": {"imu": {"protocol": "pebble_serial_v1", **_serial(imus[name])}}}
+        bridge = msgspec.json.encode(serial).decode()
+        lines += [f"{name}, in the services of its config:", f'    "serial_mcu_bridge": {bridge}']
         lines += [f'    "av_daemon": {{"video": {video}}}']
     return "\n".join(lines).encode() + b"\n"
+
+
+def _serial(mcu: PtyMcu) -> dict[str, Any]:
+    return {"serial": {"port": str(mcu.symlink)}}
 
 
 def _write(text: bytes) -> bool:

@@ -69,6 +69,7 @@ class Place(Section, frozen=True, kw_only=True):
     heading_deg: Degrees = 0.0
     radius_m: Annotated[float, Meta(ge=0.02, le=2)] = 0.1
     tag: TagId | None = None
+    imu: Annotated[bool, doc("With the second board of a Goob, its inertial sensor.")] = False
 
 
 class Room(Section, frozen=True, kw_only=True):
@@ -198,6 +199,9 @@ def _check_robots(robots: Mapping[str, Place], notes: Notes) -> None:
     for name in robots:
         if not _valid_level(name) or len(name.encode()) > LONGEST_NAME:
             notes.problem(("robots", name), f"the name must be {LEVEL_RULE}, at most {LONGEST_NAME} bytes")
+    for name, place in robots.items():
+        if place.imu and place.kind != "goob":
+            notes.problem(("robots", name, "imu"), f"must be false, a {place.kind} has no inertial sensor")
     for (name, one), (other, two) in combinations(robots.items(), 2):
         apart, least = math.hypot(one.x - two.x, one.y - two.y), one.radius_m + two.radius_m
         if apart < least:

@@ -70,6 +70,10 @@ def test_all_mistakes_are_reported_at_once_with_their_places() -> None:
             {"robots": {"goob": GOOB | {"tag": 99}}},
             "robots.goob.tag: must be below 35, the number of tags in APRILTAG_25h9, not 99",
         ),
+        (
+            {"robots": {"fred": GOOB | {"kind": "fred", "imu": True}}},
+            "robots.fred.imu: must be false, a fred has no inertial sensor",
+        ),
         ({"walls": [{"x1": 1, "y1": 1, "x2": 1, "y2": 1}]}, "walls[0]: begins where it ends"),
         (
             {"walls": [{"x1": 0.05, "y1": 1, "x2": 0.05, "y2": -1}]},

@@ -20,7 +20,7 @@ import pebble.simulation.world
 from pebble.media.world.pose_page import PoseReader, page_path
 from pebble.media.world.poses import RobotPose, Track
 from pebble.simulation.trace import read_trace
-from pebble.simulation.world.program import port_path, trace_path
+from pebble.simulation.world.program import imu_port_path, port_path, trace_path
 from tests.support import Child, until
 
 ROOM = Path(pebble.simulation.world.__file__).with_name("room.json")
@@ -87,8 +87,22 @@ def test_it_prints_what_belongs_in_the_configs(room: Path) -> None:
         world.terminate()
         printed = world.stdout.read()
     for name in ("goob", "fred"):
-        assert f'"serial": {{"port":"{port_path(room.parent / "f", name)}"}}' in printed
+        assert f'"serial_mcu_bridge": {{"serial":{{"port":"{port_path(room.parent / "f", name)}"}}' in printed
         assert f'"device":"{room}#{name}"' in printed
+
+
+def test_the_inertial_sensor_of_a_goob_has_a_serial_port_of_its_own(room: Path) -> None:
+    world = json.loads(room.read_text())
+    world["robots"]["goob"]["imu"] = True
+    room.write_text(json.dumps(world))
+    with running(room) as program:
+        port = imu_port_path(room.parent / "f", "goob")
+        with serial.Serial(str(port), timeout=30) as line:
+            assert line.read(100)
+        program.terminate()
+        assert (
+            f'"instances":{{"imu":{{"protocol":"pebble_serial_v1","serial":{{"port":"{port}"' in program.stdout.read()
+        )
 
 
 def test_robots_are_controlled_and_placed_from_standard_input(room: Path) -> None:
