@@ -14,6 +14,7 @@ import pytest
 
 from pebble.contract import MEDIA_REPORT, codec
 from pebble.contract.payloads import MediaReport
+from pebble.services.soundboard_handler.service import SoundboardHandler
 from pebble.transports import QoS
 from tests.services.soundboard_handler.soundboard_rig import LONG, Soundboard, tone, write_wav
 from tests.support import Broker, gone, until
@@ -197,6 +198,30 @@ def test_a_new_clip_replaces_the_one_before(board: Soundboard) -> None:
     assert [status["playing"] for status in board.statuses].count(False) == 1, "only before the first"
 
 
+def test_a_new_player_waits_for_the_end_of_the_one_before(make: Make) -> None:
+    slow = "echo begin >> log; trap 'sleep 0.2; echo end >> log; exit' TERM; while :; do sleep 0.01; done"
+    board = make(player_command=["sh", "-c", slow], cwd=".")
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    log = board.folder / "log"
+    for number in range(3):
+        board.play("a.wav")
+        assert until(lambda count=number: log.exists() and log.read_text().count("begin") == count + 1)
+    board.send(False)
+    assert board.became(playing=False, error=None)
+    assert log.read_text() == "begin\nend\n" * 3
+
+
+def test_what_a_player_leaves_behind_ends_with_it(make: Make) -> None:
+    board = make(player_command=["sh", "-c", "sleep 60 & echo $! > child.new; mv child.new child"], cwd=".")
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    board.start()
+    board.play("a.wav")
+    assert until((board.folder / "child").exists)
+    assert until(lambda: gone(int((board.folder / "child").read_text())))
+    assert board.became(playing=False, error=None)
+
+
 def test_how_a_stopped_player_exits_is_no_error(make: Make) -> None:
     board = make(player_command=["sh", "-c", "trap 'exit 7' TERM; while :; do sleep 0.02; done"])
     write_wav(board.sounds / "a.wav", tone(0.1))
@@ -278,8 +303,21 @@ def test_the_list_follows_the_folder(board: Soundboard) -> None:
     write_wav(board.sounds / "new.wav", tone(0.1))
     assert until(lambda: board.files == ["new.wav"], 15), "after one scan"
     (board.sounds / "new.wav").unlink()
+    assert board.refused({"action": "play", "file": "new.wav"}) == "Sound file not found: new.wav", (
+        "still listed or not"
+    )
     assert until(lambda: board.files == [], 15)
     assert len({one["timestamp"] for one in board.catalogues}) == 3, "made when it changes"
+
+
+def test_an_unchanged_list_is_not_published_again(board: Soundboard, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_wav(board.sounds / "a.wav", tone(0.1))
+    published: list[Any] = []
+    service = SoundboardHandler(board.config, board.local)
+    monkeypatch.setattr(service, "publish", lambda _channel, value: published.append(value))
+    service._scan()
+    service._scan()
+    assert [one.files for one in published] == [["a.wav"]]
 
 
 @pytest.mark.parametrize(
