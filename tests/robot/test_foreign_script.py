@@ -55,6 +55,16 @@ def started(rig: Rig) -> int:
     return int(status(rig)["pid"])
 
 
+def driven(local: Operator) -> list[dict[str, Any]]:
+    """All drive commands at the robot's broker."""
+    return [seen.json for seen in local.on("incoming/drive-values")]
+
+
+def runs(local: Operator) -> set[int]:
+    """The runs that moved the robot."""
+    return {drive["run"] for drive in driven(local) if drive.get("source") == "autonomy" and drive["x"]}
+
+
 def by_person(wheels: tuple[float, float]) -> bool:
     return wheels[0] < 0 and wheels[1] < 0
 
@@ -64,7 +74,6 @@ def test_a_person_goes_first_and_every_end_of_the_script_stops_the_wheels(rig: R
     local = Operator(rig.local.port, BASE)
     assert not odometry(rig)
     pid = started(rig)
-    assert until(lambda: published(local) and odometry(rig), step=0.1), "a program on the robot publishes it"
 
     began = time.monotonic()
     for _ in range(5):
@@ -72,6 +81,7 @@ def test_a_person_goes_first_and_every_end_of_the_script_stops_the_wheels(rig: R
         time.sleep(0.05)
     released = time.monotonic()
     rig.operator.send("incoming/drive-values", {"x": 0, "z": 0})
+    assert until(lambda: published(local) and odometry(rig), step=0.1), "a program on the robot publishes it"
     assert until(lambda: rig.mcu.moving(released + 0.5), 5), "the script goes on"
     lines = rig.mcu.drives(began)
     first = next(index for index, (_, wheels) in enumerate(lines) if by_person(wheels))
@@ -86,10 +96,9 @@ def test_a_person_goes_first_and_every_end_of_the_script_stops_the_wheels(rig: R
     assert until(lambda: status(rig)["running"] is False)
 
     pid = started(rig)
-    drives = [seen.json for seen in local.on("incoming/drive-values")]
-    signed = [drive for drive in drives if drive.get("source") == "autonomy"]
-    assert {drive["x"] for drive in drives if drive not in signed} <= {0}, "only the person's are not signed"
-    assert len({drive["run"] for drive in signed if drive["x"]}) == 2, "two starts, two runs"
+    assert until(lambda: len(runs(local)) == 2), "two starts, two runs"
+    unsigned = [drive for drive in driven(local) if drive.get("source") != "autonomy"]
+    assert {drive["x"] for drive in unsigned} <= {0}, "only the person's are not signed"
     killed = rig.kill("autonomy_manager")
     assert until(lambda: gone(pid), 1)
     assert until(lambda: rig.mcu.drives(killed) and not rig.mcu.moving(killed), 2)
