@@ -76,6 +76,7 @@ class Robot:
 
         See `pebble.camera` for the options, and for what is raised.
         """
+        self._check()
         for picture in self._seen().every(width=width, views=views, timeout=timeout):
             self._check()
             yield picture

@@ -12,7 +12,7 @@ import pytest
 from tests.commands.command_line import Run
 
 
-def tested(folder: Path) -> subprocess.CompletedProcess[str]:
+def pytest_in(folder: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
@@ -27,10 +27,10 @@ def folder(run: Run, tmp_path: Path) -> Path:
 
 
 def test_its_test_passes_and_fails_for_a_robot_that_turns_away(folder: Path) -> None:
-    assert "1 passed" in tested(folder).stdout
+    assert "1 passed" in pytest_in(folder).stdout
     script = folder / "run.py"
     script.write_text(script.read_text().replace("0.35 * tag", "-0.35 * tag"))
-    assert "1 failed" in tested(folder).stdout
+    assert "1 failed" in pytest_in(folder).stdout
 
 
 def test_it_is_a_script_of_less_than_30_lines(folder: Path) -> None:

@@ -1,0 +1,133 @@
+"""What a script can do with its robot, besides driving it: messages and pictures."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.config import parse
+from pebble.contract import DRIVE, ESTOP_RESET, WHEEL_ODOMETRY, Channel, Kind, codec
+from pebble.contract.payloads import Drive, EstopReset, WheelOdometry
+from pebble.errors import PebbleError
+from pebble.script import Robot, Stopped
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.support import until
+from tests.test_cameras import HEIGHT, WIDTH, Filming
+
+BASE = "pebble/robots/goob"
+MOOD = Channel(metric="mood", kind=Kind.EVENT, payload=dict)
+
+
+class Setting:
+    """A robot, another program on its transport, and a clock that is moved by hand."""
+
+    def __init__(self, run_dir: str) -> None:
+        hub = MemoryHub()
+        self.other, transport = MemoryTransport("other", hub).open(), MemoryTransport("script", hub).open()
+        self.now = 100.0
+        config = parse(
+            {"robot": {"id": "goob"}, "transport": {"kind": "mqtt", "run_dir": run_dir}}, folder=Path(run_dir), env={}
+        )
+        self.robot = Robot(config, transport, lambda above: above + 1, clock=lambda: self.now)
+
+    def send(self, value: WheelOdometry, *, retain: bool = False) -> None:
+        self.other.publish(WHEEL_ODOMETRY.topic(BASE), codec.encode(WHEEL_ODOMETRY, value), retain=retain)
+
+    def close(self) -> None:
+        self.robot.close()
+        self.other.close()
+
+
+@pytest.fixture
+def setting() -> Iterator[Setting]:
+    with tempfile.TemporaryDirectory(prefix="pbl") as folder:
+        setting = Setting(folder)
+        yield setting
+        setting.close()
+
+
+def odometry(x_mm: float) -> WheelOdometry:
+    return WheelOdometry(value={"x_mm": x_mm}, timestamp=0.0)
+
+
+def test_the_latest_message_ages_from_its_arrival(setting: Setting) -> None:
+    robot = setting.robot
+    assert robot.latest(WHEEL_ODOMETRY) is None
+    setting.send(odometry(1.0))
+    setting.send(odometry(2.0))
+    assert until(lambda: robot.latest(WHEEL_ODOMETRY) == odometry(2.0))
+    setting.now += 0.9
+    assert robot.latest(WHEEL_ODOMETRY, max_age=1.0) == odometry(2.0)
+    assert robot.latest(WHEEL_ODOMETRY, max_age=0.5) is None
+    setting.now += 0.2
+    assert robot.latest(WHEEL_ODOMETRY, max_age=1.0) is None
+
+
+def test_a_malformed_message_takes_no_valid_ones_place(setting: Setting) -> None:
+    robot = setting.robot
+    received: list[WheelOdometry] = []
+    robot.on(WHEEL_ODOMETRY, received.append)
+    robot.latest(WHEEL_ODOMETRY)
+    setting.send(odometry(1.0))
+    setting.other.publish(WHEEL_ODOMETRY.topic(BASE), b"{")
+    setting.send(odometry(3.0))
+    assert until(lambda: len(received) == 2)
+    assert received == [odometry(1.0), odometry(3.0)]
+
+
+def test_a_channel_of_its_own_is_published_and_received(setting: Setting) -> None:
+    received: list[dict[str, str]] = []
+    setting.robot.on(MOOD, received.append)
+    assert setting.robot.publish(MOOD, {"mood": "fine"})
+    assert until(lambda: received == [{"mood": "fine"}])
+
+
+@pytest.mark.parametrize(
+    ("channel", "value"),
+    [
+        (DRIVE, Drive(z=1.0)),
+        (ESTOP_RESET, EstopReset(boot="b", count=1)),
+        (Channel(metric="drive-values", kind=Kind.COMMAND, payload=dict), {"z": 1.0}),
+    ],
+)
+def test_a_script_neither_drives_unsigned_nor_resets(setting: Setting, channel: Channel, value: object) -> None:
+    with pytest.raises(PebbleError, match=r"use robot\.drive"):
+        setting.robot.publish(channel, value)
+
+
+def test_every_call_ends_a_script_that_is_to_end(setting: Setting) -> None:
+    robot = setting.robot
+    robot.end("enough", 3)
+    calls = [robot.drive, robot.stop, robot.picture, lambda: robot.sleep(0), lambda: robot.latest(MOOD)]
+    for call in [*calls, lambda: robot.publish(MOOD, {}), lambda: robot.on(MOOD, print), lambda: next(robot.camera())]:
+        with pytest.raises(Stopped) as stopped:
+            call()
+        assert stopped.value.code == 3
+
+
+def test_a_wait_ends_with_the_script(setting: Setting) -> None:
+    threading.Timer(0.05, lambda: setting.robot.end("enough")).start()
+    with pytest.raises(Stopped):
+        setting.robot.sleep(60)
+
+
+def test_pictures_in_a_loop_over_them_and_in_a_loop_of_its_own(setting: Setting) -> None:
+    robot = setting.robot
+    filming = Filming(robot.config.run_dir())
+    try:
+        assert next(robot.camera()).shape == (HEIGHT, WIDTH, 3)
+        assert until(lambda: robot.picture(max_age=0.5) is not None)
+        assert robot.picture(max_age=0.0) is None
+    finally:
+        filming.close()
+    assert until(lambda: robot.picture(max_age=0.2) is None)
+
+
+def test_a_loop_over_pictures_that_do_not_come_ends_with_the_script(setting: Setting) -> None:
+    threading.Timer(0.3, lambda: setting.robot.end("enough")).start()
+    with pytest.raises(Stopped):
+        next(setting.robot.camera())
