@@ -54,20 +54,25 @@ class ManagerRig:
         self.section["scripts"][name] = {"arbitrate": False, **section}
         return folder
 
-    def start(self) -> None:
+    def start(self, *command: str) -> None:
+        """Start the manager alone, or with ``command`` what runs it."""
         config = self.folder / f"{ROBOT}.json"
         raw = {
             "robot": {"id": ROBOT},
-            "transport": {"kind": "mqtt", **self.network.transport, "state_dir": str(self.folder / "state")},
+            "transport": {
+                "kind": "mqtt",
+                "run_dir": str(self.folder / "run"),
+                **self.network.transport,
+                "state_dir": str(self.folder / "state"),
+            },
             "local_mqtt": self.network.local_mqtt,
             "services": {"autonomy_manager": {"enabled": True, "autonomy_root": str(self.root), **self.section}},
         }
         config.write_text(json.dumps(raw))
         self.log = self.folder / "log"
         with self.log.open("a") as log:
-            self.process = Child(
-                [sys.executable, "-m", "pebble.services.autonomy_manager", str(config)], cwd=ROOT, stderr=log
-            )
+            words = command or ("pebble.services.autonomy_manager",)
+            self.process = Child([sys.executable, "-m", *words, str(config)], cwd=ROOT, stderr=log)
         assert until(self.listed, 20), self.log.read_text()
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> None:
@@ -117,15 +122,15 @@ def started(folder: Path) -> list[tuple[int, list[str], str | None]]:
     return [tuple(json.loads(line)) for line in lines]
 
 
-def alive(marker: str) -> list[int]:
-    """The processes whose command line contains ``marker``."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                words = (entry / "cmdline").read_bytes()
-            except OSError:
-                continue
-            if marker.encode() in words and not gone(int(entry.name)):
-                found.append(int(entry.name))
-    return found
+def alive(*markers: str) -> list[int]:
+    """The processes that are alive at one time and whose command line contains one of ``markers``."""
+    found = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit() and _marked(entry, markers)]
+    return [pid for pid in found if not gone(pid)]  # one that was found first may have ended before the last was found
+
+
+def _marked(process: Path, markers: tuple[str, ...]) -> bool:
+    try:
+        words = (process / "cmdline").read_bytes()
+    except OSError:
+        return False
+    return int(process.name) != os.getpid() and any(marker.encode() in words for marker in markers)

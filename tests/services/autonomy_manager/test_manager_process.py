@@ -96,7 +96,7 @@ def test_many_starts_never_run_two_scripts_at_once_and_the_last_one_runs(rig: Ma
 
     def watch() -> None:
         while not ended.wait(0.005):
-            most[0] = max(most[0], sum(len(alive(main)) for main in mains))
+            most[0] = max(most[0], len(alive(*mains)))
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -153,7 +153,7 @@ def test_what_a_script_leaves_behind_ends_with_it(mqtt: ManagerRig) -> None:
     folder = mqtt.script("family", PARENT.replace("time.sleep(600)\n", "raise SystemExit(3)\n", 2)[:-1])
     mqtt.start()
     mqtt.command({"action": "start", "file": "family"})
-    assert until(lambda: mqtt.status["error"] == "family exited with code 3")
+    assert until(lambda: mqtt.status.get("error") == "family exited with code 3")
     assert until(lambda: all(map(gone, family(folder))))
 
 
@@ -177,9 +177,11 @@ def test_a_shell_script_with_a_manifest_is_a_script(mqtt: ManagerRig) -> None:
 
 def test_a_retained_start_runs_nothing_when_the_manager_starts(rig: ManagerRig) -> None:
     folder = rig.script("walk")
+    rig.script("live")
     rig.command({"action": "start", "file": "walk"}, retain=True)
     for _ in range(2):
         rig.start()
+        rig.run("live")  # after the retained command has been refused
         rig.end()
     assert started(folder) == []
 
@@ -207,6 +209,20 @@ def test_a_flood_of_lines_is_bounded(mqtt: ManagerRig) -> None:
     assert lines[0].endswith("] line 0")
     assert "lines dropped: only 200 lines per second are logged" in lines[-1]
     assert max(map(len, lines)) < 3600
+
+
+def test_a_launcher_logs_a_scripts_lines_under_its_name_and_when_killed_leaves_no_script(mqtt: ManagerRig) -> None:
+    folder = mqtt.script("family", "print('08:00:00 [ERROR] no camera', flush=True)" + PARENT)
+    mqtt.start("pebble", "up")
+    pid = mqtt.run("family")
+    pids = family(folder)
+    expected = ("autonomy_manager:family", "ERROR", pid, "[autonomy_manager:family] no camera")
+    assert until(lambda: expected in [
+        tuple(record[key] for key in ("service", "level", "pid", "message")) for record in mqtt.world.payloads("logs")
+    ])  # fmt: skip
+    assert mqtt.newest("capabilities")["value"]["autonomy"]["available"] is True
+    mqtt.end(signal.SIGKILL)
+    assert until(lambda: all(map(gone, pids)), 5)
 
 
 def test_scripts_inherit_nothing_of_the_launchers(mqtt: ManagerRig, monkeypatch: pytest.MonkeyPatch) -> None:
