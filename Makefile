@@ -4,13 +4,14 @@
 VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test stops check firmware report clean
+.PHONY: help demo test stops schedules check firmware report clean
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=20  ends by itself; succeeds only if every robot moved and stopped as commanded"
 	@echo "make test             all checks and tests"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
+	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
 	@echo "make report           run every comparison and pebble impair, one hour; writes docs/results"
@@ -32,6 +33,11 @@ stops: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@$(VENV) -m tests.robot.stop_schedules --transport zenoh --log build/stops
 	@$(VENV) -m tests.robot.stop_schedules --transport mqtt --log build/stops
+
+# The shortest schedule that violates a rule is printed.
+schedules: .venv/.ready-dev
+	@$(VENV) -m tests.robot.lockstep --schedules 10000
+	@$(VENV) -m tests.robot.lockstep --mutations --schedules 1000
 
 firmware: .venv/.ready-dev
 	@sh tools/debian-packages.sh node=nodejs

@@ -1,0 +1,161 @@
+"""The motor owner: the real service, with a recorded serial line, files in memory, and a deadline behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import patch
+
+import msgspec
+
+from pebble.config import Config
+from pebble.services.serial_mcu_bridge.line.outbox import Outbox
+from pebble.services.serial_mcu_bridge.motion import motor_guard
+from pebble.services.serial_mcu_bridge.text import motor_bridge
+from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
+from tests.robot.lockstep.network import Connection, Network
+from tests.robot.lockstep.processes import Process, ServiceProcess
+from tests.robot.lockstep.scheduler import Scheduler
+
+DEADMAN_S = 1.0  # of the MCU
+_BOOT_S = 0.5
+_SAVED_S = 0.003
+_STOP = motor_bridge.goob_base.STOP
+
+Disk = dict[Path, bytes]
+
+
+class Wheels:
+    """What the MCU does with the lines that it receives."""
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        self._scheduler = scheduler
+        self._line = _STOP
+        self._at = scheduler.now
+        self.received = 0
+
+    def receive(self, line: bytes) -> None:
+        self.received += 1
+        self._line, self._at = line, self._scheduler.now
+
+    @property
+    def speeds(self) -> tuple[int, int] | None:
+        """In thousandths; None: they do not turn."""
+        if self._line == _STOP or self._scheduler.now - self._at >= DEADMAN_S:
+            return None
+        _, left, right = self._line.split()
+        return round(1000 * float(left)), round(1000 * float(right))
+
+    @property
+    def at(self) -> float:
+        """When the newest line was received."""
+        return self._at
+
+
+class RecordedLine:
+    """Stands in for SerialLine; the outbox is the real one."""
+
+    opened = 1
+    problem = ""
+
+    def __init__(self, wheels: Wheels, process: Process, scheduler: Scheduler) -> None:
+        self._wheels, self._process, self._scheduler = wheels, process, scheduler
+        self._outbox = Outbox(_STOP, 0.75)
+        self._open = self._ready = False
+
+    def open(self) -> None:
+        self._open = True
+        self._wheels.receive(_STOP)
+        self._scheduler.after(_BOOT_S, lambda: self._process.do(self._become_ready))
+
+    def close(self) -> None:
+        self._wheels.receive(_STOP)
+
+    def drive(self, line: bytes, valid_s: float) -> None:
+        self._outbox.drive(line, self._scheduler.now, valid_s)
+        self._pump()
+
+    def halt(self) -> None:
+        self._outbox.halt()
+        self._pump()
+
+    def send(self, kind: str, line: bytes) -> None:
+        """Lights turn no wheel."""
+
+    def _become_ready(self) -> None:
+        """Unless the process has ended meanwhile."""
+        if self._process.alive and getattr(self._process.service, "line", None) is self:  # type: ignore[attr-defined]
+            self._ready = True
+            self._wheels.receive(_STOP)
+            self._pump()
+
+    def _pump(self) -> None:
+        while self._ready and (line := self._outbox.take(self._scheduler.now)) is not None:
+            self._wheels.receive(line)
+
+
+class MemoryFile:
+    """Stands in for StateFile: what is saved is on the disk at once, and known to be there a little later."""
+
+    def __init__(
+        self, disk: Disk, process: Process, path: Path, on_saved: Callable[[int, bool], None] = lambda _n, _ok: None
+    ) -> None:
+        self.path = path
+        self.busy = False
+        self._disk, self._process, self._on_saved = disk, process, on_saved
+        self._number = 0
+
+    def can_save(self) -> bool:
+        return True
+
+    def load(self) -> Any:
+        return msgspec.json.decode(self._disk[self.path]) if self.path in self._disk else None
+
+    def save(self, value: Any) -> int:
+        self._number += 1
+        number, life = self._number, self._process.connection
+        self._disk[self.path] = msgspec.json.encode(value)
+
+        def saved() -> None:
+            if self._process.connection is life:
+                self._on_saved(number, True)
+                self._process.wake()
+
+        self._process.scheduler.after(_SAVED_S, lambda: self._process.do(saved))
+        return number
+
+    def close(self) -> None:
+        """It is written already."""
+
+
+class Owner(ServiceProcess):
+    """``before`` and ``after`` are called around each turn."""
+
+    def __init__(self, network: Network, config: Config, disk: Disk, wheels: Wheels) -> None:
+        super().__init__("owner", network.scheduler, lambda process: self._service(network, config, disk))
+        self.wheels = wheels
+        self.before: Callable[[], None] = lambda: None
+        self.after: Callable[[], None] = lambda: None
+
+    @property
+    def boot(self) -> str:
+        """The name of this life, as the latch has it."""
+        return f"{self.lives:08x}"
+
+    def _service(self, network: Network, config: Config, disk: Disk) -> MotorBridge:
+        def file(path: Path, *on_saved: Any) -> MemoryFile:
+            return MemoryFile(disk, self, path, *on_saved)
+
+        random = SimpleNamespace(token_hex=lambda size: f"{self.lives:0{2 * size}x}")
+        with patch.object(motor_bridge, "StateFile", file), patch.object(motor_guard, "secrets", random):
+            service = MotorBridge(config, Connection(self, network), clock=self.scheduler.clock)
+        service.line.close()
+        service.line = RecordedLine(self.wheels, self, self.scheduler)  # type: ignore[assignment]
+        return service
+
+    def turn(self) -> None:
+        self.before()
+        super().turn()
+        self.after()
