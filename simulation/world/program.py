@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import select
 import signal
 import sys
 import tempfile
@@ -45,15 +46,34 @@ class Snapshot(msgspec.Struct, frozen=True):
 def main(arguments: list[str] | None = None) -> int:
     """Run until a signal, or with ``--control`` until standard input ends."""
     options = _parser().parse_args(arguments)
-    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # also in later threads; sigtimedwait below receives them
     try:
-        return _run(options)
+        return _run(options, EndRequest())
     except PebbleError as error:
         sys.stderr.write(f"{error}\n")
         return 1
     except OSError as error:
         sys.stderr.write(f"{error.filename}: {error.strerror}\n")
         return 1
+
+
+class EndRequest:
+    """A signal, or a call of ``send``, that ends the program. Make it on the main thread.
+
+    Signals are handled, not blocked: the threads that NumPy starts when it is imported would still receive them.
+    """
+
+    def __init__(self) -> None:
+        self._reader, self._writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
+        for number in _SIGNALS:
+            signal.signal(number, lambda *_: None)
+
+    def send(self) -> None:
+        """From any thread."""
+        os.write(self._writer, b"\0")
+
+    def wait(self, seconds: float) -> bool:
+        return bool(select.select([self._reader], [], [], seconds)[0])
 
 
 def port_path(folder: Path, robot: str) -> Path:
@@ -71,7 +91,7 @@ def trace_path(folder: Path, robot: str) -> Path:
     return folder / f"{robot}.trace.jsonl"
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, end: EndRequest) -> int:
     path = options.file.absolute()
     world = _read(path)
     folder = options.folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
@@ -85,8 +105,8 @@ def _run(options: argparse.Namespace) -> int:
         if not options.report:
             _write(_introduction(path, mcus, imus))
         if options.control:
-            threading.Thread(target=_run_commands, args=(mcus,), name="pebble-world control", daemon=True).start()
-        _publish_poses(page, mcus, report=options.report)
+            threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
+        _publish_poses(page, mcus, end, report=options.report)
     return 0
 
 
@@ -135,10 +155,10 @@ def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcu
     }
 
 
-def _publish_poses(page: PosePage, mcus: Mcus, *, report: bool) -> None:
-    """Write samples to the page until a signal arrives."""
+def _publish_poses(page: PosePage, mcus: Mcus, end: EndRequest, *, report: bool) -> None:
+    """Write samples to the page until the end is requested."""
     due, count = time.monotonic(), 0
-    while signal.sigtimedwait(_SIGNALS, max(0.0, due - time.monotonic())) is None:
+    while not end.wait(max(0.0, due - time.monotonic())):
         due = max(due + PERIOD_S, time.monotonic())
         states = {name: mcu.state() for name, mcu in mcus.items()}
         ns = time.monotonic_ns()
@@ -183,11 +203,11 @@ def _write(text: bytes) -> bool:
     return True
 
 
-def _run_commands(mcus: Mcus) -> None:
+def _run_commands(mcus: Mcus, end: EndRequest) -> None:
     for line in sys.stdin:
         if problem := _command(mcus, line.split()):
             sys.stderr.write(f"{line.strip()!r}: {problem}\n")
-    os.kill(os.getpid(), signal.SIGTERM)
+    end.send()
 
 
 def _command(mcus: Mcus, words: list[str]) -> str:

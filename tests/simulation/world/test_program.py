@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import shutil
 import signal
@@ -134,6 +135,23 @@ def test_a_world_that_was_killed_starts_again(room: Path) -> None:
         assert set(poses(room)) == {"goob", "fred"}
         world.send_signal(signal.SIGINT)
         assert world.wait(30) == 0
+
+
+def test_a_signal_ends_it_whichever_thread_receives_it(room: Path) -> None:
+    """Libraries start threads when they are imported."""
+    with running(room) as world:
+        tasks = sorted(int(path.name) for path in Path(f"/proc/{world.pid}/task").iterdir())
+        assert tasks[0] == world.pid
+        assert ctypes.CDLL(None).tgkill(world.pid, tasks[1], signal.SIGTERM) == 0
+        assert world.wait(30) == 0
+
+
+def test_it_ends_at_once_where_standard_input_has_ended_already(room: Path) -> None:
+    ended = subprocess.run(
+        command(room, "--control"), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, timeout=60, check=False
+    )
+    assert ended.returncode == 0
+    assert not page_path(room).exists()
 
 
 def test_a_second_program_of_the_same_world_is_refused(room: Path) -> None:
