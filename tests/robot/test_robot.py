@@ -151,6 +151,8 @@ def test_actions_run_once_and_only_for_true(station: Station) -> None:
 
 def test_a_late_operator_finds_retained_state(station: Station) -> None:
     port = station.rig.remote.port
+    for topic in ("outgoing/capabilities", "outgoing/status", "outgoing/charging-level", "outgoing/charging-status"):
+        station.operator.wait_for(topic)  # the MCU reports its battery some seconds after its start
     retained = retained_messages(port, BASE)
     assert {"outgoing/capabilities", "outgoing/status", "outgoing/charging-level", "outgoing/charging-status"} <= set(
         retained
