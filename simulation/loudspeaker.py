@@ -112,6 +112,7 @@ class _Recorder:
         self._name = f"{time.monotonic_ns():020}-{os.getpid()}.wav"
         self._out: wave.Wave_write | None = None
         self._resources = resources
+        self._begun = False
 
     def begin(self) -> None:
         if self._folder is not None:
@@ -120,6 +121,8 @@ class _Recorder:
             self._out.setnchannels(self._sound.channels)
             self._out.setsampwidth(self._sound.width)
             self._out.setframerate(self._sound.rate)
+            self._out.writeframes(b"")  # the header: the file can be read from now on
+        self._begun = True  # before it is written: a signal may come at any time
         self._write("begin")
 
     def add(self, chunk: bytes) -> None:
@@ -127,7 +130,8 @@ class _Recorder:
             self._out.writeframes(chunk)
 
     def end(self, frames: int, *, stopped: bool) -> None:
-        self._write("end", seconds=round(frames / self._sound.rate, 4), stopped=stopped)
+        if self._begun:
+            self._write("end", seconds=round(frames / self._sound.rate, 4), stopped=stopped)
 
     def _write(self, event: Literal["begin", "end"], *, seconds: float = 0.0, stopped: bool = False) -> None:
         sound = self._sound
@@ -164,12 +168,10 @@ def _play(sound: _Sound, recorder: _Recorder) -> bool:
             time.sleep(max(0.0, due - time.monotonic()))
     except _StoppedError:
         _ignore_signals()
-        if frames:
-            recorder.end(frames, stopped=True)
+        recorder.end(frames, stopped=True)
         return False
     _ignore_signals()
-    if frames:
-        recorder.end(frames, stopped=False)
+    recorder.end(frames, stopped=False)
     return True
 
 
