@@ -19,9 +19,12 @@ _TURN_PER_RAD = 1.2  # of a pulse
 _LEAST_TURN = 0.12
 _ALIGNED_RAD = 0.08  # at the wanted distance
 _LEAST_DRIVE = 0.08
-_ARRIVED = 0.3  # of the threshold: holding begins here, and ends beyond threshold and hysteresis
+_ARRIVED = 0.4  # of the threshold: holding begins here, and ends beyond threshold and hysteresis
 _SEARCH_POWER = 1.5  # times the turn power
 _REVERSE_POWER = 0.8
+_NEAR_M = 0.1  # beyond the wanted distance: a tag that is lost here has grown out of the picture
+_AWAY_S = 0.6
+_AWAY_POWER = 0.15
 
 
 class FollowSettings(Struct, frozen=True, kw_only=True):
@@ -78,7 +81,7 @@ class Follower:
         self._seen_at = self._reversed_at = float("-inf")
         self._side = 1.0  # on which the tag was seen last: right
         self._last = Command()
-        self._holding = False
+        self._holding = self._near = False
 
     def step(self, now: float, place: Place | None) -> Command:
         self._last = self._lost(now) if place is None else self._seen(now, place)
@@ -86,6 +89,7 @@ class Follower:
 
     def _seen(self, now: float, place: Place) -> Command:
         self._seen_at = self._reversed_at = now
+        self._near = place.distance_m < self.settings.target_distance_m + _NEAR_M
         self._side = math.copysign(1.0, place.angle_rad)
         if abs(place.angle_rad) > math.radians(self.settings.forward_cone_deg):
             self._holding = False
@@ -121,6 +125,8 @@ class Follower:
         if gone_s <= settings.tag_timeout_s and self._last.reason in ("drive", "back"):
             return self._last  # one picture more or less
         self._holding = False
+        if self._near and 0.0 < gone_s - settings.tag_timeout_s <= _AWAY_S:
+            return Command(0.0, -_AWAY_POWER, "back away")
         if gone_s <= settings.lost_timeout_s:
             return Command(reason="wait")
         return self._search(now)

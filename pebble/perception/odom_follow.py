@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from msgspec.structs import replace
+
+from pebble.contract.payloads import WheelOdometry
 from pebble.perception.follow import Command, Follower, FollowSettings
 from pebble.perception.tags import Place
 
@@ -35,27 +38,55 @@ class Pose(NamedTuple):
     heading_rad: float
 
 
+def pose_of(odometry: WheelOdometry | None) -> Pose | None:
+    """The pose in a payload of any producer, in metres or millimetres; None if there is none in it."""
+    if odometry is None:
+        return None
+    value = odometry.value
+    parts = [
+        _number(value, *names) for names in (("x_mm", "x"), ("y_mm", "y"), ("heading_rad", "theta_rad", "heading"))
+    ]
+    if parts[2] is None and (degrees := _number(value, "heading_deg", "theta_deg")) is not None:
+        parts[2] = math.radians(degrees)
+    x, y, heading = parts
+    if x is None or y is None or heading is None:
+        return None
+    metres = 1.0 if odometry.unit.lower() in ("m", "meter", "meters") else 0.001
+    return Pose(x * metres, y * metres, math.remainder(heading, math.tau))
+
+
+def _number(value: dict[str, Any], *names: str) -> float | None:
+    found = next((value[name] for name in names if value.get(name) is not None), None)
+    usable = isinstance(found, int | float) and math.isfinite(found)
+    return float(found) if usable else None  # type: ignore[arg-type]
+
+
 class OdomFollower:
-    """Call ``step`` at a steady rate of about 10 Hz, with where the tag is, if it is in the picture, and the pose."""
+    """Call ``see`` for every picture, and ``step`` at a steady rate of about 10 Hz."""
 
     def __init__(self, settings: OdomFollowSettings) -> None:
         self.settings = settings
-        self._vision = Follower(settings)
+        self._vision = Follower(replace(settings, tag_timeout_s=0.0))  # how old a place may be is decided here
+        self._place: Place | None = None
         self._goal: tuple[float, float] | None = None
-        self._planned_at = self._reached_at = float("-inf")
+        self._seen_at = self._planned_at = self._reached_at = float("-inf")
 
-    def step(self, now: float, place: Place | None, pose: Pose | None) -> Command:
+    def see(self, now: float, place: Place | None, pose: Pose | None) -> None:
+        """Where the tag is, or None if it is not in the picture, and the pose at that time, if known."""
+        self._place, self._seen_at = place, now
         if place is not None:
             self._goal = None if pose is None else self._plan(place, pose)
             self._planned_at = now
-            return self._vision.step(now, place)
-        seen = self._vision.step(now, None)
-        if now - self._planned_at <= self.settings.tag_timeout_s and seen.reason in ("drive", "back"):
-            return seen
+
+    def step(self, now: float, pose: Pose | None) -> Command:
+        place = self._place if now - self._seen_at <= self.settings.tag_timeout_s else None
+        vision = self._vision.step(now, place)
+        if place is not None:
+            return vision
         blind = None if self._goal is None or pose is None else self._to_goal(now, self._goal, pose)
         if blind is not None:
             return blind
-        return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else seen
+        return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else vision
 
     def _plan(self, place: Place, pose: Pose) -> tuple[float, float] | None:
         """The point at the wanted distance from the tag, on the way to it; None: it is near."""

@@ -33,10 +33,14 @@ class WheelGeometry(Struct, frozen=True, kw_only=True):
     left: str = "a0"
     right: str = "a1"
     quadrature: str = "a2"  # of the left wheel, a quarter of a wave later
+    left_step_mm: float = 0.0  # measured; 0: by diameter and magnets
+    right_step_mm: float = 0.0
 
     @property
-    def mm_per_step(self) -> float:
-        return math.pi * self.diameter_mm / self.magnets
+    def step_mm(self) -> tuple[float, float]:
+        """Of the left and the right wheel."""
+        step = math.pi * self.diameter_mm / self.magnets
+        return self.left_step_mm or step, self.right_step_mm or step
 
 
 class WheelPose(NamedTuple):
@@ -100,7 +104,7 @@ class Odometry:
         self._was_ready = True
         self._geometry = geometry
         self._power = MotorPower(watchdog_s, now)
-        self._left, self._right = _Wheel(geometry.mm_per_step), _Wheel(geometry.mm_per_step)
+        self._left, self._right = map(_Wheel, geometry.step_mm)
         self._gyro = GyroHeading()
         self._heading_source = "wheels"
         self._samples = self._published = 0

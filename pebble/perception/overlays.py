@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from pebble.contract.payloads import (
     Corners,
     OverlayLabel,
@@ -12,7 +14,7 @@ from pebble.contract.payloads import (
     TagLocations,
     VideoOverlays,
 )
-from pebble.perception.tags import Tag
+from pebble.perception.tags import Tag, TagGeometry
 
 Size = tuple[int, int]  # width, height of the picture
 
@@ -56,6 +58,17 @@ def tag_data(marker_id: int, tag: Tag | None, size: Size, timestamp: float) -> T
         angle_rad=tag.angle_rad,
         timestamp=timestamp,
     )
+
+
+def tag_in(locations: TagLocations, tag_id: int, geometry: TagGeometry) -> Tag | None:
+    """A tag that another program has found; None if it is not among them."""
+    size = locations.frame_width, locations.frame_height
+    for detection in locations.detections:
+        if detection.marker_id == tag_id and len(detection.corners_norm) == 4 and min(size) > 0:
+            corners = np.array(detection.corners_norm) * size
+            place = geometry.place(corners, *size)
+            return None if place is None else Tag(tag_id, corners, place)
+    return None
 
 
 def _with_corners(tags: Sequence[Tag], size: Size) -> list[tuple[Tag, Corners]]:

@@ -15,5 +15,6 @@ class Rate:
         self._due = min(self._due, now + 1.0 / self.hz)  # the rate was raised
         if now < self._due:
             return False
-        self._due = max(self._due + 1.0 / self.hz, now)
+        period = 1.0 / self.hz
+        self._due = self._due + period if self._due + period > now else now + period
         return True

@@ -76,6 +76,7 @@ class TagFinder:
 
         cv2.setNumThreads(1)  # more are slower at this size, and take processors from other programs
         parameters = cv2.aruco.DetectorParameters()
+        parameters.minDistanceToBorder = 1  # pixels: a near tag fills the picture
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._cv2: Any = cv2
         self._detector: Any = cv2.aruco.ArucoDetector(_dictionary(cv2.aruco, family), parameters)
