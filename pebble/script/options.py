@@ -78,7 +78,7 @@ class OneLineParser(argparse.ArgumentParser):
 def _entry(field: inspect.Field, hint: Any) -> Entry:
     kind, meta, optional = _plain(field.type, field.name)
     name = field.encode_name
-    flag = name.replace("_", "-")
+    flag = meta.get("arg", name.replace("_", "-"))
     type_ = _kind(kind, field.name)
     entry: Entry = {
         "key": name,
@@ -87,7 +87,7 @@ def _entry(field: inspect.Field, hint: Any) -> Entry:
         "default": _default(field, type_),
         "arg": f"--{flag}",
     }
-    if field.required:
+    if field.required or meta.get("required"):
         entry["required"] = True
     for bound, key in (("ge", "min"), ("le", "max")):
         if getattr(kind, bound, None) is not None:
@@ -180,7 +180,7 @@ def _add(parser: argparse.ArgumentParser, entry: Entry) -> None:
         dest=entry["key"],
         metavar=entry["type"].upper(),
         type=_converter(entry),
-        required=entry.get("required", False),
+        required=entry.get("required", False) and entry["default"] is None,
         help=_help(entry),
     )
 

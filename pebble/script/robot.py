@@ -60,6 +60,7 @@ class Robot:
         self._transport, self._addresses, self._clock = transport, Addresses(config), clock
         self._latest: dict[str, _Arrived] = {}
         self._subscribed: set[str] = set()
+        self._last_values: dict[Channel, Callable[[], Any]] = {}
         self._pictures: Pictures | None = None
         self._opening = threading.Lock()
         self._stopped = threading.Event()
@@ -137,8 +138,7 @@ class Robot:
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
         """Publish ``value`` on ``channel``; False: it was not accepted. ``names`` fill a pattern channel's levels."""
         self._check()
-        address = self._addresses[channel]
-        topic = channel.topic(self.config.base, **names) if names else address.topic
+        topic = channel.topic(self.config.base, **names) if names else self._addresses[channel].topic
         if channel in (DRIVE, ESTOP_RESET) or topic in (
             self._addresses[DRIVE].topic,
             ESTOP_RESET.topic(self.config.base),
@@ -146,7 +146,12 @@ class Robot:
             raise PebbleError(
                 f"a script does not publish {channel.metric}: use robot.drive() to move, and let people reset"
             )
-        return self._transport.publish(topic, codec.encode(channel, value), qos=QoS(address.qos), retain=address.retain)
+        return self._publish(channel, value, topic)
+
+    def publish_at_end(self, channel: Channel, value: Callable[[], Any]) -> None:
+        """Publish what ``value()`` returns then, once the script ends, however it does; not if it is killed."""
+        self._check()
+        self._last_values[channel] = value
 
     def sleep(self, seconds: float) -> None:
         """Wait; the wheels stop after 0.75 s without a command."""
@@ -160,10 +165,14 @@ class Robot:
         """Publish the final stop, close the cameras, and have every further call raise Stopped. From any thread."""
         if os.getpid() != self._pid:
             return
-        if not self._stopped.is_set():
+        first = not self._stopped.is_set()
+        if first:
             self._exit_code = exit_code
         self._stopped.set()
         self._wheels.end(why)
+        if first:
+            for channel, value in list(self._last_values.items()):
+                self._publish(channel, value(), self._addresses[channel].topic)
         with self._opening:
             pictures = self._pictures
         if pictures is not None:
@@ -174,6 +183,10 @@ class Robot:
         if os.getpid() == self._pid:
             self.end("the script has finished")
             self._transport.close()
+
+    def _publish(self, channel: Channel, value: Any, topic: str) -> bool:
+        address = self._addresses[channel]
+        return self._transport.publish(topic, codec.encode(channel, value), qos=QoS(address.qos), retain=address.retain)
 
     def _end_run(self, why: str) -> None:
         self.log.warning("%s", why)

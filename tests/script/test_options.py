@@ -144,3 +144,19 @@ def test_what_cannot_become_a_form_is_named(kind: Any, default: object, problem:
 def test_options_that_every_script_has_are_reserved(names: tuple[str, ...]) -> None:
     with pytest.raises(TypeError, match="rename the field"):
         form(msgspec.defstruct("Wrong", [(name, bool, False) for name in names]))
+
+
+class Renamed(Struct):
+    """An option of another name than its key, which a form marks as required although it has a default."""
+
+    tag_size_m: Annotated[float, Meta(ge=0.01, extra={"arg": "marker-size", "required": True})] = 0.25
+    use_state: Annotated[bool, Meta(extra={"arg": "tuned"})] = False
+
+
+def test_an_option_may_have_another_name_than_its_key() -> None:
+    size, state = form(Renamed)
+    assert (size["key"], size["arg"], size["required"], size["default"]) == ("tag_size_m", "--marker-size", True, 0.25)
+    assert (state["arg"], state["arg_false"]) == ("--tuned", "--no-tuned")
+    given = parse(Renamed, ["--marker-size", "0.5", "--tuned"], OneLineParser(prog="run.py"))[0]
+    assert (given.tag_size_m, given.use_state) == (0.5, True)
+    assert parse(Renamed, [], OneLineParser(prog="run.py"))[0].tag_size_m == 0.25
