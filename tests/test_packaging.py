@@ -14,7 +14,7 @@ import pytest
 from tests.support import ROOT
 
 LINKED = ("bench", "configs", "firmware", "services", "simulation", "transports")
-FOR_BOARDS = "pebble/firmware/"  # imported by boards, not by the host
+NOT_MODULES = ("pebble/firmware/", "pebble/scripts/")  # imported by boards; started as programs
 NOT_SOURCES = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "tests", "docs")
 
 
@@ -48,7 +48,7 @@ def test_the_top_level_folders_are_inside_the_package_too(name: str) -> None:
 def test_every_folder_of_modules_is_a_package() -> None:
     """Python imports one without `__init__.py`, too, but the import rules do not see it."""
     folders = {
-        path.rpartition("/")[0] for path in sources() if path.endswith(".py") and not path.startswith(FOR_BOARDS)
+        path.rpartition("/")[0] for path in sources() if path.endswith(".py") and not path.startswith(NOT_MODULES)
     }
     assert [folder for folder in sorted(folders) if f"{folder}/__init__.py" not in sources()] == []
 
@@ -60,7 +60,7 @@ def test_the_wheel_holds_every_source_and_nothing_else(wheel: zipfile.ZipFile) -
 
 def test_every_module_of_the_wheel_imports_without_the_checkout(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     wheel.extractall(tmp_path)
-    host_files = [name for name in wheel.namelist() if name.endswith(".py") and not name.startswith(FOR_BOARDS)]
+    host_files = [name for name in wheel.namelist() if name.endswith(".py") and not name.startswith(NOT_MODULES)]
     names = [name.removesuffix(".py").removesuffix("/__init__") for name in host_files]
     modules = [name.replace("/", ".") for name in names if not name.endswith("__main__")]
     code = "import importlib, sys\nfor name in sys.argv[1:]: print(importlib.import_module(name).__file__)"

@@ -1,0 +1,101 @@
+"""Publishes where the robot is, from its wheels' hall sensors and the commands that its motors obey."""
+
+import json
+import math
+import queue
+import time
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct, convert
+
+from pebble import Robot, run
+from pebble.contract import DRIVE, ESTOP_STATE, IMU_FAST, TOUCH_SENSORS, WHEEL_ODOMETRY
+from pebble.contract.payloads import WheelOdometry
+from pebble.contract.renaming import renamed
+from pebble.perception.odometry import Odometry, WheelGeometry
+from pebble.perception.rate import Rate
+
+TUNE_STATE = "auto_tune_state.json"  # in the config's folder
+WAITING = 500  # inputs: 3 s of samples
+
+Pin = Literal["a0", "a1", "a2"]
+
+
+class Options(Struct):
+    use_tune_state: Annotated[bool, Meta(title="Use Tune State")] = False
+    wheel_diameter_mm: Annotated[float, Meta(ge=1, le=1000, title="Wheel Diameter (mm)")] = 61.0
+    track_width_mm: Annotated[float, Meta(ge=1, le=5000, title="Track Width (mm)")] = 130.5
+    magnets: Annotated[int, Meta(ge=1, le=200, title="Magnets per Wheel")] = 10
+    left_channel: Annotated[Pin, Meta(title="Left Sensor")] = "a0"
+    right_channel: Annotated[Pin, Meta(title="Right Sensor")] = "a1"
+    second_channel: Annotated[
+        Literal["a0", "a1", "a2", "none"], Meta(title="Second Left Sensor, a quarter wave away")
+    ] = "a2"
+    left_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Left Step (mm), 0: by geometry")] = 0.0
+    right_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Right Step (mm), 0: by geometry")] = 0.0
+    publish_rate_hz: Annotated[float, Meta(ge=1, le=50, title="Rate While Moving (Hz)")] = 20.0
+    idle_publish_rate_hz: Annotated[float, Meta(ge=0.2, le=50, title="Rate at Rest (Hz)")] = 2.0
+    topic: Annotated[str, Meta(title="Topic")] = ""
+
+
+def main(robot: Robot, options: Options) -> None:
+    channel = renamed(WHEEL_ODOMETRY, options.topic, robot.config.base)
+    watchdog_s = robot.config.services.serial_mcu_bridge.safety.drive_timeout_seconds
+    odometry = Odometry(geometry(robot, options), watchdog_s=watchdog_s, now=time.monotonic())
+    inputs: queue.Queue[tuple[Callable[..., None], Any, float]] = queue.Queue(WAITING)
+
+    def take(method: Callable[..., None]) -> Callable[..., None]:
+        """Commands and samples wait in one queue: a sample gets its direction from the commands before it."""
+
+        def receive(value: Any, **_: str) -> None:
+            if inputs.full():
+                robot.log.warning("too busy: samples are lost, and so is the position")
+            inputs.put((method, value, time.monotonic()))
+
+        return receive
+
+    robot.on(DRIVE, take(odometry.drive))
+    robot.on(TOUCH_SENSORS, take(lambda touch, now: odometry.touch(touch.value, now)))
+    robot.on(IMU_FAST, take(odometry.imu))
+    robot.on(ESTOP_STATE, take(lambda state, _now: odometry.owner(state)))
+    rate = Rate(options.publish_rate_hz)
+    while True:
+        try:
+            method, value, now = inputs.get(timeout=0.05)
+            method(value, now)
+        except queue.Empty:
+            robot.sleep(0)  # ends when it should
+            now = time.monotonic()
+        rate.hz = options.publish_rate_hz if odometry.moving(now) else options.idle_publish_rate_hz
+        if rate.due(now):
+            payload = WheelOdometry(source="wheel-odometry", value=odometry.value(), timestamp=time.time())
+            robot.publish(channel, payload)
+
+
+def geometry(robot: Robot, options: Options) -> WheelGeometry:
+    """By the options; with use_tune_state, the values of the original's tuning program win over the geometry."""
+    tuned = tune_state(robot) if options.use_tune_state else {}
+    return WheelGeometry(
+        diameter_mm=options.wheel_diameter_mm,
+        track_mm=tuned.get("track_width_mm", options.track_width_mm),
+        magnets=options.magnets,
+        left=options.left_channel,
+        right=options.right_channel,
+        quadrature="" if options.second_channel == "none" else options.second_channel,
+        left_step_mm=options.left_mm_per_event or tuned.get("left_mm_per_event", 0.0),
+        right_step_mm=options.right_mm_per_event or tuned.get("right_mm_per_event", 0.0),
+    )
+
+
+def tune_state(robot: Robot) -> dict[str, float]:
+    try:
+        values = convert(json.loads((robot.config.folder / TUNE_STATE).read_text())["current_values"], dict[str, Any])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        robot.log.warning("%s: %s; the geometry counts", TUNE_STATE, error)
+        return {}
+    return {key: float(v) for key, v in values.items() if isinstance(v, int | float) and math.isfinite(v) and v > 0}
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,65 @@
+"""The forms of the scripts that come with Pebble: the original's keys, options, defaults and limits."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+
+import msgspec
+import pytest
+
+from pebble.services.autonomy_manager.builtin_forms import DEPENDENCIES, SETTINGS
+from tests.support import ROOT
+
+SCRIPTS = ROOT / "pebble" / "scripts"
+NAMES = ("apriltag-follow", "apriltag-locations", "apriltag-odom-follow", "wheel-odometry")
+#: A path that an operator chooses, a window on the robot's screen, and a topic that the original does not use either.
+LEFT_OUT = {"log_file", "preview", "map_pose_topic"}
+
+
+@cache
+def described(name: str) -> dict[str, Any]:
+    command = [sys.executable, str(SCRIPTS / name / "run.py"), "--describe"]
+    found: dict[str, Any] = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    return found
+
+
+def of_the_original(name: str) -> list[dict[str, Any]]:
+    settings = msgspec.to_builtins(SETTINGS[name])
+    return [{key: value for key, value in entry.items() if value is not None} for entry in settings]
+
+
+def test_these_are_all() -> None:
+    assert sorted(path.name for path in SCRIPTS.iterdir() if path.name != "__pycache__") == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", ["apriltag-locations", "apriltag-odom-follow", "wheel-odometry"])
+def test_the_originals_settings_are_all_there(name: str) -> None:
+    wanted = [entry for entry in of_the_original(name) if entry["key"] not in LEFT_OUT]
+    keys = {entry["key"] for entry in wanted}
+    got = [entry for entry in described(name)["configs"] if entry["key"] in keys]
+    essential = ("key", "label", "type", "default", "arg", "min", "max", "required", "mode", "arg_false")
+    assert [[entry.get(key) or None for key in essential] for entry in got] == [
+        [entry.get(key) or None for key in essential] for entry in wanted
+    ]
+
+
+def test_following_by_odometry_has_30_settings_and_needs_two_scripts() -> None:
+    found = described("apriltag-odom-follow")
+    assert len(found["configs"]) == 30
+    needs = {need["file"]: need["config"] for need in found["dependencies"]}
+    assert needs == dict(DEPENDENCIES["apriltag-odom-follow"])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_setting_is_a_path(name: str) -> None:
+    words = {word for entry in described(name)["configs"] for word in entry["key"].split("_")}
+    assert words.isdisjoint({"file", "path", "dir", "folder", "calibration"})
+
+
+def test_the_tags_size_must_be_given_or_confirmed() -> None:
+    (entry,) = (entry for entry in described("apriltag-follow")["configs"] if entry["key"] == "tag_size_m")
+    assert (entry["arg"], entry["required"], entry["default"], entry["min"]) == ("--marker-size", True, 0.25, 0.01)
