@@ -56,7 +56,7 @@ class ManagerRig:
 
     def start(self, *command: str) -> None:
         """Start the manager alone, or with ``command`` what runs it."""
-        config = self.folder / f"{ROBOT}.json"
+        config, before = self.folder / f"{ROBOT}.json", len(self.world.on("autonomy-files"))
         raw = {
             "robot": {"id": ROBOT},
             "transport": {
@@ -73,7 +73,7 @@ class ManagerRig:
         with self.log.open("a") as log:
             words = command or ("pebble.services.autonomy_manager",)
             self.process = Child([sys.executable, "-m", *words, str(config)], cwd=ROOT, stderr=log)
-        assert until(self.listed, 20), self.log.read_text()
+        assert until(lambda: len(self.world.on("autonomy-files")) > before and self.listed(), 20), self.logged()
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> None:
         process, self.process = self.process, None
