@@ -6,9 +6,11 @@ import os
 import select
 import signal
 import threading
+import time
 from collections.abc import Callable
 
 END_S = 2.0  # for main to return after a signal; the wheels have stopped by then
+_PAUSE_S = 0.02
 _NUMBERS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
@@ -27,7 +29,7 @@ class Guard:
         signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         for number in _NUMBERS:
             if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell does for what runs in the background
-                signal.signal(number, lambda *_: None)
+                signal.signal(number, _let_others_run)
         os.register_at_fork(after_in_child=self._release)
         threading.Thread(target=self._run, name="pebble-end", daemon=True).start()
 
@@ -52,3 +54,8 @@ class Guard:
         signal.set_wakeup_fd(-1)
         for number in _NUMBERS:
             signal.signal(number, signal.SIG_DFL)
+
+
+def _let_others_run(*_: object) -> None:
+    """Pause the main thread, if it runs Python: else each step of the guard would wait 5 ms for the global lock."""
+    time.sleep(_PAUSE_S)
