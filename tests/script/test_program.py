@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from pebble.contract.payloads import Drive
 from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.script import EXIT_ENDED
+from tests.commands.command_line import config_file
 from tests.script.station import Station
-from tests.support import gone, until
+from tests.support import Child, gone, until
 
 AT_ONCE_S = 0.25  # a few milliseconds, but not on a busy machine
 
@@ -156,21 +159,15 @@ def test_a_script_that_does_not_drive_publishes_no_stop(station: Station) -> Non
     assert station.received == []
 
 
-def test_a_robot_that_is_not_up_is_named_in_one_line(station: Station) -> None:
-    port = f'"port": {station.config.local_mqtt.port}'
-    away = station.folder / "away.json"
-    text = (
-        station.config_path.read_text()
-        .replace(port, '"port": 1')
-        .replace(f"{station.folder}/run", f"{station.folder}/no")
-    )
-    away.write_text(text)
-    script = station.start("robot.drive(z=0.5)", "--config", str(away))
-    code, output = ended(script)
+def test_a_robot_that_is_not_up_is_named_in_one_line(tmp_path: Path) -> None:
+    config = config_file(tmp_path, transport={"kind": "mqtt"}, local_mqtt={"host": "127.0.0.1", "port": 1})
+    (script := tmp_path / "away.py").write_text("from pebble import run\nrun(lambda robot: None)\n")
+    command = [sys.executable, str(script), "--config", str(config)]
+    code, output = ended(Child(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
     assert code == 1
     last = output.splitlines()[-1]
     assert "[ERROR] goob is not up" in last
-    assert last.endswith(f"start it with `pebble up {away}`")
+    assert last.endswith(f"start it with `pebble up {config}`")
 
 
 def test_a_robot_that_is_not_up_beside_a_broker_that_is(station: Station) -> None:
