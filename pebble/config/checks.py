@@ -35,6 +35,8 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
             reader.notes.warning((*path, name), "is enabled, but arrives in a later release; skipped")
     if services.video_stream.enabled and not services.video_stream.command:
         reader.notes.doubt((*path, "video_stream", "command"), "is missing, write the program that streams the video")
+    if services.soundboard_handler.enabled and not services.soundboard_handler.playback.player_command:
+        reader.notes.doubt((*path, "soundboard_handler", "playback", "player_command"), "is missing, write aplay")
     return services
 
 

@@ -174,6 +174,13 @@ class TestOriginal:
         later = [line for line in load(ORIGINAL, env={}).warnings if "later release" in line]
         assert [line.partition(":")[0] for line in later] == ["services.web_handler"]
 
+    def test_a_soundboard_needs_a_player(self) -> None:
+        """Else the sound itself would be run."""
+        section = {"enabled": True, "playback": {"player_command": []}}
+        problem = only_problem(at("services.soundboard_handler", section))
+        assert problem == "services.soundboard_handler.playback.player_command: is missing, write aplay"
+        assert read(at("services.soundboard_handler", {**section, "enabled": False}))
+
     def test_keys_of_any_ending_can_be_retired(self) -> None:
         config = read(at("services.mqtt_bridge.media.video_publisher", {"source_width": 640, "source_format": "BGR"}))
         (warning,) = config.warnings
