@@ -15,7 +15,7 @@ from pebble.perception.overlays import overlays, tag_data
 from pebble.perception.rate import Rate
 from pebble.perception.tags import FAMILY, TagFinder
 
-SOURCE = "apriltag-follow"
+SOURCE = Path(__file__).parent.name
 
 Power = Annotated[float, Meta(ge=0, le=1)]
 

@@ -14,7 +14,7 @@ from pebble.perception.overlays import locations, overlays
 from pebble.perception.rate import Rate
 from pebble.perception.tags import FAMILY, TagFinder
 
-SOURCE = "apriltag-locations"
+SOURCE = Path(__file__).parent.name
 
 
 class Options(Struct):

@@ -91,11 +91,6 @@ def main(robot: Robot, options: Options) -> None:
         robot.sleep(due - time.monotonic())
 
 
-if __name__ == "__main__":
-    run(
-        main,
-        needs={
-            "apriltag-locations": {"width": 1280, "height": 720, "fps": 15.0},
-            "wheel-odometry": {"use_tune_state": False},
-        },
-    )
+if __name__ == "__main__":  # the scripts that it needs are named after their topics
+    frames = {"width": 1280, "height": 720, "fps": 15.0}
+    run(main, needs={APRILTAG_LOCATIONS.metric: frames, WHEEL_ODOMETRY.metric: {"use_tune_state": False}})

@@ -69,7 +69,7 @@ def main(robot: Robot, options: Options) -> None:
             now = time.monotonic()
         rate.hz = options.publish_rate_hz if odometry.moving(now) else options.idle_publish_rate_hz
         if rate.due(now):
-            payload = WheelOdometry(source="wheel-odometry", value=odometry.value(), timestamp=time.time())
+            payload = WheelOdometry(source=WHEEL_ODOMETRY.metric, value=odometry.value(), timestamp=time.time())
             robot.publish(channel, payload)
 
 
