@@ -6,23 +6,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
 
 import pytest
 
 from tests.robot.closed_loop import perception
 from tests.robot.closed_loop.aims import AIMS, Samples
+from tests.robot.closed_loop.following import Start, followed
 from tests.robot.closed_loop.stops import ENDINGS, Ending, ended, overridden, overridden_on_the_robot, stopped_once
 from tests.robot.world_rig import WorldRig
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
-ON_ONE = {"freeze": "zenoh", "manager": "zenoh", "launcher": "mqtt"}  # these take seconds
+SLOW = {"freeze": "zenoh", "manager": "zenoh", "launcher": "mqtt"}  # these take seconds: one transport each
+CASES = [(kind, one) for kind in ("zenoh", "mqtt") for one in ENDINGS if SLOW.get(one.key, kind) == kind]
 
 
-@pytest.fixture(scope="module", params=["zenoh", "mqtt"])
-def rig(request: pytest.FixtureRequest) -> Iterator[WorldRig]:
-    with WorldRig(request.param) as rig:
-        yield rig
+@pytest.fixture(scope="module")
+def rigs() -> Iterator[Callable[[str], WorldRig]]:
+    """Robots by their transport, each started when it is first needed."""
+    with ExitStack() as stack:
+        yield cache(lambda kind: stack.enter_context(WorldRig(kind)))
+
+
+@pytest.fixture(params=["zenoh", "mqtt"])
+def rig(request: pytest.FixtureRequest, rigs: Callable[[str], WorldRig]) -> WorldRig:
+    return rigs(request.param)
 
 
 on_zenoh, on_mqtt = (pytest.mark.parametrize("rig", [kind], indirect=True) for kind in ("zenoh", "mqtt"))
@@ -33,20 +43,15 @@ def check(found: Samples) -> None:
     assert missed == {}
 
 
-@pytest.mark.parametrize("ending", [one for one in ENDINGS if one.key not in ON_ONE], ids=lambda one: one.key)
+def test_it_follows_a_tag(rig: WorldRig) -> None:
+    found = followed(rig, Start(distance=1.1, beside=15.0, off=20.0), stay_s=1.0)
+    latency = sorted(found.pop("latency"))
+    assert latency[len(latency) // 2] < 60.0  # the limit of most commands is one of an idle machine
+    check(found)
+
+
+@pytest.mark.parametrize(("rig", "ending"), CASES, ids=lambda one: getattr(one, "key", one), indirect=["rig"])
 def test_the_wheels_rest_however_a_script_ends(rig: WorldRig, ending: Ending) -> None:
-    check(ended(rig, ending))
-
-
-@on_zenoh
-@pytest.mark.parametrize("ending", [one for one in ENDINGS if ON_ONE.get(one.key) == "zenoh"], ids=lambda one: one.key)
-def test_the_wheels_rest_however_a_script_ends_on_zenoh(rig: WorldRig, ending: Ending) -> None:
-    check(ended(rig, ending))
-
-
-@on_mqtt
-@pytest.mark.parametrize("ending", [one for one in ENDINGS if ON_ONE.get(one.key) == "mqtt"], ids=lambda one: one.key)
-def test_the_wheels_rest_however_a_script_ends_on_mqtt(rig: WorldRig, ending: Ending) -> None:
     check(ended(rig, ending))
 
 
@@ -64,3 +69,8 @@ def test_one_stop_of_a_person_is_enough(rig: WorldRig) -> None:
 @on_mqtt
 def test_a_script_stops_with_what_it_needs(rig: WorldRig) -> None:
     check(perception.crashed_dependency(rig))
+
+
+@on_zenoh
+def test_tags_are_where_the_camera_sees_them(rig: WorldRig) -> None:
+    check(perception.located(rig, seconds=2.0))

@@ -93,6 +93,7 @@ class WorldRig(Rig):
         self.world = world or self._own
         self.sounds, self._record = (self.world.folder / f"{name}.{what}" for what in ("sounds", "played"))
         self.sounds.mkdir()
+        (self.world.folder / "timing").touch()
         services = {
             "soundboard_handler": {"enabled": True, "playback": self._playback()},
             "autonomy_manager": {"enabled": True, "stop_timeout_seconds": STOP_TIMEOUT_S, "env": self._environment()},

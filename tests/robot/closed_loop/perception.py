@@ -34,7 +34,8 @@ def located(rig: WorldRig, seconds: float = 4.0) -> Samples:
     assert until(lambda: len(_empty(rig, ended)) >= 2 or gone(rig.script()["pid"] or 0), 10)
     rig.idle()
     corners = [tag["corners_norm"] for one in seen for tag in one.json["detections"]]
-    differing = [one for one in shapes if one["shapes"] not in [[tag] for tag in corners]]
+    outlines = [[tag["corners_norm"] for tag in one.json["detections"]] for one in _tags(rig, began)]
+    differing = [one for one in shapes if one["shapes"] not in outlines]
     return {
         "corners": [corner_error_px(tag, expected) for tag in corners],
         "locations rate": [(len(seen) - 1) / (seen[-1].at - seen[0].at)],
