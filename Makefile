@@ -8,7 +8,7 @@ VENV := .venv/bin/python
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
-	@echo "make demo SECONDS=20  ends by itself; succeeds only if every robot moved and stopped as commanded"
+	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make test             all checks and tests"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"

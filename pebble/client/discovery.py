@@ -1,4 +1,4 @@
-"""Discovers robots by their outgoing topics: identity, liveness, capabilities, emergency stop and battery."""
+"""Discovers robots by their outgoing topics: identity, liveness, capabilities, emergency stop, battery and script."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 from pebble.client.estop_states import RobotEstop
 from pebble.contract import (
+    AUTONOMY_STATUS,
     CAPABILITIES,
     CHARGING_LEVEL,
     CHARGING_STATUS,
@@ -18,7 +19,7 @@ from pebble.contract import (
     codec,
 )
 from pebble.contract.identity import parse_topic
-from pebble.contract.payloads import EstopState, Orientation
+from pebble.contract.payloads import AutonomyStatus, EstopState, Orientation
 from pebble.errors import PayloadError
 from pebble.media.rate_meter import RateMeter
 from pebble.transports import Message
@@ -73,6 +74,7 @@ class DiscoveredRobot:
         self.volts: float | None = None
         self.charging: bool | None = None
         self.attitude: Orientation | None = None  # of the newest sample of its inertial sensor
+        self.autonomy: AutonomyStatus | None = None
 
     @property
     def transport(self) -> str:
@@ -147,8 +149,10 @@ class Discovery:
             robot.volts = payload.value
         elif channel is IMU:
             robot.attitude = payload.value.orientation_deg
+        elif channel is AUTONOMY_STATUS:
+            robot.autonomy = payload
         else:
             robot.charging = payload.value
 
 
-_KNOWN = (ONLINE, CAPABILITIES, CHARGING_LEVEL, CHARGING_STATUS, IMU)
+_KNOWN = (ONLINE, CAPABILITIES, CHARGING_LEVEL, CHARGING_STATUS, IMU, AUTONOMY_STATUS)

@@ -7,13 +7,12 @@ import queue
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 from pebble.client.discovery import DiscoveredRobot
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.contract.payloads import Drive
-from pebble.demo.steps import COMMAND_PERIOD_S, StepResult
+from pebble.demo.steps import COMMAND_PERIOD_S
 from pebble.simulation.trace import Entry
 from pebble.transports import Message, Transport
 
@@ -51,9 +50,6 @@ class StopResult:
     def summary(self) -> str:
         confirmed = "" if self.confirmed_s is None else f", confirmed {self.confirmed_s * 1000:.0f}"
         return f"off {self.stop_s * 1000:.0f}{confirmed} ms"
-
-
-Result: TypeAlias = StepResult | StopResult
 
 
 def assess(completed: CompletedStop, entries: Sequence[Entry]) -> StopResult:

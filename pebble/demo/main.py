@@ -14,23 +14,25 @@ from types import FrameType
 from rich.console import Console
 
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.demo import emergency
+from pebble.demo import emergency, following, takeover
 from pebble.demo.broker import BrokerKind, best_kind
-from pebble.demo.emergency import CompletedStop, Result
+from pebble.demo.emergency import CompletedStop
+from pebble.demo.following import CompletedFollow
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
 from pebble.demo.operator import Operator
 from pebble.demo.steps import ROUND_S, SCRIPT, CompletedStep, assess
 from pebble.demo.testbed import ROBOTS, Testbed
-from pebble.demo.view import View, show_media_results, show_results
+from pebble.demo.view import Result, View, show_media_results, show_results
 from pebble.errors import PebbleError
 
-SHORTEST_S = ROUND_S + emergency.DURATION_S
+SHORTEST_S = ROUND_S + emergency.DURATION_S + takeover.DURATION_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _POLL_S = 0.1
 _REPORTED_S = 0.3  # an MCU reports ten times a second: the end of a step is reported a little later
+_SLOW_S = 15.0  # how much longer the first round may take: a script drives as fast as its machine permits
 _RESULTS = 200
 
 
@@ -49,7 +51,7 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         results, media, problems = _run_demo(testbed, kind, seconds, ending, console)
         with_media = [robot.name for robot in testbed.robots if robot.has_media]
         if seconds is not None:
-            problems += _steps_not_done(results)
+            problems += _steps_not_done(testbed, results)
         if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
             problems += _encodings_not_checked(with_media, media)
         problems += [f"{result.robot}, {result.step}: {wrong}" for result in results for wrong in result.wrong]
@@ -69,12 +71,14 @@ def _run_demo(
     console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
     testbed.start_brokers(kind)
     console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU, camera and microphone;")
-    console.print("Goob also with an inertial sensor that describes itself.")
+    console.print(
+        "Goob also with an inertial sensor that describes itself, a loudspeaker and scripts, in a room with tags."
+    )
     console.print("MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on simulated pins.")
     testbed.start_robots()
     operator = Operator(testbed.remote_port)
     operator.connect()
-    media_check = MediaCheck(testbed.remote_port)
+    media_check = MediaCheck(testbed.remote_port, [robot.name for robot in testbed.robots if robot.has_counter])
     try:
         with View(console, operator, media_check, testbed.robots, ending) as view:
             if not _discovered(operator, view, ending):
@@ -113,10 +117,12 @@ def _without_imu(testbed: Testbed, operator: Operator) -> list[str]:
 
 
 def _watch(testbed: Testbed, operator: Operator, view: View, seconds: float, ending: threading.Event) -> list[Result]:
-    """Drive for ``seconds``, and assess each step once its traces are complete."""
+    """Drive for ``seconds``, or until the first round is complete; assess each step once its traces are."""
     results: deque[Result] = deque(maxlen=_RESULTS)
     end = time.monotonic() + seconds
-    while time.monotonic() < end and not ending.wait(_POLL_S) and not testbed.unexpected_exits():
+    while not ending.wait(_POLL_S) and not testbed.unexpected_exits():
+        if time.monotonic() > end + (0.0 if operator.rounds else _SLOW_S):
+            break
         view.update()
         _assess_completed(testbed, operator, results, time.monotonic() - _REPORTED_S)
     operator.end()
@@ -130,19 +136,23 @@ def _assess_completed(testbed: Testbed, operator: Operator, results: deque[Resul
         results.append(_assess(testbed, operator, operator.completed.popleft()))
 
 
-def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop) -> Result:
+def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop | CompletedFollow) -> Result:
     robot = next(robot for robot in testbed.robots if robot.name == completed.robot)
     if isinstance(completed, CompletedStop):
         return emergency.assess(completed, robot.entries())
+    if isinstance(completed, CompletedFollow):
+        return following.assess(completed, robot.entries(), robot.outcome(completed.ended))
     seen = next(seen for seen in operator.discovery.all_robots() if seen.name == completed.robot)
     has_lights = seen.lights_topic(flash=False) is not None
     return assess(completed, list(robot.mcu_reports), robot.entries(), stop_s=robot.stop_s, has_lights=has_lights)
 
 
-def _steps_not_done(results: list[Result]) -> list[str]:
+def _steps_not_done(testbed: Testbed, results: list[Result]) -> list[str]:
     driven = {(result.robot, result.step) for result in results}
     steps = [*(step.name for step in SCRIPT), emergency.NAME]
-    return [f"{name}, {step}: not done" for name in ROBOTS for step in steps if (name, step) not in driven]
+    wanted = [(name, step) for name in ROBOTS for step in steps]
+    wanted += [(robot.name, following.NAME) for robot in testbed.robots if robot.has_scripts]
+    return [f"{name}, {step}: not done" for name, step in wanted if (name, step) not in driven]
 
 
 def _encodings_not_checked(names: Sequence[str], media: list[MediaResult]) -> list[str]:

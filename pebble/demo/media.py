@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 
 import numpy as np
@@ -14,7 +14,7 @@ from pebble.client.discovery import DiscoveredRobot
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
-from pebble.demo.media_assessment import MediaResult, Samples, ShownPicture, assess_pictures, assess_sound
+from pebble.demo.media_assessment import MediaResult, Samples, ShownPicture, assess_pictures, assess_rate, assess_sound
 from pebble.demo.testbed import CAMERA_FPS
 from pebble.errors import PebbleError
 from pebble.media.decode import Decoded
@@ -77,9 +77,13 @@ def _follows(before: ReceivedSound, one: ReceivedSound) -> bool:
 
 
 class MediaCheck:
-    """Requests one encoding after another, on its own threads and connection; ``results`` collects the assessments."""
+    """Requests one encoding after another, on its own threads and connection; ``results`` collects the assessments.
 
-    def __init__(self, port: int, name: str = "pebble-demo-viewer") -> None:
+    The pictures of the robots ``counting`` have a counter in them.
+    """
+
+    def __init__(self, port: int, counting: Collection[str], name: str = "pebble-demo-viewer") -> None:
+        self._counting = counting
         self.recorders: dict[str, MediaRecorder] = {}
         self.results: deque[MediaResult] = deque(maxlen=_RESULTS)
         self.rounds = 0
@@ -159,7 +163,10 @@ class MediaCheck:
             return MediaResult(name, encoding, "", (recorder.problem,))
         if medium == "video":
             fps = float(capabilities.get("fps") or 0)
-            return assess_pictures(name, encoding, recorder.take_pictures(encoding), CAMERA_FPS, fps)
+            pictures = recorder.take_pictures(encoding)
+            if name not in self._counting:
+                return assess_rate(name, encoding, [one.captured_s for one in pictures], fps)
+            return assess_pictures(name, encoding, pictures, CAMERA_FPS, fps)
         rate = recorder.audio_rate or 16_000
         original = Speech(rate).samples(0, 2 * rate * SPEECH_PERIOD_S)[:, 0].astype(float)
         return assess_sound(name, encoding, recorder.take_sound(encoding), original, rate)

@@ -50,7 +50,6 @@ def assess_pictures(
     counters = [counter for _, counter in legible]
     seconds = legible[-1][0] - legible[0][0]
     advance = (counters[-1] - counters[0]) / seconds if seconds > 0 else 0.0
-    delivered = (len(shown) - 1) / (shown[-1].captured_s - shown[0].captured_s) if seconds > 0 else 0.0
     wrong = []
     if len(legible) < LEGIBLE * len(shown):
         wrong.append(f"{encoding}: the counter of {len(shown) - len(legible)} of {len(shown)} pictures is illegible")
@@ -58,9 +57,19 @@ def assess_pictures(
         wrong.append(f"{encoding}: the frame counter fell back")
     if abs(advance - camera_fps) > RATE_TOLERANCE * camera_fps:
         wrong.append(f"{encoding}: the frame counter advances by {advance:.1f} a second instead of {camera_fps:g}")
-    if abs(delivered - fps) > DELIVERED_TOLERANCE * fps:
-        wrong.append(f"{encoding}: {delivered:.1f} pictures a second instead of {fps:g}")
-    return MediaResult(robot, encoding, f"{delivered:.1f} fps, counter {advance:.2f}/s", tuple(wrong))
+    delivered = assess_rate(robot, encoding, [one.captured_s for one in shown], fps)
+    return MediaResult(robot, encoding, f"{delivered.measured}, counter {advance:.2f}/s", (*wrong, *delivered.wrong))
+
+
+def assess_rate(robot: str, encoding: str, captured_s: Sequence[float], fps: float) -> MediaResult:
+    """Requires that ``fps`` pictures arrive, by the times of their capture."""
+    if len(captured_s) < _FEWEST:
+        return MediaResult(robot, encoding, f"{len(captured_s)} pictures", (f"{encoding}: too few pictures came",))
+    seconds = captured_s[-1] - captured_s[0]
+    delivered = (len(captured_s) - 1) / seconds if seconds > 0 else 0.0
+    wrong = f"{encoding}: {delivered:.1f} pictures a second instead of {fps:g}"
+    right = abs(delivered - fps) <= DELIVERED_TOLERANCE * fps
+    return MediaResult(robot, encoding, f"{delivered:.1f} fps", () if right else (wrong,))
 
 
 def assess_sound(robot: str, encoding: str, received: Samples, made: Samples, rate: int) -> MediaResult:

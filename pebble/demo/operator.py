@@ -1,32 +1,40 @@
-"""A scripted operator: discovers robots on a broker, and drives all of them through the same steps."""
+"""A scripted operator: discovers robots on a broker, drives them through the same steps, and overrules a script."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
+from functools import partial
 
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
 from pebble.contract import DRIVE, LIGHTS_FLASH, LIGHTS_SOLID, codec
 from pebble.contract.payloads import Drive, LightsFlash
 from pebble.demo.emergency import NAME as EMERGENCY_STOP
 from pebble.demo.emergency import CompletedStop, EmergencyStop
+from pebble.demo.following import CompletedFollow
 from pebble.demo.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
+from pebble.demo.takeover import TakeOver
 from pebble.transports import Message, MqttSettings, QoS, create
 
 STOP = Drive()
 _COMPLETED = 1000  # finished steps that wait to be assessed
+_EVENTS = 100  # that wait to be shown
 
 
 class Operator:
-    """Drives on its own thread and connection. ``activity`` is for display; ``completed`` collects finished steps."""
+    """Drives on its own thread and connection.
+
+    ``activity`` and ``events`` (monotonic seconds and a line) are for display; ``completed`` collects finished steps.
+    """
 
     def __init__(self, port: int, name: str = "pebble-demo-operator") -> None:
         self.discovery = Discovery()
         self.activity = "discovering robots"
         self.rounds = 0
         self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when (monotonic)
-        self.completed: deque[CompletedStep | CompletedStop] = deque(maxlen=_COMPLETED)
+        self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
+        self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_COMPLETED)
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._drive, name=name, daemon=True)
@@ -67,6 +75,7 @@ class Operator:
             else:
                 if not self.rounds:
                     self._stop_once(robots)
+                    self._take_over_once(robots)
                 self.rounds += 1
         self._send(STOP, robots)
         self.activity = "disconnecting"
@@ -98,6 +107,18 @@ class Operator:
         subscription = self._transport.subscribe(ALL_OUTGOING, emergency.receive)  # brings retained capabilities again
         self.completed.extend(emergency.perform(robots))
         subscription.close()
+
+    def _take_over_once(self, robots: list[DiscoveredRobot]) -> None:
+        """Let each robot with scripts follow a tag, and overrule the script for a moment."""
+        for robot in robots:
+            if robot.offers("autonomy") and not self._stopping.is_set():
+                drive = partial(self._send, robots=[robot])
+                completed = TakeOver(self._transport, robot, drive, self._stopping.wait, self._note).perform()
+                self.completed.extend([completed] if completed else [])
+
+    def _note(self, what: str, text: str) -> None:
+        self.activity = f"{what}: {text}"
+        self.events.append((time.monotonic(), f"operator {what}: {text}"))
 
     def _send(self, drive: Drive, robots: list[DiscoveredRobot]) -> None:
         payload = codec.encode(DRIVE, drive)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 import tempfile
@@ -18,9 +19,15 @@ from typing import Any, Self
 import msgspec
 
 from pebble.demo.broker import Broker, BrokerKind
+from pebble.demo.following import Outcome
 from pebble.demo.programs import Program, end_all
+from pebble.demo.room import CLIP_S, Room, write_clip
+from pebble.simulation.loudspeaker import playbacks
 from pebble.simulation.mcu import Snapshot
+from pebble.simulation.motion import Pose
 from pebble.simulation.trace import Entry
+from pebble.simulation.world.program import Snapshot as WorldSnapshot
+from pebble.simulation.world.program import port_path, trace_path
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")
 CAMERA_FPS = 15
@@ -39,7 +46,8 @@ class SimulatedRobot(ABC):
 
     runs_on: str
     stop_s: float
-    has_media = has_imu = False
+    has_media = has_imu = has_scripts = False
+    has_counter = True  # its camera shows a scene with a counter in it
 
     def __init__(self, name: str, folder: Path) -> None:
         self.name, self._folder = name, folder / name
@@ -76,19 +84,29 @@ class SimulatedRobot(ABC):
         self._entries.extend(msgspec.json.decode(line, type=Entry) for line in complete.splitlines())
         return list(self._entries)
 
+    def outcome(self, at: float) -> Outcome:
+        """What came of a script that ended at ``at``; only a robot with scripts knows."""
+        raise NotImplementedError
+
     def _start_mcu(self, module: str, *options: str) -> Program:
         command = [sys.executable, "-m", module, "--kind", self.name, "--trace", str(self._trace), "--report", *options]
-        mcu = Program(f"{self.name}'s MCU", command, self._folder / "mcu.log", reports=True)
+        return self._report(Program(f"{self.name}'s MCU", command, self._folder / "mcu.log", reports=True))
+
+    def _report(self, mcu: Program) -> Program:
+        """Collect the reports of an MCU that was just started."""
         threading.Thread(target=self._watch, args=(mcu,), name=f"reports of {self.name}", daemon=True).start()
         return mcu
 
     def _watch(self, mcu: Program) -> None:
         for line in mcu.reports:
-            self.mcu_reports.append(msgspec.json.decode(line, type=Snapshot))
+            self.mcu_reports.append(self._read(line))
+
+    def _read(self, line: bytes) -> Snapshot:
+        return msgspec.json.decode(line, type=Snapshot)
 
 
 class LinuxRobot(SimulatedRobot):
-    """Goob or Fred: the real launcher and services; camera, microphone and motor MCU are simulated."""
+    """Goob or Fred: the real launcher and services; camera, microphone, MCUs and loudspeaker are simulated."""
 
     runs_on = "Linux, SAMD21"
     stop_s = 0.85  # 0.75 s watchdog, and its resolution
@@ -103,7 +121,7 @@ class LinuxRobot(SimulatedRobot):
 
     def start(self, ending: threading.Event) -> None:
         """Start the MCU first, so that its port exists, then the robot."""
-        self.mcu = self._start_mcu("pebble.simulation.mcu", "--link", str(self._port))
+        self.mcu = self._start_motors()
         self.mcu.wait_until(self._port.exists, _MCU_START_S, ending)
         if self.has_imu:
             command = [
@@ -119,6 +137,9 @@ class LinuxRobot(SimulatedRobot):
             self.imu.wait_until(self._imu_port.exists, _MCU_START_S, ending)
         command = [sys.executable, "-m", "pebble.cli", "up", str(self._config)]
         self.launcher = Program(self.name, command, self._folder / "robot.log")
+
+    def _start_motors(self) -> Program:
+        return self._start_mcu("pebble.simulation.mcu", "--link", str(self._port))
 
     def _relocated(self, local_port: int, remote_port: int) -> dict[str, Any]:
         """The robot's own config file, with only addresses and paths changed."""
@@ -138,6 +159,50 @@ class LinuxRobot(SimulatedRobot):
             "audio": {"source": "synthetic"},
         }
         return config
+
+
+class RoomRobot(LinuxRobot):
+    """Goob: its MCU is part of a simulated room, its camera sees the room, and a simulated loudspeaker records."""
+
+    has_scripts, has_counter = True, False
+
+    def __init__(self, name: str, folder: Path, local_port: int, remote_port: int) -> None:
+        super().__init__(name, folder, local_port, remote_port, has_imu=True)
+        self._room = Room(self._folder)
+        self._port, self._trace = port_path(self._folder, name), trace_path(self._folder, name)
+        self._clip = write_clip(self._folder / "sounds")
+        config = json.loads(self._config.read_text())
+        services = config["services"]
+        services["serial_mcu_bridge"]["serial"]["port"] = str(self._port)
+        services["av_daemon"]["video"]["device"] = f"{self._room.path}#{name}"
+        services["soundboard_handler"]["playback"] = self._playback()
+        self._config.write_text(json.dumps(config, indent=2))
+
+    def outcome(self, at: float) -> Outcome:
+        """Where the tag was then, and what the loudspeaker has played of the clip."""
+        pose = next(
+            (one.board.pose for one in reversed(self.mcu_reports) if one.ns <= at * 1e9), Pose(math.nan, math.nan)
+        )
+        distance, bearing = self._room.tag_from(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad)
+        played = [len(one.frames()) for one in playbacks(self._record) if self._clip.startswith(one.frames())]
+        return Outcome(distance, bearing, CLIP_S * max(played, default=0) / len(self._clip), CLIP_S)
+
+    @property
+    def _record(self) -> Path:
+        return self._folder / "played"
+
+    def _playback(self) -> dict[str, Any]:
+        player = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self._record)]
+        return {"directory": str(self._folder / "sounds"), "player_command": player}
+
+    def _start_motors(self) -> Program:
+        options = ["--folder", str(self._folder), "--trace", "--report"]
+        command = [sys.executable, "-m", "pebble.simulation.world", str(self._room.path), *options]
+        return self._report(Program(f"{self.name}'s room", command, self._folder / "room.log", reports=True))
+
+    def _read(self, line: bytes) -> Snapshot:
+        seen = msgspec.json.decode(line, type=WorldSnapshot)
+        return Snapshot(seen.ns, True, True, seen.robots[self.name])
 
 
 class McuRobot(SimulatedRobot):
@@ -187,7 +252,7 @@ class Testbed:
             broker.wait(self._ending)
         self.remote_port = remote.port
         self.robots = [
-            LinuxRobot("goob", self.folder, local.port, remote.port, has_imu=True),
+            RoomRobot("goob", self.folder, local.port, remote.port),
             LinuxRobot("fred", self.folder, local.port, remote.port),
             McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
             McuRobot("benjr", self.folder, "ESP8266", remote.port),

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Self, TypeAlias, TypeVar
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -16,10 +16,12 @@ from rich.text import Text
 
 from pebble.client.discovery import DiscoveredRobot
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
-from pebble.demo.emergency import Result
+from pebble.demo.emergency import StopResult
+from pebble.demo.following import FollowResult
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
 from pebble.demo.operator import Operator
+from pebble.demo.steps import StepResult
 from pebble.demo.testbed import SimulatedRobot
 
 _LINE_PERIOD_S = 1.0
@@ -28,6 +30,7 @@ _COLUMN_EDGE = 3  # a line, and a space on each side
 _LABEL_WIDTH = 20  # the first column, with its edges
 
 T = TypeVar("T")
+Result: TypeAlias = StepResult | StopResult | FollowResult
 
 
 class View:
@@ -63,15 +66,25 @@ class View:
     def update(self) -> None:
         self._notice_closed_terminal()
         now = time.monotonic()
+        self._print_events()
         rows = [self._row(robot, now) for robot in self._robots]
         activity = f"{now - self._began:5.1f} s  operator: {self._operator.activity}"
         if self._live is not None:
             tables = [_table(some) for some in _side_by_side(rows, self._console)]
-            self._live.update(Group(*tables, Text.assemble(activity, ("   Ctrl-C ends it", "dim"))), refresh=True)
+            last = Text.assemble(activity, ("   Ctrl-C ends it", "dim"), no_wrap=True, overflow="ellipsis")
+            self._live.update(Group(*tables, last), refresh=True)
         elif now - self._printed_at >= _LINE_PERIOD_S:
             self._printed_at = now
             for line in (activity, *("  ".join(["       ", *row.values()]) for row in rows)):
                 self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def _print_events(self) -> None:
+        """Above the live table, where they stay."""
+        while self._operator.events:
+            at, line = self._operator.events.popleft()
+            self._console.print(
+                f"{at - self._began:5.1f} s  {line}", style="bold yellow", highlight=False, markup=False, soft_wrap=True
+            )
 
     def _notice_closed_terminal(self) -> None:
         if self._live is not None and not self._console.is_terminal:
@@ -89,6 +102,8 @@ class View:
         row["battery"] = _battery(seen)
         if robot.has_imu:
             row["attitude"] = _attitude(seen)
+        if robot.has_scripts:
+            row["script"] = _script(seen)
         if robot.has_media:
             recorder = self._media.recorders.get(robot.name)
             row["video"] = "" if recorder is None else recorder.summary("video", now)
@@ -108,19 +123,33 @@ class View:
 
 def show_results(console: Console, robots: Sequence[str], results: Sequence[Result], problems: Sequence[str]) -> None:
     """One row per step, one column per robot, the worst of several rounds; then every problem."""
-    steps = list(dict.fromkeys(result.step for result in results))
-    for some in _side_by_side(robots, console) if results else ():
+    driven = [result for result in results if not isinstance(result, FollowResult)]
+    steps = list(dict.fromkeys(result.step for result in driven))
+    for some in _side_by_side(robots, console) if driven else ():
         table = Table(title="Measured by the MCUs: distance, and time until the stop", title_justify="left")
         table.add_column("step")
         for name in some:
             table.add_column(name)
         for step in steps:
-            table.add_row(step, *(_cell(step, name, results) for name in some))
+            table.add_row(step, *(_cell(step, name, driven) for name in some))
         console.print(table)
+    for result in results:
+        if isinstance(result, FollowResult):
+            _show_follow(console, result)
     for problem in problems:
         console.print(problem, style="red", highlight=False, markup=False, soft_wrap=True)
     if results and not problems:
         console.print("Every robot moved and stopped as commanded.", style="green")
+
+
+def _show_follow(console: Console, result: FollowResult) -> None:
+    title = f"Measured by {result.robot}'s MCU, room and loudspeaker: script and override"
+    table = Table(title=title, title_justify="left")
+    table.add_column("step")
+    table.add_column(result.robot)
+    for check in result.checks:
+        table.add_row(check.name, f"{'FAILED' if check.wrong else 'ok'}  {check.measured}")
+    console.print(table)
 
 
 def show_media_results(console: Console, robots: Sequence[str], results: Sequence[MediaResult]) -> None:
@@ -144,7 +173,7 @@ def _media_cell(results: Sequence[MediaResult]) -> str:
     return f"{'FAILED' if worst.wrong else 'ok'}  {worst.measured}"
 
 
-def _cell(step: str, name: str, results: Sequence[Result]) -> str:
+def _cell(step: str, name: str, results: Sequence[StepResult | StopResult]) -> str:
     mine = [result for result in results if result.step == step and result.robot == name]
     if not mine:
         return "not done"
@@ -186,6 +215,13 @@ def _truth(robot: SimulatedRobot) -> dict[str, str]:
     wheels = f"{board.left_mm_s:+4.0f} {board.right_mm_s:+4.0f} mm/s"
     degrees = math.degrees(board.pose.heading_rad)
     return {"wheels": wheels, "pose": f"{board.pose.x_mm:+5.0f} {board.pose.y_mm:+5.0f} mm {degrees:+4.0f}°"}
+
+
+def _script(seen: DiscoveredRobot) -> str:
+    status = seen.autonomy
+    if status is None or not status.running:
+        return "none runs"
+    return f"{status.file}{', overruled' if status.overridden is True else ''}"
 
 
 def _attitude(seen: DiscoveredRobot) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pebble.demo.media_assessment import ShownPicture, assess_pictures, assess_sound, best_match, envelope
+from pebble.demo.media_assessment import ShownPicture, assess_pictures, assess_rate, assess_sound, best_match, envelope
 from pebble.media.speech import PERIOD_S, Speech
 
 RATE = 16_000
@@ -34,6 +34,15 @@ def test_pictures_as_promised() -> None:
 )
 def test_pictures_that_are_not(pictures: list[ShownPicture], complaint: str) -> None:
     assert any(complaint in wrong for wrong in assess_pictures("goob", "json", pictures, 15, 10).wrong)
+
+
+@pytest.mark.parametrize(
+    ("count", "fps", "wrong"),
+    [(41, 10.0, ()), (41, 6.5, ("json: 6.5 pictures a second",)), (3, 10, ("json: too few",))],
+)
+def test_pictures_without_a_counter(count: int, fps: float, wrong: tuple[str, ...]) -> None:
+    result = assess_rate("goob", "json", [one.captured_s for one in shown(count, fps)], 10)
+    assert [one.startswith(start) for one, start in zip(result.wrong, wrong, strict=True)] == [True] * len(wrong)
 
 
 def speech(first: int, count: int) -> np.ndarray:

@@ -1,0 +1,48 @@
+"""Where Goob lives in the demo: a room with a tag on each wall; and a clip that Goob can play."""
+
+from __future__ import annotations
+
+import json
+import math
+import wave
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from pebble.media.world.world_file import read_world
+
+TAG_ID, TAG_SIZE_M = 21, 0.25  # of the tag that Goob follows, as in the world file
+CLIP, CLIP_S = "horn.wav", 1.0
+_RATE = 16_000
+#: After the first round of driving Goob looks at that tag, and has space for further rounds wherever it is then.
+_START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
+
+
+class Room:
+    """The world file that comes with Pebble, with Goob alone in it, written to ``folder``."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "room.json"
+        room = json.loads((files("pebble.simulation.world") / "room.json").read_text())
+        self.path.write_text(json.dumps(room | {"robots": _START}, indent=1))
+        self._tag = next(tag for tag in read_world(self.path).tags if tag.id == TAG_ID)
+
+    def tag_from(self, x_m: float, y_m: float, heading_rad: float) -> tuple[float, float]:
+        """Distance and bearing (positive to the left) of the tag from a camera at this place."""
+        dx, dy = self._tag.x - x_m, self._tag.y - y_m
+        return math.hypot(dx, dy), math.remainder(math.atan2(dy, dx) - heading_rad, math.tau)
+
+
+def write_clip(folder: Path) -> bytes:
+    """A horn in ``folder``, which is created; returns its samples."""
+    folder.mkdir()
+    seconds = np.arange(round(CLIP_S * _RATE)) / _RATE
+    tone = np.sin(2 * np.pi * 440.0 * seconds) + np.sin(2 * np.pi * 554.4 * seconds)
+    samples = (tone * 8000).astype("<i2").tobytes()
+    with wave.open(str(folder / CLIP), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(_RATE)
+        file.writeframes(samples)
+    return samples
