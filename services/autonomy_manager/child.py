@@ -63,10 +63,12 @@ Spawn = Callable[[Launch, Callable[[int], None]], Child]
 class Processes:
     """Starts real processes. Only on the main thread: the kernel ties a process to the thread that starts it."""
 
-    def __init__(self) -> None:
-        self._guard = Guard()
+    def __init__(self, lock: Path) -> None:
+        self._guard = Guard(lock)
 
     def __call__(self, launch: Launch, ended: Callable[[int], None]) -> Child:
+        """The first call waits until no script of an earlier manager is alive. Raises PebbleError if one stays."""
+        self._guard.begin()
         process = Process(launch)
 
         def on_end(code: int) -> None:

@@ -1,33 +1,67 @@
-"""Ends all processes of all scripts when this process has ended, however it ended."""
+"""Ends all processes of all scripts when this process has ended, however it ended, before the next one begins."""
 
 from __future__ import annotations
 
+import fcntl
+import logging
 import os
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
+
+from pebble.errors import PebbleError
 
 # Each line of its input is the whole list, "TERM:123 KILL:456"; at the end of the input, this process has ended.
 # A process that is killed cannot do this itself, and the kernel's parent death signal reaches only a script's first
 # process. A shell is the smallest program there is for it.
 _PROGRAM = """
+left() { for group in $groups; do kill -0 -- "-${group##*:}" && return; done; return 1; }
+await() { tries=$1; while [ "$tries" -gt 0 ] && left; do tries=$((tries - 1)); sleep 0.02; done; }
 while read -r line; do groups=$line; done
 for group in $groups; do kill -s "${group%%:*}" -- "-${group##*:}"; done
-[ -z "$groups" ] || sleep 0.4
+await 20
 for group in $groups; do kill -s KILL -- "-${group##*:}"; done
+await 50
 """
+_LOCKED_S = 5.0  # longer than the program takes
+_TRY_S = 0.02
+
+log = logging.getLogger(__name__)
 
 
 class Guard:
-    """A small process that outlives this one by half a second. It runs from the first script on. Any thread."""
+    """A small process that outlives this one until no script is left. It runs from the first script on. Any thread.
 
-    def __init__(self) -> None:
+    It holds ``lock``, which the next manager of scripts waits for: never are scripts of two managers alive.
+    """
+
+    def __init__(self, lock: Path) -> None:
+        self._path, self._locked = lock, -1
         self._lock = threading.Lock()
         self._groups: dict[int, signal.Signals] = {}
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe = -1  # its input, while there is one
+
+    def begin(self) -> None:
+        """Wait until the guard of an earlier process has ended. Raises PebbleError if it does not."""
+        if self._locked >= 0:
+            return
+        try:
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._locked = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            log.warning("%s cannot be opened: %s", self._path, error.strerror)
+            return
+        deadline = time.monotonic() + _LOCKED_S
+        while not self._try_to_lock():
+            if time.monotonic() > deadline:
+                self._unlock()
+                raise PebbleError(f"scripts of an earlier process are still running: end what has {self._path} open")
+            time.sleep(_TRY_S)
 
     def add(self, group: int, number: signal.Signals) -> None:
         """End this process group with ``number``, and with SIGKILL if it has not ended then. Raises OSError."""
@@ -47,6 +81,19 @@ class Guard:
                 with suppress(OSError):
                     self._write({})
                 self._end()
+            self._unlock()
+
+    def _unlock(self) -> None:
+        if self._locked >= 0:
+            os.close(self._locked)
+            self._locked = -1
+
+    def _try_to_lock(self) -> bool:
+        try:
+            fcntl.flock(self._locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
 
     def _update(self, groups: Mapping[int, signal.Signals]) -> None:
         if self._process is not None:
@@ -70,6 +117,7 @@ class Guard:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # a kill of this process's group must not reach it
+            pass_fds=() if self._locked < 0 else (self._locked,),
         )
 
     def _end(self) -> None:
