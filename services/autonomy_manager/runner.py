@@ -156,6 +156,7 @@ class Runner:
         try:
             number, baseline = self._surroundings.begin_run()
             self._run = run = Run(number, plan, baseline)
+            self._surroundings.halt(number)  # the motor owner knows the run: who stops now, stops it before it drives
             for step in plan.dependencies:
                 run.dependencies.append(self._started(run, step))
             run.main = self._started(run, plan.main)

@@ -16,6 +16,7 @@ _MOVES_S = 0.8  # from a start to the first command
 _AT_REST_S = 0.02  # from a stop to wheels at rest, where nothing is slow
 _END_S = 2.1  # a script that is busy may take
 _STEP_S = 0.005
+_SHORT_S = 0.6  # a script that is late has not driven by then
 
 
 def rest(world: World) -> None:
@@ -140,6 +141,16 @@ def _release(world: World, script: Script) -> None:
     world.scheduler.check(_driven_by(world, script), "a script does not resume after a person has let go")
 
 
+def _halt_before_it_drives(world: World, _: Script) -> None:
+    """A person stops a script that has not driven yet."""
+    world.people[0].start("late")
+    world.scheduler.run(_SHORT_S)
+    script = world.manager.newest
+    assert script is not None
+    world.people[1].zero(final=True)
+    _ends(world, script, "stopped by an operator")
+
+
 def _restart_the_manager(world: World, script: Script) -> None:
     world.manager.kill(0.05)
     _ends(world, script, None)
@@ -147,4 +158,5 @@ def _restart_the_manager(world: World, script: Script) -> None:
 
 _ENDS: tuple[Callable[[World, Script], None], ...] = (
     *(_halt, _release, _end, _kill, _lose, _emergency_stop, _zero_while_it_drives, _release, _restart_the_manager),
+    _halt_before_it_drives,
 )

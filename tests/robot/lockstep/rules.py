@@ -16,7 +16,6 @@ While nothing turns the owner, the MCU's own deadline of 1 s stops the wheels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from pebble.contract import DRIVE, ESTOP, ESTOP_RESET, codec
@@ -39,7 +38,6 @@ class WheelRules:
         self._order = 0
         self.stopped = 0  # runs up to this number never move anything again
         self.seen: set[int] = set()  # runs that have moved the wheels
-        self.on_stop: Callable[[int], None] = lambda run: None
         self._life = 0
         self._begin()
         owner.before, owner.after = self.before_turn, self.after_turn
@@ -55,6 +53,7 @@ class WheelRules:
         self._zero_order = -1
         self._person_at: float | None = None
         self._lost_from: float | None = None  # a person's command that was not followed by a zero yet
+        self._lost = 0  # the newest run that this may end
         self._batch: list[tuple[int, Any]] = []
         self._turning: Command | None = None
         self._checked_at = self.since
@@ -126,10 +125,13 @@ class WheelRules:
         self._checked_at = now
 
     def lapse(self) -> None:
-        """A person who drove, and then sent nothing for 2 s, has lost the connection: the run is over."""
-        if self._lost_from is not None and self._clock() - self._lost_from >= HOLD_S + _MS:
+        """A person who drove, and then sent nothing for 2 s, has lost the connection: the runs so far are over."""
+        silent_s = -1.0 if self._lost_from is None else self._clock() - self._lost_from
+        if silent_s < HOLD_S - _MS:
+            self._lost = self.newest
+        elif silent_s >= HOLD_S + _MS:
             self._lost_from = None
-            self._end_runs()
+            self._end_runs(self._lost)
 
     def turning(self) -> Command | None:
         """The command by which the wheels turn now."""
@@ -195,10 +197,8 @@ class WheelRules:
         if newest and now - arrived < RESET_S:
             self.latched = False
 
-    def _end_runs(self) -> None:
-        if self.newest > self.stopped:
-            self.stopped = self.newest
-            self.on_stop(self.stopped)
+    def _end_runs(self, newest: int | None = None) -> None:
+        self.stopped = max(self.stopped, self.newest if newest is None else newest)
 
     def _judge(self, command: Command, now: float) -> None:
         self._check(command.may_move, "a retained or malformed command moves the wheels")

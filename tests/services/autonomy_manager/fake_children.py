@@ -127,8 +127,8 @@ class Bench:
         assert until(lambda: len(done) == 2, 3)
 
     def zeros(self, run: int) -> int:
-        """How often the manager has stopped the wheels for a run."""
-        return self.drives.count({"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run})
+        """How often the manager has stopped the wheels for a run since this began."""
+        return self.drives.count({"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run}) - 1
 
     def close(self) -> None:
         with suppress(AssertionError):

@@ -84,7 +84,7 @@ def test_a_script_is_listed_started_and_stopped(rig: ManagerRig) -> None:
     rig.run("ours")
     assert until(lambda: started(rig.root / "ours"))
     ((_, arguments, run),) = started(rig.root / "ours")
-    assert (arguments[2:], rig.drives[-1]["run"] < int(run or 0)) == (["--n", "1"], True)
+    assert (arguments[2:], rig.drives[0]["run"] < int(run or 0)) == (["--n", "1"], True)
 
 
 def test_many_starts_never_run_two_scripts_at_once_and_the_last_one_runs(rig: ManagerRig) -> None:

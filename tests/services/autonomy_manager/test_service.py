@@ -125,6 +125,12 @@ def test_nonsense_does_nothing(bench: Bench) -> None:
     assert (walk.signals, bench.children.files) == ([], ["walk"])
 
 
+def test_motor_owners_know_a_run_before_it_drives(bench: Bench) -> None:
+    """Else a person who stops a script that has not driven yet would not end it."""
+    walk = bench.start("walk")
+    assert until(lambda: bench.drives[-1] == {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run_of(walk)})
+
+
 def test_stop_halts_the_wheels_first_and_again_when_the_process_has_ended(bench: Bench) -> None:
     walk = bench.start("walk")
     bench.command({"action": "stop"})
