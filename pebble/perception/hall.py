@@ -14,7 +14,7 @@ from typing import NamedTuple
 _SMALLEST_SWING = 30  # ADC counts between the extremes; less is noise
 _WARM_UP_EXTREMA = 12  # of the sensor's signal, until its range is known
 _WARM_UP_SAMPLES = 400
-_FADE = 0.02  # per extremum: how fast the range follows a signal that becomes smaller
+_FADE = 0.005  # per extremum: how fast the range follows a signal that becomes smaller; a fast wheel shows few peaks
 _CARRY = 0.72  # of its speed a wheel carries over a sample of 20 ms: motors have a lag of about 60 ms
 _FULL_SPEED_RAD = 1.25  # phase per sample at full power, until it is known: Goob's
 _SMOOTH = 0.4  # per sample
