@@ -4,7 +4,7 @@
 VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test stops schedules check firmware report clean
+.PHONY: help demo test stops schedules script-schedules check firmware report clean
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -12,6 +12,7 @@ help:
 	@echo "make test             all checks and tests"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
+	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
 	@echo "make report           run every comparison and pebble impair, one hour; writes docs/results"
@@ -38,6 +39,11 @@ stops: .venv/.ready-dev
 schedules: .venv/.ready-dev
 	@$(VENV) -m tests.robot.lockstep --schedules 10000
 	@$(VENV) -m tests.robot.lockstep --mutations --schedules 1000
+
+script-schedules: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@$(VENV) -m tests.robot.script_schedules --transport zenoh
+	@$(VENV) -m tests.robot.script_schedules --transport mqtt
 
 firmware: .venv/.ready-dev
 	@sh tools/debian-packages.sh node=nodejs
