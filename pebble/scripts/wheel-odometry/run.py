@@ -15,6 +15,7 @@ from pebble.contract.payloads import WheelOdometry
 from pebble.contract.renaming import renamed
 from pebble.perception.odometry import Odometry, WheelGeometry
 from pebble.perception.rate import Rate
+from pebble.runtime.rate_limit import RateLimitedLog
 
 TUNE_STATE = "auto_tune_state.json"  # in the config's folder
 WAITING = 500  # inputs: 3 s of samples
@@ -45,13 +46,16 @@ def main(robot: Robot, options: Options) -> None:
     odometry = Odometry(geometry(robot, options), watchdog_s=watchdog_s, now=time.monotonic())
     inputs: queue.Queue[tuple[Callable[..., None], Any, float]] = queue.Queue(WAITING)
 
+    log = RateLimitedLog(robot.log)
+
     def take(method: Callable[..., None]) -> Callable[..., None]:
         """Commands and samples wait in one queue: a sample gets its direction from the commands before it."""
 
         def receive(value: Any, **_: str) -> None:
-            if inputs.full():
-                robot.log.warning("too busy: samples are lost, and so is the position")
-            inputs.put((method, value, time.monotonic()))
+            try:
+                inputs.put_nowait((method, value, time.monotonic()))
+            except queue.Full:
+                log.warning("busy", "too busy: samples are lost, and the position with them")
 
         return receive
 
