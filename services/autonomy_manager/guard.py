@@ -19,7 +19,7 @@ from pebble.errors import PebbleError
 # A process that is killed cannot do this itself, and the kernel's parent death signal reaches only a script's first
 # process. A shell is the smallest program there is for it.
 _PROGRAM = """
-left() { for group in $groups; do kill -0 -- "-${group##*:}" && return; done; return 1; }
+left() { for group in $groups; do kill -s 0 -- "-${group##*:}" && return; done; return 1; }
 await() { tries=$1; while [ "$tries" -gt 0 ] && left; do tries=$((tries - 1)); sleep 0.02; done; }
 while read -r line; do groups=$line; done
 for group in $groups; do kill -s "${group%%:*}" -- "-${group##*:}"; done

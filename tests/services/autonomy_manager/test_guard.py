@@ -37,6 +37,7 @@ def test_no_script_starts_before_those_of_a_killed_manager_have_ended(tmp_path: 
     earlier = int((tmp_path / "pid").read_text())
     killed.kill()
     killed.wait(5)
+    assert not gone(earlier), "it has time to end by itself"
 
     processes, ended = Processes(tmp_path / "lock"), threading.Event()
     sleeper = Launch("sleeper", ("sleep", "600"), tmp_path, {}, signal.SIGKILL)
