@@ -10,19 +10,27 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pebble.config import Config
-from pebble.contract import DRIVE, ESTOP_RESET, Channel, Kind, codec
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP_RESET, ESTOP_STATE, Channel, Kind, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.script.wheels import Wheels
 from pebble.transports import Message, QoS, Transport
+from pebble.transports.topics import matches
 
 if TYPE_CHECKING:
     from pebble.cameras import Picture
     from pebble.script.pictures import Pictures
 
 _ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
+#: What no script publishes, and why; the gate of `autonomy_manager` drops the same from scripts of others.
+_REFUSED = {
+    DRIVE: "use robot.drive() to move",
+    ESTOP_RESET: "let people reset",
+    ESTOP_STATE: "motor owners publish it",
+    AUTONOMY_COMMAND: "let people start scripts, or list those it needs in run(main, needs=…)",
+}
 _WAITING = 100  # messages of one channel that wait for its handler, before the oldest is dropped
 
 EXIT_ENDED = 3  # of a script whose run was ended: by an operator, an emergency stop or a newer run
@@ -139,18 +147,13 @@ class Robot:
         """Publish ``value`` on ``channel``; False: it was not accepted. ``names`` fill a pattern channel's levels."""
         self._check()
         topic = channel.topic(self.config.base, **names) if names else self._addresses[channel].topic
-        if channel in (DRIVE, ESTOP_RESET) or topic in (
-            self._addresses[DRIVE].topic,
-            ESTOP_RESET.topic(self.config.base),
-        ):
-            raise PebbleError(
-                f"a script does not publish {channel.metric}: use robot.drive() to move, and let people reset"
-            )
+        check_publish(topic, self._addresses)
         return self._publish(channel, value, topic)
 
     def publish_at_end(self, channel: Channel, value: Callable[[], Any]) -> None:
         """Publish what ``value()`` returns then, once the script ends, however it does; not if it is killed."""
         self._check()
+        check_publish(self._addresses[channel].topic, self._addresses)
         self._last_values[channel] = value
 
     def sleep(self, seconds: float) -> None:
@@ -220,3 +223,10 @@ class Robot:
 
         topic = self._addresses[channel].topic
         self._transport.subscribe(topic, receive, qos=QoS(channel.default_qos), limit=_WAITING)
+
+
+def check_publish(topic: str, addresses: Addresses) -> None:
+    """Raise PebbleError for a topic that a script must not publish on."""
+    for channel, instead in _REFUSED.items():
+        if matches(addresses[channel].topic, topic) or matches(channel.filter(addresses.base), topic):
+            raise PebbleError(f"a script does not publish {channel.metric}: {instead}")

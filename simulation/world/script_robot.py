@@ -13,8 +13,10 @@ from pebble.contract import DRIVE, Channel
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.media.world.world_file import read_world
+from pebble.runtime.addresses import Addresses
 from pebble.script import Robot, Stopped
 from pebble.script.drive_sender import DriveSender
+from pebble.script.robot import check_publish
 from pebble.simulation.world.lockstep import STEP_S, LockstepRobot, LockstepWorld
 
 _WATCHDOG_S = 0.75  # of serial_mcu_bridge
@@ -46,6 +48,8 @@ class SimulatedRobot(Robot):
         self.config = parse({"robot": {"id": name}}, folder=Path(file).absolute().parent, env={})
         self.log = logging.getLogger(f"pebble.script.{name}")
         self.published: list[tuple[Channel, Any]] = []
+        self._addresses = Addresses(self.config)
+        self._last_values: dict[Channel, Callable[[], Any]] = {}
         self._model, self._body = model, self.world.robots[name]
         self._sender = DriveSender(1, self._drive)
         self._driven_at = float("-inf")
@@ -65,6 +69,7 @@ class SimulatedRobot(Robot):
         except Stopped:
             self.log.debug("its time is over")
         self._sender.end("its time is over", self.world.now())
+        self.published += [(channel, value()) for channel, value in self._last_values.items()]
 
     def distance_to(self, *, tag: int) -> float:
         """How far the robot's middle is from a tag's, along the floor, in m. Raises PebbleError if there is none."""
@@ -128,8 +133,8 @@ class SimulatedRobot(Robot):
         return self._sender.refusal(self.world.now())
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
-        del names
         self._check()
+        check_publish(channel.topic(self.config.base, **names), self._addresses)
         self.published.append((channel, value))
         return True
 

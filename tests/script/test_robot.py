@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from pebble.config import parse
-from pebble.contract import DRIVE, ESTOP_RESET, WHEEL_ODOMETRY, Channel, Kind, codec
-from pebble.contract.payloads import Drive, EstopReset, WheelOdometry
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP_RESET, ESTOP_STATE, WHEEL_ODOMETRY, Channel, Kind, codec
+from pebble.contract.payloads import WheelOdometry
 from pebble.errors import PebbleError
 from pebble.script import Robot, Stopped
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -87,16 +87,22 @@ def test_a_channel_of_its_own_is_published_and_received(setting: Setting) -> Non
 
 
 @pytest.mark.parametrize(
-    ("channel", "value"),
+    ("channel", "names", "why"),
     [
-        (DRIVE, Drive(z=1.0)),
-        (ESTOP_RESET, EstopReset(boot="b", count=1)),
-        (Channel(metric="drive-values", kind=Kind.COMMAND, payload=dict), {"z": 1.0}),
+        (DRIVE, {}, "use robot.drive"),
+        (Channel(metric="drive-values", kind=Kind.COMMAND, payload=dict), {}, "use robot.drive"),
+        (ESTOP_RESET, {}, "let people reset"),
+        (ESTOP_STATE, {"owner": "wheels"}, "motor owners publish it"),
+        (AUTONOMY_COMMAND, {}, "let people start scripts"),
     ],
 )
-def test_a_script_neither_drives_unsigned_nor_resets(setting: Setting, channel: Channel, value: object) -> None:
-    with pytest.raises(PebbleError, match=r"use robot\.drive"):
-        setting.robot.publish(channel, value)
+def test_a_script_neither_drives_unsigned_nor_resets_nor_starts_scripts(
+    setting: Setting, channel: Channel, names: dict[str, str], why: str
+) -> None:
+    with pytest.raises(PebbleError, match=why):
+        setting.robot.publish(channel, {}, **names)
+    with pytest.raises(PebbleError, match=why):
+        setting.robot.publish_at_end(channel, dict)
 
 
 def test_every_call_ends_a_script_that_is_to_end(setting: Setting) -> None:

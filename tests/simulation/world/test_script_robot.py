@@ -76,6 +76,20 @@ def test_messages_are_received_and_published(robot: SimulatedRobot) -> None:
     assert [channel for channel, _ in robot.published] == [APRILTAG_DATA]
 
 
+def test_the_last_value_is_published_when_the_script_ends(robot: SimulatedRobot) -> None:
+    def main(robot: Robot) -> None:
+        robot.publish_at_end(APRILTAG_DATA, lambda: TagData(detected=False, timestamp=5.0))
+        robot.sleep(60)
+
+    robot.run(main, seconds=0.1)
+    assert robot.published == [(APRILTAG_DATA, TagData(detected=False, timestamp=5.0))]
+
+
+def test_what_a_robot_refuses_to_publish_is_refused_here_too(robot: SimulatedRobot) -> None:
+    with pytest.raises(PebbleError, match="use robot"):
+        robot.publish(DRIVE, Drive(z=1.0))
+
+
 def test_a_picture_is_new_or_young_enough(robot: SimulatedRobot) -> None:
     shapes: list[tuple[int, ...]] = []
 
