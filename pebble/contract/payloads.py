@@ -202,6 +202,11 @@ class EstopState(Payload, frozen=True, kw_only=True):
     persisted: bool | None = None  # whether this survives a power cut; None: the owner cannot save it
     barred: int | UnsetType = UNSET  # no script's run up to this one moves anything
 
+    @property
+    def last_barred(self) -> int:
+        """``barred``; 0 where it is unset."""
+        return self.barred if isinstance(self.barred, int) else 0
+
 
 class LogRecord(Payload, frozen=True, kw_only=True):
     """One log line (paper A.8.7); ``message`` at most 2048 characters by default."""

@@ -38,8 +38,7 @@ class MotorPower:
     def owner(self, state: EstopState) -> None:
         """Follow the motor owner's state."""
         self._latch.latched = state.latched
-        if isinstance(state.barred, int):
-            self._arbiter.barred = max(self._arbiter.barred, state.barred)
+        self._arbiter.barred = max(self._arbiter.barred, state.last_barred)
         if state.latched:
             self._power = (0.0, 0.0)
 

@@ -100,7 +100,7 @@ class DriveSender:
         before = self._owners if len(self._owners) < _MAX_OWNERS else {}
         self._owners = {**before, **states}  # one that is gone for a while may come back restarted
         self._latched = max((s for s in states.values() if s.latched), key=lambda state: state.since, default=None)
-        barred = max((s.barred for s in states.values() if isinstance(s.barred, int)), default=0)
+        barred = max((state.last_barred for state in states.values()), default=0)
         if barred > self.run:
             self._superseded_by = max(self._superseded_by, barred)
         elif barred == self.run and self._barred_at is None:

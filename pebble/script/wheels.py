@@ -88,7 +88,7 @@ class Wheels:
 
     @property
     def _barred(self) -> int:
-        return max((s.barred for s in self.estop.states.values() if isinstance(s.barred, int)), default=0)
+        return max((state.last_barred for state in self.estop.states.values()), default=0)
 
     def _tick(self) -> None:
         """Publish what has waited for its turn, and notice the end of the run, while the script does other things."""

@@ -28,7 +28,7 @@ class MotorOwners:
     @property
     def barred(self) -> int:
         """No run up to this one moves anything."""
-        return max(map(_barred, self._states.values()), default=0)
+        return max((state.last_barred for state in self._states.values()), default=0)
 
     @property
     def refusal(self) -> str:
@@ -45,15 +45,11 @@ class MotorOwners:
             boot, count = baseline.setdefault(owner, (state.boot, state.count))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
-            if _barred(state) >= run:
+            if state.last_barred >= run:
                 return OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"
         return ""
-
-
-def _barred(state: EstopState) -> int:
-    return state.barred if isinstance(state.barred, int) else 0
 
 
 def _stopped(owner: str, state: EstopState) -> str:

@@ -142,7 +142,7 @@ class ScriptRules:
         state = self._state
         if state is None or script.signalled:
             return False
-        barred = isinstance(state.barred, int) and state.barred >= script.run
+        barred = state.last_barred >= script.run
         same = (one is None or (state.boot, state.count) == (one.boot, one.count) for one in self._baselines)
         return state.latched or barred or not any(same)
 

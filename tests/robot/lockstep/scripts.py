@@ -320,10 +320,7 @@ class OwnScriptRules:
         self._script.scheduler.check(len(self._times) <= 50, "a script publishes more than 50 commands a second")
 
     def receives(self, estop: RobotEstop) -> None:
-        self._refused = any(
-            state.latched or (isinstance(state.barred, int) and state.barred >= self._script.run)
-            for state in estop.states.values()
-        )
+        self._refused = any(state.latched or state.last_barred >= self._script.run for state in estop.states.values())
 
     def has_ended(self) -> None:
         self._ended = True
