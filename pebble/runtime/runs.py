@@ -15,6 +15,9 @@ from pebble.errors import PebbleError
 
 log = logging.getLogger(__name__)
 
+RUN = "PEBBLE_RUN"  # the number of its run, in the environment of a script that signs its drive commands itself
+CONFIG = "PEBBLE_CONFIG"  # the path of the robot's config, in every script's environment
+
 _DIGITS = 10  # of the number in the file
 _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a run's number until 2059
 

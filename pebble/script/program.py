@@ -18,14 +18,12 @@ from pebble.contract.payloads import LAST_RUN
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.connections import local_transport
 from pebble.runtime.parent import launcher_runs, set_up_logging
-from pebble.runtime.runs import next_run
+from pebble.runtime.runs import CONFIG, RUN, next_run
 from pebble.script.guard import END_S, Guard
 from pebble.script.options import OneLineParser, form, parse
 from pebble.script.robot import EXIT_ENDED, Robot
 from pebble.transports import State, Transport
 
-RUN = "PEBBLE_RUN"  # the run's number, from the process that started this one
-CONFIG = "PEBBLE_CONFIG"  # the robot's config file
 _CONNECT_S = 2.0
 
 log = logging.getLogger(__name__)

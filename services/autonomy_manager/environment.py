@@ -6,9 +6,8 @@ import os
 from collections.abc import Mapping
 
 from pebble.runtime.parent import ENCODING, LAUNCHER_PID, NOTIFY_FD, WANTED
+from pebble.runtime.runs import CONFIG, RUN
 
-RUN = "PEBBLE_RUN"  # the number of its run, for scripts that sign their drive commands themselves
-CONFIG = "PEBBLE_CONFIG"  # the path of the robot's config
 _LAUNCHERS = (ENCODING, LAUNCHER_PID, NOTIFY_FD, WANTED)  # between the launcher and this process
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Protocol
 
 from pebble.errors import PebbleError
+from pebble.runtime.runs import CONFIG, RUN
 from pebble.services.autonomy_manager.child import Child, Launch, Spawn
-from pebble.services.autonomy_manager.environment import CONFIG, RUN, environment
+from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.forms import Value
 from pebble.services.autonomy_manager.motor_owners import Baseline
 from pebble.services.autonomy_manager.script import Plan, Script, Step

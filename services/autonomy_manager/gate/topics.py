@@ -46,7 +46,8 @@ class TopicRules:
         """What happens to a message on ``topic``."""
         if topic in self.drive_topics:
             return Rule.DRIVE
-        _, _, _, direction, *metric = (*topic.split("/"), "", "", "", "")[: max(4, topic.count("/") + 1)]
+        levels = topic.split("/")  # a base has three
+        direction, metric = "".join(levels[3:4]), levels[4:]
         if direction == INCOMING and metric and metric[-1] in _REFUSED:
             return Rule.REFUSE
         if topic in self._refused or (direction == OUTGOING and metric[:1] == ["estop"]):

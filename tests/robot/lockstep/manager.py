@@ -12,9 +12,9 @@ import msgspec
 
 from pebble.config import Config
 from pebble.contract import DRIVE
+from pebble.runtime.runs import CONFIG, RUN
 from pebble.services.autonomy_manager import service as manager_module
 from pebble.services.autonomy_manager.child import Launch
-from pebble.services.autonomy_manager.environment import CONFIG, RUN
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Login
 from pebble.services.autonomy_manager.gate.gate import Gate
 from pebble.services.autonomy_manager.gate.packets import Connect, write_connect
