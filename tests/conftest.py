@@ -8,12 +8,17 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from pebble.transports import segments
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+# An example may take long on a busy machine.
+settings.register_profile("pebble", deadline=None)
+settings.load_profile("pebble")
 
 # What robots save belongs to the run, not to the user who runs it.
 _STATE = tempfile.mkdtemp(prefix="pebble-tests-")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -19,6 +20,15 @@ from tests.robot.world_rig import WorldRig
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
+#: Wider than the aims, which are those of an idle machine: a busy one skips pictures, and adds to each deadline.
+LIMITS = {
+    **AIMS,
+    "command rate": replace(AIMS["command rate"], least=3.0, most=15.0),
+    "locations rate": replace(AIMS["locations rate"], least=4.0, most=18.0),
+    "freeze": replace(AIMS["freeze"], most=1500.0),
+    "terminate": replace(AIMS["terminate"], most=150.0),
+    "resume": replace(AIMS["resume"], most=4.0),
+}
 SLOW = {"freeze": "zenoh", "manager": "zenoh", "launcher": "mqtt"}  # these take seconds: one transport each
 CASES = [(kind, one) for kind in ("zenoh", "mqtt") for one in ENDINGS if SLOW.get(one.key, kind) == kind]
 
@@ -39,7 +49,7 @@ on_zenoh, on_mqtt = (pytest.mark.parametrize("rig", [kind], indirect=True) for k
 
 
 def check(found: Samples) -> None:
-    missed = {AIMS[key].name: samples for key, samples in found.items() if not AIMS[key].holds(samples)}
+    missed = {LIMITS[key].name: samples for key, samples in found.items() if not LIMITS[key].holds(samples)}
     assert missed == {}
 
 

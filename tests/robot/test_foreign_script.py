@@ -86,8 +86,8 @@ def test_a_person_goes_first_and_every_end_of_the_script_stops_the_wheels(rig: R
     lines = rig.mcu.drives(began)
     first = next(index for index, (_, wheels) in enumerate(lines) if by_person(wheels))
     resumed = next(at for at, wheels in lines[first:] if not by_person(wheels) and wheels != STOP)
-    assert lines[first][0] - began < 0.1
-    assert 1.9 < resumed - released < 2.5
+    assert lines[first][0] - began < 0.25, "a few milliseconds on an idle machine"
+    assert 1.9 < resumed - released < 4.0, "2 s on an idle machine"
 
     stopped = time.monotonic()
     rig.operator.send("incoming/autonomy-command", {"action": "stop"})

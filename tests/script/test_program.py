@@ -73,7 +73,7 @@ def test_a_script_that_does_not_look_ends_2_s_after_the_signal(station: Station)
     script.terminate()
     began = time.monotonic()
     assert ended(script)[0] == 128 + signal.SIGTERM
-    assert 1.0 < time.monotonic() - began < 4.0
+    assert 1.0 < time.monotonic() - began < 8.0
     assert until(station.rests)
 
 

@@ -124,7 +124,7 @@ MUTATIONS = {
         "        return max(102, self._owners.barred), self._owners.baseline()\n",
     ),
     "a barred run goes on": Mutation(
-        f"{_MANAGER}.motor_owners", "            if _barred(state) >= run:\n", "            if run < 0:\n"
+        f"{_MANAGER}.motor_owners", "            if state.last_barred >= run:\n", "            if run < 0:\n"
     ),
     "a run outlives a restart of the motor owner": Mutation(
         f"{_MANAGER}.motor_owners", "            if state.boot != boot:\n", "            if run < 0:\n"

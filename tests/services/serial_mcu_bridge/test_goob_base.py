@@ -110,7 +110,7 @@ def test_garbage_never_raises_and_never_reports_what_is_no_number() -> None:
         _check(parse(line))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.binary(max_size=300) | st.text(max_size=100).map(str.encode))
 def test_any_line_can_be_parsed(line: bytes) -> None:
     _check(parse(line))

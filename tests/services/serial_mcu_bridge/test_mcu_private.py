@@ -294,7 +294,7 @@ _manifest = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.lists(_manifest | _json, min_size=1, max_size=3))
 def test_all_readable_parts_of_any_manifest_are_retained(manifests: list[Any]) -> None:
     topics = PrivateTopics(BASE)

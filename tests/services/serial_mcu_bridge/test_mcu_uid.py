@@ -224,7 +224,7 @@ _ODD_INTERFACE = st.fixed_dictionaries({}, optional={
 })  # fmt: skip
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=1000)
 @given(st.lists(_ODD_INTERFACE, max_size=4))
 @example([{"channel": "sensors/imu", "profile": "imu.summary.v1", "encoding": {"fields": 5}}])
 def test_no_manifest_of_another_device_raises_anything(interfaces: list[dict[str, object]]) -> None:

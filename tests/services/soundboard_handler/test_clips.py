@@ -58,13 +58,13 @@ def test_the_folder_may_be_a_link(tmp_path: Path) -> None:
     assert clips.find(str(tmp_path / "link" / "a.wav")) is not None
 
 
-def test_ten_thousand_files(tmp_path: Path) -> None:
+def test_thousands_of_files(tmp_path: Path) -> None:
     for number in range(10):
         (tmp_path / f"{number}").mkdir()
-    for number in range(10_000):
+    for number in range(2_000):
         os.close(os.open(f"{tmp_path}/{number % 10}/{number:05}.wav", os.O_CREAT | os.O_WRONLY))
     clips = Clips(tmp_path)
-    assert len(clips.scan()) == 10_000
+    assert len(clips.scan()) == 2_000
     assert clips.problem == ""
 
 
