@@ -13,6 +13,7 @@ from msgspec.structs import replace
 
 from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE, ESTOP_STATE
 from pebble.contract.payloads import (
+    LAST_RUN,
     SCRIPT,
     AutonomyCommand,
     AutonomyDependency,
@@ -179,6 +180,7 @@ class AutonomyManager(Service):
         if self._gate is not None and self._gate[0] == run:
             self._gate[1].close()
             self._gate = None
+        self.halt(min(run + 1, LAST_RUN))  # bars this run: a process of it may have escaped
 
     def halt(self, run: int) -> None:
         if self._gate is not None and self._gate[0] == run:

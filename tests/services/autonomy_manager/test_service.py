@@ -144,6 +144,17 @@ def test_stop_halts_the_wheels_first_and_again_when_the_process_has_ended(bench:
     assert bench.zeros(run_of(walk)) == 4
 
 
+def test_a_run_that_has_ended_is_barred(bench: Bench) -> None:
+    """Else a process that left the script's process group could drive on."""
+    walk = bench.start("walk")
+    bench.command({"action": "stop"})
+    assert until(lambda: walk.signals == [TERM])
+    walk.end(0)
+    assert bench.becomes(**IDLE)
+    bench.quiet()
+    assert (bench.drives[-1]["run"], bench.drives[-1]["x"], bench.drives[-1]["z"]) == (run_of(walk) + 1, 0, 0)
+
+
 def test_what_does_not_end_is_killed(bench: Bench) -> None:
     walk = bench.start("walk")
     bench.command({"action": "stop"})
