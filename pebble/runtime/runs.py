@@ -53,10 +53,10 @@ def _next(path: Path, above: int, wall_clock: Callable[[], float]) -> int:
 
 def _read(file: int, path: Path, wall_clock: Callable[[], float]) -> int:
     raw = os.pread(file, 64, 0).strip()
-    if len(raw) == _DIGITS and raw.isdigit() and int(raw) <= LAST_RUN:
+    if len(raw) == _DIGITS and raw.isdigit() and int(raw) < LAST_RUN:
         return int(raw)
     if raw:
-        log.warning("%s is damaged: the run's number is made from the clock", path)
+        log.warning("%s is damaged, or its numbers have ended: the run's number is made from the clock", path)
     return _from_clock(wall_clock)
 
 
@@ -68,5 +68,5 @@ def _from_clock(wall_clock: Callable[[], float]) -> int:
 
 def _above(number: int) -> int:
     if number >= LAST_RUN:
-        raise PebbleError(f"run numbers end at {LAST_RUN}: restart the robot's computer, delete its autonomy-run file")
+        raise PebbleError(f"run numbers end at {LAST_RUN}: restart the robot's computer")
     return number + 1

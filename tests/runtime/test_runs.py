@@ -65,6 +65,13 @@ def test_where_nothing_can_be_saved_the_clock_counts(tmp_path: Path, caplog: pyt
     assert "cannot be opened" in caplog.text
 
 
+def test_after_the_last_number_in_the_file_the_clock_counts_again(tmp_path: Path) -> None:
+    """Else one command of another program, with the last number, would end scripts for good."""
+    path = tmp_path / "autonomy-run.json"
+    assert _next(path, LAST_RUN - 1, clock) == LAST_RUN
+    assert _next(path, 0, clock) == NOW - 1_735_689_600 + 1
+
+
 def test_numbers_end(tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match="run numbers end"):
         _next(tmp_path / "autonomy-run.json", LAST_RUN, clock)
