@@ -166,6 +166,7 @@ class World:
         self._end(Step(0.0, "end"))
         if not until(lambda: not self.alive.groups, _GONE_S):
             return ["a script does not end"]
+        time.sleep(_ANSWER_S)  # the state after the last stop may still be on its way
         if not until(self._is_reset, 5.0, step=0.4):
             return ["a stop cannot be reset"]
         time.sleep(_HOLD_S)
