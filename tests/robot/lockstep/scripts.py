@@ -18,6 +18,7 @@ from tests.robot.lockstep.commands import Command, Commands
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.people import BASE
 from tests.robot.lockstep.processes import Process
+from tests.robot.lockstep.publish_rules import PublishRules
 
 _BEGIN_S = 0.2  # until an interpreter has started
 _RETURN_S = 0.01  # until main has noticed that it is to end
@@ -201,7 +202,7 @@ class OwnScript(Script):
         self._driven = False  # before, nothing ends it but signals
         self._exit_code = 0
         self._published: list[Drive] = []
-        self.rules = OwnScriptRules(self)
+        self.rules = PublishRules(self.run, self.scheduler)
 
     def _begin(self) -> None:
         if self.ended:
@@ -281,46 +282,3 @@ class OwnScript(Script):
                 self.sender.receive(codec.decode(DRIVE, message.payload), self.scheduler.now)
             except PayloadError:
                 return
-
-
-class OwnScriptRules:
-    """What a script of ours may publish."""
-
-    def __init__(self, script: OwnScript) -> None:
-        self._script = script
-        self._times: list[float] = []
-        self._wanted: set[tuple[float, float]] = set()  # since the newest zero
-        self._last_is_zero = True
-        self._refused = False
-        self._ended = False
-
-    def wants_to_drive(self, x: float, z: float) -> None:
-        self._wanted.add((x, z))
-
-    def wants_zero(self, *, waits: bool) -> None:
-        """It has called for a zero; ``waits``: its run goes on, so nothing else explains why it was not published."""
-        self._wanted.clear()
-        self._script.scheduler.check(self._last_is_zero or not waits, "a script's zero waits")
-
-    def publishes(self, command: Drive, now: float) -> None:
-        self._script.scheduler.check(
-            command.signed and command.run == self._script.run, "a script's command is not signed with its run"
-        )
-        self._last_is_zero = not command.moves
-        if not command.moves:
-            return
-        self._script.scheduler.check(not self._ended, "a script moves the robot after its end")
-        self._script.scheduler.check(
-            (command.x, command.z) in self._wanted, "a script's command is published after a later zero"
-        )
-        self._script.scheduler.check(
-            not self._refused, "a script moves a robot that is stopped, or that has ended its run"
-        )
-        self._times = [at for at in self._times if now - at < 1.0] + [now]
-        self._script.scheduler.check(len(self._times) <= 50, "a script publishes more than 50 commands a second")
-
-    def receives(self, estop: RobotEstop) -> None:
-        self._refused = any(state.latched or state.last_barred >= self._script.run for state in estop.states.values())
-
-    def has_ended(self) -> None:
-        self._ended = True
