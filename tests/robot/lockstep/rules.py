@@ -105,7 +105,7 @@ class WheelRules:
                     stops.append(value)
                     self._stop(value)
             elif isinstance(value, tuple):
-                self._reset(*value, now)
+                self._reset(value[0], value[1], now)
             elif not value.moves:
                 self._zero(order, value)
         for _, value in batch:

@@ -12,12 +12,13 @@ from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
+from pebble.client.estop import new_name
 from tests.robot.rig import Rig
 from tests.robot.script_schedules.alive import Alive
 from tests.robot.script_schedules.rules import by_script, problems
 from tests.robot.script_schedules.schedules import ACTIVE_S, FILES, Schedule, Step
 from tests.robot.stop_schedules.history import History
-from tests.robot.stop_schedules.people import Driver, new_name
+from tests.robot.stop_schedules.people import Driver
 from tests.support import ROOT, until
 
 STOP_TIMEOUT_S = 1.5
