@@ -170,6 +170,11 @@ class World:
         time.sleep(_ANSWER_S)  # the state after the last stop may still be on its way
         if not until(self._is_reset, 5.0, step=0.4):
             return ["a stop cannot be reset"]
+        if not until(self._is_known, _UP_S, step=0.5):
+            return [f"a script is not known: {self._status()}"]
+        self._end(Step(0.0, "end"))
+        if not until(lambda: not self.alive.groups, _GONE_S):
+            return ["a script does not end"]
         time.sleep(_HOLD_S)
         return self._use()
 
@@ -186,6 +191,14 @@ class World:
             return ["a script that a person has stopped does not end"]
         shown = until(lambda: self._status().get("error") == "stopped by an operator", 2.0)
         return [] if shown else [f"the status does not say why the script has ended: {self._status()}"]
+
+    def _is_known(self) -> bool:
+        """Whether the manager can start a script: one that has just started asks them first what they are."""
+        began = time.monotonic()
+        self._start(Step(0.0, "start", FILES[0]))
+        seen = self.rig.operator
+        until(lambda: seen.on("outgoing/autonomy-status", began), 2.0)
+        return bool(self._status().get("running"))
 
     def _status(self) -> dict[str, Any]:
         seen = self.rig.operator.last("outgoing/autonomy-status")
