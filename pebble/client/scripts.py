@@ -69,7 +69,7 @@ class RobotScripts:
 def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
     """The settings that words such as ``--tag-id 5 --no-search`` select in a script's form. Raises PebbleError."""
     form = [one for one in entry.get("configs") or () if isinstance(one, dict) and isinstance(one.get("key"), str)]
-    options = {option: (one, value) for one in form for option, value in _options(one)}
+    options = {option: (one, value) for one in form for option, value in options_of(one)}
     chosen: dict[str, Any] = {}
     rest = iter(words)
     for word in rest:
@@ -87,12 +87,18 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
     return chosen
 
 
-def _options(one: Entry) -> list[tuple[str, bool | None]]:
-    """Its options, with the value of those that are flags."""
-    flag = "--" + str(one["key"]).replace("_", "-")
+def options_of(one: Entry) -> list[tuple[str, bool | None]]:
+    """The options of a form's entry: first the script's own, then those made of its key; for flags with their value."""
+    key = str(one.get("key", "")).replace("_", "-")
+    on = _distinct(one.get("arg"), f"--{key}")
     if one.get("type") != "bool":
-        return [(flag, None)]
-    return [(flag, True), (f"--no-{flag[2:]}", False)]
+        return [(option, None) for option in on]
+    off = _distinct(one.get("arg_false"), f"--no-{key}")
+    return [*((option, True) for option in on), *((option, False) for option in off)]
+
+
+def _distinct(own: object, made: str) -> list[str]:
+    return list(dict.fromkeys((own, made))) if isinstance(own, str) and own.startswith("--") else [made]
 
 
 def _value(option: str, type_: str, text: str) -> Any:

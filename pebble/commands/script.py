@@ -12,7 +12,7 @@ import typer
 
 from pebble.client.connection import Target, connected, target_of
 from pebble.client.names import id_of
-from pebble.client.scripts import RobotScripts
+from pebble.client.scripts import RobotScripts, options_of
 from pebble.commands import show
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
 from pebble.contract.payloads import AutonomyStatus
@@ -177,9 +177,9 @@ def _print_status(status: AutonomyStatus) -> None:
 
 def _option(one: dict[str, Any]) -> str:
     """``--tag-id INT  Tag ID (default: 13)``."""
-    flag = f"--{str(one.get('key', '')).replace('_', '-')}"
-    kind = str(one.get("type"))
-    shown = f"[{flag} | --no-{flag[2:]}]" if kind == "bool" else f"{flag} {kind.upper()}"
+    kind, options = str(one.get("type")), options_of(one)
+    first = {value: option for option, value in reversed(options)}
+    shown = f"[{first[True]} | {first[False]}]" if kind == "bool" else f"{first[None]} {kind.upper()}"
     notes = [", ".join(map(str, one["options"]))] if one.get("options") else []
     notes += [f"{word} {one[word]}" for word in ("min", "max") if word in one]
     notes.append("required" if one.get("required") else f"default: {one.get('default')}")

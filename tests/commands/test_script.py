@@ -131,3 +131,14 @@ def test_wrong_options_are_named(words: list[str], problem: str) -> None:
     with pytest.raises(PebbleError) as error:
         settings(ENTRY, words)
     assert str(error.value) == problem
+
+
+@pytest.mark.parametrize(
+    "words", [["--marker-id=7", "--preview"], ["--tag-id", "7", "--preview"]], ids=["own", "by key"]
+)
+def test_an_option_is_the_scripts_own_or_made_of_its_key(words: list[str]) -> None:
+    form = [
+        {"key": "tag_id", "type": "int", "arg": "--marker-id"},
+        {"key": "preview", "type": "bool", "arg": "--preview"},
+    ]
+    assert settings({"file": "follow", "configs": form}, words) == {"tag_id": 7, "preview": True}
