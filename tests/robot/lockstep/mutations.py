@@ -142,9 +142,6 @@ MUTATIONS = {
     "a script that does not end is not killed": Mutation(
         f"{_MANAGER}.runner", "                part.child.signal(signal.SIGKILL)\n", "                pass\n"
     ),
-    "a run is unknown to the motor owner before it drives": Mutation(
-        f"{_MANAGER}.runner", "            self._surroundings.halt(number)  # the", "            # the"
-    ),
     "nothing stops the wheels when a script has ended": Mutation(
         f"{_MANAGER}.runner", "            self._surroundings.halt_repeatedly(run.number)\n", ""
     ),
