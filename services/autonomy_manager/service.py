@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
@@ -30,11 +30,14 @@ from pebble.runtime.runs import next_run
 from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.catalogue import Catalogue, files
 from pebble.services.autonomy_manager.child import Processes, Spawn
-from pebble.services.autonomy_manager.gate.gate import Gate, broker_of
+from pebble.services.autonomy_manager.gate.config_copy import broker_of
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.runner import Runner
 from pebble.services.autonomy_manager.script import Plan, Script, StartError, plan
 from pebble.transports import QoS
+
+if TYPE_CHECKING:
+    from pebble.services.autonomy_manager.gate.gate import Gate
 
 _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _STOP = frozenset(("stop", "disable", "disabled", "off"))
@@ -171,6 +174,10 @@ class AutonomyManager(Service):
         if not script.needs_gate:
             return self.config.path or self.config.folder
         if self._gate is None:
+            from pebble.services.autonomy_manager.gate.gate import (
+                Gate,  # asyncio and ssl cost 2 MB, which few robots need
+            )
+
             gate = Gate(self.config, self._publish_signed, run)
             gate.open()
             self._gate = (run, gate)

@@ -9,7 +9,7 @@ import shutil
 from itertools import islice
 from typing import Any
 
-from pebble.config import Config
+from pebble.config import Config, Mqtt
 from pebble.errors import PebbleError
 
 _SECRET = re.compile("password|secret|token", re.IGNORECASE)
@@ -68,3 +68,11 @@ def _public(value: Any) -> Any:
     if isinstance(value, list):
         return [_public(item) for item in value]
     return _LOGIN.sub("***", value) if isinstance(value, str) else value
+
+
+def broker_of(config: Config) -> Mqtt:
+    """The broker that has the robot's topics. Raises PebbleError if there is none."""
+    broker = config.local_mqtt if config.transport.kind == "mqtt" else config.transport.mqtt_mirror
+    if broker is None:
+        raise PebbleError("it speaks MQTT, and this robot has no broker: set transport.mqtt_mirror")
+    return broker

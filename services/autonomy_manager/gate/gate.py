@@ -10,11 +10,11 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from pebble.config import Config, Mqtt
+from pebble.config import Config
 from pebble.errors import PebbleError
 from pebble.runtime.connections import tls_settings
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Login
-from pebble.services.autonomy_manager.gate.config_copy import ConfigCopy
+from pebble.services.autonomy_manager.gate.config_copy import ConfigCopy, broker_of
 from pebble.services.autonomy_manager.gate.drive_outlet import DriveOutlet
 from pebble.services.autonomy_manager.gate.server import MAX_CONNECTIONS, GateServer
 from pebble.services.autonomy_manager.gate.topics import TopicRules
@@ -101,11 +101,3 @@ class Gate:
 
 def _encoded(text: str | None) -> bytes | None:
     return None if text is None else text.encode()
-
-
-def broker_of(config: Config) -> Mqtt:
-    """The broker that has the robot's topics. Raises PebbleError if there is none."""
-    broker = config.local_mqtt if config.transport.kind == "mqtt" else config.transport.mqtt_mirror
-    if broker is None:
-        raise PebbleError("it speaks MQTT, and this robot has no broker: set transport.mqtt_mirror")
-    return broker

@@ -13,8 +13,8 @@ import msgspec
 from pebble.config import Config
 from pebble.contract import DRIVE
 from pebble.runtime.runs import CONFIG, RUN
-from pebble.services.autonomy_manager import service as manager_module
 from pebble.services.autonomy_manager.child import Launch
+from pebble.services.autonomy_manager.gate import gate as gate_module
 from pebble.services.autonomy_manager.gate.client_filter import ClientFilter, Login
 from pebble.services.autonomy_manager.gate.gate import Gate
 from pebble.services.autonomy_manager.gate.packets import Connect, write_connect
@@ -58,7 +58,7 @@ class Manager(ServiceProcess):
 
     def turn(self) -> None:
         self.before()
-        with patch.object(manager_module, "Gate", self._gate):
+        with patch.object(gate_module, "Gate", self._gate):
             super().turn()
         self.after()
 

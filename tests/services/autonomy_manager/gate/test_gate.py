@@ -22,7 +22,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.runtime.connections import local_transport
-from pebble.services.autonomy_manager.gate import Gate
+from pebble.services.autonomy_manager.gate.gate import Gate
 from pebble.services.autonomy_manager.gate.server import GateServer
 from pebble.transports import QoS
 from tests.services.autonomy_manager.gate.mqtt_bytes import (
