@@ -78,11 +78,11 @@ AIMS = {
 
 def table(found: Samples, kind: str) -> list[str]:
     """A line for each figure: its samples, its limit, the reference, and whether it holds."""
-    head = f"{'':<52}{'n':>4}{'p50':>9}{'p95':>9}{'worst':>9}  {'limit':<20}{'reference':<12}"
+    head = f"{'':<52}{'n':>4}{'p50':>10}{'p95':>10}{'worst':>10}  {'limit':<20}{'reference':<12}"
     lines = [head]
     for key, samples in found.items():
         aim = AIMS[key]
-        cells = "".join(f"{value:>9.4g}" for value in _statistics(aim, samples))
+        cells = "".join(f"{value:>10.4g}" for value in _statistics(aim, samples))
         reference = aim.mqtt if kind != "zenoh" else aim.zenoh
         name = f"{aim.name}, {aim.unit}" if aim.unit else aim.name
         holds = "ok" if aim.holds(samples) else "MISSED"
