@@ -109,9 +109,9 @@ class WorldRig(Rig):
 
     def wait_until_up(self, since: float, timeout: float = 15.0) -> None:
         super().wait_until_up(since, timeout)
-        self.wait_for_scripts(since, timeout)
+        self.wait_for_scripts(since)
 
-    def wait_for_scripts(self, since: float, timeout: float = 15.0) -> None:
+    def wait_for_scripts(self, since: float, timeout: float = 60.0) -> None:
         """A catalogue with all scripts of the tests was published after ``since``."""
         wanted = {folder.name for folder in SCRIPTS.iterdir()}
         assert until(lambda: wanted <= self._offered(since), timeout), f"only {self._offered(since)} of {wanted}"
