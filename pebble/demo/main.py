@@ -6,7 +6,6 @@ import math
 import signal
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -17,7 +16,7 @@ from pebble.contract.encodings import ALL_VIDEO
 from pebble.demo import emergency, following, takeover
 from pebble.demo.broker import BrokerKind, best_kind
 from pebble.demo.emergency import CompletedStop
-from pebble.demo.following import CompletedFollow
+from pebble.demo.following import CompletedFollow, FollowResult
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
@@ -33,7 +32,6 @@ _MEDIA_START_S = 2.0  # from the first request to the first picture, with some t
 _POLL_S = 0.1
 _REPORTED_S = 0.3  # an MCU reports ten times a second: the end of a step is reported a little later
 _SLOW_S = 15.0  # how much longer the first round may take: a script drives as fast as its machine permits
-_RESULTS = 200
 
 
 def run(seconds: float | None = None, *, broker: BrokerKind | None = None, console: Console | None = None) -> int:
@@ -118,7 +116,7 @@ def _without_imu(testbed: Testbed, operator: Operator) -> list[str]:
 
 def _watch(testbed: Testbed, operator: Operator, view: View, seconds: float, ending: threading.Event) -> list[Result]:
     """Drive for ``seconds``, or until the first round is complete; assess each step once its traces are."""
-    results: deque[Result] = deque(maxlen=_RESULTS)
+    results: dict[tuple[str, str], Result] = {}
     end = time.monotonic() + seconds
     while not ending.wait(_POLL_S) and not testbed.unexpected_exits():
         if time.monotonic() > end + (0.0 if operator.rounds else _SLOW_S):
@@ -128,12 +126,24 @@ def _watch(testbed: Testbed, operator: Operator, view: View, seconds: float, end
     operator.end()
     time.sleep(_REPORTED_S)
     _assess_completed(testbed, operator, results, math.inf)
-    return list(results)
+    return list(results.values())
 
 
-def _assess_completed(testbed: Testbed, operator: Operator, results: deque[Result], until: float) -> None:
+def _assess_completed(
+    testbed: Testbed, operator: Operator, results: dict[tuple[str, str], Result], until: float
+) -> None:
     while operator.completed and operator.completed[0].ended < until:
-        results.append(_assess(testbed, operator, operator.completed.popleft()))
+        retain_worst(results, _assess(testbed, operator, operator.completed.popleft()))
+
+
+def retain_worst(results: dict[tuple[str, str], Result], result: Result) -> None:
+    """Add a result by its robot and step; of several rounds the worst one stays, however long the demo runs."""
+
+    def badness(one: Result) -> tuple[int, float]:
+        return len(one.wrong), 0.0 if isinstance(one, FollowResult) else one.stop_s
+
+    key = (result.robot, result.step)
+    results[key] = max((results.get(key, result), result), key=badness)
 
 
 def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop | CompletedFollow) -> Result:
