@@ -18,7 +18,7 @@ from pebble.simulation.world.program import port_path, trace_path
 from tests.robot.rig import Motors, Rig
 from tests.support import ROOT, Child, until
 
-SCRIPTS = Path(__file__).parent / "scripts"
+SCRIPTS, PEBBLES_SCRIPTS = Path(__file__).parent / "scripts", ROOT / "pebble" / "scripts"
 TAG, TAG_SIZE_M = 13, 0.25
 #: One robot in a large room with one tag, 2 m ahead of the middle.
 ROOM: dict[str, Any] = {
@@ -112,8 +112,8 @@ class WorldRig(Rig):
         self.wait_for_scripts(since)
 
     def wait_for_scripts(self, since: float, timeout: float = 60.0) -> None:
-        """A catalogue with all scripts of the tests was published after ``since``."""
-        wanted = {folder.name for folder in SCRIPTS.iterdir()}
+        """A catalogue with all scripts, Pebble's and those of the tests, was published after ``since``."""
+        wanted = {run.parent.name for root in (SCRIPTS, PEBBLES_SCRIPTS) for run in root.glob("*/run.py")}
         assert until(lambda: wanted <= self._offered(since), timeout), f"only {self._offered(since)} of {wanted}"
 
     def close(self) -> None:
