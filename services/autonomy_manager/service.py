@@ -72,6 +72,7 @@ class AutonomyManager(Service):
         self._files: list[dict[str, object]] | None = None
         self._status: AutonomyStatus | None = None
         self._connected_before = False
+        self._last_number = 0  # that has barred a run: a person may have barred it since, as the newest one
         self._gate: tuple[int, Gate] | None = None  # of the present run, if one of its scripts needs it
 
     @property
@@ -168,7 +169,7 @@ class AutonomyManager(Service):
     def begin_run(self) -> tuple[int, Baseline]:
         if refusal := self._owners.refusal:
             raise StartError(refusal)
-        return next_run(self.config, self._owners.barred), self._owners.baseline()
+        return next_run(self.config, max(self._owners.barred, self._last_number)), self._owners.baseline()
 
     def config_path(self, script: Script, run: int) -> Path:
         if not script.needs_gate:
@@ -187,7 +188,8 @@ class AutonomyManager(Service):
         if self._gate is not None and self._gate[0] == run:
             self._gate[1].close()
             self._gate = None
-        self.halt(min(run + 1, LAST_RUN))  # bars this run: a process of it may have escaped
+        self._last_number = min(run + 1, LAST_RUN)
+        self.halt(self._last_number)  # bars this run: a process of it may have escaped
 
     def halt(self, run: int) -> None:
         if self._gate is not None and self._gate[0] == run:

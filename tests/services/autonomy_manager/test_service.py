@@ -153,6 +153,7 @@ def test_a_run_that_has_ended_is_barred(bench: Bench) -> None:
     assert bench.becomes(**IDLE)
     bench.quiet()
     assert (bench.drives[-1]["run"], bench.drives[-1]["x"], bench.drives[-1]["z"]) == (run_of(walk) + 1, 0, 0)
+    assert run_of(bench.start("sing")) > run_of(walk) + 1, "a person may have barred that number meanwhile"
 
 
 def test_what_does_not_end_is_killed(bench: Bench) -> None:
