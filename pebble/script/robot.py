@@ -124,10 +124,10 @@ class Robot:
 
         It moves the robot for 0.75 s at most: repeat it, 5 to 50 times a second. False: it has no effect, because a
         person drives, the robot is stopped, or there is no connection. At most 50 commands a second are published: of
-        more, the newest; a stop never waits.
+        more, the newest; a stop never waits. Numbers of NumPy will do. Raises ValueError or TypeError for no number.
         """
         self._check()
-        return self._wheels.drive(Drive(x=x, z=z, y=y))
+        return self._wheels.drive(Drive(x=float(x), z=float(z), y=float(y)))
 
     def stop(self) -> bool:
         """Stop the wheels: the same as ``drive()``."""

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pebble.config import parse
@@ -103,6 +104,20 @@ def test_a_script_neither_drives_unsigned_nor_resets_nor_starts_scripts(
         setting.robot.publish(channel, {}, **names)
     with pytest.raises(PebbleError, match=why):
         setting.robot.publish_at_end(channel, dict)
+
+
+@pytest.mark.parametrize("half", [0.5, np.float32(0.5), np.float64(0.5), np.array(0.5)])
+def test_models_drive_with_numbers_of_numpy(setting: Setting, half: float) -> None:
+    received: list[Drive] = []
+    setting.other.subscribe(DRIVE.topic(BASE), lambda message: received.append(codec.decode(DRIVE, message.payload)))
+    assert setting.robot.drive(x=half)
+    assert until(lambda: [drive.x for drive in received] == [0.5])
+
+
+@pytest.mark.parametrize("nonsense", [float("nan"), float("inf"), "fast", None])
+def test_what_is_no_number_drives_nothing(setting: Setting, nonsense: float) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        setting.robot.drive(z=nonsense)
 
 
 def test_every_call_ends_a_script_that_is_to_end(setting: Setting) -> None:
