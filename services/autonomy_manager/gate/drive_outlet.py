@@ -51,7 +51,7 @@ class DriveOutlet:
     def publish_due(self, now: float) -> None:
         """Publish the commands whose turn it is."""
         while (taken := self._pacer.take(now)) is not None:
-            self._send(*taken, moves=True)  # a zero never waits
+            self._send(*taken)
 
     def halt(self) -> None:
         """From now on publish zeros only."""
