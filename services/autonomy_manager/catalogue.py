@@ -22,6 +22,7 @@ from pebble.services.autonomy_manager.describe import (
     ask,
     is_ours,
     read_manifest,
+    stamp,
 )
 from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting, form
@@ -59,6 +60,7 @@ class Catalogue:
         self._config, self._section = config, config.services.autonomy_manager
         self._roots = roots(config)
         self._manifests, self._answers = Descriptions(), Descriptions()
+        self._ours: dict[str, tuple[object, bool]] = {}  # by name: of this version of the entry, whether it is ours
         self._scanned = False
         self._complained: set[str] = set()  # names with a warning in the log
 
@@ -72,6 +74,7 @@ class Catalogue:
                 scripts[name] = script
         for descriptions in (self._manifests, self._answers):
             descriptions.retain_only(set(folders))
+        self._ours = {name: known for name, known in self._ours.items() if name in folders}
         self._scanned = True
         found(scripts)
 
@@ -99,7 +102,7 @@ class Catalogue:
         described = self._manifests.get(name, [manifest], lambda: _manifest(manifest)) or Description()
         if not described.command and not entry.is_file():
             return None
-        ours = not described.command and is_ours(entry)
+        ours = not described.command and self._is_ours(name, entry)
         command = self._command(folder, entry, section, described)
         variables = environment(self._section.env, section.env)
         if ours:
@@ -122,6 +125,13 @@ class Catalogue:
             ours=ours,
             arbitrate=section.arbitrate,
         )
+
+    def _is_ours(self, name: str, entry: Path) -> bool:
+        """Parsed only when the file has changed: a large one takes a second of the whole process."""
+        before, now = self._ours.get(name), stamp(entry)
+        if before is None or before[0] != now:
+            self._ours[name] = before = (now, is_ours(entry))
+        return before[1]
 
     def _command(self, folder: Path, entry: Path, section: ScriptSection, described: Description) -> tuple[str, ...]:
         if described.command:

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -49,9 +49,19 @@ class Description(Struct, frozen=True):
     def __post_init__(self) -> None:
         if len(self.configs) > MAX_SETTINGS:
             raise ValueError(f"more than {MAX_SETTINGS} settings")
+        if not all(map(str.isprintable, _texts(self))):
+            raise ValueError("its texts must not contain control characters")
         keys = [setting.key for setting in self.configs]
         if len(set(keys)) < len(keys):
             raise ValueError("two settings have the same key")
+
+
+def _texts(description: Description) -> Iterator[str]:
+    """What operators see of it, also in a terminal."""
+    yield description.label or ""
+    for setting in description.configs:
+        options = map(str, setting.options)
+        yield from (setting.key, setting.label or "", setting.arg or "", setting.arg_false or "", *options)
 
 
 class DescribeError(Exception):
@@ -83,6 +93,8 @@ def _imports_ours(node: ast.AST) -> bool:
 def read_manifest(path: Path) -> Description | None:
     """The description in a `script.json`; None without one. Raises DescribeError."""
     try:
+        if path.exists() and not path.is_file():
+            raise DescribeError(f"{MANIFEST} is no file")  # to open a pipe would wait for its other end
         with path.open("rb") as file:
             raw = file.read(_LONGEST + 1)
     except FileNotFoundError:
@@ -119,8 +131,13 @@ def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) ->
         answer, reason = _content(output), _content(errors)[-_REASON_BYTES:].decode(errors="replace")
     if code != 0:
         last = reason.strip().rpartition("\n")[2]
-        raise DescribeError(f"its --describe ended with code {code}{f': {last[:300]}' if last else ''}")
+        raise DescribeError(f"its --describe ended with code {code}{f': {_shown(last[:300])}' if last else ''}")
     return _parse(answer, "its --describe")
+
+
+def _shown(text: str) -> str:
+    """Fit for a log: what a terminal would obey is left out."""
+    return "".join(letter for letter in text if letter.isprintable())
 
 
 def _content(file: IO[bytes]) -> bytes:
@@ -148,11 +165,11 @@ class Descriptions:
 
     def get(self, name: str, files: Sequence[Path], make: Callable[[], Description]) -> Description | None:
         """``make()``, or what it returned for the same ``files``; None if it fails, which is logged."""
-        stamp = [_stamp(file) for file in files]
+        stamps = [stamp(file) for file in files]
         before = self._answers.get(name)
         if (
             before is not None
-            and before[0] == stamp
+            and before[0] == stamps
             and (isinstance(before[2], Description) or self._clock() < before[1])
         ):
             return before[2] if isinstance(before[2], Description) else None
@@ -163,7 +180,7 @@ class Descriptions:
             result = failure
             if before is None or str(before[2]) != str(failure):
                 log.warning("%s is offered without settings: %s", name, failure)
-        self._answers[name] = (stamp, self._clock() + _RETRY_S, result)
+        self._answers[name] = (stamps, self._clock() + _RETRY_S, result)
         return result if isinstance(result, Description) else None
 
     def retain_only(self, names: set[str]) -> None:
@@ -171,7 +188,8 @@ class Descriptions:
         self._answers = {name: answer for name, answer in self._answers.items() if name in names}
 
 
-def _stamp(file: Path) -> tuple[int, int] | None:
+def stamp(file: Path) -> tuple[int, int] | None:
+    """Differs when the file has changed; None: there is none."""
     try:
         status = file.stat()
     except OSError:

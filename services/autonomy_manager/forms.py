@@ -47,7 +47,8 @@ class Setting(Struct, frozen=True, kw_only=True):
     def names_file(self) -> bool:
         """Whether its value is the name of a file or folder: a command must not choose one on the robot."""
         words = re.split(r"[^a-z]+", f"{self.key} {self.arg or ''}".lower())
-        return self.type == "string" and not _FILE_WORDS.isdisjoint(words)
+        free_text = self.type == "string" or (self.type == "enum" and not self.options)
+        return free_text and not _FILE_WORDS.isdisjoint(words)
 
     def entry(self) -> dict[str, Any]:
         """The entry as published."""

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from pebble.config import Config, parse
+from pebble.services.autonomy_manager import catalogue as catalogue_module
 from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
 from pebble.services.autonomy_manager.forms import Setting, form
 from pebble.services.autonomy_manager.script import Script
@@ -173,3 +174,15 @@ def test_the_list_is_bounded(tmp_path: Path) -> None:
     assert entries[0]["configs"] == form(large)
     assert entries[-1]["configs"] == []
     assert len(msgspec.json.encode(entries)) < 300_000
+
+
+def test_a_file_is_parsed_again_only_when_it_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[Path] = []
+    monkeypatch.setattr(catalogue_module, "is_ours", lambda entry: bool(parsed.append(entry)))
+    catalogue = Catalogue(config(tmp_path))
+    entry = write(tmp_path, "walk", "pass")
+    scanned(catalogue)
+    scanned(catalogue)
+    entry.write_text("pass  # changed")
+    scanned(catalogue)
+    assert parsed == [entry, entry]

@@ -148,3 +148,33 @@ def test_a_failure_is_logged_once_and_tried_again_after_a_minute(entry: Path, ca
             assert known.get("walk", [entry], question) is None
     assert question.times == 2
     assert [record.getMessage() for record in caplog.records] == ["walk is offered without settings: no camera"]
+
+
+def test_a_pipe_is_no_manifest(tmp_path: Path) -> None:
+    """To open it would wait for a writer, and no script would be listed any more."""
+    os.mkfifo(tmp_path / "script.json")
+    with pytest.raises(DescribeError, match="no file"):
+        read_manifest(tmp_path / "script.json")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        r'{"label": "\u001b[31mred"}',
+        r'{"configs": [{"key": "a\nb"}]}',
+        r'{"configs": [{"key": "a", "label": "\u202e"}]}',
+        r'{"configs": [{"key": "a", "arg": "--a\u0000"}]}',
+        r'{"configs": [{"key": "a", "type": "enum", "options": ["\r"]}]}',
+    ],
+)
+def test_texts_for_operators_have_no_control_characters(tmp_path: Path, text: str) -> None:
+    (tmp_path / "script.json").write_text(text)
+    with pytest.raises(DescribeError, match="control characters"):
+        read_manifest(tmp_path / "script.json")
+
+
+def test_what_a_failing_script_wrote_is_fit_for_a_log(entry: Path) -> None:
+    entry.write_text(r"""raise SystemExit("\x1b[31mred\r12:00:00 [ERROR] forged")""")
+    with pytest.raises(DescribeError) as caught:
+        ask([sys.executable, str(entry)], entry.parent, os.environ)
+    assert str(caught.value).isprintable()

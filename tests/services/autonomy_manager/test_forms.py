@@ -146,6 +146,7 @@ def test_a_command_cannot_name_a_file_on_the_robot(key: str) -> None:
 
 def test_an_option_that_writes_a_file_is_recognised_by_its_name_on_the_command_line() -> None:
     assert Setting(key="record", arg="--record-file").names_file
+    assert Setting(key="log_file", type="enum").names_file, "without options it is any text"
     assert not Setting(key="profile", arg="--profile").names_file
 
 
