@@ -12,7 +12,7 @@ import pytest
 
 from pebble.config import parse
 from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP_RESET, ESTOP_STATE, WHEEL_ODOMETRY, Channel, Kind, codec
-from pebble.contract.payloads import WheelOdometry
+from pebble.contract.payloads import Drive, WheelOdometry
 from pebble.errors import PebbleError
 from pebble.script import Robot, Stopped
 from pebble.transports.memory import MemoryHub, MemoryTransport
