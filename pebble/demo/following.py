@@ -6,12 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pebble.motion.arbiter import HOLD_MS
 from pebble.simulation.trace import Entry
 
 NAME = "by itself"
 SCRIPT = "apriltag-follow"
 DISTANCE_M, TOLERANCE_M, BEARING_RAD = 0.9, 0.05, 0.09
-HOLD_S = 2.0  # scripts are refused this long after a person's last command
+HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command
 _STARTED_S = 10.0  # interpreter, OpenCV and camera on the smallest machine
 _TAKEN_OVER_S = 0.25
 _RESUMED_S = 3.5
