@@ -106,6 +106,9 @@ class Guard:
         os.set_blocking(self._pipe, False)
         try:
             self._process = self._start(read_end)
+        except OSError:
+            os.close(self._pipe)
+            raise
         finally:
             os.close(read_end)
         self._write(groups)
