@@ -30,6 +30,7 @@ from pebble.runtime.runs import next_run
 from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.catalogue import Catalogue, files
 from pebble.services.autonomy_manager.child import Processes, Spawn
+from pebble.services.autonomy_manager.forms import shown
 from pebble.services.autonomy_manager.gate.config_copy import broker_of
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.runner import Runner
@@ -65,7 +66,7 @@ class AutonomyManager(Service):
         self.on_stop(processes.close)
         self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds)
         self._scripts = dict(scripts or {})
-        self._fixed = scripts is not None
+        self._fixed = self._listed = scripts is not None
         self._scan_now = threading.Event()
         self._stopping = False
         self._overridden_until = float("-inf")
@@ -115,6 +116,8 @@ class AutonomyManager(Service):
         try:
             if not file:
                 raise StartError("Start command missing file")
+            if file not in self._scripts and not self._listed:
+                raise StartError(f"Unknown autonomy file: {shown(file)}: scripts are still being listed, try again")
             wanted = plan(self._scripts, file, config)
             self._check(wanted)
         except StartError as error:
@@ -246,8 +249,12 @@ class AutonomyManager(Service):
             self._scan_now.clear()
             try:
                 catalogue.scan(lambda scripts: self.post(lambda: self._found(scripts), newest_of="scripts"))
+                self.post(self._scanned, newest_of="scanned")
             except Exception:  # the thread's boundary: the next scan may succeed
                 self.log.exception("the scripts cannot be listed")
+
+    def _scanned(self) -> None:
+        self._listed = True
 
     def _found(self, scripts: Mapping[str, Script]) -> None:
         self._scripts = dict(scripts)

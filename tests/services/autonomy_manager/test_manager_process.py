@@ -246,3 +246,17 @@ def test_scripts_inherit_nothing_of_the_launchers(mqtt: ManagerRig, monkeypatch:
         str(mqtt.folder / "rover.json"),
     )
     assert (leads_group, stdin) == (True, "")
+
+
+def test_a_start_before_all_scripts_are_listed_is_refused_with_the_reason(mqtt: ManagerRig) -> None:
+    mqtt.script("first")
+    slow = mqtt.root / "slow"
+    slow.mkdir()
+    (slow / "run.py").write_text("import os, time\nwhile not os.path.exists('go'): time.sleep(0.01)\n" + OURS + SLEEPER)
+    mqtt.start()
+    mqtt.command({"action": "start", "file": "slow"})
+    expected = "Unknown autonomy file: slow: scripts are still being listed, try again"
+    assert until(lambda: mqtt.status.get("error") == expected), mqtt.status
+    (slow / "go").touch()
+    assert until(lambda: len(mqtt.newest("autonomy-files")["files"]) == 2)
+    mqtt.run("slow")
