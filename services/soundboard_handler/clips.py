@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from itertools import islice
+from itertools import accumulate, islice
 from pathlib import Path
 
 from msgspec import Struct
@@ -14,6 +14,7 @@ from pebble.media import pyav
 _WAV = ".wav"
 _NEED_PYAV = (".mp3", ".ogg", ".flac")
 _MOST = 100_000  # files that a scan looks at: the folder may be / by mistake
+_LONGEST_LIST = 256 * 1024  # bytes of all names: the list is published again and again, to every operator
 
 
 class Clip(Struct, frozen=True):
@@ -37,11 +38,19 @@ class Clips:
         self._endings = (_WAV, *_NEED_PYAV) if pyav.installed() else (_WAV,)
 
     def scan(self) -> list[str]:
-        """The names of all clips, sorted without regard to case. What lies outside is left out, as ``find`` does."""
+        """The names of clips, sorted without regard to case: all, or 256 KiB of them. ``find`` knows the others, too.
+
+        What lies outside is left out, as ``find`` does.
+        """
         self.problem = ""
         root = self._folder.resolve()
         names = (path[len(str(root)) :].lstrip("/") for path in islice(self._files(root), _MOST) if self._is_clip(path))
-        return sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
+        found = sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
+        sizes = accumulate(len(name.encode()) for name in found)
+        listed = sum(size <= _LONGEST_LIST for size in sizes)
+        if listed < len(found):
+            self.problem = self.problem or f"only the first {listed} of {len(found)} are listed"
+        return found[:listed]
 
     def find(self, name: str) -> Clip | None:
         """The clip that a command names: relative to the folder, or absolute inside it. None if there is none."""

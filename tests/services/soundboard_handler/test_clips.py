@@ -68,6 +68,15 @@ def test_thousands_of_files(tmp_path: Path) -> None:
     assert clips.problem == ""
 
 
+def test_the_list_is_bounded_and_what_is_not_listed_can_be_played(tmp_path: Path) -> None:
+    for number in range(1_400):
+        os.close(os.open(f"{tmp_path}/{number:04}{'s' * 192}.wav", os.O_CREAT | os.O_WRONLY))
+    clips = Clips(tmp_path)
+    assert len(clips.scan()) == 256 * 1024 // 200
+    assert clips.problem == "only the first 1310 of 1400 are listed"
+    assert clips.find(f"1399{'s' * 192}.wav")
+
+
 def test_what_cannot_be_read_or_named_is_left_out_and_reported(tmp_path: Path) -> None:
     missing = Clips(tmp_path / "missing")
     assert missing.scan() == []
