@@ -19,6 +19,8 @@ RUN = "PEBBLE_RUN"  # the number of its run, in the environment of a script that
 CONFIG = "PEBBLE_CONFIG"  # the path of the robot's config, in every script's environment
 
 _DIGITS = 10  # of the number in the file
+_LOCKED_S = 2.0
+_TRY_S = 0.005
 _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a run's number until 2059
 
 
@@ -26,7 +28,7 @@ def next_run(config: Config, above: int = 0) -> int:
     """The number of a run that starts now: above every earlier one of this robot, and ``above`` the given one.
 
     Several processes may call this at once. Without the file, or with a damaged one, it counts from the clock. Raises
-    PebbleError if there are no numbers left.
+    PebbleError if there are no numbers left, or if another process does not give the file free.
     """
     return _next(config.state_file("autonomy-run"), above, time.time)
 
@@ -39,7 +41,7 @@ def _next(path: Path, above: int, wall_clock: Callable[[], float]) -> int:
         log.warning("%s cannot be opened (%s): the run's number is made from the clock", path, error.strerror)
         return _above(max(above, _from_clock(wall_clock)))
     try:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        _lock(file, path)
         number = _above(max(above, _read(file, path, wall_clock)))
         os.pwrite(file, f"{number:0{_DIGITS}d}\n".encode(), 0)
         os.fsync(file)
@@ -49,6 +51,19 @@ def _next(path: Path, above: int, wall_clock: Callable[[], float]) -> int:
     finally:
         os.close(file)
     return number
+
+
+def _lock(file: int, path: Path) -> None:
+    """Wait for other processes, but not for one that is frozen meanwhile. Raises PebbleError."""
+    deadline = time.monotonic() + _LOCKED_S
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                raise PebbleError(f"no run can begin: end what has locked {path}") from None
+        time.sleep(_TRY_S)
 
 
 def _read(file: int, path: Path, wall_clock: Callable[[], float]) -> int:

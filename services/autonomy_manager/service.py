@@ -97,7 +97,10 @@ class AutonomyManager(Service):
     def on_connected(self) -> None:
         if not self._connected_before:  # a predecessor may have been killed together with its script
             self._connected_before = True
-            self.halt(next_run(self.config, self._owners.barred))
+            try:
+                self.halt(next_run(self.config, self._owners.barred))
+            except PebbleError as error:
+                self.log.error("%s", error)
 
     # -- what operators send
 

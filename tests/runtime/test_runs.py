@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from pebble.contract.payloads import LAST_RUN
 from pebble.errors import PebbleError
+from pebble.runtime import runs
 from pebble.runtime.runs import _next
 from tests.support import ROOT
 
@@ -70,6 +72,17 @@ def test_after_the_last_number_in_the_file_the_clock_counts_again(tmp_path: Path
     path = tmp_path / "autonomy-run.json"
     assert _next(path, LAST_RUN - 1, clock) == LAST_RUN
     assert _next(path, 0, clock) == NOW - 1_735_689_600 + 1
+
+
+def test_a_file_that_stays_locked_is_an_error_that_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else who stops a script would wait for a process that is frozen."""
+    monkeypatch.setattr(runs, "_LOCKED_S", 0.05)
+    path = tmp_path / "autonomy-run.json"
+    with path.open("w") as locked:
+        fcntl.flock(locked, fcntl.LOCK_EX)
+        with pytest.raises(PebbleError, match=r"autonomy-run\.json"):
+            _next(path, 0, clock)
+    assert _next(path, 0, clock) > 0
 
 
 def test_numbers_end(tmp_path: Path) -> None:
