@@ -63,8 +63,8 @@ class DriveOutlet:
         for topic in [topic for topic, mover in self._moving.items() if mover == connection]:
             del self._moving[topic]
             payload = zero(self._run)
-            self._pacer.offer(topic, payload, moves=False, now=now)
-            self._send(topic, payload, moves=False)
+            if self._pacer.offer(topic, payload, moves=False, now=now):
+                self._send(topic, payload, moves=False)
 
     def _send(self, topic: str, payload: bytes, moves: bool) -> None:
         self._publish(topic, payload, moves)

@@ -78,6 +78,7 @@ class GateServer:
 
     def _ended(self, relay: Relay) -> None:
         self._outlet.ended(relay, self._loop.time())
+        self._set_timer()
 
     def _set_timer(self) -> None:
         due = self._outlet.due

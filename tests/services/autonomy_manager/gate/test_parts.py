@@ -156,6 +156,16 @@ def test_a_connection_that_has_stopped_needs_no_stop() -> None:
     assert len(sent) == 2
 
 
+def test_a_script_that_connects_again_and_again_floods_nobody() -> None:
+    sent = Sent()
+    for number in range(1000):
+        sent.drive('{"z":1}', f"connection {number}", 0.001)
+        sent.outlet.ended(f"connection {number}", 0.001)
+    assert [payload["z"] for _, payload in sent] == [1, 0]
+    sent.outlet.publish_due(1.0)
+    assert [payload["z"] for _, payload in sent] == [1, 0, 0]
+
+
 def test_after_halt_only_zeros_pass() -> None:
     sent = Sent()
     sent.drive('{"z":1}', now=0.0)
