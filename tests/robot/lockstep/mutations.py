@@ -120,7 +120,7 @@ MUTATIONS = {
     ),
     "numbers of runs are used again": Mutation(
         f"{_MANAGER}.service",
-        "        return next_run(self.config, self._owners.barred), self._owners.baseline()\n",
+        "        return next_run(self.config, max(self._owners.barred, self._last_number)), self._owners.baseline()\n",
         "        return max(102, self._owners.barred), self._owners.baseline()\n",
     ),
     "a barred run goes on": Mutation(

@@ -156,7 +156,7 @@ def test_a_connection_that_has_stopped_needs_no_stop() -> None:
     assert len(sent) == 2
 
 
-def test_a_script_that_connects_again_and_again_floods_nobody() -> None:
+def test_many_connections_after_each_other_flood_no_motor_owner() -> None:
     sent = Sent()
     for number in range(1000):
         sent.drive('{"z":1}', f"connection {number}", 0.001)
