@@ -55,7 +55,7 @@ def _clear(world: World) -> None:
     for process in world.manager.alive_scripts:
         process.thaw()
     world.people[1].end_script()
-    world.scheduler.run(STOP_TIMEOUT_S + _ANSWER_S)
+    world.scheduler.run(2 * STOP_TIMEOUT_S + _ANSWER_S)
     world.scheduler.check(not world.manager.alive_scripts, "a script does not end")
     world.scheduler.check(not _turning(world), "the wheels turn though nobody drives")
     for _ in range(_RESETS):
