@@ -69,7 +69,7 @@ class AutonomyManager(Service):
         self._fixed = self._listed = scripts is not None
         self._scan_now = threading.Event()
         self._stopping = False
-        self._overridden_until = float("-inf")
+        self._overridden_until = self._refused_until = float("-inf")
         self._files: list[dict[str, object]] | None = None
         self._status: AutonomyStatus | None = None
         self._connected_before = False
@@ -132,6 +132,8 @@ class AutonomyManager(Service):
     def _check(self, wanted: Plan) -> None:
         """Raise StartError if this robot cannot run ``wanted`` at present."""
         problem = self._owners.refusal
+        if not problem and self.clock() < self._refused_until:
+            problem = f"{OVERRIDDEN} just now: start it again in {_HOLD_S:g} s"
         if any(step.script.needs_gate for step in (wanted.main, *wanted.dependencies)):
             try:
                 broker_of(self.config)
@@ -154,6 +156,8 @@ class AutonomyManager(Service):
         """On the transport's thread. A person's commands all mean the same here."""
         if not drive.signed:
             self.post(self._person_drives, newest_of="person")
+            if not drive.moves and drive.valid_ms == 0:
+                self.post(self._person_stops, newest_of="person stops")
 
     def _person_drives(self) -> None:
         now = self.clock()
@@ -163,6 +167,10 @@ class AutonomyManager(Service):
             self.call_at(now + _HOLD_S, self._check_override)
         self._overridden_until = now + _HOLD_S
         self.changed()
+
+    def _person_stops(self) -> None:
+        """The arbiter bars what starts during the hold of such a zero, too: it may have been asked for before."""
+        self._refused_until = self.clock() + _HOLD_S
 
     def _check_override(self) -> None:
         if self.clock() < self._overridden_until:

@@ -349,6 +349,17 @@ def test_a_person_may_end_the_script_where_the_config_wants_it(tmp_path: Path) -
     bench.close()
 
 
+def test_a_start_right_after_a_persons_final_zero_is_refused_instead_of_ended_two_seconds_later(bench: Bench) -> None:
+    bench.drive(z=0.0, valid_ms=0)
+    bench.quiet()
+    bench.command({"action": "start", "file": "walk"})
+    assert bench.becomes(error=f"Failed to start walk: {OVERRIDDEN} just now: start it again in 2 s", running=False)
+    bench.advance(2.01)
+    bench.drive(z=0.0)  # a release
+    bench.quiet()
+    bench.start("walk")
+
+
 # -- its own end
 
 
