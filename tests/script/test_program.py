@@ -181,6 +181,14 @@ def test_a_robot_that_is_not_up_beside_a_broker_that_is(station: Station) -> Non
     assert f"[WARNING] goob is not up, so it does not move: start it with `pebble up {station.config_path}`" in output
 
 
+def test_describe_with_anything_else_starts_nothing(tmp_path: Path) -> None:
+    config = config_file(tmp_path, transport={"kind": "mqtt"})
+    (script := tmp_path / "walk.py").write_text("from pebble import run\nrun(lambda robot: print('runs'))\n")
+    command = [sys.executable, str(script), "--describe", "--config", str(config)]
+    found = ended(Child(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+    assert found == (2, "walk.py: --describe goes alone: it prints the form and starts nothing (see --help)\n")
+
+
 def test_a_wrong_run_number_is_named(station: Station) -> None:
     code, output = ended(station.start("robot.drive()", run=0))
     assert code == 1
