@@ -52,7 +52,7 @@ class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
 
     autonomy_root: Annotated[
         str,
-        doc("Folder of the scripts. `autonomy`: the folder of that name beside the config, and the scripts of Pebble."),
+        doc("Folder of scripts. Relative: seen from the config's folder, and Pebble's own are offered, too."),
     ] = "autonomy"
     scan_interval_seconds: Annotated[Interval, doc("Seconds between scans of the folder.")] = 5.0
     stop_timeout_seconds: Annotated[Seconds, doc("How long a script may take to stop before it is killed.")] = 8.0

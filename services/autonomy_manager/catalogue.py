@@ -34,7 +34,6 @@ _LONGEST_FORM = 16 * 1024  # bytes
 _LONGEST_FILES = 256 * 1024  # bytes of all forms together
 _MAX_DEPENDENCIES = 8
 _OWN_SCRIPTS = Path(pebble.__file__).parent / "scripts"
-_DEFAULT_ROOT = "autonomy"
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +41,7 @@ log = logging.getLogger(__name__)
 def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
     """The folders of scripts; of two scripts with one name, that in the first folder counts.
 
+    An absolute path is the only folder; a relative one is searched beside the config, and then Pebble's own.
     The original starts relative paths at its repository, two folders above its configs.
     """
     given = Path(config.services.autonomy_manager.autonomy_root).expanduser()
@@ -50,7 +50,7 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
     beside = [config.folder / given]
     if config.folder.parts[-2:] == ("control", "configs"):
         beside.append(config.folder.parent.parent / given)
-    return (*beside, own) if str(given) == _DEFAULT_ROOT else tuple(beside)
+    return (*beside, own)
 
 
 class Catalogue:

@@ -69,7 +69,7 @@ def test_a_missing_folder_has_no_scripts(tmp_path: Path) -> None:
     assert scripts(tmp_path / "missing") == {}
 
 
-def test_the_default_folder_is_beside_the_config_and_ours_come_last(tmp_path: Path) -> None:
+def test_a_relative_folder_is_beside_the_config_and_ours_come_last(tmp_path: Path) -> None:
     own = tmp_path / "own"
 
     def of(root: str, folder: Path) -> tuple[Path, ...]:
@@ -79,7 +79,7 @@ def test_the_default_folder_is_beside_the_config_and_ours_come_last(tmp_path: Pa
     originals = tmp_path / "control/configs"
     assert of("autonomy", tmp_path) == (tmp_path / "autonomy", own)
     assert of("autonomy", originals) == (originals / "autonomy", tmp_path / "autonomy", own)
-    assert of("mine", tmp_path) == (tmp_path / "mine",)
+    assert of("..", tmp_path) == (tmp_path / "..", own)
     assert of("/opt/scripts", tmp_path) == (Path("/opt/scripts"),)
 
 
