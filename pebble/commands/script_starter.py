@@ -30,6 +30,7 @@ def write(name: str, folder: Path) -> Iterator[Path]:
         test: _text("test_run.py.txt"),
         "room.json": _room(),
         "goob.json": _robot(target),
+        "pytest.ini": _text("pytest.ini"),
     }
     for file, text in texts.items():
         (target / file).write_text(text)

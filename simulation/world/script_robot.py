@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import math
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pebble.config import parse
@@ -24,6 +27,20 @@ _PATIENCE = 10_000  # calls during which no time passes
 
 Image = Any
 Handler = Callable[..., None]
+
+
+def load_script(file: Path) -> ModuleType:
+    """The module of a script's ``run.py``, whose name many scripts share, so an import would find only the first.
+
+    Raises OSError, and what the module raises.
+    """
+    name = str(file.absolute())
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise PebbleError(f"{file} is no Python file")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 class SimulatedRobot(Robot):

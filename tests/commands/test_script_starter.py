@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from pebble.config import load
+from pebble.services.autonomy_manager.catalogue import roots
 from tests.commands.command_line import Run
 
 
-def pytest_in(folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+def pytest_in(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
@@ -21,7 +24,7 @@ def pytest_in(folder: Path) -> subprocess.CompletedProcess[str]:
 def folder(run: Run, tmp_path: Path) -> Path:
     assert run("script", "new", "follow-me", "--folder", tmp_path) == 0, run.err
     folder = tmp_path / "follow-me"
-    files = ["run.py", "test_follow_me.py", "room.json", "goob.json"]
+    files = ["run.py", "test_follow_me.py", "room.json", "goob.json", "pytest.ini"]
     assert run.out.splitlines() == [str(folder / file) for file in files]
     return folder
 
@@ -31,6 +34,23 @@ def test_its_test_passes_and_fails_for_a_robot_that_turns_away(folder: Path) -> 
     script = folder / "run.py"
     script.write_text(script.read_text().replace("0.35 * tag", "-0.35 * tag"))
     assert "1 failed" in pytest_in(folder).stdout
+
+
+def test_it_passes_below_a_folder_with_other_settings_for_pytest(folder: Path) -> None:
+    (folder.parent / "pyproject.toml").write_text(
+        '[tool.pytest.ini_options]\naddopts = "-qq --strict-config"\nunknown = 1\n'
+    )
+    assert "1 passed" in pytest_in(folder.parent, folder.name).stdout
+
+
+def test_the_tests_of_two_scripts_pass_in_one_run(folder: Path) -> None:
+    second = shutil.copytree(folder, folder.with_name("second"))
+    (second / "test_follow_me.py").rename(second / "test_second.py")
+    (second / "run.py").write_text((second / "run.py").read_text().replace("= 0.6", "= 0.9"))
+    (folder / "run.py").write_text("")
+    done = pytest_in(folder.parent, folder.name, second.name)
+    assert "1 failed, 1 passed" in done.stdout
+    assert "has no attribute 'Options'" in done.stdout
 
 
 def test_it_is_a_script_of_less_than_30_lines(folder: Path) -> None:
@@ -45,6 +65,12 @@ def test_it_is_a_script_of_less_than_30_lines(folder: Path) -> None:
 def test_its_robot_is_one(folder: Path, run: Run) -> None:
     assert run("check", folder / "goob.json") == 0, run.err
     assert "autonomy_manager" in run.out
+
+
+def test_its_robot_offers_it_and_the_scripts_of_pebble(folder: Path) -> None:
+    beside, own = roots(load(folder / "goob.json"))
+    assert beside.resolve() == folder.parent
+    assert (own / "wheel-odometry" / "run.py").is_file()
 
 
 def test_an_existing_folder_is_left_alone(folder: Path, run: Run) -> None:
