@@ -17,6 +17,7 @@ from pebble.config.autonomy import Script as ScriptSection
 from pebble.services.autonomy_manager import builtin_forms
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
+    BrokenScriptError,
     Description,
     Descriptions,
     ask,
@@ -60,7 +61,7 @@ class Catalogue:
         self._config, self._section = config, config.services.autonomy_manager
         self._roots = roots(config)
         self._manifests, self._answers = Descriptions(), Descriptions()
-        self._ours: dict[str, tuple[object, bool]] = {}  # by name: of this version of the entry, whether it is ours
+        self._ours: dict[str, tuple[object, bool, str]] = {}  # by name: version, whether it is ours, what is wrong
         self._scanned = False
         self._complained: set[str] = set()  # names with a warning in the log
 
@@ -102,7 +103,7 @@ class Catalogue:
         described = self._manifests.get(name, [manifest], lambda: _manifest(manifest)) or Description()
         if not described.command and not entry.is_file():
             return None
-        ours = not described.command and self._is_ours(name, entry)
+        ours, broken = (False, "") if described.command else self._is_ours(name, entry, section)
         command = self._command(folder, entry, section, described)
         variables = environment(self._section.env, section.env)
         if ours:
@@ -112,6 +113,7 @@ class Catalogue:
                 return ask(command, folder, variables)
 
             answer = self._answers.get(name, [entry], question)
+            broken = self._answers.broken(name)
             described = _merged(described, answer or Description())
         settings = self._settings(name, section, described, ours=ours)
         return Script(
@@ -124,14 +126,26 @@ class Catalogue:
             environment={**self._section.env, **section.env},
             ours=ours,
             arbitrate=section.arbitrate,
+            broken=broken,
         )
 
-    def _is_ours(self, name: str, entry: Path) -> bool:
-        """Parsed only when the file has changed: a large one takes a second of the whole process."""
+    def _is_ours(self, name: str, entry: Path, section: ScriptSection) -> tuple[bool, str]:
+        """Whether it is ours, and why it cannot be started; parsed only when it has changed, which may take a second.
+
+        What another Python runs may be written for that.
+        """
         before, now = self._ours.get(name), stamp(entry)
-        if before is None or before[0] != now:
-            self._ours[name] = before = (now, is_ours(entry))
-        return before[1]
+        if before is not None and before[0] == now:
+            return before[1:]
+        ours, broken = False, ""
+        try:
+            ours = is_ours(entry)
+        except BrokenScriptError as error:
+            if section.python is None:
+                broken = str(error)
+                log.warning("%s cannot be started: %s", name, broken)
+        self._ours[name] = (now, ours, broken)
+        return ours, broken
 
     def _command(self, folder: Path, entry: Path, section: ScriptSection, described: Description) -> tuple[str, ...]:
         if described.command:

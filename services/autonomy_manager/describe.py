@@ -68,15 +68,24 @@ class DescribeError(Exception):
     """Why a script has no form."""
 
 
+class BrokenScriptError(DescribeError):
+    """Why it cannot be started either."""
+
+
 def is_ours(entry: Path) -> bool:
-    """Whether a Python file imports ``run`` from pebble, or pebble.script. It is read, never run."""
+    """Whether a Python file imports ``run`` from pebble, or pebble.script. It is read, never run.
+
+    Raises BrokenScriptError for what is no Python.
+    """
     if entry.suffix != ".py":
         return False
     try:
         if entry.stat().st_size > _LONGEST_SOURCE:
             return False
         tree = ast.parse(entry.read_bytes())
-    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+    except SyntaxError as error:
+        raise BrokenScriptError(f"{entry.name}, line {error.lineno or 1}: {_shown(error.msg)}") from None
+    except (OSError, ValueError, RecursionError, MemoryError):
         return False
     return any(map(_imports_ours, ast.walk(tree)))
 
@@ -131,7 +140,7 @@ def ask(command: Sequence[str], folder: Path, environment: Mapping[str, str]) ->
         answer, reason = _content(output), _content(errors)[-_REASON_BYTES:].decode(errors="replace")
     if code != 0:
         last = reason.strip().rpartition("\n")[2]
-        raise DescribeError(f"its --describe ended with code {code}{f': {_shown(last[:300])}' if last else ''}")
+        raise BrokenScriptError(f"its --describe ended with code {code}{f': {_shown(last[:300])}' if last else ''}")
     return _parse(answer, "its --describe")
 
 
@@ -182,6 +191,11 @@ class Descriptions:
                 log.warning("%s is offered without settings: %s", name, failure)
         self._answers[name] = (stamps, self._clock() + _RETRY_S, result)
         return result if isinstance(result, Description) else None
+
+    def broken(self, name: str) -> str:
+        """Why this script cannot be started; empty: it can, as far as is known."""
+        answer = self._answers.get(name)
+        return str(answer[2]) if answer is not None and isinstance(answer[2], BrokenScriptError) else ""
 
     def retain_only(self, names: set[str]) -> None:
         """Forget the others."""

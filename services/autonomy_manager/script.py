@@ -35,6 +35,7 @@ class Script(Struct, frozen=True, kw_only=True):
     environment: dict[str, str] = {}
     ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
     arbitrate: bool = True  # sign the drive commands of one that is not
+    broken: str = ""  # why it cannot be started
 
     @property
     def needs_gate(self) -> bool:
@@ -62,6 +63,8 @@ def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) ->
     script = scripts.get(file)
     if script is None:
         raise StartError(f"Unknown autonomy file: {shown(file)}")
+    if script.broken:
+        raise StartError(f"Failed to start {file}: {script.broken}")
     try:
         values = effective(script.settings, config)
     except SettingError as error:
@@ -74,6 +77,8 @@ def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency
     script = scripts.get(dependency.file)
     if script is None:
         raise StartError(f"Failed to start {file}: Dependency script not found: {shown(dependency.file)}")
+    if script.broken:
+        raise StartError(f"Failed to start {file}: {dependency.file}: {script.broken}")
     try:
         values = effective(script.settings, dependency.config)
     except SettingError as error:

@@ -158,8 +158,43 @@ def test_a_script_that_fails_to_answer_is_offered_without_settings(
 ) -> None:
     write(tmp_path, "walk", "import pebble.script\nraise SystemExit('no camera')")
     with caplog.at_level(logging.WARNING):
-        assert scripts(tmp_path)["walk"].settings == ()
+        walk = scripts(tmp_path)["walk"]
+    assert (walk.settings, walk.broken) == ((), "its --describe ended with code 1: no camera")
     assert "walk is offered without settings: its --describe ended with code 1: no camera" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "import nump\nfrom pebble import run",
+            "its --describe ended with code 1: ModuleNotFoundError: No module named 'nump'",
+        ),
+        (
+            "import msgspec\nfrom pebble import run\nclass Options(msgspec.Struct):\n    tags: list[str] = []\n"
+            "def main(robot, options: Options): pass\nrun(main)",
+            "its --describe ended with code 1: TypeError: option tags",
+        ),
+        ("from pebble import run\n\ndef main(robot:\n    pass", "run.py, line 3: '(' was never closed"),
+    ],
+    ids=["no module", "an option's type", "syntax"],
+)
+def test_a_broken_script_is_not_started_and_the_reason_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str, reason: str
+) -> None:
+    write(tmp_path, "follow", text)
+    catalogue = Catalogue(config(tmp_path))
+    with caplog.at_level(logging.WARNING):
+        found = [scanned(catalogue)["follow"] for _ in range(2)]
+    assert all(script.broken.startswith(reason) for script in found), found
+    assert caplog.text.count(reason) == 1
+    write(tmp_path, "follow", PRETENDS)
+    assert scanned(catalogue)["follow"].broken == ""
+
+
+def test_what_another_python_runs_may_be_written_for_that(tmp_path: Path) -> None:
+    write(tmp_path, "old", "print 'hi'")
+    assert scripts(tmp_path, scripts={"old": {"python": "python2"}})["old"].broken == ""
 
 
 def test_the_list_is_bounded(tmp_path: Path) -> None:

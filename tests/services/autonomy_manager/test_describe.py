@@ -41,15 +41,20 @@ def entry(tmp_path: Path) -> Path:
         ("# from pebble import run", False),
         ("from .pebble import run", False),
         ("from pebble.scripts import run", False),
-        ("def broken(:", False),
         ("x = 1\0", False),
-        ("(" * 5000, False),
         ("import argparse\nprint(open('asked', 'w'))", False),
     ],
 )
 def test_only_what_imports_our_script_module_is_ours(entry: Path, text: str, ours: bool) -> None:
     entry.write_text(text)
     assert is_ours(entry) is ours
+
+
+@pytest.mark.parametrize("text", ["def broken(:", "(" * 5000])
+def test_what_is_no_python_is_named_with_its_line(entry: Path, text: str) -> None:
+    entry.write_text(text)
+    with pytest.raises(DescribeError, match=r"^run\.py, line 1: "):
+        is_ours(entry)
 
 
 def test_no_other_file_is_ours(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from pebble.services.autonomy_manager.forms import Setting
 from pebble.services.autonomy_manager.script import Dependency, Script, StartError, plan
@@ -22,6 +23,8 @@ SCRIPTS = {
     "walk": script("walk", Dependency("eyes", {"speed": 1})),
     "eyes": script("eyes"),
     "lost": script("lost", Dependency("nose")),
+    "torn": structs.replace(script("torn"), broken="run.py, line 3: invalid syntax"),
+    "needy": script("needy", Dependency("torn")),
     "fast": script("fast", Dependency("eyes", {"speed": 9})),
 }
 
@@ -41,6 +44,8 @@ def test_a_plan_has_the_dependencies_with_their_own_settings() -> None:
         ("run\x1b", {}, "Unknown autonomy file: run?"),
         ("walk", {"speed": 2}, "Invalid config for walk: speed above maximum 1"),
         ("lost", {}, "Failed to start lost: Dependency script not found: nose"),
+        ("torn", {"speed": 2}, "Failed to start torn: run.py, line 3: invalid syntax"),
+        ("needy", {}, "Failed to start needy: torn: run.py, line 3: invalid syntax"),
         ("fast", {}, "Failed to start fast: Invalid config for eyes: speed above maximum 1"),
     ],
 )
