@@ -82,6 +82,25 @@ def test_it_begins_free_and_publishes_that(rig: Rig) -> None:
     assert rig.guard.judge(Drive(z=1), rig.now) == 0.75
 
 
+def test_a_zero_of_a_script_that_starts_with_the_robot_bars_older_runs_silently(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A manager publishes it at its start, mostly before the motor owner admits scripts: its predecessor's may run."""
+    rig = Rig(path)
+    assert rig.guard.judge(Drive(source="autonomy", run=8), rig.now) is None
+    assert (rig.state.barred, caplog.text) == (7, "")
+    rig.advance(3)
+    assert rig.guard.judge(SCRIPT, rig.now) is None
+    assert "refused a drive command: run 7 has ended" in caplog.text
+    rig.close()
+
+
+def test_a_zero_of_a_manager_that_starts_again_stops_the_script_of_its_predecessor(rig: Rig) -> None:
+    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
+    assert rig.guard.judge(Drive(source="autonomy", run=8), rig.now) == 0
+    assert rig.guard.judge(SCRIPT, rig.now) is None
+
+
 def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: Path) -> None:
     rig.stop(A, by="eve", why="a test")
     assert (rig.states[-1].latched, rig.states[-1].recent, rig.states[-1].persisted) == (True, [A], False)
