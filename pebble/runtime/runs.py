@@ -16,6 +16,8 @@ from pebble.errors import PebbleError
 log = logging.getLogger(__name__)
 
 RUN = "PEBBLE_RUN"  # the number of its run, in the environment of a script that signs its drive commands itself
+
+SUPERSEDED = "superseded: a newer run drives the robot"  # why a run has ended
 CONFIG = "PEBBLE_CONFIG"  # the path of the robot's config, in every script's environment
 
 _DIGITS = 10  # of the number in the file

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from pebble.contract.payloads import SCRIPT, Drive, EstopState
 from pebble.motion.arbiter import HOLD_MS
+from pebble.runtime.runs import SUPERSEDED
 
 MAX_PER_S = 50
 HOLD_S = HOLD_MS / 1000  # so long after a person's last command scripts are refused
@@ -126,7 +127,7 @@ class DriveSender:
         """Why this run can never drive again; empty: it may, or it never wanted to."""
         if not self._end and self._tried:
             if self._superseded_by:
-                self._end = "superseded: a newer run drives the robot"
+                self._end = SUPERSEDED
             elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:
                 self._end = "stopped by an operator"
         return self._end

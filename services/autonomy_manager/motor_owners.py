@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from pebble.contract.payloads import EstopState
+from pebble.runtime.runs import SUPERSEDED
 
 _MOST = 16  # owners; their names come from other processes
 
@@ -18,6 +19,7 @@ class MotorOwners:
     """The newest state of each motor owner; of those in ``names`` only, where there are any."""
 
     def __init__(self, names: Collection[str]) -> None:
+        self.newest_run = 0  # of all drive commands; an owner bars the run before it
         self._names = names
         self._states: dict[str, EstopState] = {}
 
@@ -46,7 +48,7 @@ class MotorOwners:
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
             if state.last_barred >= run:
-                return OVERRIDDEN
+                return SUPERSEDED if max(state.last_barred, self.newest_run) > run else OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"
         return ""

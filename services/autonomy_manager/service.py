@@ -158,6 +158,8 @@ class AutonomyManager(Service):
             self.post(self._person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:
                 self.post(self._person_stops, newest_of="person stops")
+        elif isinstance(drive.run, int) and drive.run > self._owners.newest_run:
+            self._owners.newest_run = drive.run  # only this thread writes it
 
     def _person_drives(self) -> None:
         now = self.clock()

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from pebble.contract.payloads import EstopState
+from pebble.runtime.runs import SUPERSEDED
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, MotorOwners
 
 
@@ -39,7 +40,7 @@ def test_a_latched_one_refuses_and_names_who(owners: MotorOwners) -> None:
         ({"latched": True, "count": 1, "barred": 8}, "emergency stop of motor owner serial: reset it first"),
         ({"count": 1, "barred": 8, "by": "bob"}, "emergency stop by bob of motor owner serial: it was reset since"),
         ({"barred": 8}, OVERRIDDEN),
-        ({"barred": 9, "boot": "bb"}, OVERRIDDEN),
+        ({"barred": 9, "boot": "bb"}, SUPERSEDED),
         ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
         ({"barred": 7}, ""),
     ],
@@ -48,6 +49,13 @@ def test_a_run_ends_with_the_reason(owners: MotorOwners, fields: dict[str, Any],
     baseline = owners.baseline()
     owners.receive("serial", state(**fields))
     assert owners.ending(8, baseline) == why
+
+
+@pytest.mark.parametrize(("newest_run", "why"), [(8, OVERRIDDEN), (9, SUPERSEDED)])
+def test_a_newer_run_is_no_operator(owners: MotorOwners, newest_run: int, why: str) -> None:
+    owners.newest_run = newest_run
+    owners.receive("serial", state(barred=8))
+    assert owners.ending(8, owners.baseline()) == why
 
 
 def test_an_owner_that_appears_during_a_run_must_not_change_from_then_on() -> None:

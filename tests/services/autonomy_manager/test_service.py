@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from pebble.runtime.runs import SUPERSEDED
 from pebble.services.autonomy_manager.forms import Setting
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
 from pebble.services.autonomy_manager.script import Dependency, Script
@@ -293,7 +294,7 @@ def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(be
     [
         ({"count": 1}, "emergency stop of motor owner serial: it was reset since"),
         ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
-        ({"barred": 1_000_000_000}, OVERRIDDEN),
+        ({"barred": 1_000_000_000}, SUPERSEDED),
     ],
 )
 def test_what_ended_a_run_at_the_motors_ends_its_script(bench: Bench, fields: dict[str, Any], error: str) -> None:
@@ -338,6 +339,14 @@ def test_the_status_shows_that_a_person_drives(bench: Bench) -> None:
     bench.advance(0.6)
     assert "overridden" not in bench.status
     assert bench.status["running"] is True
+
+
+def test_a_run_by_hand_ends_the_script_with_that_reason(bench: Bench) -> None:
+    """The owner bars the run before the newer one, as if a person had stopped it."""
+    walk = bench.start("walk")
+    bench.drive(z=0.5, source="autonomy", run=run_of(walk) + 1)
+    bench.owner(barred=run_of(walk))
+    assert bench.becomes(error=SUPERSEDED)
 
 
 def test_a_person_may_end_the_script_where_the_config_wants_it(tmp_path: Path) -> None:
