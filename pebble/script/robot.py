@@ -127,7 +127,7 @@ class Robot:
         more, the newest; a stop never waits. Numbers of NumPy will do. Raises ValueError or TypeError for no number.
         """
         self._check()
-        return self._wheels.drive(Drive(x=float(x), z=float(z), y=float(y)))
+        return self._wheels.drive(Drive(x=_axis("x", x), z=_axis("z", z), y=_axis("y", y)))
 
     def stop(self) -> bool:
         """Stop the wheels: the same as ``drive()``."""
@@ -223,6 +223,14 @@ class Robot:
 
         topic = self._addresses[channel].topic
         self._transport.subscribe(topic, receive, qos=QoS(channel.default_qos), limit=_WAITING)
+
+
+def _axis(name: str, value: Any) -> float:
+    """Raises ValueError or TypeError that names the axis."""
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"robot.drive: {name} is a number from -1 to 1, not {value!r:.40}") from None
 
 
 def check_publish(topic: str, addresses: Addresses) -> None:

@@ -6,6 +6,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,6 +105,12 @@ def test_a_script_neither_drives_unsigned_nor_resets_nor_starts_scripts(
         setting.robot.publish(channel, {}, **names)
     with pytest.raises(PebbleError, match=why):
         setting.robot.publish_at_end(channel, dict)
+
+
+@pytest.mark.parametrize(("x", "error"), [("left", ValueError), (None, TypeError), ([1], TypeError)])
+def test_what_is_no_number_is_named(setting: Setting, x: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match=r"^robot\.drive: x is a number from -1 to 1, not "):
+        setting.robot.drive(x=x)
 
 
 @pytest.mark.parametrize("half", [0.5, np.float32(0.5), np.float64(0.5), np.array(0.5)])
