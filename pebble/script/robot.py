@@ -175,7 +175,7 @@ class Robot:
         self._wheels.end(why)
         if first:
             for channel, value in list(self._last_values.items()):
-                self._publish(channel, value(), self._addresses[channel].topic)
+                self._publish_last(channel, value)
         with self._opening:
             pictures = self._pictures
         if pictures is not None:
@@ -190,6 +190,12 @@ class Robot:
     def _publish(self, channel: Channel, value: Any, topic: str) -> bool:
         address = self._addresses[channel]
         return self._transport.publish(topic, codec.encode(channel, value), qos=QoS(address.qos), retain=address.retain)
+
+    def _publish_last(self, channel: Channel, value: Callable[[], Any]) -> None:
+        try:
+            self._publish(channel, value(), self._addresses[channel].topic)
+        except Exception:  # the boundary to the script's own function: the rest of the end goes on
+            self.log.exception("publish_at_end: no last %s", channel.metric)
 
     def _end_run(self, why: str) -> None:
         self.log.warning("%s", why)

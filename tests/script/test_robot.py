@@ -107,6 +107,17 @@ def test_a_script_neither_drives_unsigned_nor_resets_nor_starts_scripts(
         setting.robot.publish_at_end(channel, dict)
 
 
+def test_a_last_value_that_fails_keeps_nothing_from_ending(setting: Setting, caplog: pytest.LogCaptureFixture) -> None:
+    sorrow = Channel(metric="sorrow", kind=Kind.EVENT, payload=dict)
+    received: list[dict[str, str]] = []
+    setting.other.subscribe(sorrow.topic(BASE), lambda message: received.append(codec.decode(sorrow, message.payload)))
+    setting.robot.publish_at_end(MOOD, lambda: {"mood": str(1 // 0)})
+    setting.robot.publish_at_end(sorrow, lambda: {"mood": "sad"})
+    setting.robot.end("a test")
+    assert until(lambda: received == [{"mood": "sad"}])
+    assert "publish_at_end: no last mood" in caplog.text
+
+
 @pytest.mark.parametrize(("x", "error"), [("left", ValueError), (None, TypeError), ([1], TypeError)])
 def test_what_is_no_number_is_named(setting: Setting, x: Any, error: type[Exception]) -> None:
     with pytest.raises(error, match=r"^robot\.drive: x is a number from -1 to 1, not "):
