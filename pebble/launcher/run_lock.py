@@ -28,7 +28,9 @@ class RunLock:
         self._lock = FileLock.take(self.path)
         if self._lock is None:
             holder = self.path.read_text(errors="replace").strip()
-            raise PebbleError(f"{self._robot} already runs: process {holder} holds {self.path}")
+            raise PebbleError(
+                f"{self._robot} already runs: process {holder} holds {self.path}; end it there with Ctrl-C"
+            )
         self._lock.write(f"{os.getpid()}\n".encode())
         return self
 

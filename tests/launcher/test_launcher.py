@@ -77,7 +77,7 @@ def test_a_second_launcher_for_the_same_robot_is_refused(launch: Launch) -> None
     second = robot.second()
     assert second.returncode == 1
     expected = f"refused: {BASE} already runs: process {robot.process.pid} holds {robot.run_dir}/launcher.lock"
-    assert second.stderr.strip() == expected
+    assert second.stderr.strip() == f"{expected}; end it there with Ctrl-C"
     assert robot.run_dir.stat().st_mode & 0o777 == 0o700
     assert len(robot.events("bridge", "start")) == 1
 

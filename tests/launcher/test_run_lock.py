@@ -25,7 +25,8 @@ def test_a_second_lock_names_the_holder(tmp_path: Path) -> None:
     with RunLock(tmp_path, "x/y/z") as lock:
         with pytest.raises(PebbleError) as refused:
             RunLock(tmp_path, "x/y/z").take()
-        assert str(refused.value) == f"x/y/z already runs: process {os.getpid()} holds {lock.path}"
+        fact = f"x/y/z already runs: process {os.getpid()} holds {lock.path}"
+        assert str(refused.value) == f"{fact}; end it there with Ctrl-C"
     with RunLock(tmp_path, "x/y/z"):
         pass
 
