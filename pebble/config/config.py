@@ -13,7 +13,7 @@ from typing import Any
 from msgspec.structs import asdict, fields
 
 from pebble.config.checks import CHECKS
-from pebble.config.raw import decode, inherit, plain, read_text
+from pebble.config.raw import Pairs, decode, inherit, plain, read_text
 from pebble.config.reader import Reader
 from pebble.config.tree import Root, SerialBridge, SerialBridges
 from pebble.config.types import Secret, Section
@@ -96,7 +96,10 @@ class Config(Root, frozen=True, kw_only=True):
 def load(path: Path | str, env: Mapping[str, str] = os.environ) -> Config:
     """Read a config file. Raises ConfigError with every problem in it."""
     path = Path(path).absolute()
-    return _config(decode(read_text(path), path.name), path, path.parent, env)
+    raw = decode(read_text(path), path.name)
+    if isinstance(raw, Pairs) and (keys := dict(raw).keys()) & {"robots", "tags"} and "robot" not in keys:
+        raise ConfigError(f"{path.name}: this is a world file, for pebble sim world; name the config file of a robot")
+    return _config(raw, path, path.parent, env)
 
 
 def parse(raw: dict[str, Any], *, folder: Path, env: Mapping[str, str]) -> Config:

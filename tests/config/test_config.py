@@ -532,6 +532,10 @@ class TestFiles:
         (tmp_path / "binary").write_bytes(b"{\xff")
         assert "is not UTF-8 text, see its byte 1" in file_problem(tmp_path / "binary")
 
+    def test_a_world_file_is_recognised(self, tmp_path: Path) -> None:
+        problem = file_problem(written(tmp_path, '{"family": "APRILTAG_25h9", "robots": {"goob": {}}}'))
+        assert "this is a world file" in problem
+
     def test_a_file_that_cannot_be_read(self, tmp_path: Path) -> None:
         loop = tmp_path / "loop.json"
         loop.symlink_to(loop)
