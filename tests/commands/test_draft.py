@@ -40,9 +40,16 @@ def test_a_retained_command_is_refused(name: str) -> None:
         ("flags/reboot", "1", "will refuse"),
         ("outgoing/online", '{"t": 1}', "published by robots"),
         ("heartbeat", '{"t": 1}', "older name of online"),
+        ("drive-values", '{"speed": 0.5}', "there is no axis in it (x: steering, z: throttle, y), only speed"),
+        ("drive-values", '{"value": {"speed": 0.5}}', "no axis"),
         ("house/lamp", "on", "not in the contract"),
     ],
 )
 def test_doubtful_messages_are_sent_with_a_warning(name: str, text: str, doubt: str) -> None:
     message = draft(Names(GOOB), name, text, retain=None, qos=None, force=False)
     assert any(doubt in one for one in message.warnings)
+
+
+@pytest.mark.parametrize("text", ["{}", '{"z": 0.5, "speed": 1}', '{"source": "autonomy"}'])
+def test_a_stop_and_a_command_with_an_axis_are_sent_without_a_warning(text: str) -> None:
+    assert draft(Names(GOOB), "drive-values", text, retain=None, qos=None, force=False).warnings == ()
