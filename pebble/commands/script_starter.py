@@ -16,12 +16,12 @@ _name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
 def write(name: str, folder: Path) -> Iterator[Path]:
     """Make ``folder/name`` with its files, and yield their paths. Raises PebbleError, also if it exists already."""
     if not _name(name):
-        raise PebbleError(f"{name}: a script's name is letters, digits, - and _, beginning with a letter")
+        raise PebbleError(f"{name!r}: a script's name is letters, digits, - and _, beginning with a letter")
     target = folder / name
     try:
+        if (alike := _alike(target)) is not None:
+            raise PebbleError(f"{alike} exists already: choose another name, or another --folder")
         target.mkdir(parents=True)
-    except FileExistsError:
-        raise PebbleError(f"{target} exists already: choose another name, or another --folder") from None
     except OSError as error:
         raise PebbleError(f"{target}: {error.strerror}") from None
     test = f"test_{name.replace('-', '_')}.py"
@@ -35,6 +35,13 @@ def write(name: str, folder: Path) -> Iterator[Path]:
     for file, text in texts.items():
         (target / file).write_text(text)
         yield target / file
+
+
+def _alike(target: Path) -> Path | None:
+    """What exists with this name, whatever its case: many file systems make no difference."""
+    if not target.parent.is_dir():
+        return None
+    return next((one for one in target.parent.iterdir() if one.name.lower() == target.name.lower()), None)
 
 
 def _text(file: str) -> str:
