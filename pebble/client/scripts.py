@@ -84,7 +84,20 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
                 raise PebbleError(f"{option} needs a value")
             value = following
         chosen[one["key"]] = fixed if fixed is not None else _value(option, str(one.get("type")), value)
+        _check_bounds(f"{option} of {entry['file']}", chosen[one["key"]], one)
     return chosen
+
+
+def _check_bounds(name: str, value: Any, one: Entry) -> None:
+    """Raises PebbleError for a value that the robot would refuse."""
+    least, most, options = one.get("min"), one.get("max"), one.get("options")
+    if one.get("type") in ("int", "float"):
+        if isinstance(least, int | float) and value < least:
+            raise PebbleError(f"{name}: {value} is too little, it is at least {least}")
+        if isinstance(most, int | float) and value > most:
+            raise PebbleError(f"{name}: {value} is too much, it is at most {most}")
+    elif one.get("type") == "enum" and isinstance(options, list) and value not in map(str, options):
+        raise PebbleError(f"{name}: {value!r} is not one of {', '.join(map(str, options))}")
 
 
 def options_of(one: Entry) -> list[tuple[str, bool | None]]:

@@ -29,6 +29,7 @@ _HELP = """Programs that move a robot by themselves; docs/scripts.md explains th
     pebble script stop goob.json
 """
 _ANSWER_S = 5.0
+_FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
 _SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
 
 _Robot = Annotated[
@@ -72,15 +73,17 @@ def list_(
 
 def start(
     context: typer.Context, robot: _Robot,
-    file: Annotated[str, typer.Argument(help="The script; its own options follow.", show_default=False)],
+    file: Annotated[str, typer.Argument(help="The script; its own options follow.", show_default=False)] = "",
     config: ConfigOption = None, url: UrlOption = None, remote: RemoteOption = False,
     password_file: PasswordFile = None, ca_cert: CaCert = None,
 ) -> int:  # fmt: skip
-    """Start a script on its robot, and wait until it runs. A script that runs already is stopped first.
+    """Start a script on its robot, and wait until it has run for a second. A script that runs already is stopped first.
 
     \b
         pebble script start goob.json follow --tag-id 7 --distance-m 0.5
     """
+    if not file or file.startswith("-"):
+        raise PebbleError(f'which script? see "pebble script list {robot}"')
     options = Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
     with _scripts(robot, options) as (transport, scripts, _):
         before, answers, began = scripts.status, scripts.answers, time.monotonic()
@@ -92,6 +95,9 @@ def start(
         if not _runs(before, status, file):
             raise PebbleError(show.printable(status.error or f"{file} does not run"))
         _print_status(status)
+        _wait(lambda: _ended(scripts.status), _FIRST_SECOND_S)
+        if scripts.status is not None and _ended(scripts.status) and scripts.status.error:
+            raise PebbleError(show.printable(scripts.status.error))
     return 0
 
 
@@ -125,7 +131,7 @@ def status(
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_HELP, rich_markup_mode=None)
-    group.command("new")(new)
+    group.command("new", context_settings={"ignore_unknown_options": True})(new)  # else -x is not seen as a name
     group.command("list")(list_)
     group.command("start", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(start)
     group.command("stop")(stop)
@@ -154,6 +160,10 @@ def _runs(before: AutonomyStatus | None, now: AutonomyStatus, file: str) -> bool
     """Whether the script runs, as another process than before."""
     as_before = before is not None and before.running and now.pid == before.pid
     return now.running and now.file == file and not as_before
+
+
+def _ended(now: AutonomyStatus | None) -> bool:
+    return now is not None and not now.running
 
 
 def _sent(transport: Transport, accepted: bool) -> None:
