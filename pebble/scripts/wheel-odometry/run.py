@@ -19,6 +19,8 @@ from pebble.runtime.rate_limit import RateLimitedLog
 
 TUNE_STATE = "auto_tune_state.json"  # in the config's folder
 WAITING = 500  # inputs: 3 s of samples
+SILENCE_S = 3.0  # without a sample: none is published
+NO_SAMPLES = "no hall sensors: set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true"
 
 Pin = Literal["a0", "a1", "a2"]
 
@@ -59,18 +61,26 @@ def main(robot: Robot, options: Options) -> None:
 
         return receive
 
+    def touched(touch: Any, now: float) -> None:
+        odometry.touch(touch.value, now)
+
     robot.on(DRIVE, take(odometry.drive))
-    robot.on(TOUCH_SENSORS, take(lambda touch, now: odometry.touch(touch.value, now)))
+    robot.on(TOUCH_SENSORS, take(touched))
     robot.on(IMU_FAST, take(odometry.imu))
     robot.on(ESTOP_STATE, take(lambda state, _now: odometry.owner(state)))
     rate = Rate(options.publish_rate_hz)
+    silent_at: float | None = time.monotonic() + SILENCE_S  # None: a sample has arrived, or the warning is logged
     while True:
         try:
             method, value, now = inputs.get(timeout=0.05)
             method(value, now)
+            silent_at = None if method is touched else silent_at
         except queue.Empty:
             robot.sleep(0)  # ends when it should
             now = time.monotonic()
+        if silent_at is not None and now >= silent_at:
+            silent_at = None
+            robot.log.warning(NO_SAMPLES)
         rate.hz = options.publish_rate_hz if odometry.moving(now) else options.idle_publish_rate_hz
         if rate.due(now):
             payload = WheelOdometry(source=WHEEL_ODOMETRY.metric, value=odometry.value(), timestamp=time.time())
