@@ -20,6 +20,8 @@ _SLOT_S = 0.021  # between commands: with an early zero and the final one, at mo
 _MAX_OWNERS = 64  # whose last state is remembered
 _GRACE_S = 0.1  # for the first command of a newer run to arrive: it bars this run as a person does
 
+ENDED = "this run was ended"  # by others: why, is known a moment later
+
 _ZERO = Drive()
 
 
@@ -120,7 +122,7 @@ class DriveSender:
         if self._latched is not None:
             return f"the robot is stopped {_described(self._latched)}"
         if self._superseded_by or self._barred_at is not None:
-            return "this run was ended"
+            return ENDED
         return "a person drives" if self.overridden(now) else ""
 
     def ended(self, now: float) -> str:

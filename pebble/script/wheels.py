@@ -12,7 +12,7 @@ from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.robot_estop import RobotEstop
-from pebble.script.drive_sender import DriveSender
+from pebble.script.drive_sender import ENDED, DriveSender
 from pebble.transports import Message, QoS, Transport
 
 _STUCK_S = 0.3  # the final zero waits no longer than this for a publish that hangs
@@ -42,6 +42,8 @@ class Wheels:
         self._changed = threading.Event()
         self._thread: threading.Thread | None = None
         self._over = False
+        self._robot = addresses.base.rpartition("/")[2]
+        self._reported: str | None = None  # why commands had no effect, as logged last; None: nothing was
         for channel in (ESTOP_STATE, CAPABILITIES):  # direct: what is retained has arrived when this returns
             transport.subscribe(channel.filter(addresses.base), self._receive_owner, direct=True)
         self._sender = DriveSender(number(self._barred), self._publish)
@@ -63,6 +65,8 @@ class Wheels:
                 self._thread.start()
             if self._sender.due is not None:
                 self._changed.set()
+            refusal = self._sender.refusal(now) or ("" if obeyed else "there is no connection")
+        self._report(refusal)
         return obeyed
 
     @property
@@ -85,6 +89,16 @@ class Wheels:
             if locked:
                 self._lock.release()
         self._changed.set()
+
+    def _report(self, refusal: str) -> None:
+        """Log when commands begin to have an effect, and when they have none any more."""
+        before, self._reported = self._reported, refusal
+        if refusal in (before, ENDED):  # the reason of the end follows
+            return
+        if refusal:
+            log.warning("%s does not obey this script: %s", self._robot, refusal)
+        else:
+            log.info("run %d drives %s%s", self.run, self._robot, "" if before is None else " again")
 
     @property
     def _barred(self) -> int:
