@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import select
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from typing import Protocol
 
 from msgspec import Struct
 
+from pebble.errors import PebbleError
 from pebble.runtime.parent import tagged, tied_to_parent
 from pebble.services.autonomy_manager.guard import Guard
 from pebble.services.autonomy_manager.output import Output
@@ -25,6 +27,7 @@ _READ_BYTES = 65_536
 _LAST_READS = 16  # of what it left in its pipe when it ended
 _FLOOD_PAUSE_S = 0.01
 _TICK_MS = 500
+_LONGEST_FIRST_LINE = 256  # bytes that the kernel reads of it
 
 log = logging.getLogger(__name__)
 
@@ -92,6 +95,7 @@ class Process:
     """A child process in a group of its own, and the thread that reads its output and waits for its end."""
 
     def __init__(self, launch: Launch) -> None:
+        _check_program(Path(launch.command[0]))
         self._pipe, write_end = os.pipe2(os.O_CLOEXEC)
         try:
             self._process = subprocess.Popen(
@@ -179,6 +183,19 @@ class Process:
         sys.stderr.flush()
         with suppress(OSError):
             os.write(sys.stderr.fileno(), tagged(self._file, self.pid, line))
+
+
+def _check_program(path: Path) -> None:
+    """Raises PebbleError for what the kernel reports as a missing file, although it is there."""
+    if not path.is_file():
+        return
+    if not os.access(path, os.X_OK):
+        raise PebbleError(f"{path} is not executable: chmod +x {path}")
+    with suppress(OSError), path.open("rb") as file:
+        first = file.readline(_LONGEST_FIRST_LINE)
+        interpreter = os.fsdecode(re.split(rb"[ \t\n]", first[2:])[0]) if first.startswith(b"#!/") else ""
+        if interpreter and not Path(interpreter).is_file():
+            raise PebbleError(f"{path}: there is no {interpreter!r}, which its first line names")
 
 
 def _read(pipe: int, output: Output) -> bool:
