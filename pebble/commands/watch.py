@@ -12,6 +12,7 @@ import typer
 
 from pebble.client.connection import Target, connected
 from pebble.commands.options import CaCert, PasswordFile
+from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 
@@ -50,7 +51,7 @@ def watch(
     """Show a robot's camera, with what scripts draw over it, and play its microphone, until Ctrl-C.
 
     Opens a window, and plays sound through aplay. Without a screen it writes a picture per second (PNG) and the sound
-    (WAV) into a folder.
+    (WAV) into a folder. A robot without a remote broker is shown on its own machine, without sound.
 
     \b
         pebble watch goob.json
@@ -105,10 +106,16 @@ def snapshot(
 
 @contextmanager
 def _receiver(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Iterator[MediaReceiver]:
+    from pebble.client.local_camera import LocalReceiver
     from pebble.client.media_receiver import MediaReceiver
 
-    with connected(_target(robot, url, password_file, ca_cert)) as (transport, names):
-        receiver = MediaReceiver(transport, names.base)
+    target = _target(robot, url, password_file, ca_cert)
+    with connected(target) as (transport, names):
+        if target.config is not None and not target.remote:
+            typer.echo(f"pebble: {robot} names no remote broker: this machine's camera, without sound", err=True)
+            receiver: MediaReceiver = LocalReceiver(transport, names.base, target.config)
+        else:
+            receiver = MediaReceiver(transport, names.base)
         try:
             receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
             yield receiver
@@ -121,7 +128,8 @@ def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Pa
         return Target(url=url, robot=robot, password_file=password_file, ca_cert=ca_cert)
     if not Path(robot).is_file():
         raise PebbleError(f"{robot} is not a config file: name one, or add --url with the broker of the robot {robot}")
-    return Target(config=Path(robot), remote=True)
+    bridge = load(robot).services.mqtt_bridge
+    return Target(config=Path(robot), remote=bool(bridge.remote_mqtt.host) or bridge.remote is not None)
 
 
 def register(app: typer.Typer) -> None:

@@ -1,0 +1,42 @@
+"""A robot without a remote broker is shown on its own machine."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.commands.command_line import Run, config_file
+from tests.support import Broker
+from tests.test_cameras import HEIGHT, WIDTH, Filming
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Iterator[Path]:
+    broker = Broker(tmp_path)
+    with tempfile.TemporaryDirectory(prefix="pebble-") as run_dir:  # pytest's own may be too long for a socket
+        filming = Filming(Path(run_dir))
+        yield config_file(
+            tmp_path, local_mqtt={"host": "127.0.0.1", "port": broker.port}, transport={"run_dir": run_dir}
+        )
+        filming.close()
+    broker.stop()
+
+
+def test_a_snapshot_is_of_the_local_camera(run: Run, config: Path) -> None:
+    file = config.with_name("view.png")
+    assert run("snapshot", config, file) == 0, run.err
+    assert run.out == f"{file}: {WIDTH}×{HEIGHT}\n"
+    assert run.err == f"pebble: {config} names no remote broker: this machine's camera, without sound\n"
+    picture = cv2.imread(str(file))
+    assert picture is not None
+    assert picture[5, 5].tolist() == [10, 20, 30]
+
+
+def test_it_is_watched_until_the_time_is_over(run: Run, config: Path) -> None:
+    folder = config.with_name("out")
+    assert run("watch", config, "--out", folder, "--seconds", "1.5") == 0, run.err
+    assert cv2.imread(str(folder / "0001.png")) is not None
