@@ -20,7 +20,9 @@ def config(tmp_path: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="pebble-") as run_dir:  # pytest's own may be too long for a socket
         filming = Filming(Path(run_dir))
         yield config_file(
-            tmp_path, local_mqtt={"host": "127.0.0.1", "port": broker.port}, transport={"run_dir": run_dir}
+            tmp_path,
+            local_mqtt={"host": "127.0.0.1", "port": broker.port},
+            transport={"kind": "mqtt", "run_dir": run_dir},
         )
         filming.close()
     broker.stop()
