@@ -31,6 +31,7 @@ _REFUSED = {
     ESTOP_STATE: "motor owners publish it",
     AUTONOMY_COMMAND: "let people start scripts, or list those it needs in run(main, needs=…)",
 }
+_STUCK_S = 1.0  # the last values wait no longer than this for a publish that hangs
 _WAITING = 100  # messages of one channel that wait for its handler, before the oldest is dropped
 
 EXIT_ENDED = 3  # of a script whose run was ended: by an operator, an emergency stop or a newer run
@@ -71,6 +72,7 @@ class Robot:
         self._last_values: dict[Channel, Callable[[], Any]] = {}
         self._pictures: Pictures | None = None
         self._opening = threading.Lock()
+        self._publishing = threading.RLock()  # the last values are published after all others, before disconnecting
         self._stopped = threading.Event()
         self._exit_code = 0
         self._pid = os.getpid()
@@ -145,10 +147,11 @@ class Robot:
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
         """Publish ``value`` on ``channel``; False: it was not accepted. ``names`` fill a pattern channel's levels."""
-        self._check()
         topic = channel.topic(self.config.base, **names) if names else self._addresses[channel].topic
-        check_publish(topic, self._addresses)
-        return self._publish(channel, value, topic)
+        with self._publishing:
+            self._check()
+            check_publish(topic, self._addresses)
+            return self._publish(channel, value, topic)
 
     def publish_at_end(self, channel: Channel, value: Callable[[], Any]) -> None:
         """Publish what ``value()`` returns then, once the script ends, however it does; not if it is killed."""
@@ -168,14 +171,18 @@ class Robot:
         """Publish the final stop, close the cameras, and have every further call raise Stopped. From any thread."""
         if os.getpid() != self._pid:
             return
-        first = not self._stopped.is_set()
-        if first:
+        if not self._stopped.is_set():
             self._exit_code = exit_code
         self._stopped.set()
         self._wheels.end(why)
-        if first:
-            for channel, value in list(self._last_values.items()):
+        locked = self._publishing.acquire(timeout=_STUCK_S)
+        try:
+            values, self._last_values = self._last_values, {}
+            for channel, value in values.items():
                 self._publish_last(channel, value)
+        finally:
+            if locked:
+                self._publishing.release()
         with self._opening:
             pictures = self._pictures
         if pictures is not None:
