@@ -25,14 +25,15 @@ MOOD = Channel(metric="mood", kind=Kind.EVENT, payload=dict)
 
 
 class Slow(MemoryTransport):
-    """A publish waits while ``gate`` is closed."""
+    """What is late is published once ``gate`` is open."""
 
     gate = threading.Event()
     waiting = threading.Event()
 
     def publish(self, topic: str, payload: bytes, **options: Any) -> bool:
-        self.waiting.set()
-        self.gate.wait(10)
+        for _ in range(payload.count(b"late")):
+            self.waiting.set()
+            self.gate.wait(10)
         return super().publish(topic, payload, **options)
 
 
