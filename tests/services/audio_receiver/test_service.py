@@ -215,4 +215,4 @@ def test_delay_from_the_operator_to_the_player(
             operator.send(Sound(Codec.PCM16LE, 1, 16000, 320, number, 1000 + 20 * number, body).pack())
             played = recorder.samples()
             behind.append(number - (played[-1] if len(played) else 0))
-        assert median(behind[50:]) < 25  # half a second, on a busy machine; the usual is 5
+        assert median(behind[50:]) < 45  # 0.9 s, on a busy machine; the usual is 5
