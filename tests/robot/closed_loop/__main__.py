@@ -52,6 +52,7 @@ PARTS: dict[str, Part] = {
     "dependency": lambda rig, _: perception.crashed_dependency(rig),
     "odometry": lambda rig, options: _merged(following.measured_odometry(rig) for _ in range(options.rounds)),
     "two": lambda rig, _: following.followed_robot(rig.kind),
+    "original": lambda rig, options: following.followed_by_an_original(rig.kind, options.rounds, options.seed),
     "memory": _memory,
 }
 

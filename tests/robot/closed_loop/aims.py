@@ -72,6 +72,9 @@ AIMS = {
     "touch rate": Aim("touch-sensors at the operator", "Hz", least=45.0, zenoh="42.8", mqtt="50.1"),
     "lag": Aim("lag behind a robot at 95 mm/s", "m", 0.3, zenoh="0.16"),
     "follower": Aim("final distance behind that robot", "m", 0.7, 0.5, zenoh="0.59"),
+    "original settled": Aim("a script of the original's shape: settled", "s", 30.0, zenoh="6.4", mqtt="6.4"),
+    "original distance": Aim("its final distance", "m", 0.68, 0.52, zenoh="0.644", mqtt="0.645"),
+    "unsigned": Aim("its commands without a signature", "", 0.0, zenoh="0", mqtt="0"),
     "memory": Aim("whole robot while following, without the renderer", "MB PSS", 230.0),
 }
 

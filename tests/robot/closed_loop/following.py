@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from tests.robot.closed_loop.aims import Samples
+from tests.robot.operator import Operator
 from tests.robot.rig import Rig
 from tests.robot.world_rig import FOLLOW, TAG, World, WorldRig
 from tests.support import until
 
-TARGET_M, WITHIN_M = 0.6, 0.05
+TARGET_M, WITHIN_M, ORIGINAL_WITHIN_M = 0.6, 0.05, 0.08
 _LONGEST_S, _STEP_S = 30.0, 0.05
 TAG_BEHIND_M, TAG_ON_ROBOT_M = 0.08, 0.12  # the tag on a robot of 0.1 m radius: from its middle, and its size
 
@@ -44,14 +45,7 @@ def followed(rig: WorldRig, start: Start, stay_s: float = 5.0) -> Samples:
     rig.world.place(rig.name, *start.pose)
     already = len(rig.timings())
     began = rig.run("timed-follow", FOLLOW)
-    running = first_tag = math.inf
-    since = math.inf
-    while time.monotonic() < began + _LONGEST_S and time.monotonic() - since < stay_s:
-        time.sleep(_STEP_S)
-        now = time.monotonic()
-        distance, _ = rig.world.tag_from(rig.name)
-        since = min(since, now) if abs(distance - TARGET_M) <= WITHIN_M else math.inf
-    took = since - began
+    took = _settled(rig, stay_s, WITHIN_M) - began
     distance, bearing = rig.world.tag_from(rig.name)
     statuses = [seen.at for seen in rig.operator.on("outgoing/autonomy-status", began) if seen.json["running"]]
     tags = [seen.at for seen in rig.operator.on("outgoing/apriltag-data", began)]
@@ -68,6 +62,35 @@ def followed(rig: WorldRig, start: Start, stay_s: float = 5.0) -> Samples:
         "latency": [1000 * (published - captured) for captured, published in timings],
         "command rate": [len(spans) / sum(spans)] if spans else [],
     }
+
+
+def _settled(rig: WorldRig, stay_s: float, within_m: float) -> float:
+    """When the robot began to stay at its distance for ``stay_s``; infinite if it does not within 30 s."""
+    since, end = math.inf, time.monotonic() + _LONGEST_S
+    while time.monotonic() < end and time.monotonic() - since < stay_s:
+        time.sleep(_STEP_S)
+        distance, _ = rig.world.tag_from(rig.name)
+        since = min(since, time.monotonic()) if abs(distance - TARGET_M) <= within_m else math.inf
+    return since
+
+
+def followed_by_an_original(kind: str, count: int, seed: int) -> Samples:
+    """A stand-in for a script of the original follows the tag, through the gate."""
+    found: Samples = {"original settled": [], "original distance": [], "unsigned": []}
+    with WorldRig(kind, mirror=kind == "zenoh") as rig:
+        assert rig.local is not None
+        local = Operator(rig.local.port, rig.operator.base)
+        for start in starts(count, seed):
+            rig.world.place(rig.name, *start.pose)
+            began = rig.run("original-follow", FOLLOW)
+            found["original settled"].append(_settled(rig, 3.0, ORIGINAL_WITHIN_M) - began)
+            found["original distance"].append(rig.world.tag_from(rig.name)[0])
+            rig.idle()
+        sources = [seen.json.get("source") for seen in local.on("incoming/drive-values")]
+        local.close()
+    assert len(sources) > 10 * count, "its commands are published"
+    found["unsigned"].append(len(sources) - sources.count("autonomy"))
+    return found
 
 
 def measured_odometry(rig: WorldRig) -> Samples:
