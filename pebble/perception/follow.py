@@ -20,7 +20,6 @@ _LEAST_TURN = 0.12
 _ALIGNED_RAD = 0.08  # at the wanted distance
 _LEAST_DRIVE = 0.08
 _ARRIVED = 0.4  # of the threshold: holding begins here, and ends beyond threshold and hysteresis
-_SEARCH_POWER = 1.5  # times the turn power
 _REVERSE_POWER = 0.8
 _NEAR_M = 0.1  # beyond the wanted distance: a tag that is lost here has grown out of the picture
 _AWAY_S = 0.6
@@ -137,6 +136,6 @@ class Follower:
         if reverse_s > 0.0 and now - self._reversed_at > reverse_s:
             self._side = -self._side
             self._reversed_at = now
-        power = min(1.0, _SEARCH_POWER * settings.turn_power)
-        x = self._pulses.turn(self._side * power, settings.turn_pulse_s, settings.search_pause_s, now)
+        # A pulse lasts for one or two commands: with more power one could turn past all that the camera sees.
+        x = self._pulses.turn(self._side * settings.turn_power, settings.turn_pulse_s, settings.search_pause_s, now)
         return Command(x, 0.0, "search")

@@ -68,7 +68,7 @@ def test_a_picture_without_the_tag_interrupts_nothing_but_a_lost_tag_stops_and_i
     assert robot.step(0.1, None) == driving
     assert robot.step(0.5, None) == Command(reason="wait")
     search = robot.step(0.8, None)
-    assert (search.x, search.reason) == (-0.75, "search"), "to the side where it was"
+    assert (search.x, search.reason) == (-0.5, "search"), "to the side where it was"
 
 
 def test_a_search_may_change_its_direction() -> None:

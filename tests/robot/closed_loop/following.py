@@ -45,7 +45,7 @@ def followed(rig: WorldRig, start: Start, stay_s: float = 5.0) -> Samples:
     rig.world.place(rig.name, *start.pose)
     already = len(rig.timings())
     began = rig.run("timed-follow", FOLLOW)
-    took = _settled(rig, stay_s, WITHIN_M) - began
+    took = _arrival(rig, stay_s, WITHIN_M) - began
     distance, bearing = rig.world.tag_from(rig.name)
     statuses = [seen.at for seen in rig.operator.on("outgoing/autonomy-status", began) if seen.json["running"]]
     tags = [seen.at for seen in rig.operator.on("outgoing/apriltag-data", began)]
@@ -64,7 +64,7 @@ def followed(rig: WorldRig, start: Start, stay_s: float = 5.0) -> Samples:
     }
 
 
-def _settled(rig: WorldRig, stay_s: float, within_m: float) -> float:
+def _arrival(rig: WorldRig, stay_s: float, within_m: float) -> float:
     """When the robot began to stay at its distance for ``stay_s``; infinite if it does not within 30 s."""
     since, end = math.inf, time.monotonic() + _LONGEST_S
     while time.monotonic() < end and time.monotonic() - since < stay_s:
@@ -83,7 +83,7 @@ def followed_by_an_original(kind: str, count: int, seed: int) -> Samples:
         for start in starts(count, seed):
             rig.world.place(rig.name, *start.pose)
             began = rig.run("original-follow", FOLLOW)
-            found["original settled"].append(_settled(rig, 3.0, ORIGINAL_WITHIN_M) - began)
+            found["original settled"].append(_arrival(rig, 3.0, ORIGINAL_WITHIN_M) - began)
             found["original distance"].append(rig.world.tag_from(rig.name)[0])
             rig.idle()
         sources = [seen.json.get("source") for seen in local.on("incoming/drive-values")]
