@@ -33,7 +33,7 @@ class Liveness:
 
     def __init__(self) -> None:
         self.received_at: float | None = None  # monotonic
-        self._reported_offline = False
+        self.reported_offline = False
         self._intervals: deque[float] = deque(maxlen=_HISTORY)
         self._latencies: deque[float] = deque(maxlen=_HISTORY)
 
@@ -42,7 +42,7 @@ class Liveness:
             self._intervals.append(now - self.received_at)
         if -1.0 <= latency_s <= 10.0:
             self._latencies.append(max(0.0, latency_s))
-        self.received_at, self._reported_offline = now, not online
+        self.received_at, self.reported_offline = now, not online
 
     @property
     def latency_s(self) -> float | None:
@@ -54,7 +54,7 @@ class Liveness:
 
     def online(self, now: float) -> bool | None:
         """None while there are too few heartbeats to decide."""
-        if self._reported_offline:
+        if self.reported_offline:
             return False
         if self.received_at is None or len(self._intervals) < 2 or not self._latencies:
             return None
@@ -123,7 +123,7 @@ class Discovery:
     def receive(self, message: Message, now: float, wall: float) -> None:
         """Update from one message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
         address = parse_topic(message.topic)
-        if address is None:
+        if address is None or address.identity.is_server:
             return
         identity = address.identity
         robot = self.robots.get(identity.base)

@@ -210,6 +210,8 @@ class StopSender:
         if address is None or address.direction is not Direction.OUTGOING:
             return
         robot = self.robots.get(address.identity.base)
+        if robot is None and address.identity.is_server:
+            return
         if robot is None and self.collecting and message.payload:  # an empty one removes what was retained
             if len(self.robots) >= MAX_ROBOTS:
                 self._make_room(message)

@@ -221,6 +221,10 @@ NAVIGATION_LOCAL_PLAN = _c("navigation/local-plan", Kind.STREAM, p.AnyObject, "N
 NAVIGATION_GLOBAL_PLAN = _c("navigation/global-plan", Kind.STREAM, p.AnyObject, "Whole route of a ROS planner.")
 DIAGNOSTICS = _c("diagnostics", Kind.STATE, p.AnyObject, "Diagnostics of a ROS robot.", rate_hz=1)
 
+# -- outgoing: of servers, which are no robots
+DRIVING = _c("driving", Kind.EVENT, p.Driving, "Which robots are driven by way of a server (`{system}/servers/{id}`).",
+             rate_hz=1, bridged=False)  # fmt: skip
+
 CHANNELS: tuple[Channel, ...] = tuple(value for value in list(vars().values()) if isinstance(value, Channel))
 _EXACT = {channel.suffix: channel for channel in CHANNELS if not channel.is_pattern}
 _PATTERNS = [

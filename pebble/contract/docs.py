@@ -172,7 +172,7 @@ def _type_name(kind: Any) -> str:
     if origin is tuple:
         return f"[{', '.join(map(_type_name, inner))}]"
     if origin is dict:
-        return "object"
+        return f"object of {_type_name(inner[1])}" if inner[1] is not Any else "object"
     return _JSON_TYPES.get(kind) or f"[{kind.__name__}](#{kind.__name__.lower()})"
 
 

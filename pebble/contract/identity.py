@@ -15,6 +15,9 @@ _RESERVED = r"/+#$\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
 LEVEL = rf"^[^{_RESERVED}]{{1,64}}$(?!\n)"
 LEVEL_RULE = "a topic level: 1 to 64 characters, without / + # $ and control characters"
 
+#: The type of operators' servers, which publish below their own identity but are no robots.
+SERVERS = "servers"
+
 _valid_level = re.compile(LEVEL).search
 
 
@@ -51,6 +54,11 @@ class Identity(Struct, frozen=True):
     def base(self) -> str:
         """What all topics of this component begin with, without a final slash."""
         return f"{self.system}/{self.type}/{self.id}"
+
+    @property
+    def is_server(self) -> bool:
+        """Whether it is an operators' server: nothing that drives, is stopped or is listed among robots."""
+        return self.type == SERVERS
 
     def incoming(self, metric: str) -> str:
         """A topic that this component subscribes to; ``metric`` may have several levels."""

@@ -44,6 +44,13 @@ def test_a_retained_heartbeat_is_no_sign_of_life() -> None:
     assert discovery.robots[BASE].liveness.received_at is None
 
 
+def test_a_server_is_no_robot() -> None:
+    discovery = Discovery()
+    driving = b'{"t": 1, "robots": {}}'
+    discovery.receive(Message("pebble/servers/fair-1/outgoing/driving", driving), 0.0, WALL)
+    assert discovery.all_robots() == []
+
+
 def test_a_slow_link_widens_the_window() -> None:
     liveness = Liveness()
     for now in (0.0, 0.25, 0.5):

@@ -235,6 +235,7 @@ def test_a_named_robot_is_never_spared() -> None:
         Message("other/topic", b"1"),
         Message(f"{GOOB}/incoming/drive-values", b"{}"),
         Message(f"{GOOB}/outgoing/status", b"", retain=True),
+        Message("pebble/servers/fair-1/outgoing/driving", b'{"t": 1, "robots": {}}'),
         Message("a\x1bb/robots/goob/outgoing/online", b"{}"),
         Message(f"{'x' * 65}/robots/goob/outgoing/online", b"{}"),
     ],

@@ -123,7 +123,7 @@ def test_what_stays_on_the_robot_and_what_never_passes_the_bridge() -> None:
     inside = [channel.metric for channel in CHANNELS if not channel.remote]
     assert inside == ["sensors/imu-fast", "media-report/{program}"]
     assert {channel.suffix for channel in CHANNELS if not channel.bridged} == {
-        "incoming/audio-stream", "outgoing/front-camera", "outgoing/audio",
+        "incoming/audio-stream", "outgoing/front-camera", "outgoing/audio", "outgoing/driving",
     }  # fmt: skip
 
 
