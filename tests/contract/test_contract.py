@@ -219,7 +219,8 @@ SPELLED = re.compile(r"(^|/)(incoming|outgoing)/[\w{+#]")
 
 def code_files() -> list[Path]:
     folders = [ROOT / "pebble", ROOT / "services", ROOT / "transports", ROOT / "simulation", ROOT / "bench"]
-    excepted = ("channels.py", "builtin_forms.py")  # the latter names scripts of the original after their topics
+    # The second names scripts of the original after their topics, the third operations of the page.
+    excepted = ("channels.py", "builtin_forms.py", "messages.py")
     return sorted(path for folder in folders for path in folder.rglob("*.py") if path.name not in excepted)
 
 
