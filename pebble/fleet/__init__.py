@@ -1,0 +1,1 @@
+"""People and certificates: who may use the operator page, what they did, and the small authority that signs for it."""

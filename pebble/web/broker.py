@@ -1,0 +1,73 @@
+"""The server's connection to the broker, for code on an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable
+
+from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
+
+Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
+
+
+class Broker:
+    """Handlers and watchers run on the event loop; subscribing waits for the broker, so it does not happen there."""
+
+    def __init__(self, settings: MqttSettings) -> None:
+        self.transport: Transport = create("mqtt", f"pebble-web-{secrets.token_hex(4)}", settings)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._watchers: list[Callable[[], None]] = []
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        assert self._loop is not None, "the connection is not open"  # noqa: S101
+        return self._loop
+
+    @property
+    def connected(self) -> bool:
+        return self.transport.state is State.CONNECTED
+
+    @property
+    def problem(self) -> str:
+        """Why there is no connection, in one line; empty while there is one."""
+        return "" if self.connected else self.transport.problem or "not connected yet"
+
+    async def open(self) -> None:
+        """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""
+        self._loop = asyncio.get_running_loop()
+        self.transport.on_state(lambda _state: self._call(self._notify))
+        await asyncio.to_thread(self.transport.open, 2.0)
+
+    async def close(self) -> None:
+        await asyncio.to_thread(self.transport.close)
+
+    def on_state(self, watcher: Callable[[], None]) -> None:
+        """Call ``watcher`` when the connection is made or lost."""
+        self._watchers.append(watcher)
+
+    def publish(self, topic: str, payload: bytes, *, retain: bool = False, qos: QoS = QoS.DELIVERED) -> bool:
+        """Publish now, ahead of streams; False if it was refused because there is no connection."""
+        return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
+
+    async def subscribe(self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED) -> Subscription:
+        """Deliver what matches ``filter_`` until it is unsubscribed."""
+
+        def take(message: Message) -> None:
+            self._call(handler, message, time.monotonic())
+
+        return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)
+
+    async def unsubscribe(self, subscription: Subscription) -> None:
+        """Stop delivery; a message that has arrived before may still be handled."""
+        await asyncio.to_thread(subscription.close)
+
+    def _notify(self) -> None:
+        for watcher in self._watchers:
+            watcher()
+
+    def _call(self, function: Callable[..., None], *arguments: object) -> None:
+        """On a thread of the transport. The loop may have ended meanwhile."""
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(function, *arguments)

@@ -1,0 +1,333 @@
+"""The control socket of one page: what it asks for, and the state that it is sent."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from pebble.client.estop_states import Reset
+from pebble.fleet.roles import Session, rights
+from pebble.web import messages as m
+from pebble.web.driving import Tab
+from pebble.web.page_clock import PING_S, ClockJumpError
+from pebble.web.robots import Interest
+from pebble.web.server import Server, clock, encode
+
+log = logging.getLogger(__name__)
+
+FLUSH_S = 0.05  # between two states
+HELLO_S = 5.0  # to begin with
+CHECK_S = 5.0  # between two looks at whether the session still exists
+_WAITING = 64  # messages that wait to be sent, besides the state
+_RELOAD = "This page is older than the server: reload it"
+
+_decoder = msgspec.json.Decoder(m.FromPage)
+
+
+class Leave(Exception):  # noqa: N818 - not an error
+    """The server ends this connection. ``again``: the page may connect anew."""
+
+    def __init__(self, why: str, *, again: bool) -> None:
+        super().__init__(why)
+        self.why, self.again = why, again
+
+
+class Control:
+    """One connection, accepted and with a session; ``serve`` returns when it has ended."""
+
+    def __init__(
+        self, server: Server, websocket: WebSocket, session: Session, check: Callable[[], Session | None]
+    ) -> None:
+        """``check`` returns the session as it is now; None: it was revoked."""
+        self._server, self._websocket, self._session, self._check = server, websocket, session, check
+        self._tab = Tab(secrets.token_urlsafe(12), session.user, "")
+        self._interest = Interest(lambda: self._wake.set())
+        self._wake = asyncio.Event()
+        self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
+        self._drives = True
+        self._why_not = ""  # why this page may not drive at all
+        self._logs_sent = 0
+        self._moved: set[str] = set()  # robots that this lease has moved, for the audit
+
+    async def serve(self) -> None:
+        """Until the page or the server ends it. What the page moved has been stopped then."""
+        sender: asyncio.Task[None] | None = None
+        try:
+            self._begin(await asyncio.wait_for(self._receive(), HELLO_S))
+            sender = asyncio.ensure_future(self._send_all())
+            while not sender.done():
+                self._handle(await self._receive())
+        except Leave as reason:
+            await self._leave(reason)
+        except TimeoutError:
+            await self._leave(Leave("no hello", again=True))
+        except ClockJumpError as error:
+            await self._leave(Leave(str(error), again=True))
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # the page has gone
+        finally:
+            self._end()
+            if sender is not None:
+                sender.cancel()
+                await asyncio.gather(sender, return_exceptions=True)
+
+    # -- begin and end
+
+    def _begin(self, hello: Any) -> None:
+        if not isinstance(hello, m.Hello):
+            raise Leave("the first message must be hello", again=True)
+        server, settings = self._server, self._server.settings
+        self._tab.device = _printable(hello.device)
+        self._drives = settings.plain_http_drive or self._is_secure()
+        version = self._websocket.app.state.version
+        if not self._drives:
+            self._why_not = "This connection is not encrypted: driving is switched off"
+        elif hello.version != version:
+            self._why_not = _RELOAD
+        self._post(
+            m.Welcome(
+                server=server.name,
+                version=version,
+                user=self._session.user,
+                role=self._session.role,
+                rights=tuple(sorted(rights(self._session.role))),
+                login=settings.login,
+                token=self._tab.token,
+                now=1000 * time.time(),
+                drives=self._drives,
+            )
+        )
+        if "drive" in rights(self._session.role):
+            server.driving.restore(hello.token, self._tab, clock())
+        server.robots.join(self._interest)
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
+        self._post(self._ping())
+
+    def _end(self) -> None:
+        self._server.robots.leave(self._interest)
+        self._server.publish(self._server.driving.closed(self._tab, clock()))
+        if self._interest.watched:
+            self._server.unwatch(self._interest.watched)
+
+    async def _leave(self, reason: Leave) -> None:
+        self._end_leases()
+        try:
+            await self._websocket.send_text(encode(m.Bye(why=reason.why, again=reason.again)))
+            await self._websocket.close(4000)
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # it has gone already
+
+    def _end_leases(self) -> None:
+        self._server.publish(self._server.driving.withdraw(self._tab, clock()))
+
+    def _is_secure(self) -> bool:
+        client = self._websocket.client
+        return self._websocket.url.scheme == "wss" or (client is not None and client.host in ("127.0.0.1", "::1"))
+
+    # -- from the page
+
+    async def _receive(self) -> Any:
+        text = await self._receive_text()
+        try:
+            return _decoder.decode(text)
+        except (msgspec.MsgspecError, RecursionError) as error:
+            raise Leave(f"not understood: {error}"[:200], again=True) from None
+
+    async def _receive_text(self) -> str:
+        message = await self._websocket.receive()
+        if message["type"] != "websocket.receive":
+            raise WebSocketDisconnect
+        text = message.get("text")
+        if text is None:
+            raise Leave("messages on this connection are text", again=True)
+        if len(text) > m.MAX_OP_BYTES:
+            raise Leave(f"a message is longer than {m.MAX_OP_BYTES} characters", again=True)
+        return str(text)
+
+    def _handle(self, op: Any) -> None:
+        match op:
+            case m.Echo():
+                self._tab.clock.echo(op.n, op.t, clock())
+            case m.DriveOp():
+                self._drive(op)
+            case m.StopOp():
+                self._stop(op)
+            case m.EstopOp():
+                self._server.stop(op.ref, op.stop, self._session, self._tab.device, op.why)
+            case m.EstopEndOp():
+                self._server.stops.end(op.stop)
+            case m.EstopResetOp():
+                self._reset(op)
+            case m.Watch():
+                self._watch(op.ref)
+            case m.Lease():
+                self._lease(op)
+            case m.EncodingOp():
+                if self._may("drive", "encoding", op.ref):
+                    self._server.media.pin(op.ref, op.encoding)
+            case m.PictureFromOp():
+                if self._may("drive", "picture-from", op.ref):
+                    self._server.picture_from(op.ref, op.source)
+            case _:
+                raise Leave("hello comes only once", again=True)
+        self._wake.set()
+
+    def _drive(self, op: m.DriveOp) -> None:
+        if not self._may("drive", "drive", op.ref, g=op.g):
+            return
+        server, now = self._server, clock()
+        if op.ref not in server.robots.components:
+            self._refuse("drive", op.ref, "unknown component", g=op.g)
+            return
+        outcome = server.driving.drive(self._tab, op, now, self._why_not or server.blocked(op.ref))
+        accepted = server.publish(outcome.commands)
+        if outcome.refused:
+            self._refuse("drive", op.ref, outcome.refused, g=op.g)
+        elif not accepted:
+            server.publish(server.driving.stop(op.ref, now))
+            self._refuse("drive", op.ref, "The server cannot reach the broker", g=op.g)
+        elif outcome.commands and outcome.commands[0].drive.moves and op.ref not in self._moved:
+            self._moved.add(op.ref)
+            self._audit("drive", op.ref)
+
+    def _stop(self, op: m.StopOp) -> None:
+        component = self._server.robots.components.get(op.ref)
+        if component is not None and (component.drives() or not component.capabilities):
+            self._server.publish(self._server.driving.stop(op.ref, clock()))
+
+    def _reset(self, op: m.EstopResetOp) -> None:
+        component = self._server.robots.components.get(op.ref)
+        if not self._may("reset", "estop-reset", op.ref) or component is None:
+            return
+        reset = Reset(component.estop, self._session.user)
+        shown = {one.owner: (one.boot, one.count) for one in op.owners}
+        reset.shown = {
+            owner: msgspec.structs.replace(state, boot=shown[owner][0], count=shown[owner][1])
+            for owner, state in reset.shown.items()
+            if owner in shown
+        }
+        for message in reset.messages():
+            self._server.broker.publish(message.topic, message.payload, qos=message.qos)
+        self._audit("reset", op.ref)
+
+    def _watch(self, ref: str) -> None:
+        before = self._interest.watched
+        if ref == before:
+            return
+        self._server.robots.watch(self._interest, ref)
+        self._logs_sent = 0
+        if ref:
+            self._server.watch(ref)
+        if before:
+            self._server.unwatch(before)
+
+    def _lease(self, op: m.Lease) -> None:
+        server = self._server
+        if not op.take:
+            server.publish(server.driving.release(self._tab, op.ref, clock()))
+            self._audit("release", op.ref)
+        elif self._may("drive", "lease", op.ref):
+            why = self._why_not or ("" if op.ref in server.robots.components else "unknown component")
+            if not why:
+                now = int(1000 * time.time())
+                commands, why = server.driving.take(self._tab, op.ref, clock(), now, over=op.over)
+                server.publish(commands)
+            if why:
+                self._refuse("lease", op.ref, why)
+                return
+            self._audit("take over" if op.over else "take", op.ref)
+        self._moved.discard(op.ref)
+
+    def _may(self, right: str, cmd: str, ref: str, *, g: int = -1) -> bool:
+        if right in rights(self._session.role):
+            return True
+        self._refuse(cmd, ref, f"The role {self._session.role} may not do this", g=g)
+        return False
+
+    def _refuse(self, cmd: str, ref: str, why: str, *, g: int = -1) -> None:
+        self._post(m.Refused(cmd=cmd, ref=ref, why=why, g=g))
+
+    def _audit(self, what: str, ref: str) -> None:
+        client = self._websocket.client
+        address = "" if client is None else client.host
+        self._server.audit.write(what, ref=ref, user=self._session.user, device=self._tab.device, address=address)
+
+    # -- to the page
+
+    def _post(self, message: m.ToPage) -> None:
+        self._waiting.append(message)
+        self._wake.set()
+
+    async def _send_all(self) -> None:
+        """States at most every 50 ms, pings twice a second."""
+        ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
+        while self._websocket.application_state is WebSocketState.CONNECTED:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), max(0.0, min(ping_at, check_at) - time.monotonic()))
+            self._wake.clear()
+            now = time.monotonic()
+            if now >= ping_at:
+                ping_at = now + PING_S
+                self._waiting.append(self._ping())
+            if now >= check_at:
+                check_at = now + CHECK_S
+                await self._check_session()
+            await self._flush(now)
+            await asyncio.sleep(FLUSH_S if not self._waiting else 0)
+
+    async def _flush(self, now: float) -> None:
+        while self._waiting:
+            await self._websocket.send_text(encode(self._waiting.popleft()))
+        drivers = {one for one in self._interest.dirty if one[1] == "web/driver"}
+        self._interest.dirty -= drivers
+        values = self._server.robots.take(self._interest, now) + tuple(
+            (ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers
+        )
+        gone, self._interest.gone = tuple(self._interest.gone), set()
+        if values or gone:
+            await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))
+        await self._send_logs()
+
+    async def _send_logs(self) -> None:
+        ref = self._interest.watched
+        lines = [(number, line) for number, line in self._server.robots.logs.get(ref, ()) if number > self._logs_sent]
+        if lines:
+            self._logs_sent = lines[-1][0]
+            message = m.Logs(ref=ref, first=lines[0][0], lines=tuple(line for _, line in lines))
+            await self._websocket.send_text(encode(message))
+
+    async def _check_session(self) -> None:
+        session = await asyncio.to_thread(self._check)
+        if session is None or session.role != self._session.role:
+            self._end_leases()
+            await self._websocket.send_text(encode(m.Bye(why="logged out", again=False)))
+            await self._websocket.close(4001)
+
+    def _ping(self) -> m.Ping:
+        round_trip = self._tab.clock.round_trip_s
+        number = self._tab.clock.ping(clock())
+        return m.Ping(n=number, now=1000 * time.time(), round_trip_ms=-1 if round_trip is None else 1000 * round_trip)
+
+    def _driver(self, ref: str) -> m.DriverView:
+        driving, now = self._server.driving, clock()
+        if (other := driving.elsewhere(ref, now)) is not None:
+            return m.DriverView(by=other.by, device=other.device, server=other.server, you=False, idle_s=None)
+        lease = driving.leases.get(ref)
+        if lease is None:
+            return m.DriverView(by="", device="", server="", you=False, idle_s=None)
+        tab = lease.tab
+        idle = None if tab.live is not None and tab.live_ref == ref else now - lease.idle_from
+        return m.DriverView(by=tab.user, device=tab.device, server="", you=tab is self._tab, idle_s=idle)
+
+
+def _printable(text: str) -> str:
+    return "".join(char if " " <= char <= "~" else "?" for char in text[:32])

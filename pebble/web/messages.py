@@ -1,0 +1,273 @@
+"""What a page and the server send each other on the control socket: JSON text, one struct per ``op``.
+
+``ref`` is a component's base topic, ``pebble/robots/goob``; "" is the server itself. Page clocks (``t``) are milliseconds
+of ``performance.now()``; server stamps (``now``) are epoch milliseconds. docs/web-messages.md and the page's
+``messages.d.ts`` are generated from these structs.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeAlias
+
+from msgspec import Meta, Struct
+
+MAX_OP_BYTES = 16 * 1024  # of one message of a page
+
+Ref = Annotated[str, Meta(max_length=200)]
+Short = Annotated[str, Meta(max_length=64)]
+Axis = Annotated[float, Meta(ge=-1, le=1)]
+Stamp = Annotated[float, Meta(ge=0, le=1e13)]
+Number = Annotated[int, Meta(ge=0, le=1 << 31)]
+
+
+class _FromPage(Struct, frozen=True, kw_only=True, tag_field="op"):
+    """What a page sends."""
+
+
+class Hello(_FromPage, frozen=True, kw_only=True, tag="hello"):
+    """The first message. ``token`` is the one of the page's last connection; it restores a lease within 5 s."""
+
+    version: Short  # of the page; another one than the server's may not drive
+    device: Short = ""  # what others see beside the user's name: "phone"
+    token: Short = ""
+    can: Annotated[tuple[Short, ...], Meta(max_length=16)] = ()  # encodings of pictures it decodes
+
+
+class Echo(_FromPage, frozen=True, kw_only=True, tag="echo"):
+    """The answer to a Ping, at once."""
+
+    n: Number
+    t: Stamp
+
+
+class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
+    """The component whose page is open; "" is none. Its further metrics are sent from now on."""
+
+    ref: Ref
+
+
+class Lease(_FromPage, frozen=True, kw_only=True, tag="lease"):
+    """Request (``take``) or release the driver lease. ``over``: from somebody who is driving."""
+
+    ref: Ref
+    take: bool
+    over: bool = False
+
+
+class DriveOp(_FromPage, frozen=True, kw_only=True, tag="drive"):
+    """Wanted motion of gesture ``g``, every 50 ms while it lasts, and zeros at its end.
+
+    ``final``: this zero is no release by the driver (focus lost, page hidden …): an interrupted script must not resume.
+    """
+
+    ref: Ref
+    g: Number  # of this connection, growing
+    t: Stamp
+    x: Axis = 0.0
+    z: Axis = 0.0
+    y: Axis = 0.0
+    final: bool = False
+
+
+class StopOp(_FromPage, frozen=True, kw_only=True, tag="stop"):
+    """The space bar: a zero, from everybody, with or without a lease. It does not latch."""
+
+    ref: Ref
+
+
+class EstopOp(_FromPage, frozen=True, kw_only=True, tag="estop"):
+    """Emergency stop of one component, or of all (``ref`` ""), repeated by the server until it is confirmed."""
+
+    ref: Ref
+    stop: Annotated[str, Meta(pattern="^[0-9a-f]{16}$")]  # new for every press
+    why: Annotated[str, Meta(max_length=40)] = ""
+
+
+class EstopEndOp(_FromPage, frozen=True, kw_only=True, tag="estop-end"):
+    """Send this stop no more. Robots that are stopped stay so."""
+
+    stop: Short
+
+
+class ShownOwner(Struct, frozen=True, kw_only=True):
+    """A stopped motor owner as the page showed it."""
+
+    owner: Short
+    boot: Short
+    count: Number
+
+
+class EstopResetOp(_FromPage, frozen=True, kw_only=True, tag="estop-reset"):
+    """End exactly the stops that the page showed."""
+
+    ref: Ref
+    owners: Annotated[tuple[ShownOwner, ...], Meta(max_length=16)]
+
+
+class EncodingOp(_FromPage, frozen=True, kw_only=True, tag="encoding"):
+    """Pin the encoding of a robot's pictures for all its viewers; "" is automatic."""
+
+    ref: Ref
+    encoding: Short
+
+
+class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
+    """Show the picture of ``source`` on the page of ``ref``, for everybody, from now on; "" is its own."""
+
+    ref: Ref
+    source: Ref
+
+
+FromPage: TypeAlias = (
+    Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp
+)
+
+
+class _ToPage(Struct, frozen=True, kw_only=True, tag_field="op"):
+    """What the server sends."""
+
+
+class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
+    """The answer to Hello. ``rights``: of drive, reset, system, people."""
+
+    server: str
+    version: str
+    user: str
+    role: str
+    rights: tuple[str, ...]
+    login: bool  # whether there is anything to log out of
+    token: str
+    now: float
+    drives: bool = True  # False: the page came over plain http from another machine, where driving is switched off
+
+
+class Ping(_ToPage, frozen=True, kw_only=True, tag="ping"):
+    """Twice a second. ``round_trip_ms`` is that of the last one; -1: not known yet."""
+
+    n: int
+    now: float
+    round_trip_ms: float = -1.0
+
+
+class State(_ToPage, frozen=True, kw_only=True, tag="state"):
+    """The newest value of everything that changed: ``[ref, metric, value, age in ms]``; ``gone`` are removed components.
+
+    Metrics are those of the contract, with their payload as JSON, and some of the server's own, below ``web/``.
+    """
+
+    now: float
+    set: tuple[tuple[str, str, Any, float], ...]
+    gone: tuple[str, ...] = ()
+
+
+class Logs(_ToPage, frozen=True, kw_only=True, tag="logs"):
+    """Log lines of the watched component; ``first`` is the number of the first one."""
+
+    ref: str
+    first: int
+    lines: tuple[Any, ...]
+
+
+class Refused(_ToPage, frozen=True, kw_only=True, tag="refused"):
+    """Something was not done. ``g``: the gesture that is over, if it was a drive command."""
+
+    cmd: str
+    ref: str
+    why: str  # for people
+    g: int = -1
+
+
+class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
+    """The last message of a connection that the server closes. ``again``: whether to connect again."""
+
+    why: str
+    again: bool
+
+
+ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Bye
+
+
+# -- values of the server's own metrics
+
+
+class Liveness(Struct, frozen=True, kw_only=True):
+    """``web/liveness``: whether the component is there."""
+
+    online: bool | None  # None: not known yet
+    silent_s: float | None  # since its last sign of life; None: only retained messages were received
+    latency_ms: float | None
+    whole_seconds: bool  # its clock counts whole seconds: latency says nothing
+
+
+class OwnerState(Struct, frozen=True, kw_only=True):
+    """One motor owner in EstopView."""
+
+    owner: str
+    latched: bool
+    boot: str
+    count: int
+    by: str
+    why: str
+    since: int
+    persisted: bool | None
+    reset_refused: str | None
+
+
+class EstopView(Struct, frozen=True, kw_only=True):
+    """``web/estop``: the emergency stop of a component, and of the stop that is being sent to it."""
+
+    available: bool  # False: an old robot, or a broker that refuses: it can be stopped, but not held
+    latched: bool
+    by: str
+    why: str
+    since: int
+    owners: tuple[OwnerState, ...]
+    sending: str  # "", "sent", "confirmed", "old", "spared" or "not confirmed"
+    sending_text: str
+    stop: str  # the name of the stop that is or was sent
+
+
+class DriverView(Struct, frozen=True, kw_only=True):
+    """``web/driver``: who holds the lease; ``by`` "" is nobody."""
+
+    by: str
+    device: str
+    server: str  # "": this one
+    you: bool
+    idle_s: float | None  # since the last gesture ended; None: a gesture lasts
+
+
+class PictureView(Struct, frozen=True, kw_only=True):
+    """``web/picture``: the pictures of a component, as they come from it."""
+
+    state: str  # "rest", "starting", "flowing", "silent" or "refused"
+    why: str
+    encoding: str
+    per_second: float
+    kbits: float
+    viewers: int
+    pinned: str
+
+
+class BrokerView(Struct, frozen=True, kw_only=True):
+    """``web/broker`` of ref "": the server's connection to the broker."""
+
+    connected: bool
+    problem: str
+    robots_omitted: int
+
+
+class PictureFrom(Struct, frozen=True, kw_only=True):
+    """``web/picture-from``: the component whose picture is shown on the page of this one; "" is its own."""
+
+    source: str
+
+
+SERVER_METRICS: dict[str, type] = {
+    "web/liveness": Liveness,
+    "web/estop": EstopView,
+    "web/driver": DriverView,
+    "web/picture": PictureView,
+    "web/picture-from": PictureFrom,
+    "web/broker": BrokerView,
+}

@@ -1,0 +1,345 @@
+"""The newest value of every component and metric, and what of it each page has not received yet.
+
+No queue forms: a slow page receives the newest value less often. A page that connects again receives everything.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from typing import Any, NamedTuple
+
+import msgspec
+
+from pebble.client.discovery import Liveness
+from pebble.contract import (
+    AUTONOMY_STATUS,
+    CAPABILITIES,
+    CHANNELS,
+    CHARGING_LEVEL,
+    CHARGING_STATUS,
+    ESTOP_STATE,
+    LOGS,
+    MEDIA_STATUS,
+    ONLINE,
+    STATUS,
+    Channel,
+    Kind,
+    channel_of,
+    codec,
+)
+from pebble.contract.identity import Direction, parse_topic
+from pebble.errors import PayloadError
+from pebble.runtime.robot_estop import RobotEstop
+from pebble.transports import Message
+from pebble.web import messages as m
+
+MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
+MAX_BYTES = 32 * 1024 * 1024  # of all values together
+LOG_LINES = 500  # of the watched component
+_SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
+_SILENT_S = 1.5  # a component is not called silent before
+_REFRESH_S = 1.0  # values that change with every heartbeat are sent this often
+_STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
+
+#: What the page shows of every component, and what only of the one that is open.
+FLEET = (ONLINE, CAPABILITIES, STATUS, ESTOP_STATE, CHARGING_STATUS, CHARGING_LEVEL, AUTONOMY_STATUS, MEDIA_STATUS)
+SYNONYMS = tuple(channel for channel in CHANNELS if channel.synonym_of is not None)
+WATCHED = tuple(
+    channel
+    for channel in CHANNELS
+    if channel.direction == Direction.OUTGOING
+    and channel.payload is not bytes
+    and channel.remote
+    and channel not in FLEET
+    and channel not in SYNONYMS
+    and channel.kind is not Kind.EVENT
+)
+
+
+class _Value(NamedTuple):
+    raw: msgspec.Raw
+    at: float  # monotonic
+
+
+class Component:
+    """One component, by the messages it publishes."""
+
+    def __init__(self, ref: str) -> None:
+        self.ref = ref
+        self.name = ref.rpartition("/")[2]
+        self.liveness = Liveness()
+        self.estop = RobotEstop(ref)
+        self.capabilities: dict[str, Any] = {}
+        self.known: dict[str, Message] = {}  # what a stop needs to know of it, by topic
+        self.values: dict[str, _Value] = {}
+        self.sent_online: bool | None = None
+        self.refreshed_at = float("-inf")
+        self._stamps: deque[int] = deque(maxlen=_STAMPS)
+
+    @property
+    def live(self) -> bool:
+        """Whether anything but retained messages has arrived from it."""
+        return self.liveness.received_at is not None
+
+    def online(self, now: float) -> bool | None:
+        """As the paper's operator page decides it, but nothing is silent after less than 1.5 s."""
+        age, online = self.liveness.age_s(now), self.liveness.online(now)
+        if online is False and not self.liveness.reported_offline and age is not None and age < _SILENT_S:
+            return True
+        return online
+
+    def heartbeat(self, t_ms: int, now: float, wall: float, *, online: bool) -> None:
+        self._stamps.append(t_ms)
+        self.liveness.heartbeat(now, wall - t_ms / 1000, online=online)
+
+    def view(self, now: float) -> m.Liveness:
+        latency = self.liveness.latency_s
+        return m.Liveness(
+            online=self.online(now),
+            silent_s=self.liveness.age_s(now),
+            latency_ms=None if latency is None else 1000 * latency,
+            whole_seconds=len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps),
+        )
+
+    def drives(self) -> bool:
+        """Whether it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
+        drive = self.capabilities.get("drive")
+        return isinstance(drive, dict) and drive.get("available") is True and drive.get("controls") is not False
+
+
+class Interest:
+    """What one page has not received yet, and which component it has open."""
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self.watched = ""
+        self.dirty: set[tuple[str, str]] = set()
+        self.gone: set[str] = set()
+        self.notify = changed
+
+
+class Robots:
+    """All components. Only the event loop calls it."""
+
+    def __init__(self) -> None:
+        self.components: dict[str, Component] = {}
+        self.omitted = 0  # messages of components, metrics and values beyond the limits
+        self.interests: set[Interest] = set()
+        self.on_message: list[Callable[[Message, float], None]] = []  # of every component, before it is interpreted
+        self.logs: dict[str, deque[tuple[int, msgspec.Raw]]] = {}  # of watched components: number and line
+        self._server: dict[tuple[str, str], _Value] = {}
+        self._bytes = 0
+        self._log_number = 0
+
+    # -- reading
+
+    def capabilities(self, ref: str) -> dict[str, Any]:
+        """Empty until they are known."""
+        component = self.components.get(ref)
+        return {} if component is None else component.capabilities
+
+    def topic(self, ref: str, section: str, key: str, channel: Channel) -> str:
+        """The topic that the capabilities name, if it is the component's own; else the channel's."""
+        listed = self.capabilities(ref).get(section)
+        topic = str(listed.get(key)) if isinstance(listed, dict) else ""
+        return topic if own_topic(ref, topic, channel.direction) else channel.topic(ref)
+
+    def value(self, ref: str, metric: str) -> msgspec.Raw | None:
+        """The newest value; that of a server's metric as well."""
+        found = self._find(ref, metric)
+        return None if found is None else found.raw
+
+    def take(self, interest: Interest, now: float) -> tuple[tuple[str, str, Any, float], ...]:
+        """What this page has not received yet; it counts as received from now on."""
+        dirty, interest.dirty = interest.dirty, set()
+        found = ((ref, metric, self._find(ref, metric)) for ref, metric in dirty)
+        return tuple((ref, metric, one.raw, 1000 * (now - one.at)) for ref, metric, one in found if one is not None)
+
+    def _find(self, ref: str, metric: str) -> _Value | None:
+        if metric.startswith("web/"):
+            return self._server.get((ref, metric))
+        component = self.components.get(ref)
+        return None if component is None else component.values.get(metric)
+
+    # -- pages
+
+    def join(self, interest: Interest) -> None:
+        """Send everything to this page."""
+        self.interests.add(interest)
+        interest.dirty |= set(self._all(FLEET)) | set(self._server)
+
+    def watch(self, interest: Interest, ref: str) -> None:
+        """Send further metrics of ``ref`` to this page."""
+        interest.watched = ref
+        component = self.components.get(ref)
+        if component is not None:
+            interest.dirty |= {(ref, metric) for metric in component.values}
+
+    def leave(self, interest: Interest) -> None:
+        self.interests.discard(interest)
+
+    def _all(self, channels: Collection[Channel | None]) -> Iterator[tuple[str, str]]:
+        for ref, component in self.components.items():
+            for metric in component.values:
+                if _channel(metric) in channels:
+                    yield ref, metric
+
+    # -- changes
+
+    def set_server_metric(self, ref: str, metric: str, value: Any) -> None:
+        """Set one of the server's own metrics for all pages; unchanged values are not sent again."""
+        raw = msgspec.Raw(msgspec.json.encode(value))
+        old = self._server.get((ref, metric))
+        if old is None or bytes(old.raw) != bytes(raw):
+            self._server[ref, metric] = _Value(raw, time.monotonic())
+            self._mark(ref, metric, everybody=True)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take a message of any component."""
+        address = parse_topic(message.topic)
+        if address is None or address.direction is not Direction.OUTGOING or address.identity.type == _SERVERS:
+            return
+        self.receive_as(address.identity.base, address.metric, message, now)
+
+    def receive_as(self, ref: str, metric: str, message: Message, now: float) -> None:
+        """Take a message as the metric that it carries, whatever its topic is called."""
+        component = self.components.get(ref) or self._add(ref, retained=message.retain)
+        channel = _channel(metric)
+        if component is None or channel is None:
+            return
+        if channel is LOGS:
+            self._log(component, message)
+        elif not message.payload:
+            self._remove_value(component, metric, message)
+        elif self._store(component, metric, channel, message, now):
+            self._interpret(component, channel, message, now)
+
+    def forget(self, ref: str) -> None:
+        """Remove a component; it comes back with its next message."""
+        component = self.components.pop(ref, None)
+        if component is None:
+            return
+        self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
+        for key in [key for key in self._server if key[0] == ref]:
+            del self._server[key]
+        for interest in self.interests:
+            interest.gone.add(ref)
+            interest.notify()
+
+    def refresh(self, now: float) -> None:
+        """Send what changes with time; to be called a few times a second."""
+        for component in self.components.values():
+            online = component.online(now)
+            due = now - component.refreshed_at >= _REFRESH_S and (component.live or component.sent_online is not None)
+            if online is not component.sent_online or due or component.refreshed_at == float("-inf"):
+                component.sent_online, component.refreshed_at = online, now
+                self.set_server_metric(component.ref, "web/liveness", component.view(now))
+                if ONLINE.metric in component.values:
+                    self._mark(component.ref, ONLINE.metric)
+
+    def _add(self, ref: str, *, retained: bool) -> Component | None:
+        if len(self.components) >= MAX_COMPONENTS and (retained or not self._make_room()):
+            self.omitted += 1
+            return None
+        component = self.components[ref] = Component(ref)
+        return component
+
+    def _make_room(self) -> bool:
+        """For a component that is there, forget one that was never."""
+        old = next((one.ref for one in self.components.values() if not one.live and not one.capabilities), None)
+        if old is not None:
+            self.forget(old)
+            self.omitted += 1
+        return old is not None
+
+    def _store(self, component: Component, metric: str, channel: Channel, message: Message, now: float) -> bool:
+        """Check and store the value; False if it is refused."""
+        old = component.values.get(metric)
+        size = len(message.payload)
+        grows = size - (0 if old is None else len(bytes(old.raw)))
+        if (
+            size > MAX_VALUE_BYTES
+            or (old is None and len(component.values) >= MAX_METRICS)
+            or self._bytes + grows > MAX_BYTES
+        ):
+            self.omitted += 1
+            return False
+        try:
+            codec.plain(channel, message.payload)
+        except PayloadError:
+            return False
+        self._bytes += grows
+        component.values[metric] = _Value(msgspec.Raw(message.payload), now)
+        if channel is not ONLINE:
+            self._mark(component.ref, metric)
+        return True
+
+    def _remove_value(self, component: Component, metric: str, message: Message) -> None:
+        """An empty message removes what was retained."""
+        old = component.values.pop(metric, None)
+        if old is not None:
+            self._bytes -= len(bytes(old.raw))
+        component.known.pop(message.topic, None)
+        component.estop.receive(message)
+
+    def _interpret(self, component: Component, channel: Channel, message: Message, now: float) -> None:
+        if channel in (CAPABILITIES, ESTOP_STATE, ONLINE):
+            component.known[message.topic] = message
+        component.estop.receive(message)
+        if channel is CAPABILITIES:
+            component.capabilities = _capabilities(message.payload) or component.capabilities
+        elif channel is ONLINE or channel in SYNONYMS:
+            self._heartbeat(component, message, now)
+
+    def _heartbeat(self, component: Component, message: Message, now: float) -> None:
+        if message.retain:
+            return  # no sign of life
+        try:
+            payload = codec.decode(ONLINE, message.payload)
+        except PayloadError:
+            return
+        component.heartbeat(payload.t, now, time.time(), online=payload.online is not False)
+
+    def _log(self, component: Component, message: Message) -> None:
+        lines = self.logs.get(component.ref)
+        if lines is None or message.retain or len(message.payload) > MAX_VALUE_BYTES:
+            return
+        try:
+            codec.plain(LOGS, message.payload)
+        except PayloadError:
+            return
+        self._log_number += 1
+        lines.append((self._log_number, msgspec.Raw(message.payload)))
+        for interest in self.interests:
+            if interest.watched == component.ref:
+                interest.notify()
+
+    def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
+        everybody = everybody or _channel(metric) in FLEET
+        for interest in self.interests:
+            if everybody or interest.watched == ref:
+                interest.dirty.add((ref, metric))
+                interest.notify()
+
+
+def own_topic(ref: str, topic: object, direction: str) -> bool:
+    """Whether this is a topic of ``ref`` in that direction. Capabilities may name others; they are not used."""
+    return (
+        isinstance(topic, str)
+        and topic.startswith(f"{ref}/{direction}/")
+        and parse_topic(topic) is not None
+        and not set(topic) & {"+", "#", "\0"}
+    )
+
+
+def _channel(metric: str) -> Channel | None:
+    return channel_of(f"{Direction.OUTGOING}/{metric}")
+
+
+def _capabilities(payload: bytes) -> dict[str, Any]:
+    try:
+        value = codec.decode(CAPABILITIES, payload).value
+    except PayloadError:
+        return {}
+    return value if isinstance(value, dict) else {}

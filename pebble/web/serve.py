@@ -1,0 +1,83 @@
+"""Runs the server of the operator page until a signal ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+
+import uvicorn
+
+from pebble.errors import PebbleError
+from pebble.web.app import create_app
+from pebble.web.settings import WebSettings
+
+_LARGEST_MESSAGE = 64 * 1024
+_END_S = 1
+
+
+def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None) -> int:
+    """Serve until SIGINT or SIGTERM; ``on_ready`` gets the address once it can be opened. Raises PebbleError."""
+    listener = _listen(settings)
+    try:
+        asyncio.run(_serve(settings, listener, on_ready))
+    finally:
+        listener.close()
+    return 0
+
+
+async def _serve(settings: WebSettings, listener: socket.socket, on_ready: Callable[[str], None] | None) -> None:
+    server = uvicorn.Server(_config(settings))
+    watching = asyncio.ensure_future(_report(server, url_of(settings, listener), on_ready))
+    try:
+        await server.serve(sockets=[listener])
+    finally:
+        watching.cancel()
+
+
+async def _report(server: uvicorn.Server, url: str, on_ready: Callable[[str], None] | None) -> None:
+    while not server.started:
+        await asyncio.sleep(0.02)
+    if on_ready is not None:
+        on_ready(url)
+
+
+def _config(settings: WebSettings) -> uvicorn.Config:
+    return uvicorn.Config(
+        create_app(settings),
+        ssl_certfile=settings.certificate,
+        ssl_keyfile=settings.key,
+        log_config=None,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        date_header=False,
+        ws="websockets-sansio",
+        ws_per_message_deflate=False,  # pictures are compressed already: it would double the time they take
+        ws_max_size=_LARGEST_MESSAGE,
+        ws_ping_interval=2.0,
+        ws_ping_timeout=4.0,
+        timeout_graceful_shutdown=_END_S,
+        limit_concurrency=200,
+    )
+
+
+def _listen(settings: WebSettings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((settings.host, settings.port))
+    except OSError as error:
+        listener.close()
+        raise PebbleError(
+            f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose another with --port"
+        ) from None
+    return listener
+
+
+def url_of(settings: WebSettings, listener: socket.socket) -> str:
+    """The address that a browser on this machine opens, or the name by which others reach it."""
+    host = settings.names[0] if settings.names else settings.host
+    shown = f"[{host}]" if ":" in host else host
+    return f"{'https' if settings.certificate else 'http'}://{shown}:{listener.getsockname()[1]}/"

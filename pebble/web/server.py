@@ -1,0 +1,321 @@
+"""Ties the parts of the server together: what arrives from the broker, what pages ask for, and what is due."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import socket
+import time
+from collections import deque
+from contextlib import suppress
+
+import msgspec
+
+from pebble.contract import (
+    CHARGING_LEVEL,
+    CHARGING_STATUS,
+    DRIVE,
+    DRIVING,
+    IMU,
+    LOGS,
+    TOUCH_SENSORS,
+    WHEEL_ODOMETRY,
+    Channel,
+    codec,
+)
+from pebble.contract.identity import Identity, parse_topic
+from pebble.contract.payloads import Driver
+from pebble.contract.payloads import Driving as DrivingPayload
+from pebble.errors import ConfigError, PayloadError
+from pebble.fleet.audit import Audit
+from pebble.fleet.people import People
+from pebble.fleet.roles import Session
+from pebble.transports import Message, Subscription
+from pebble.web import messages as m
+from pebble.web.broker import Broker
+from pebble.web.driving import Command, Driving
+from pebble.web.media import MediaHub
+from pebble.web.robots import FLEET, LOG_LINES, SYNONYMS, WATCHED, Robots, own_topic
+from pebble.web.settings import WebSettings
+from pebble.web.stops import Stops
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.05
+_REFRESH_S = 0.25
+_ANNOUNCE_S = 1.0
+_KEEP_S = 5.0  # so long the metrics of a component are still received after the last page has closed it
+_ANNOUNCED = 64  # robots in one announcement
+
+#: Channels whose effective topic capabilities may name, below ``telemetry``.
+_TELEMETRY: dict[str, Channel] = {
+    "touch_topic": TOUCH_SENSORS,
+    "charging_topic": CHARGING_STATUS,
+    "charging_level_topic": CHARGING_LEVEL,
+    "wheel_odometry_topic": WHEEL_ODOMETRY,
+    "imu_topic": IMU,
+}
+
+
+def clock() -> float:
+    """Seconds that go on while the machine is suspended, where the system has such a clock."""
+    boottime = getattr(time, "CLOCK_BOOTTIME", None)
+    return time.monotonic() if boottime is None else time.clock_gettime(boottime)
+
+
+class Server:
+    """All state of one server. Everything runs on one event loop."""
+
+    def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
+        self.settings, self.people, self.audit = settings, people, audit
+        self.name = settings.server or socket.gethostname().partition(".")[0] or "server"
+        self.id = f"{self.name}-{secrets.token_hex(2)}"
+        self.broker = Broker(settings.broker)
+        self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
+        self.media = MediaHub(self.broker, self.robots)
+        self.drive_changed: set[str] = set()
+        self._watching: dict[str, int] = {}  # how many pages have a component open
+        self._subscribed: dict[str, list[Subscription]] = {}  # what is received of it
+        self._extra: dict[str, frozenset[str]] = {}  # its effective topics, as subscribed
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._announced_at = float("-inf")
+        self._announcing: set[str] = set()  # systems of the robots in the last announcement
+
+    async def open(self) -> None:
+        """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
+        await self.broker.open()
+        self.broker.on_state(self._show_broker)
+        self._show_broker()
+        for channel in (*FLEET, *SYNONYMS):
+            await self.broker.subscribe(channel.filter("+/+/+"), self._receive)
+        await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
+        self.spawn(self._tick())
+
+    async def close(self) -> None:
+        """Stop what pages move, then disconnect."""
+        for lease in list(self.driving.leases.values()):
+            self.publish(self.driving.closed(lease.tab, clock()))
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.media.close()
+        await self.broker.close()
+
+    def spawn(self, work: object) -> None:
+        """Run a coroutine until it ends or the server does."""
+        task = asyncio.ensure_future(work)  # type: ignore[call-overload]
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # -- from the broker
+
+    def _receive(self, message: Message, now: float) -> None:
+        self.robots.receive(message, now)
+        self.stops.receive(message, clock())
+        address = parse_topic(message.topic)
+        if address is not None:
+            self._after(address.identity.base)
+
+    def _after(self, ref: str) -> None:
+        """What follows from a change of a component: new topics, and messages of stops."""
+        self._send(self.stops.tick(clock()))
+        if ref in self._subscribed and self._effective(ref) != self._extra.get(ref):
+            self.spawn(self._subscribe(ref))
+
+    def _announced(self, message: Message, _now: float) -> None:
+        """Another server drives robots."""
+        address = parse_topic(message.topic)
+        if address is None or message.retain or address.identity.id == self.id:
+            return
+        try:
+            payload = codec.decode(DRIVING, message.payload)
+        except PayloadError:
+            return
+        robots = {ref: (one.by, one.device, one.since) for ref, one in payload.robots.items()}
+        self.publish(self.driving.announced(address.identity.id, robots, clock()))
+
+    def _show_broker(self) -> None:
+        view = m.BrokerView(
+            connected=self.broker.connected, problem=self.broker.problem, robots_omitted=self.robots.omitted
+        )
+        self.robots.set_server_metric("", "web/broker", view)
+
+    # -- to the broker
+
+    def publish(self, commands: list[Command]) -> bool:
+        """Publish drive commands, each to the robot's own topic; False if one was not accepted."""
+        accepted = True
+        for ref, drive in commands:
+            topic = self.robots.topic(ref, "drive", "topic", DRIVE)
+            accepted = self.broker.publish(topic, codec.encode(DRIVE, drive)) and accepted
+        self._show_drivers()
+        return accepted
+
+    def _send(self, messages: list[Message]) -> None:
+        for message in messages:
+            self.broker.publish(message.topic, message.payload, qos=message.qos)
+
+    def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
+        """An emergency stop of one component, or of all (""): sent at once, and repeated until it is confirmed."""
+        by = f"{session.user} on {device}" if device else session.user
+        if ref and not _is_base(ref):
+            return
+        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=self.robots.components.values()))
+        self._show_stops()
+        self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
+
+    def blocked(self, ref: str) -> str:
+        """Why this component may not be moved by any page; empty if it may."""
+        component = self.robots.components.get(ref)
+        if not self.broker.connected:
+            return f"The server cannot reach the broker: {self.broker.problem}"
+        if component is None or not component.drives():
+            return "This component does not drive"
+        if component.estop.latched:
+            return (
+                f"Stopped by {component.estop.stopped_by.by or 'unknown'}" if component.estop.stopped_by else "Stopped"
+            )
+        return "" if component.online(time.monotonic()) is not False else f"{component.name} is silent"
+
+    def picture_from(self, ref: str, source: str) -> None:
+        """Show the picture of ``source`` on the page of ``ref``, for everybody; "" is its own."""
+        if ref in self.robots.components and (not source or source in self.robots.components):
+            self.people.set(f"picture-from {ref}", "" if source == ref else source)
+            self._show_picture_from(ref)
+
+    def _show_picture_from(self, ref: str) -> None:
+        source = self.people.get(f"picture-from {ref}") or ""
+        self.robots.set_server_metric(ref, "web/picture-from", m.PictureFrom(source=source))
+
+    # -- what is open
+
+    def watch(self, ref: str) -> None:
+        """A page has opened this component."""
+        self._watching[ref] = self._watching.get(ref, 0) + 1
+        if ref not in self._subscribed and _is_base(ref):
+            self._subscribed[ref] = []
+            self._show_picture_from(ref)
+            self.robots.logs[ref] = deque(maxlen=LOG_LINES)
+            self.spawn(self._subscribe(ref))
+
+    def unwatch(self, ref: str) -> None:
+        """A page has closed it."""
+        self._watching[ref] -= 1
+        if not self._watching[ref]:
+            del self._watching[ref]
+            self.broker.loop.call_later(_KEEP_S, lambda: self.spawn(self._unsubscribe(ref)))
+
+    async def _subscribe(self, ref: str) -> None:
+        extra = self._extra[ref] = self._effective(ref)
+        filters = {channel.filter(ref): None for channel in WATCHED if channel is not LOGS}
+        filters |= {LOGS.filter(ref): None} | dict.fromkeys(extra)
+        names = dict(self._named(ref))
+
+        def take(message: Message, now: float) -> None:
+            channel = names.get(message.topic)
+            if channel is None:
+                self.robots.receive(message, now)
+            else:
+                self.robots.receive_as(ref, channel.metric, message, now)
+
+        done = self._subscribed[ref]
+        known = {subscription.filter for subscription in done}
+        for filter_ in filters:
+            if filter_ not in known and ref in self._subscribed:
+                done.append(await self.broker.subscribe(filter_, take))
+
+    async def _unsubscribe(self, ref: str) -> None:
+        if ref in self._watching or ref not in self._subscribed:
+            return
+        self.robots.logs.pop(ref, None)
+        self._extra.pop(ref, None)
+        for subscription in self._subscribed.pop(ref):
+            await self.broker.unsubscribe(subscription)
+
+    def _effective(self, ref: str) -> frozenset[str]:
+        return frozenset(topic for topic, channel in self._named(ref) if topic != channel.topic(ref))
+
+    def _named(self, ref: str) -> list[tuple[str, Channel]]:
+        """The topics of telemetry that the capabilities name, if they are the component's own."""
+        telemetry = self.robots.capabilities(ref).get("telemetry")
+        listed = telemetry if isinstance(telemetry, dict) else {}
+        return [
+            (str(listed[key]), channel)
+            for key, channel in _TELEMETRY.items()
+            if own_topic(ref, listed.get(key), "outgoing")
+        ]
+
+    # -- what is due
+
+    async def _tick(self) -> None:
+        refresh_at = 0.0
+        while True:
+            await asyncio.sleep(TICK_S)
+            now = clock()
+            with _logged():
+                self.publish(self.driving.tick(now))
+                self._send(self.stops.tick(now))
+                self._show_stops()
+                if now >= refresh_at:
+                    refresh_at = now + _REFRESH_S
+                    self.robots.refresh(time.monotonic())
+                self._announce(now)
+
+    def _announce(self, now: float) -> None:
+        """Tell other servers once a second, and when a lease changes, which robots are driven from here."""
+        if now - self._announced_at < _ANNOUNCE_S and not self.drive_changed:
+            return
+        self.drive_changed.clear()
+        self._announced_at = now
+        systems: dict[str, dict[str, Driver]] = {system: {} for system in self._announcing}
+        for ref, lease in list(self.driving.leases.items())[:_ANNOUNCED]:
+            one = Driver(by=lease.tab.user, device=lease.tab.device, since=lease.since_ms)
+            systems.setdefault(ref.partition("/")[0], {})[ref] = one
+        self._announcing = {system for system, robots in systems.items() if robots}  # the others: once more, empty
+        for system, robots in systems.items():
+            payload = DrivingPayload(t=int(1000 * time.time()), robots=robots)
+            self.broker.publish(
+                DRIVING.topic(Identity(system, "servers", self.id).base), codec.encode(DRIVING, payload)
+            )
+
+    def _show_stops(self) -> None:
+        changed, self.stops.changed = self.stops.changed, set()
+        for ref in changed:
+            component = self.robots.components.get(ref)
+            if component is not None:
+                self.robots.set_server_metric(ref, "web/estop", self.stops.view(component.estop))
+
+    def _show_drivers(self) -> None:
+        changed, self.driving.changed = self.driving.changed, set()
+        self.drive_changed |= changed
+        for interest in self.robots.interests if changed else ():
+            interest.dirty |= {(ref, "web/driver") for ref in changed}
+            interest.notify()
+
+
+def _is_base(ref: str) -> bool:
+    levels = ref.split("/")
+    if len(levels) != 3:
+        return False
+    with suppress(ConfigError):
+        return Identity(*levels).base == ref
+    return False
+
+
+class _logged:  # noqa: N801 - used like a function
+    """One faulty round must not end all later ones, on which the end of silent gestures depends."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _tb: object) -> bool:
+        if isinstance(error, Exception):
+            log.error("a round of the server failed", exc_info=error)
+            return True
+        return False
+
+
+def encode(message: m.ToPage) -> str:
+    """The text that a page receives."""
+    return msgspec.json.encode(message).decode()

@@ -1,0 +1,131 @@
+"""The emergency stops that pages have asked for, sent until they are confirmed, and what pages see of them. Pure.
+
+The robot remembers the stop; see docs/emergency-stop.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
+from pebble.contract.identity import Direction, parse_topic
+from pebble.runtime.robot_estop import RobotEstop
+from pebble.transports import Message
+from pebble.web import messages as m
+from pebble.web.robots import Component, own_topic
+
+MAX_STOPS = 32  # that are being sent at once; beyond, the oldest is no longer sent
+_SHOWN_S = 60.0  # so long pages see how a finished stop ended
+
+_SENDING = {
+    Progress.WAITING: "sent",
+    Progress.CONFIRMED: "confirmed",
+    Progress.OLD: "old",
+    Progress.SPARED: "spared",
+    Progress.NOT_CONFIRMED: "not confirmed",
+}
+
+
+class Stops:
+    """Publish what its methods return, and pass every message of the robots to ``receive``."""
+
+    def __init__(self) -> None:
+        self.changed: set[str] = set()  # robots whose view may be another one now
+        self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
+        self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
+
+    def press(self, ref: str, name: str, *, by: str, why: str, now: float, known: Iterable[Component]) -> list[Message]:
+        """Stop one robot, or all if ``ref`` is "". ``known`` are the components from which messages were received."""
+        if name in self._senders:
+            return []
+        while len(self._senders) >= MAX_STOPS:
+            oldest = next(iter(self._senders))
+            self._senders.pop(oldest)[0].end()
+        sender = StopSender(name, by=by, why=why, now=now, robots=[ref] if ref else None)
+        self._senders[name] = sender, now
+        for component in known:
+            if not ref or component.ref == ref:
+                for message in component.known.values():
+                    sender.receive(message, now)
+        return self.tick(now)
+
+    def end(self, name: str) -> None:
+        """Send this stop no more."""
+        if name in self._senders:
+            sender = self._senders[name][0]
+            sender.end()
+            self.changed |= set(sender.robots)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take a message of any robot."""
+        address = parse_topic(message.topic)
+        if address is None:
+            return
+        for sender, began in self._senders.values():
+            if not sender.finished or now - began < COLLECT_S:
+                sender.receive(message, now)
+        self.changed.add(address.identity.base)
+
+    def tick(self, now: float) -> list[Message]:
+        """What to publish now; to be called every 50 ms, and after a message."""
+        messages = []
+        for name, (sender, began) in list(self._senders.items()):
+            messages += [one for one in sender.tick(now) if _own(one.topic, sender)]
+            self.changed |= {ref for ref, stop in sender.robots.items() if self._shown.get(ref) != _progress(stop)}
+            if sender.finished and now - began > _SHOWN_S:
+                del self._senders[name]
+                self.changed |= set(sender.robots)
+        return messages
+
+    def view(self, estop: RobotEstop) -> m.EstopView:
+        """What pages see of the emergency stop of one component."""
+        name, stop = self._newest(estop.base)
+        sending, text = ("", "") if stop is None else _progress(stop)
+        self._shown[estop.base] = sending, text
+        by = estop.stopped_by
+        return m.EstopView(
+            available=estop.available,
+            latched=bool(estop.latched),
+            by="" if by is None else by.by,
+            why="" if by is None else by.why,
+            since=0 if by is None else by.since,
+            owners=tuple(_owner(owner, estop) for owner in estop.states),
+            sending=sending,
+            sending_text=text,
+            stop=name,
+        )
+
+    def _newest(self, ref: str) -> tuple[str, RobotStop | None]:
+        for name, (sender, _) in reversed(self._senders.items()):
+            if ref in sender.robots:
+                return name, sender.robots[ref]
+        return "", None
+
+
+def _progress(stop: RobotStop) -> tuple[str, str]:
+    progress = stop.progress
+    if progress is Progress.CONFIRMED and not stop.saved:
+        return _SENDING[progress], "stopped, but not saved: after a power cut it is free"
+    return _SENDING[progress], stop.why
+
+
+def _owner(owner: str, estop: RobotEstop) -> m.OwnerState:
+    state = estop.states[owner]
+    return m.OwnerState(
+        owner=owner,
+        latched=state.latched,
+        boot=state.boot,
+        count=state.count,
+        by=state.by,
+        why=state.why,
+        since=state.since,
+        persisted=state.persisted,
+        reset_refused=state.reset_refused,
+    )
+
+
+def _own(topic: str, sender: StopSender) -> bool:
+    """Whether it is an incoming topic of a robot that is being stopped: capabilities may name another robot's."""
+    address = parse_topic(topic)
+    base = "" if address is None else address.identity.base
+    return base in sender.robots and own_topic(base, topic, Direction.INCOMING)
