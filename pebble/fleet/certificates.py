@@ -1,0 +1,280 @@
+"""A small certificate authority of one's own, so that browsers and phones in a lab can use https."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+
+CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY = "ca.pem", "ca.key", "server.pem", "server.key"
+SERVER_DAYS = 397  # the longest that browsers accept
+AUTHORITY_DAYS = 3650
+_HOST = re.compile(r"(?=.{1,253}$)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)(\.[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)*")
+_CLOCKS_DIFFER = datetime.timedelta(hours=1)
+#: What an authority may sign for, besides the names it is made for. Whatever happens to its key, a phone that trusts it
+#: accepts no certificate of it for a bank.
+_LOCAL_DOMAINS = ("local", "localhost", "lan", "internal", "home.arpa")
+_LOCAL_NETWORKS = (
+    "127.0.0.0/8",
+    "10.0.0.0/8",
+    "172.16.0.0/12",
+    "192.168.0.0/16",
+    "169.254.0.0/16",
+    "100.64.0.0/10",
+    "::1/128",
+    "fc00::/7",
+    "fe80::/10",
+)
+
+
+class CertificateError(PebbleError):
+    """Certificates cannot be made or read. Example: ``tls/ca.pem exists: …``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What one certificate file holds."""
+
+    file: Path
+    names: tuple[str, ...]  # empty for an authority
+    until: datetime.datetime
+    sha256: str  # of the certificate, as browsers show it
+
+
+def init(folder: Path, names: Sequence[str]) -> None:
+    """Write a new authority and a server certificate for ``names``. Raises CertificateError; overwrites nothing."""
+    hosts = _hosts(names)
+    for name in (CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY):
+        if (folder / name).exists():
+            raise CertificateError(
+                f"{folder / name} exists: `pebble cert renew --folder {folder}` makes a new server certificate, "
+                "and another --folder a new authority"
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CertificateError(f"{folder}: {error.strerror}") from None
+    key, certificate = _authority(hosts)
+    _write_key(folder / CA_KEY, key)
+    _write(folder / CA_CERT, _pem(certificate), 0o644)
+    _sign(folder, key, certificate, hosts)
+
+
+def renew(folder: Path, names: Sequence[str] = ()) -> None:
+    """A new server certificate and key by the same authority, for ``names`` or those of before.
+
+    Raises CertificateError.
+    """
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    authority = _read(folder / CA_CERT)
+    try:
+        key = load_pem_private_key((folder / CA_KEY).read_bytes(), None)
+    except (OSError, ValueError, TypeError) as error:
+        raise CertificateError(f"{folder / CA_KEY}: {getattr(error, 'strerror', error)}") from None
+    if key.public_key() != authority.public_key():
+        raise CertificateError(f"{folder / CA_KEY} is not the key of {folder / CA_CERT}")
+    _sign(folder, key, authority, _hosts(names or show(folder / SERVER_CERT).names))  # type: ignore[arg-type]
+
+
+def show(file: Path) -> Shown:
+    """Raises CertificateError."""
+    from cryptography.hazmat.primitives.hashes import SHA256
+
+    certificate = _read(file)
+    digest = certificate.fingerprint(SHA256()).hex().upper()
+    pairs = (digest[place : place + 2] for place in range(0, len(digest), 2))
+    return Shown(file, _names_of(certificate), certificate.not_valid_after_utc, ":".join(pairs))
+
+
+# -- inside
+
+
+def _hosts(names: Iterable[str]) -> list[str]:
+    hosts = list(dict.fromkeys(_host(name) for name in names))
+    if not hosts:
+        raise CertificateError("name the addresses by which browsers reach the server: robot-lab.local 192.168.1.20")
+    return hosts
+
+
+def _host(name: str) -> str:
+    """A host name or IP address in its one spelling. Raises CertificateError."""
+    try:
+        return str(ipaddress.ip_address(name.strip("[]")))
+    except ValueError:
+        pass
+    host = name.lower().rstrip(".")
+    if not _HOST.fullmatch(host) or host.rpartition(".")[2].isdigit():
+        raise CertificateError(f"{name!r} is neither a host name nor an IP address; leave out https:// and the port")
+    return host
+
+
+def _authority(hosts: Sequence[str]) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, f"Pebble authority of {hosts[0]}"[:64])])
+    domains = [x509.DNSName(host) for host in dict.fromkeys((*_LOCAL_DOMAINS, *filter(_is_name, hosts)))]
+    own = (str(ipaddress.ip_network(host)) for host in hosts if not _is_name(host))
+    networks = [x509.IPAddress(ipaddress.ip_network(net)) for net in dict.fromkeys((*_LOCAL_NETWORKS, *own))]
+    builder = (
+        _builder(subject, subject, key, AUTHORITY_DAYS)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_key_usage(signs_certificates=True), critical=True)
+        .add_extension(x509.NameConstraints([*domains, *networks], None), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+    return key, _signed(builder, key)
+
+
+def _sign(folder: Path, key: EllipticCurvePrivateKey, authority: x509.Certificate, hosts: Sequence[str]) -> None:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    _check_permitted(folder, authority, hosts)
+    own = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, hosts[0][:64])])
+    names = [x509.DNSName(host) if _is_name(host) else x509.IPAddress(ipaddress.ip_address(host)) for host in hosts]
+    public = authority.public_key()
+    builder = (
+        _builder(subject, authority.subject, own, SERVER_DAYS, authority.not_valid_after_utc)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_key_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([x509.oid.ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(own.public_key()), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(public), critical=False)  # type: ignore[arg-type]
+    )
+    certificate = _signed(builder, key)
+    _write_key(folder / SERVER_KEY, own)
+    _write(folder / SERVER_CERT, _pem(certificate), 0o644)
+
+
+def _check_permitted(folder: Path, authority: x509.Certificate, hosts: Iterable[str]) -> None:
+    from cryptography import x509
+
+    permitted = authority.extensions.get_extension_for_class(x509.NameConstraints).value.permitted_subtrees or []
+    values = [name.value for name in permitted]
+    for host in hosts:
+        if _is_name(host):
+            fits = any(host == value or host.endswith(f".{value}") for value in values if isinstance(value, str))
+        else:
+            address = ipaddress.ip_address(host)
+            fits = any(address in value for value in values if not isinstance(value, str))
+        if not fits:
+            raise CertificateError(
+                f"the authority in {folder} may not sign for {host}: "
+                f"make another one that may, `pebble cert init --folder NEW {host}`"
+            )
+
+
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: EllipticCurvePrivateKey,
+    days: int,
+    latest: datetime.datetime | None = None,
+) -> x509.CertificateBuilder:
+    from cryptography import x509
+
+    now = datetime.datetime.now(datetime.UTC)
+    until = now + datetime.timedelta(days=days) - _CLOCKS_DIFFER
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCKS_DIFFER)
+        .not_valid_after(until if latest is None else min(until, latest))
+    )
+
+
+def _signed(builder: x509.CertificateBuilder, key: EllipticCurvePrivateKey) -> x509.Certificate:
+    from cryptography.hazmat.primitives.hashes import SHA256
+
+    return builder.sign(key, SHA256())
+
+
+def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    from cryptography import x509
+
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _is_name(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return True
+    return False
+
+
+def _names_of(certificate: x509.Certificate) -> tuple[str, ...]:
+    from cryptography import x509
+
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ()
+    return tuple(str(name.value) for name in names if isinstance(name, x509.DNSName | x509.IPAddress))
+
+
+def _read(file: Path) -> x509.Certificate:
+    from cryptography import x509
+
+    try:
+        return x509.load_pem_x509_certificate(file.read_bytes())
+    except OSError as error:
+        raise CertificateError(f"{file}: {error.strerror}; `pebble cert init` makes certificates") from None
+    except ValueError:
+        raise CertificateError(f"{file} holds no certificate") from None
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    from cryptography.hazmat.primitives.serialization import Encoding
+
+    return certificate.public_bytes(Encoding.PEM)
+
+
+def _write_key(file: Path, key: EllipticCurvePrivateKey) -> None:
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+    _write(file, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 0o600)
+
+
+def _write(file: Path, content: bytes, mode: int) -> None:
+    """Replace the file at once: never half of it, never a key that others can read for a moment."""
+    temporary = file.with_name(f".{file.name}.new")
+    try:
+        temporary.unlink(missing_ok=True)
+        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as output:
+            output.write(content)
+            output.flush()
+            os.fsync(output.fileno())
+        temporary.chmod(mode)
+        temporary.replace(file)
+    except OSError as error:
+        raise CertificateError(f"{file}: {error.strerror}") from None

@@ -1,0 +1,222 @@
+"""People who may use the operator page, their sessions, and settings of the server: one SQLite file."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import re
+import secrets
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pebble.errors import PebbleError
+from pebble.fleet.database import open_database
+from pebble.fleet.roles import Role
+from pebble.fleet.tries import Tries, network_of
+
+NAME = re.compile(r"[a-z0-9_-]{1,32}")
+SESSION_S = 7 * 24 * 3600.0  # a session ends after this long, whether it is used or not
+MIN_PASSWORD = 8
+MAX_PASSWORD = 256  # longer ones are refused unread: hashing them costs time
+_SESSIONS_EACH = 20  # of one person; the oldest ends when there are more
+_TABLES = """
+CREATE TABLE IF NOT EXISTS people (name TEXT PRIMARY KEY, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS sessions (
+    digest BLOB PRIMARY KEY, id TEXT NOT NULL, name TEXT NOT NULL REFERENCES people(name) ON DELETE CASCADE,
+    address TEXT NOT NULL, started REAL NOT NULL, expires REAL NOT NULL);
+CREATE INDEX IF NOT EXISTS sessions_of ON sessions (name, address);
+CREATE TABLE IF NOT EXISTS settings (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+"""
+
+
+class PeopleError(PebbleError):
+    """A name, password or role that cannot be used. Example: ``alice exists already``."""
+
+
+class TooManyTriesError(PebbleError):
+    """Too many passwords were tried from one address or for one name; ``wait_s`` is when the next one is read."""
+
+    def __init__(self, wait_s: float) -> None:
+        self.wait_s = wait_s
+        super().__init__(f"too many tries: wait {max(1, round(wait_s))} s")
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """A person."""
+
+    name: str
+    role: Role
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One login. ``id`` names it in the audit log; it cannot be used to log in."""
+
+    id: str
+    user: str
+    role: Role
+
+
+#: What a browser on the same machine gets where there is no login.
+LOCAL = Session("local", "local", Role.ADMIN)
+
+
+class People:
+    """Thread-safe. Each call reads the file, so that changes by another process count at once.
+
+    ``path`` None: in memory. Passwords are stored as scrypt hashes, session tokens as their SHA-256.
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        *,
+        clock: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._lock = threading.Lock()
+        self._database = open_database(path, _TABLES)
+        self._clock = clock
+        self._addresses, self._names = Tries(monotonic), Tries(monotonic)
+        self._no_hash = _hash("", b"no such person..")  # compared where the name is unknown: the same time
+
+    def close(self) -> None:
+        with self._lock:
+            self._database.close()
+
+    # -- people
+
+    def add(self, name: str, password: str, role: Role) -> None:
+        """Raises PeopleError."""
+        if not NAME.fullmatch(name):
+            raise PeopleError(f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
+        salt = secrets.token_bytes(16)
+        values = (name, role.value, salt, _hash(_usable(password), salt))
+        try:
+            self._change("INSERT INTO people (name, role, salt, hash) VALUES (?, ?, ?, ?)", *values)
+        except sqlite3.IntegrityError:
+            raise PeopleError(f"{name} exists already: change the password or the role, or remove {name}") from None
+
+    def remove(self, name: str) -> None:
+        """Ends the person's sessions, too. Raises PeopleError."""
+        self._change_one(name, "DELETE FROM people WHERE name = ?", name)
+
+    def set_password(self, name: str, password: str) -> None:
+        """Ends the person's sessions, too. Raises PeopleError."""
+        salt = secrets.token_bytes(16)
+        hashed = _hash(_usable(password), salt)
+        self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
+        self._change("DELETE FROM sessions WHERE name = ?", name)
+
+    def set_role(self, name: str, role: Role) -> None:
+        """Counts for running sessions, too. Raises PeopleError."""
+        self._change_one(name, "UPDATE people SET role = ? WHERE name = ?", role.value, name)
+
+    def list(self) -> list[User]:
+        return [User(name, Role(role)) for name, role in self._rows("SELECT name, role FROM people ORDER BY name")]
+
+    # -- sessions
+
+    def check(self, name: str, password: str, address: str) -> User | None:
+        """The person with this password. Blocks for some 20 ms, the same for unknown names. Raises TooManyTriesError.
+
+        A name whose tries are used up can still log in from an address where it has a session: others cannot keep a
+        person out.
+        """
+        self._count_try(name, address)
+        known = name if NAME.fullmatch(name) else ""
+        rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", known)
+        found, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
+        given = _hash(password[:MAX_PASSWORD], salt)
+        if not hmac.compare_digest(given, expected) or not found or len(password) > MAX_PASSWORD:
+            return None
+        self._addresses.give_back(network_of(address))
+        self._names.give_back(name)
+        return User(found, Role(role))
+
+    def start_session(self, user: User, address: str = "") -> str:
+        """A new session's token; the only copy of it."""
+        token = secrets.token_urlsafe(32)
+        now = self._clock()
+        self._change("DELETE FROM sessions WHERE expires <= ?", now)
+        self._change(
+            "DELETE FROM sessions WHERE name = ? AND digest NOT IN "
+            "(SELECT digest FROM sessions WHERE name = ? ORDER BY started DESC LIMIT ?)",
+            user.name,
+            user.name,
+            _SESSIONS_EACH - 1,
+        )
+        self._change(
+            "INSERT INTO sessions (digest, id, name, address, started, expires) VALUES (?, ?, ?, ?, ?, ?)",
+            _digest(token),
+            secrets.token_hex(4),
+            user.name,
+            address,
+            now,
+            now + SESSION_S,
+        )
+        return token
+
+    def session(self, token: str) -> Session | None:
+        """The running session of this token, with the person's role of now."""
+        rows = self._rows(
+            "SELECT sessions.id, people.name, people.role FROM sessions JOIN people USING (name) "
+            "WHERE digest = ? AND expires > ?",
+            _digest(token),
+            self._clock(),
+        )
+        return Session(rows[0][0], rows[0][1], Role(rows[0][2])) if rows else None
+
+    def end_session(self, token: str) -> None:
+        self._change("DELETE FROM sessions WHERE digest = ?", _digest(token))
+
+    # -- settings of the server
+
+    def get(self, key: str) -> str | None:
+        rows = self._rows("SELECT value FROM settings WHERE key = ?", key)
+        return str(rows[0][0]) if rows else None
+
+    def set(self, key: str, value: str) -> None:
+        self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
+
+    # -- inside
+
+    def _count_try(self, name: str, address: str) -> None:
+        wait_s = self._addresses.take(network_of(address))
+        if wait_s:
+            raise TooManyTriesError(wait_s)
+        wait_s = self._names.take(name)
+        if wait_s and not self._rows("SELECT 1 FROM sessions WHERE name = ? AND address = ?", name, address):
+            raise TooManyTriesError(wait_s)
+
+    def _rows(self, statement: str, *values: Any) -> Sequence[Any]:
+        with self._lock:
+            return self._database.execute(statement, values).fetchall()
+
+    def _change(self, statement: str, *values: Any) -> int:
+        with self._lock:
+            return self._database.execute(statement, values).rowcount
+
+    def _change_one(self, name: str, statement: str, *values: Any) -> None:
+        if self._change(statement, *values) == 0:
+            raise PeopleError(f"there is no {name!r}: `pebble web user list` lists the names")
+
+
+def _usable(password: str) -> str:
+    if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
+        raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
+    return password
+
+
+def _hash(password: str, salt: bytes) -> bytes:
+    return hashlib.scrypt(password.encode(errors="surrogatepass"), salt=salt, n=2**14, r=8, p=1)
+
+
+def _digest(token: str) -> bytes:
+    return hashlib.sha256(token.encode(errors="surrogatepass")).digest()

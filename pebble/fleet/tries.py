@@ -1,0 +1,52 @@
+"""Counts password tries, so that guessing takes years."""
+
+from __future__ import annotations
+
+import ipaddress
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable
+
+TRIES = 5
+WINDOW_S = 60.0
+_KEYS = 10_000  # addresses or names that are remembered; beyond that the oldest is forgotten
+
+
+class Tries:
+    """At most TRIES within WINDOW_S for each key. Thread-safe."""
+
+    def __init__(self, monotonic: Callable[[], float]) -> None:
+        self._monotonic = monotonic
+        self._lock = threading.Lock()
+        self._times: OrderedDict[str, deque[float]] = OrderedDict()
+
+    def take(self, key: str) -> float:
+        """Count a try; 0, or if it is one too many the seconds until the next one."""
+        now = self._monotonic()
+        with self._lock:
+            times = self._times.setdefault(key[:64], deque(maxlen=TRIES))
+            self._times.move_to_end(key[:64])
+            if len(self._times) > _KEYS:
+                self._times.popitem(last=False)
+            if len(times) == TRIES and now - times[0] < WINDOW_S:
+                return WINDOW_S - (now - times[0])
+            times.append(now)
+            return 0.0
+
+    def give_back(self, key: str) -> None:
+        """A try that was right does not count."""
+        with self._lock:
+            times = self._times.get(key[:64])
+            if times:
+                times.pop()
+
+
+def network_of(address: str) -> str:
+    """What counts as one address: with IPv6 the /64, of which one machine can use every address."""
+    try:
+        parsed = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if parsed.version == 4 or parsed.ipv4_mapped is not None:
+        return str(parsed)
+    return str(ipaddress.ip_network((parsed, 64), strict=False))
