@@ -437,7 +437,7 @@ class OutletStatus(Payload, frozen=True, kw_only=True):
     label: str | UnsetType = UNSET
 
 
-class DrivenRobot(Payload, frozen=True, kw_only=True):
+class Driver(Payload, frozen=True, kw_only=True):
     """Who drives a robot by way of a server."""
 
     by: Annotated[str, Meta(max_length=64)]  # the user
@@ -445,7 +445,7 @@ class DrivenRobot(Payload, frozen=True, kw_only=True):
     since: Annotated[int, Meta(ge=0)]  # epoch milliseconds
 
 
-_Drivers = Annotated[dict[Annotated[str, Meta(max_length=200)], DrivenRobot], Meta(max_length=64)]
+_Drivers = Annotated[dict[Annotated[str, Meta(max_length=200)], Driver], Meta(max_length=64)]
 
 
 class Driving(Payload, frozen=True, kw_only=True):
