@@ -13,8 +13,10 @@ from pebble.config.reader import Check, Reader
 from pebble.config.transport import Mqtt, Tls
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
+from pebble.config.web import WebInterface, WebMqtt, WebTls
+from pebble.contract.identity import SERVERS
 
-_LATER = ("ros1_bridge", "web_handler")
+_LATER = ("ros1_bridge",)
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
 
 
@@ -24,6 +26,8 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         reader.notes.doubt(
             ("transport", "mqtt_mirror"), f'only a Zenoh robot has a mirror and kind is "{kind}": leave it out'
         )
+    if root.robot.type == SERVERS:
+        reader.notes.problem(("robot", "type"), f'must not be "{SERVERS}": those are operators\' servers, not robots')
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
     return root
@@ -104,6 +108,34 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
     return tls
 
 
+def _web(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
+    """A mistake here must not keep the robot from starting: without a page it still drives."""
+    if not web.local and web.tls.certificate is None and not web.plain_http:
+        reader.notes.warning(
+            (*path, "host"),
+            f"other machines reach {web.host}, so the page starts only with a certificate and a user: run "
+            f"`pebble cert init` and `pebble web user add`, write web_interface.tls; or leave out host",
+        )
+    if web.mqtt_history.enabled:
+        reader.notes.warning((*path, "mqtt_history"), "is enabled, but recording arrives in a later release; skipped")
+    if not web.mqtt.host and web.mqtt != WebMqtt():
+        reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
+    if web.plain_http and web.tls.certificate is not None:
+        reader.notes.warning((*path, "plain_http"), "has no effect: there is a certificate, so the page is https")
+    return web
+
+
+def _web_tls(reader: Reader, tls: WebTls, path: Path) -> WebTls:
+    for key, other in (("certificate", "key"), ("key", "certificate")):
+        if getattr(tls, key) is not None and getattr(tls, other) is None:
+            reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")
+    for key in ("certificate", "key", "ca"):
+        file = getattr(tls, key)
+        if file is not None and not file.is_file():
+            reader.notes.warning((*path, key), f"there is no file {file}; run `pebble cert init`")
+    return tls
+
+
 def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     given = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
     if len(given) > 1:
@@ -155,4 +187,6 @@ CHECKS = _table(
     (SerialSafety, _safety),
     (Tls, _tls),
     (Mqtt, _mqtt),
+    (WebTls, _web_tls),
+    (WebInterface, _web),
 )

@@ -1,22 +1,10 @@
 """The config sections of services that later releases bring: typed and checked now, so that files stay valid."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from msgspec import Meta, field
+from msgspec import Meta
 
-from pebble.config.transport import Mqtt
-from pebble.config.types import (
-    EMPTY,
-    Count,
-    Interval,
-    LogLevel,
-    Port,
-    Qos,
-    Section,
-    ServiceSection,
-    Topic,
-    doc,
-)
+from pebble.config.types import Count, Interval, Qos, Section, ServiceSection, Topic, doc
 
 
 class RosSwitch(Section, frozen=True, kw_only=True):
@@ -120,37 +108,3 @@ class Ros1Bridge(ServiceSection, frozen=True, kw_only=True):
     motion: Annotated[RosMotion, doc("Speeds.")] = RosMotion()
     telemetry: Annotated[RosTelemetry, doc("Reports.")] = RosTelemetry()
     safety: Annotated[RosSafety, doc("When to stop.")] = RosSafety()
-
-
-class WebHandler(ServiceSection, frozen=True, kw_only=True):
-    """Runs the web page on the robot."""
-
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
-
-
-class MqttHistory(Section, frozen=True, kw_only=True):
-    """A record of all messages."""
-
-    enabled: Annotated[bool, doc("Keep one.")] = False
-    uri: Annotated[str, doc("MongoDB to keep it in.")] = "mongodb://127.0.0.1:27017"
-    database: Annotated[str, doc("Its database.")] = "pebble"
-    collection: Annotated[str, doc("Its collection.")] = "mqtt_history"
-    max_bytes: Annotated[int, Meta(ge=1, description="How large it may become.")] = 500 * 1024**3
-    subscribe_all_topics: Annotated[bool, doc("Record other systems' topics too.")] = True
-    prune_check_every_messages: Annotated[Count, doc("How often its size is checked.")] = 2000
-    prune_chunk_documents: Annotated[Count, doc("How many messages are deleted at once.")] = 50000
-    prune_target_ratio: Annotated[float, Meta(gt=0, le=1, description="How full it is after deleting.")] = 0.9
-
-
-class WebInterface(Section, frozen=True, kw_only=True):
-    """The operators' web page."""
-
-    log_level: Annotated[LogLevel, doc("Log level; the root's log_level unless set.")] = "INFO"
-    host: Annotated[str, doc("Address to listen on.")] = "0.0.0.0"  # noqa: S104 - the operators' page is for others
-    port: Annotated[Port, doc("TCP port to listen on.")] = 8080
-    mqtt: Annotated[Mqtt, doc("The broker that robots connect to.")] = Mqtt()
-    robots: Annotated[tuple[dict[str, Any], ...], doc("Hints about robots, in the original's format.")] = ()
-    robot_discovery: Annotated[dict[str, Any], doc("Read and ignored: robots are found by their messages.")] = field(
-        default_factory=dict
-    )
-    mqtt_history: Annotated[MqttHistory, doc("A record of all messages.")] = MqttHistory()

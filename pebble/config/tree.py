@@ -6,7 +6,7 @@ from msgspec import Meta, field
 
 from pebble.config.autonomy import AutonomyManager
 from pebble.config.media import AvDaemon, Media, VideoStream
-from pebble.config.planned import Ros1Bridge, WebHandler, WebInterface
+from pebble.config.planned import Ros1Bridge
 from pebble.config.soundboard import SoundboardHandler
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
@@ -23,6 +23,7 @@ from pebble.config.types import (
     Topic,
     doc,
 )
+from pebble.config.web import WebHandler, WebInterface
 from pebble.contract.serial_protocols import SerialProtocolName
 
 
@@ -276,7 +277,7 @@ class Services(Section, frozen=True, kw_only=True):
     video_stream: Annotated[VideoStream, doc("A streaming program of a third party.")] = VideoStream()
     soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()
     autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()
-    web_handler: Annotated[WebHandler, doc("Runs the web page.")] = WebHandler()
+    web_handler: Annotated[WebHandler, doc("Runs the operator page.")] = WebHandler()
 
 
 class Root(Section, frozen=True, kw_only=True):
@@ -292,4 +293,4 @@ class Root(Section, frozen=True, kw_only=True):
         kind="mqtt"
     )
     services: Annotated[Services, doc("One section per service.")] = Services()
-    web_interface: Annotated[WebInterface, doc("The operators' web page.")] = WebInterface()
+    web_interface: Annotated[WebInterface, doc("The operator page.")] = WebInterface()

@@ -171,8 +171,19 @@ class TestOriginal:
         assert all(line.partition("no longer used, ")[2] for line in gone)
 
     def test_services_of_later_releases_are_skipped_with_a_warning_each(self) -> None:
-        later = [line for line in load(ORIGINAL, env={}).warnings if "later release" in line]
-        assert [line.partition(":")[0] for line in later] == ["services.web_handler"]
+        enabled = {"services": {"ros1_bridge": {"enabled": True}}, "web_interface": {"mqtt_history": {"enabled": True}}}
+        later = [line for line in read({"robot": {"id": "goob"}} | enabled).warnings if "later release" in line]
+        assert sorted(line.partition(":")[0] for line in later) == [
+            "services.ros1_bridge",
+            "web_interface.mqtt_history",
+        ]
+
+    def test_its_page_for_other_machines_needs_a_certificate(self) -> None:
+        config = load(ORIGINAL, env={})
+        (warning,) = [line for line in config.warnings if line.startswith("web_interface")]
+        assert warning.startswith("web_interface.host: other machines reach 0.0.0.0, so the page starts only with a ")
+        assert "`pebble cert init`" in warning
+        assert (config.services.web_handler.enabled, config.web_interface.mqtt.host) == (True, "127.0.0.1")
 
     def test_a_soundboard_needs_a_player(self) -> None:
         """Else the sound itself would be run."""
@@ -588,6 +599,80 @@ class TestPasswords:
         shown = json.dumps(resolved(read(raw)))
         assert "mongodb://***@db.example/x" in shown
         assert all(secret not in shown for secret in ("correct", "t0k3n", "s3cret"))
+
+
+class TestWebInterface:
+    def test_it_is_for_this_machine_unless_the_config_says_otherwise(self) -> None:
+        web = read({"robot": {"id": "goob"}}).web_interface
+        assert (web.host, web.port, web.local, web.mqtt.host) == ("127.0.0.1", 8080, True, "")
+        assert (web.plain_http, web.plain_http_drive) == (False, False)
+
+    @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
+    def test_addresses_of_this_machine(self, host: str) -> None:
+        config = read(at("web_interface.host", host))
+        assert (config.web_interface.local, config.warnings) == (True, ())
+
+    @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "goob.local"])
+    def test_addresses_that_other_machines_reach(self, host: str) -> None:
+        config = read(at("web_interface.host", host))
+        assert not config.web_interface.local
+        (warning,) = config.warnings
+        assert warning.startswith(f"web_interface.host: other machines reach {host}, ")
+        assert read(at("web_interface", {"host": host, "plain_http": True})).warnings == ()
+
+    def test_a_certificate_and_its_key_are_relative_to_the_config(self, tmp_path: Path) -> None:
+        for name in ("server.pem", "server.key", "ca.pem"):
+            (tmp_path / name).write_text("x")
+        tls = {"certificate": "server.pem", "key": "server.key", "ca": "ca.pem"}
+        raw = at("web_interface", {"host": "0.0.0.0", "tls": tls, "people": "people.sqlite"})
+        config = load(written(tmp_path, json.dumps(raw)), env={})
+        assert config.warnings == ()
+        assert config.web_interface.tls.certificate == tmp_path / "server.pem"
+        assert config.web_interface.people == tmp_path / "people.sqlite"
+
+    def test_a_certificate_that_does_not_exist_yet_stops_the_page_and_not_the_robot(self) -> None:
+        config = read(at("web_interface.tls", {"certificate": "server.pem", "key": "server.key"}))
+        assert [line.partition("; ")[0] for line in config.warnings] == [
+            "web_interface.tls.certificate: there is no file /nowhere/server.pem",
+            "web_interface.tls.key: there is no file /nowhere/server.key",
+        ]
+
+    @pytest.mark.parametrize(
+        ("keys", "expected"),
+        [
+            ({"tls": {"certificate": "a"}}, "tls.key: is missing, it belongs to certificate"),
+            ({"tls": {"key": "a"}}, "tls.certificate: is missing, it belongs to key"),
+            ({"host": "http://x/"}, "host: must be a host name or address"),
+            ({"names": ["fair.local", "a b"]}, "names[1]: must be a host name or address"),
+            ({"server": "a/b"}, "server: must be a topic level"),
+            ({"port": 0}, "port: must be a whole number from 1 to 65535"),
+        ],
+    )
+    def test_mistakes_name_the_key(self, keys: dict[str, Any], expected: str) -> None:
+        assert only_problem(at("web_interface", keys)).startswith(f"web_interface.{expected}")
+
+    @pytest.mark.parametrize(
+        ("keys", "expected"),
+        [
+            ({"mqtt": {"port": 8883}}, "mqtt: not used: it has no host"),
+            ({"mqtt_history": {"enabled": True}}, "mqtt_history: is enabled, but recording arrives in a later release"),
+        ],
+    )
+    def test_keys_without_an_effect_are_reported(self, keys: dict[str, Any], expected: str) -> None:
+        (warning,) = read(at("web_interface", keys)).warnings
+        assert warning.startswith(f"web_interface.{expected}")
+
+    def test_plain_http_beside_a_certificate_has_no_effect(self, tmp_path: Path) -> None:
+        (tmp_path / "a").write_text("x")
+        (warning,) = read(
+            at("web_interface", {"plain_http": True, "tls": {"certificate": "a", "key": "a"}}), folder=tmp_path
+        ).warnings
+        assert warning.startswith("web_interface.plain_http: has no effect")
+
+    def test_no_robot_may_pass_for_a_server(self) -> None:
+        assert only_problem(at("robot", {"id": "goob", "type": "servers"})).startswith(
+            'robot.type: must not be "servers"'
+        )
 
 
 class TestTls:

@@ -1,0 +1,92 @@
+"""The config sections of the operator page: where it listens, who may use it, and the robot's service that runs it."""
+
+import ipaddress
+from typing import Annotated, Any
+
+from msgspec import Meta, field
+
+from pebble.config.transport import Mqtt
+from pebble.config.types import EMPTY, Count, File, Level, LogLevel, Port, Section, ServiceSection, doc
+
+HostName = Annotated[
+    str,
+    Meta(pattern=r"^[A-Za-z0-9.:_-]{1,253}$(?!\n)", extra={"expected": 'a host name or address, such as "fair.local"'}),
+]
+
+
+class WebHandler(ServiceSection, frozen=True, kw_only=True):
+    """Runs the operator page on the robot; `web_interface` sets it up. It needs `pip install 'pebble-robot[web]'`."""
+
+    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+
+
+class WebMqtt(Mqtt, frozen=True, kw_only=True):
+    """The broker that robots connect to."""
+
+    host: Annotated[
+        str, doc("Name or address of the broker; unset: the robot's own, services.mqtt_bridge.remote_mqtt.")
+    ] = ""
+
+
+class WebTls(Section, frozen=True, kw_only=True):
+    """The certificate that the page shows to browsers; `pebble cert init` makes one."""
+
+    certificate: Annotated[File | None, doc("Certificate of the server; with it the page is https.")] = None
+    key: Annotated[File | None, doc("Private key of certificate.")] = None
+    ca: Annotated[File | None, doc("Authority of certificate, offered at `/ca.pem` so that phones can trust it.")] = (
+        None
+    )
+
+
+class MqttHistory(Section, frozen=True, kw_only=True):
+    """A record of all messages, which a later release brings."""
+
+    enabled: Annotated[bool, doc("Keep one.")] = False
+    uri: Annotated[str, doc("MongoDB to keep it in.")] = "mongodb://127.0.0.1:27017"
+    database: Annotated[str, doc("Its database.")] = "pebble"
+    collection: Annotated[str, doc("Its collection.")] = "mqtt_history"
+    max_bytes: Annotated[int, Meta(ge=1, description="How large it may become.")] = 500 * 1024**3
+    subscribe_all_topics: Annotated[bool, doc("Record other systems' topics too.")] = True
+    prune_check_every_messages: Annotated[Count, doc("How often its size is checked.")] = 2000
+    prune_chunk_documents: Annotated[Count, doc("How many messages are deleted at once.")] = 50000
+    prune_target_ratio: Annotated[float, Meta(gt=0, le=1, description="How full it is after deleting.")] = 0.9
+
+
+class WebInterface(Section, frozen=True, kw_only=True):
+    """The operator page, of `pebble web CONFIG` and of `services.web_handler`."""
+
+    log_level: Annotated[LogLevel, doc("Log level of `pebble web`; the root's log_level unless set.")] = "INFO"
+    host: Annotated[
+        HostName,
+        doc("Address to listen on; one that other machines reach needs tls and a user (`pebble web user add`)."),
+    ] = "127.0.0.1"
+    port: Annotated[Port, doc("TCP port to listen on.")] = 8080
+    names: Annotated[tuple[HostName, ...], doc("Further host names and addresses that browsers may use for it.")] = ()
+    server: Annotated[Level | None, doc("What it is called on pages and for other servers; unset: this machine.")] = (
+        None
+    )
+    tls: Annotated[WebTls, doc("The page's certificate.")] = WebTls()
+    people: Annotated[File | None, doc("Database of users and sessions; unset: in the robot's state directory.")] = None
+    plain_http: Annotated[
+        bool, doc("Serve other machines without encryption: everybody on the network can read passwords and pictures.")
+    ] = False
+    plain_http_drive: Annotated[bool, doc("Allow driving from there, too.")] = False
+    mqtt: Annotated[WebMqtt, doc("The broker that robots connect to.")] = WebMqtt()
+    robots: Annotated[tuple[dict[str, Any], ...], doc("Hints about robots, in the original's format.")] = ()
+    robot_discovery: Annotated[dict[str, Any], doc("Read and ignored: robots are found by their messages.")] = field(
+        default_factory=dict
+    )
+    mqtt_history: Annotated[MqttHistory, doc("A record of all messages.")] = MqttHistory()
+
+    @property
+    def local(self) -> bool:
+        """Whether only this machine can reach it."""
+        return is_loopback(self.host)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether ``host`` is an address of this machine that no other one reaches."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"

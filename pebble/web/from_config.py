@@ -1,0 +1,66 @@
+"""The settings of an operator page from a robot's config, for ``pebble web CONFIG`` and for the robot's own service."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pebble.config import Config, Mqtt
+from pebble.errors import ConfigError
+from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
+from pebble.web.settings import WebSettings
+
+PEOPLE = "people.sqlite"  # in the state directory
+
+
+def settings_of(config: Config) -> WebSettings:
+    """How ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
+
+    Whether there is a user, who is needed where ``login`` is true, is in the database ``people``, not in the config.
+    """
+    web = config.web_interface
+    if not web.local and web.tls.certificate is None and not web.plain_http:
+        raise ConfigError(
+            f"web_interface.host: other machines reach {web.host}, which needs a certificate and a user: run "
+            f"`pebble cert init` and `pebble web user add`, and write web_interface.tls; or write 127.0.0.1"
+        )
+    for key in ("certificate", "key", "ca"):
+        _check(f"web_interface.tls.{key}", getattr(web.tls, key))
+    return WebSettings(
+        broker=mqtt_settings(_broker(config), reconnect_max_s=REMOTE_RECONNECT_S),
+        host=web.host,
+        port=web.port,
+        names=web.names,
+        server=web.server or "",
+        login=not web.local or web.tls.certificate is not None,
+        people=web.people or config.state_dir() / PEOPLE,
+        certificate=web.tls.certificate,
+        key=web.tls.key,
+        authority=web.tls.ca,
+        plain_http_drive=web.plain_http_drive,
+    )
+
+
+def _broker(config: Config) -> Mqtt:
+    """The broker of ``web_interface.mqtt``, else the one that the robot's bridge connects to."""
+    bridge = config.services.mqtt_bridge
+    if config.web_interface.mqtt.host:
+        return config.web_interface.mqtt
+    if bridge.remote is not None and bridge.remote.kind != "mqtt":
+        raise ConfigError(
+            f'web_interface.mqtt.host: is missing, and the robot\'s own connection is "{bridge.remote.kind}"; '
+            "the page needs MQTT: write the name of a broker that robots connect to"
+        )
+    if not bridge.remote_mqtt.host:
+        raise ConfigError(
+            "web_interface.mqtt.host: is missing, and so is services.mqtt_bridge.remote_mqtt.host: "
+            "write the name of the broker that robots connect to"
+        )
+    return bridge.remote_mqtt
+
+
+def _check(key: str, file: Path | None) -> None:
+    try:
+        if file is not None:
+            file.open("rb").close()
+    except OSError as error:
+        raise ConfigError(f"{key}: {file} cannot be read: {error.strerror}; `pebble cert init` makes one") from None
