@@ -16,7 +16,7 @@ from typing import Any
 
 from pebble.errors import PebbleError
 from pebble.fleet.database import open_database
-from pebble.fleet.roles import Role
+from pebble.fleet.roles import Role, Session
 from pebble.fleet.tries import Tries, network_of
 
 NAME = re.compile(r"[a-z0-9_-]{1,32}")
@@ -52,19 +52,6 @@ class User:
 
     name: str
     role: Role
-
-
-@dataclass(frozen=True, slots=True)
-class Session:
-    """One login. ``id`` names it in the audit log; it cannot be used to log in."""
-
-    id: str
-    user: str
-    role: Role
-
-
-#: What a browser on the same machine gets where there is no login.
-LOCAL = Session("local", "local", Role.ADMIN)
 
 
 class People:

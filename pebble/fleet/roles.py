@@ -1,7 +1,8 @@
-"""What a person may do: roles, and the rights of each. Every role may stop a robot."""
+"""What a person may do: roles, the rights of each, and sessions. Every role may stop a robot."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -28,3 +29,16 @@ _RIGHTS: dict[Role, frozenset[str]] = {
 def rights(role: Role) -> frozenset[str]:
     """Those of ``drive``, ``reset``, ``system`` (restart, reboot, update) and ``people`` that the role has."""
     return _RIGHTS[role]
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One login. ``id`` names it in the audit log; it cannot be used to log in."""
+
+    id: str
+    user: str
+    role: Role
+
+
+#: What a browser on the same machine gets where there is no login.
+LOCAL = Session("local", "local", Role.ADMIN)

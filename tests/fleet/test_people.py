@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import PebbleError
-from pebble.fleet.people import LOCAL, SESSION_S, People, PeopleError, TooManyTriesError, User
-from pebble.fleet.roles import Role, rights
+from pebble.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User
+from pebble.fleet.roles import LOCAL, Role, rights
 from pebble.fleet.tries import TRIES, WINDOW_S, network_of
 
 PASSWORD = "correct horse"
