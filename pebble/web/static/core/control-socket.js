@@ -1,0 +1,133 @@
+/** The control socket: commands to the server, state from it; made anew whenever it is lost. */
+
+import { PING_TIMEOUT_MS } from "./reasons.js";
+
+const FIRST_DELAY_MS = 250;
+const LONGEST_DELAY_MS = 4000;
+const CHECK_MS = 250;
+const TOKEN = "pebble-token"; // restores the driver lease after a reload
+
+/** @typedef {{store: any, version: string, can: string[], onOpen?: () => void, onLost?: () => void,
+ *   onRefused?: (message: any) => void, onLogs?: (message: any) => void, onBye?: (message: any) => void,
+ *   onChange?: () => void}} Options */
+
+export class ControlSocket {
+  /** @param {Options} options */
+  constructor(options) {
+    this.options = options;
+    /** @type {"connecting"|"open"|"lost"} */
+    this.state = "connecting";
+    /** @type {any} */
+    this.you = null; // the server's welcome
+    this.roundTripMs = -1;
+    this.lostAt = 0; // Date.now()
+    this.attempts = 0;
+    this.again = true;
+    /** @type {WebSocket|null} */
+    this.socket = null;
+    this.heardAt = 0;
+    setInterval(() => this.check(), CHECK_MS);
+  }
+
+  connect() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/ws/control`);
+    this.socket = socket;
+    this.heardAt = performance.now();
+    socket.onopen = () => this.hello(socket);
+    socket.onmessage = (event) => socket === this.socket && this.receive(JSON.parse(event.data));
+    socket.onclose = (event) => socket === this.socket && this.lost(event.code);
+  }
+
+  /** @param {Record<string, any>} op @returns {boolean} whether it was sent */
+  send(op) {
+    if (this.state !== "open" || this.socket?.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(op));
+    return true;
+  }
+
+  /** Give the connection up, and make a new one: its clock is not to be trusted any more. */
+  restart() {
+    const socket = this.socket;
+    this.socket = null;
+    socket?.close();
+    this.lost(0);
+  }
+
+  hello(socket) {
+    const token = sessionStorage.getItem(TOKEN) ?? "";
+    const { version, can } = this.options;
+    socket.send(JSON.stringify({ op: "hello", version, device: device(), token, can }));
+  }
+
+  receive(message) {
+    this.heardAt = performance.now();
+    switch (message.op) {
+      case "ping":
+        this.socket?.send(JSON.stringify({ op: "echo", n: message.n, t: performance.now() }));
+        this.roundTripMs = message.round_trip_ms;
+        this.options.store.clock(message.now, Math.max(0, message.round_trip_ms));
+        return this.options.onChange?.();
+      case "state":
+        return this.take(message);
+      case "welcome":
+        return this.welcome(message);
+      case "refused":
+        return this.options.onRefused?.(message);
+      case "logs":
+        return this.options.onLogs?.(message);
+      case "bye":
+        this.again = message.again;
+        return this.options.onBye?.(message);
+    }
+  }
+
+  welcome(message) {
+    sessionStorage.setItem(TOKEN, message.token);
+    this.you = message;
+    this.attempts = 0;
+    this.state = "open";
+    this.options.store.clock(message.now, 0);
+    this.options.onOpen?.();
+    this.options.onChange?.();
+  }
+
+  take(message) {
+    for (const ref of message.gone ?? []) this.options.store.remove(ref);
+    for (const [ref, metric, value, age] of message.set) this.options.store.set(ref, metric, value, age);
+  }
+
+  check() {
+    if (this.socket && performance.now() - this.heardAt > PING_TIMEOUT_MS) this.restart();
+  }
+
+  lost(code) {
+    this.socket = null;
+    if (this.state === "open" || !this.lostAt) this.lostAt = Date.now();
+    if (this.state === "open") this.options.onLost?.();
+    this.state = "lost";
+    this.roundTripMs = -1;
+    this.options.onChange?.();
+    if (!this.again) return;
+    if (code === 4401 || code === 1006) askForLogin();
+    const delay = Math.min(LONGEST_DELAY_MS, FIRST_DELAY_MS * 2 ** this.attempts) * (0.75 + Math.random() / 2);
+    this.attempts += 1;
+    setTimeout(() => this.connect(), delay);
+  }
+}
+
+/** A refused handshake looks like a lost connection: only a request tells whether the session has ended. */
+async function askForLogin() {
+  try {
+    const answer = await fetch("/", { redirect: "manual", cache: "no-store" });
+    if (answer.type === "opaqueredirect") location.assign("/login");
+  } catch {
+    // there is no server at the moment
+  }
+}
+
+function device() {
+  const phone = matchMedia("(pointer: coarse)").matches;
+  const system = /Android|iPhone|iPad|Windows|Mac|Linux/.exec(navigator.userAgent)?.[0] ?? "";
+  return phone ? `phone ${system}`.trim() : system || "browser";
+}

@@ -1,0 +1,236 @@
+/** Ties inputs, gesture and control socket together: from events of the browser to drive commands. */
+
+import { Gesture, PERIOD_MS } from "./gesture.js";
+import { DRIVE_KEYS, Inputs } from "./inputs.js";
+import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
+
+const SUSPENDED_MS = 500; // between the wall clock and the page's own
+const TWICE_MS = 600; // Escape, pressed twice
+const TYPING = "input:not([type=range]):not([type=checkbox]):not([type=radio]), select, textarea, [contenteditable]";
+const PAD_STOP = 0;
+const PAD_ESTOP = [8, 9];
+
+export class Driver {
+  /** @param {{socket: any, store: any, estop: any, reload: () => boolean}} parts */
+  constructor({ socket, store, estop, reload }) {
+    this.socket = socket;
+    this.store = store;
+    this.estop = estop;
+    this.reload = reload;
+    this.ref = "";
+    this.inputs = new Inputs();
+    this.gesture = new Gesture((command) => this.socket.send({ op: "drive", ref: this.ref, ...command }));
+    this.sliders = { speed: 0.6, turn: 0.6, balance: 0 };
+    this.inSight = false; // the driver sees the robot itself
+    /** @type {() => number|null} the age of the picture in ms; null: none is wanted on this page */
+    this.pictureAge = () => null;
+    this.padName = "";
+    this.output = { x: 0, z: 0, y: 0 };
+    this.escapeAt = -Infinity;
+    this.padStopped = false;
+    this.clockBase = Date.now() - performance.now();
+    /** @type {Set<() => void>} */
+    this.watchers = new Set();
+    this.shown = "";
+  }
+
+  /** Listen to the window; to be called once. */
+  start() {
+    addEventListener("keydown", (event) => this.keyDown(event), true);
+    addEventListener("keyup", (event) => this.inputs.keyUp(event.code) && this.update(), true);
+    for (const name of ["blur", "pagehide", "freeze"]) addEventListener(name, () => this.interrupt());
+    document.addEventListener("freeze", () => this.interrupt());
+    document.addEventListener("visibilitychange", () => document.hidden && this.interrupt());
+    document.addEventListener("contextmenu", () => this.interrupt());
+    screen.orientation?.addEventListener?.("change", () => this.interrupt());
+    addEventListener("gamepaddisconnected", () => this.inputs.padGone());
+    setInterval(() => this.tick(), PERIOD_MS);
+  }
+
+  /** @param {string} ref the component to drive; "" none */
+  select(ref) {
+    if (ref === this.ref) return;
+    this.interrupt();
+    this.gesture.repeats = []; // they would be sent to the other one
+    this.ref = ref;
+    this.inSight = false;
+    this.socket.send({ op: "watch", ref });
+    this.changed();
+  }
+
+  /** The connection was made anew. */
+  opened() {
+    this.gesture.reset();
+    if (this.ref) this.socket.send({ op: "watch", ref: this.ref });
+  }
+
+  /** What was under way is over. */
+  lost() {
+    this.inputs.clear();
+    this.gesture.reset();
+    this.changed();
+  }
+
+  /** @param {{cmd: string, ref: string, g: number}} message */
+  refused(message) {
+    if (message.cmd === "drive" && message.ref === this.ref) this.gesture.refused(message.g);
+    this.changed();
+  }
+
+  /** @returns {import("./reasons.js").Reason|null} why this component cannot be driven now */
+  reason() {
+    return this.ref ? driveReason(this.situation()) : { code: "none", text: "No robot is chosen" };
+  }
+
+  situation() {
+    const value = (metric) => this.store.get(this.ref, metric)?.value;
+    const broker = this.store.get("", "web/broker")?.value;
+    return {
+      name: this.ref.split("/").pop() ?? "",
+      open: this.socket.state === "open",
+      broker: broker && !broker.connected ? broker.problem : "",
+      reload: this.reload(),
+      drives: this.socket.you?.drives !== false,
+      rights: this.socket.you?.rights ?? [],
+      hidden: document.hidden,
+      focus: document.hasFocus(),
+      fromKeys: this.inputs.fromKeys,
+      liveness: value("web/liveness"),
+      estop: value("web/estop"),
+      capabilities: value("capabilities")?.value ?? {},
+      driver: value("web/driver"),
+      script: value("autonomy-status"),
+      pictureAgeMs: this.pictureAge(),
+      inSight: this.inSight,
+      roundTripMs: this.socket.roundTripMs,
+      padFrozen: this.inputs.padFrozen,
+      mustRelease: this.gesture.mustRelease,
+    };
+  }
+
+  take(over = false) {
+    this.interrupt();
+    this.socket.send({ op: "lease", ref: this.ref, take: true, over });
+  }
+
+  release() {
+    this.interrupt();
+    this.socket.send({ op: "lease", ref: this.ref, take: false });
+  }
+
+  /** The space bar: stops the robot, whoever drives it. */
+  space() {
+    this.interrupt();
+    this.socket.send({ op: "stop", ref: this.ref });
+  }
+
+  /** End the gesture; what is held counts again after it was released. */
+  interrupt() {
+    this.inputs.clear();
+    this.gesture.interrupt(performance.now());
+    this.output = { x: 0, z: 0, y: 0 };
+    this.changed();
+  }
+
+  stickStart(pointer) {
+    return this.inputs.stickStart(pointer);
+  }
+
+  stick(x, z) {
+    this.inputs.stickMove(x, z);
+    this.update();
+  }
+
+  stickEnd() {
+    this.inputs.stickEnd();
+    this.update();
+  }
+
+  /** A button for the auxiliary axis. @param {string} name @param {number} value 0: released */
+  hold(name, value) {
+    this.inputs.hold(name, value);
+    this.update();
+  }
+
+  get gestureActive() {
+    return this.gesture.active;
+  }
+
+  /** @param {() => void} watcher @returns {() => void} */
+  onChange(watcher) {
+    this.watchers.add(watcher);
+    return () => this.watchers.delete(watcher);
+  }
+
+  keyDown(event) {
+    if (event.code === "Escape" && !event.repeat) {
+      if (performance.now() - this.escapeAt < TWICE_MS) this.latch("Escape twice");
+      this.escapeAt = performance.now();
+    }
+    if (event.code === "Space" && event.ctrlKey) {
+      event.preventDefault();
+      if (!event.repeat) this.latch("Ctrl+Space");
+      return;
+    }
+    if (event.ctrlKey || event.altKey || event.metaKey || event.target.matches?.(TYPING)) return;
+    if (event.code === "Space") {
+      if (!event.target.matches?.("button, [role=button], summary, a")) event.preventDefault();
+      this.space();
+    } else if (DRIVE_KEYS.has(event.code) && this.ref && !event.target.matches?.("input[type=range], [role=radio]")) {
+      event.preventDefault();
+      if (document.querySelector("dialog[open]")) return;
+      this.inputs.keyDown(event.code, event.repeat);
+      this.update();
+    }
+  }
+
+  latch(why) {
+    this.interrupt();
+    this.estop.press(this.ref, why); // without an open component: all
+  }
+
+  tick() {
+    const drift = Date.now() - performance.now() - this.clockBase;
+    if (Math.abs(drift) > SUSPENDED_MS) {
+      this.clockBase += drift; // this machine was suspended, or its clock was set
+      this.interrupt();
+      this.socket.restart();
+    }
+    this.readPad();
+    this.update();
+  }
+
+  readPad() {
+    const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad !== null && pad.connected !== false);
+    const pad = pads.find((one) => /attack 3/i.test(one.id)) ?? pads[0] ?? null;
+    this.padName = pad?.id ?? "";
+    this.inputs.padSample(document.hasFocus() ? pad : null, performance.now());
+    const pressed = (index) => pad?.buttons[index]?.pressed === true;
+    if (pad && document.hasFocus() && PAD_ESTOP.every(pressed)) {
+      if (!this.padStopped) this.latch("gamepad");
+      this.padStopped = true;
+    } else if (pad && pressed(PAD_STOP)) {
+      if (!this.padStopped) this.space();
+      this.padStopped = true;
+    } else this.padStopped = false;
+  }
+
+  update() {
+    const situation = this.ref ? this.situation() : null;
+    const why = situation && driveReason({ ...situation, mustRelease: false });
+    const slow = this.socket.roundTripMs >= SLOW_MS ? SLOW_SPEED : 1;
+    const vector = this.inputs.vector({ ...this.sliders, speed: Math.min(this.sliders.speed, slow) });
+    this.gesture.update(vector, situation !== null && why === null, performance.now());
+    this.output = this.gesture.active ? vector : { x: 0, z: 0, y: 0 };
+    this.changed();
+  }
+
+  /** Notify watchers, if what they show is another than before. */
+  changed() {
+    const { x, z, y } = this.output;
+    const shown = JSON.stringify([this.ref, this.reason(), x, z, y, this.padName, this.sliders, this.inSight]);
+    if (shown === this.shown) return;
+    this.shown = shown;
+    for (const watcher of this.watchers) watcher();
+  }
+}

@@ -1,0 +1,144 @@
+/** What keys, stick, buttons and gamepad ask for, as one vector. Pure: events are passed in by driver.js. */
+
+const LEFT = ["KeyA", "ArrowLeft"];
+const RIGHT = ["KeyD", "ArrowRight"];
+const FORWARD = ["KeyW", "ArrowUp"];
+const BACK = ["KeyS", "ArrowDown"];
+const UP = ["KeyQ"];
+const DOWN = ["KeyE"];
+export const DRIVE_KEYS = new Set([...LEFT, ...RIGHT, ...FORWARD, ...BACK, ...UP, ...DOWN]);
+
+const DEAD_ZONE = 0.1;
+const FROZEN_MS = 3000; // a deflected gamepad whose time stands still may be gone
+const AUXILIARY_BUTTON = 1; // while held, the horizontal axis is the auxiliary one
+
+/** @typedef {{speed: number, turn: number, balance: number}} Sliders speed and turn 0..1, balance -1..1 */
+/** @typedef {{id: string, axes: readonly number[], buttons: readonly {pressed: boolean}[], timestamp: number}} Pad */
+
+export class Inputs {
+  constructor() {
+    /** @type {Set<string>} */
+    this.keys = new Set();
+    /** @type {Map<string, number>} value of each button that is held on the page, by name */
+    this.held = new Map();
+    this.stick = { x: 0, z: 0 };
+    /** @type {number|null} */
+    this.pointer = null; // that moves the stick
+    this.pad = { x: 0, z: 0, y: 0 };
+    this.padArmed = false; // it was seen in neutral since it appeared
+    this.padFrozen = false;
+    this.padStamp = -1;
+    this.padMovedAt = 0;
+  }
+
+  /** @param {string} code @param {boolean} repeat @returns {boolean} whether the key drives */
+  keyDown(code, repeat) {
+    if (!DRIVE_KEYS.has(code)) return false;
+    if (!repeat) this.keys.add(code); // a repetition is of a key that was held before, perhaps in another window
+    return true;
+  }
+
+  /** @param {string} code */
+  keyUp(code) {
+    return this.keys.delete(code);
+  }
+
+  /** @param {number} pointer @returns {boolean} whether the stick is free for it */
+  stickStart(pointer) {
+    if (this.pointer !== null) return false;
+    this.pointer = pointer;
+    return true;
+  }
+
+  /** @param {number} x @param {number} z each -1..1 */
+  stickMove(x, z) {
+    const length = Math.hypot(x, z);
+    const scale = length > 1 ? 1 / length : 1;
+    this.stick = { x: zone(x * scale), z: zone(z * scale) };
+  }
+
+  stickEnd() {
+    this.pointer = null;
+    this.stick = { x: 0, z: 0 };
+  }
+
+  /** A button of the page that moves an axis while it is held. @param {string} name @param {number} value 0: released */
+  hold(name, value) {
+    if (value) this.held.set(name, value);
+    else this.held.delete(name);
+  }
+
+  /**
+   * What the gamepad shows now; null: there is none.
+   * @param {Pad|null} pad @param {number} now milliseconds
+   */
+  padSample(pad, now) {
+    if (pad === null) return this.padGone();
+    const across = zone(pad.axes[0] ?? 0);
+    const auxiliary = pad.buttons[AUXILIARY_BUTTON]?.pressed === true;
+    const sample = { x: auxiliary ? 0 : across, z: -zone(pad.axes[1] ?? 0), y: auxiliary ? across : 0 };
+    const neutral = sample.x === 0 && sample.z === 0 && sample.y === 0;
+    if (pad.timestamp !== this.padStamp || neutral) {
+      this.padStamp = pad.timestamp;
+      this.padMovedAt = now;
+      this.padFrozen = false;
+    } else if (now - this.padMovedAt > FROZEN_MS) {
+      this.padFrozen = true;
+      this.padArmed = false;
+    }
+    if (neutral) this.padArmed = true;
+    this.pad = this.padArmed ? { x: sample.x + 0, z: sample.z + 0, y: sample.y + 0 } : { x: 0, z: 0, y: 0 };
+  }
+
+  padGone() {
+    this.pad = { x: 0, z: 0, y: 0 };
+    this.padArmed = this.padFrozen = false;
+  }
+
+  /** Forget what is held: it counts again after it was released. */
+  clear() {
+    this.keys.clear();
+    this.held.clear();
+    this.stickEnd();
+    this.pad = { x: 0, z: 0, y: 0 };
+    this.padArmed = false;
+  }
+
+  /** Whether a key, or the gamepad, asks for motion: these need the focus of the window. */
+  get fromKeys() {
+    return this.keys.size > 0 || this.pad.x !== 0 || this.pad.z !== 0 || this.pad.y !== 0;
+  }
+
+  /**
+   * The wanted motion: steering x and throttle z as the original page mixes them, and the auxiliary axis y.
+   * @param {Sliders} sliders
+   */
+  vector(sliders) {
+    const x = limit(this.axis(RIGHT, LEFT) + this.stick.x + this.pad.x) * sliders.turn;
+    const z = limit(this.axis(FORWARD, BACK) + this.stick.z + this.pad.z) * sliders.speed;
+    let y = this.axis(UP, DOWN) + this.pad.y;
+    for (const value of this.held.values()) y += value;
+    return { ...balanced(x, z, sliders.balance), y: limit(y) * sliders.speed };
+  }
+
+  axis(plus, minus) {
+    return Number(plus.some((code) => this.keys.has(code))) - Number(minus.some((code) => this.keys.has(code)));
+  }
+}
+
+/** Scale left and right wheels apart, for robots that pull to one side. */
+export function balanced(x, z, balance) {
+  const left = (z + x) * Math.min(1, 1 + balance);
+  const right = (z - x) * Math.min(1, 1 - balance);
+  const most = Math.max(1, Math.abs(left), Math.abs(right));
+  return { x: (left - right) / 2 / most, z: (left + right) / 2 / most };
+}
+
+function zone(value) {
+  const size = Math.abs(value);
+  return !(size > DEAD_ZONE) ? 0 : Math.sign(value) * Math.min(1, (size - DEAD_ZONE) / (1 - DEAD_ZONE));
+}
+
+function limit(value) {
+  return Math.max(-1, Math.min(1, value));
+}

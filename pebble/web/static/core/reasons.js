@@ -1,0 +1,95 @@
+/** Why a control is off, in one line for people; the first reason counts. Pure. */
+
+export const PING_TIMEOUT_MS = 1500;
+const PICTURE_OLD_MS = 2000;
+export const SLOW_MS = 300; // from this round trip on, the speed is limited
+const LATE_MS = 600;
+export const SLOW_SPEED = 0.4;
+
+/** @typedef {{code: string, text: string, action?: {label: string, kind: "take"|"take-over"|"see"|"login"|"reload"}}} Reason */
+
+/**
+ * @typedef {object} Situation
+ * @property {string} name of the component
+ * @property {boolean} open whether the control socket is
+ * @property {string} broker why the server cannot reach the broker; "" it can
+ * @property {boolean} reload the page is older than the server
+ * @property {boolean} drives false: not over this connection
+ * @property {readonly string[]} rights
+ * @property {boolean} hidden
+ * @property {boolean} focus
+ * @property {boolean} fromKeys whether a key or the gamepad is used
+ * @property {{online: boolean|null, silent_s: number|null}|undefined} liveness
+ * @property {{latched: boolean, by: string}|undefined} estop
+ * @property {Record<string, any>} capabilities
+ * @property {{by: string, device: string, server: string, you: boolean}|undefined} driver
+ * @property {{running?: boolean, file?: string}|undefined} script
+ * @property {number|null} pictureAgeMs null: no picture is wanted here
+ * @property {boolean} inSight the driver sees the robot itself
+ * @property {number} roundTripMs
+ * @property {boolean} padFrozen
+ * @property {boolean} mustRelease
+ */
+
+/** Why nothing may be commanded at all. @param {Situation} s @returns {Reason|null} */
+export function offReason(s) {
+  if (!s.open) return reason("server", "No connection to the server");
+  if (s.broker) return reason("broker", `The server cannot reach the broker: ${s.broker}`);
+  return null;
+}
+
+/** Why this component cannot be driven now. @param {Situation} s @returns {Reason|null} */
+export function driveReason(s) {
+  return offReason(s) ?? pageReason(s) ?? robotReason(s) ?? leaseReason(s) ?? momentReason(s);
+}
+
+function pageReason(s) {
+  if (s.reload) return reason("reload", "This page is older than the server", { label: "Reload", kind: "reload" });
+  if (!s.drives) return reason("plain", "Driving needs https: this connection is not encrypted");
+  if (!s.rights.includes("drive")) return reason("role", "Log in as driver to drive", { label: "Log in", kind: "login" });
+  if (s.hidden) return reason("hidden", "This page is in the background");
+  return null;
+}
+
+function robotReason(s) {
+  if (!s.liveness || s.liveness.online === false) return reason("silent", silence(s));
+  if (s.estop?.latched) return reason("stopped", `Stopped by ${s.estop.by || "unknown"}`);
+  const drive = s.capabilities.drive;
+  if (drive?.available !== true || drive.controls === false) return reason("no-drive", `${s.name} does not drive`);
+  return null;
+}
+
+function silence(s) {
+  const since = s.liveness?.silent_s;
+  return since === null || since === undefined ? `${s.name} is offline` : `${s.name} is silent for ${Math.round(since)} s`;
+}
+
+function leaseReason(s) {
+  if (s.driver?.you) return null;
+  if (!s.driver?.by) return reason("free", "Take control to drive", { label: "Take control", kind: "take" });
+  const where = [s.driver.device, s.driver.server].filter(Boolean).join(", ");
+  const text = `${s.driver.by}${where ? ` (${where})` : ""} is driving`;
+  return reason("lease", text, { label: `Take over from ${s.driver.by}`, kind: "take-over" });
+}
+
+function momentReason(s) {
+  if (s.script?.running && s.capabilities.drive?.arbitrates !== true)
+    return reason("script", `${s.script.file || "A script"} is driving: stop it first`);
+  if (s.pictureAgeMs !== null && s.pictureAgeMs > PICTURE_OLD_MS && !s.inSight) return reason("picture", oldPicture(s), SEE);
+  if (s.roundTripMs >= LATE_MS) return reason("late", `Commands are late (${Math.round(s.roundTripMs)} ms)`);
+  if (s.padFrozen) return reason("pad", "The gamepad stands still: move its stick to neutral and back");
+  if (s.fromKeys && !s.focus) return reason("focus", "Click this page first: keys go to another window");
+  if (s.mustRelease) return reason("release", "Let go first");
+  return null;
+}
+
+const SEE = { label: "I can see the robot", kind: "see" };
+
+function oldPicture(s) {
+  if (!Number.isFinite(s.pictureAgeMs)) return "There is no picture yet";
+  return `The picture is ${(s.pictureAgeMs / 1000).toFixed(1)} s old`;
+}
+
+function reason(code, text, action) {
+  return action ? { code, text, action } : { code, text };
+}
