@@ -66,7 +66,7 @@ export class ControlSocket {
       case "ping":
         this.socket?.send(JSON.stringify({ op: "echo", n: message.n, t: performance.now() }));
         this.roundTripMs = message.round_trip_ms;
-        this.options.store.clock(message.now, Math.max(0, message.round_trip_ms));
+        this.options.store.sync(message.now, message.round_trip_ms);
         return this.options.onChange?.();
       case "state":
         return this.take(message);
@@ -87,7 +87,8 @@ export class ControlSocket {
     this.you = message;
     this.attempts = 0;
     this.state = "open";
-    this.options.store.clock(message.now, 0);
+    this.options.store.clear(); // the server sends all that there is
+    this.options.store.sync(message.now);
     this.options.onOpen?.();
     this.options.onChange?.();
   }

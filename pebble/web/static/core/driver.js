@@ -136,8 +136,9 @@ export class Driver {
     return this.inputs.stickStart(pointer);
   }
 
+  /** @param {number} x @param {number} z each -1..1; ignored after the gesture was interrupted */
   stick(x, z) {
-    this.inputs.stickMove(x, z);
+    if (this.inputs.pointer !== null) this.inputs.stickMove(x, z);
     this.update();
   }
 
