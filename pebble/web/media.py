@@ -1,0 +1,151 @@
+"""Robots' pictures for pages: one request per robot, however many pages show it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import struct
+import time
+from typing import Final
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from pebble.contract.identity import Direction
+from pebble.web.broker import Broker
+from pebble.web.encoding_choice import BEST_FIRST
+from pebble.web.messages import PictureView
+from pebble.web.picture_stream import PageViewer, PictureStream, rest
+from pebble.web.rescue import RescuedPicture, newest_jpeg
+from pebble.web.robots import Robots, own_topic
+
+log = logging.getLogger(__name__)
+
+PICTURE_METRIC: Final = "web/picture"
+_ANSWER: Final = struct.Struct(">IB")  # number of a frame, and what became of it
+_BAD_REQUEST: Final = 4400  # codes of closed sockets
+_GONE: Final = 1001
+_SNAPSHOT_S: Final = 0.5  # a snapshot this recent is used again
+
+
+class MediaHub:
+    """All streams of pictures. Only the event loop calls it."""
+
+    def __init__(self, broker: Broker, robots: Robots) -> None:
+        self._broker, self._robots = broker, robots
+        self._streams: dict[str, PictureStream] = {}
+        self._snapshots: dict[str, _Snapshot] = {}
+        self._pinned: dict[str, str] = {}
+        self._closed = False
+
+    async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
+        """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
+        if self._closed or not own_topic(ref, f"{ref}/{Direction.OUTGOING}/front-camera", Direction.OUTGOING):
+            await websocket.close(_BAD_REQUEST, "no such component")
+            return
+        viewer = PageViewer(can)
+        stream = self._stream(ref)
+        stream.join(viewer)
+        tasks = {
+            asyncio.create_task(_send(websocket, viewer)),
+            asyncio.create_task(_receive(websocket, stream, viewer)),
+        }
+        try:
+            await asyncio.wait({*tasks, stream.task}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            stream.leave(viewer)
+            await _end(tasks)
+            with contextlib.suppress(RuntimeError):  # it is closed already
+                await websocket.close(_GONE)
+
+    def pin(self, ref: str, encoding: str) -> None:
+        """Request this encoding for all viewers; "" is automatic. One that the robot does not offer has no effect."""
+        if encoding not in BEST_FIRST or not self._robots.capabilities(ref):
+            self._pinned.pop(ref, None)
+        else:
+            self._pinned[ref] = encoding
+        stream = self._streams.get(ref)
+        if stream is not None:
+            stream.pin(self._pinned.get(ref, ""))
+        else:
+            self._show(ref, rest(self._pinned.get(ref, "")))
+
+    async def snapshot(self, ref: str) -> bytes | None:
+        """The newest picture as a JPEG, if pictures are flowing; it starts no camera."""
+        stream = self._streams.get(ref)
+        if stream is None:
+            return None
+        return await self._snapshots.setdefault(ref, _Snapshot()).take(stream)
+
+    async def close(self) -> None:
+        """Withdraw all requests."""
+        self._closed = True
+        await asyncio.gather(*(stream.close() for stream in self._streams.values()), return_exceptions=True)
+
+    def _stream(self, ref: str) -> PictureStream:
+        stream = self._streams.get(ref)
+        if stream is None:
+            stream = PictureStream(self._broker, self._robots, ref, self._pinned.get(ref, ""), self._show)
+            self._streams[ref] = stream
+            stream.task.add_done_callback(lambda task: self._forget(ref, task))
+        return stream
+
+    def _forget(self, ref: str, task: asyncio.Task[None]) -> None:
+        self._streams.pop(ref, None)
+        self._snapshots.pop(ref, None)
+        if not task.cancelled() and task.exception() is not None:
+            log.error("the pictures of %s have ended", ref, exc_info=task.exception())
+
+    def _show(self, ref: str, view: PictureView) -> None:
+        if self._robots.capabilities(ref):
+            self._robots.set_server_metric(ref, PICTURE_METRIC, view)
+
+
+class _Snapshot:
+    """The last picture that was taken of one stream, for those who want it at the same time."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+        self._taken: RescuedPicture | None = None
+        self._taken_at = float("-inf")
+
+    async def take(self, stream: PictureStream) -> bytes | None:
+        async with self._lock:
+            chain = stream.chain()
+            if not chain:
+                return None
+            if time.monotonic() - self._taken_at > _SNAPSHOT_S:
+                self._taken = await asyncio.to_thread(newest_jpeg, chain)
+                self._taken_at = time.monotonic()
+            return None if self._taken is None else self._taken.jpeg
+
+
+async def _send(websocket: WebSocket, viewer: PageViewer) -> None:
+    try:
+        while True:
+            frame = viewer.queue.take(time.monotonic())
+            if frame is None:
+                await viewer.wakeup.wait()
+                viewer.wakeup.clear()
+            else:
+                await websocket.send_bytes(frame.data)
+    except (WebSocketDisconnect, RuntimeError, OSError):  # RuntimeError: it is closed
+        return
+
+
+async def _receive(websocket: WebSocket, stream: PictureStream, viewer: PageViewer) -> None:
+    """Take the page's answers until it leaves, or sends what is none."""
+    while True:
+        message = await websocket.receive()
+        answer = message.get("bytes")
+        if message["type"] != "websocket.receive" or answer is None or len(answer) != _ANSWER.size:
+            return
+        stream.acknowledge(viewer, *_ANSWER.unpack(answer))
+
+
+async def _end(tasks: set[asyncio.Task[None]]) -> None:
+    for task in tasks:
+        task.cancel()
+    for result in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(result, Exception):
+            log.warning("a page's pictures have ended: %s", result)

@@ -1,0 +1,193 @@
+"""What one page receives next of a robot's pictures, and who gets the rescue stream. Pure: times are passed in.
+
+A page acknowledges each frame when it has drawn it, and few frames are under way at a time: without that, a slow
+connection shows what happened seconds ago. A difference is of no use without all before it since the last key frame,
+so where one is left out, all are until the next key frame.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Final
+
+WINDOW: Final = 2  # frames sent and not acknowledged
+SLOW_ACK_S: Final = 0.15  # with acknowledgements later than this the window is 1
+MAX_FRAMES: Final = 4
+MAX_QUEUED_BYTES: Final = 4 << 20
+NO_FRAME: Final = 0xFFFF_FFFF  # the number in an acknowledgement of no frame
+
+_FRESH_FRAMES: Final = 2  # with no more than these in the queue, a key frame does not replace them
+_JPEG_PATIENCE_S: Final = 1.0  # JPEG encodings have a key frame each third of a second, unless configured otherwise
+_RESCUE_AFTER_S: Final = 1.5  # of waiting for a key frame of h264
+_FIRST_RETRY_S, _LAST_RETRY_S = 10.0, 160.0  # in the rescue stream, before the robot's own pictures are tried again
+_RECOVERED_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One message to pages; all of them share its bytes."""
+
+    seq: int
+    data: bytes
+    encoding: str
+    keyframe: bool  # needs no picture before it
+
+
+class MediaQueue:
+    """The frames that wait for one page, and those under way."""
+
+    def __init__(self) -> None:
+        self.waiting = True  # for a key frame
+        self.overflowed = False  # waiting because the page is too slow
+        self.skipped = 0
+        self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
+        self._queue: deque[Frame] = deque()
+        self._under_way: dict[int, tuple[float, Frame]] = {}
+
+    @property
+    def window(self) -> int:
+        return WINDOW if self.ack_s <= SLOW_ACK_S else 1
+
+    def offer(self, frame: Frame) -> None:
+        """Queue a frame, or skip it."""
+        if frame.keyframe:
+            self._begin_at(frame)
+        elif self.waiting:
+            self.skipped += 1
+        elif len(self._queue) < MAX_FRAMES and self._queued_bytes() + len(frame.data) <= MAX_QUEUED_BYTES:
+            self._queue.append(frame)
+        else:
+            self.overflowed = True
+            self.wait_for_keyframe(1)
+
+    def take(self, now: float) -> Frame | None:
+        """The frame to send now; None if there is none, or too many are under way."""
+        if not self._queue or len(self._under_way) >= self.window:
+            return None
+        frame = self._queue.popleft()
+        self._under_way[frame.seq] = (now, frame)
+        return frame
+
+    def acknowledge(self, seq: int, now: float) -> Frame | None:
+        """The page is done with this frame: return it, if it was under way."""
+        sent_at, frame = self._under_way.pop(seq, (0.0, None))
+        if frame is not None:
+            self.ack_s = now - sent_at
+        return frame
+
+    def wait_for_keyframe(self, skipped: int = 0) -> None:
+        """Skip everything before the next key frame."""
+        self.skipped += len(self._queue) + skipped
+        self._queue.clear()
+        self.waiting = True
+
+    def not_drawn(self) -> None:
+        """The page could not draw a frame: unless a key frame is on its way, it waits for one."""
+        under_way = [frame for _, frame in self._under_way.values()]
+        if not any(frame.keyframe for frame in (*under_way, *self._queue)):
+            self.wait_for_keyframe()
+
+    def _begin_at(self, frame: Frame) -> None:
+        """A page that keeps up receives what came before as well; another one only what is newest."""
+        late = self.window < WINDOW or len(self._queue) > _FRESH_FRAMES
+        if self.waiting or late or self._queued_bytes() + len(frame.data) > MAX_QUEUED_BYTES:
+            self.wait_for_keyframe()
+        self._queue.append(frame)
+        self.waiting = self.overflowed = False
+
+    def _queued_bytes(self) -> int:
+        return sum(len(frame.data) for frame in self._queue)
+
+
+class ViewerQueue(MediaQueue):
+    """The queue of one page, which gets the robot's own pictures or, if it cannot use them, the rescue stream."""
+
+    def __init__(self, can: frozenset[str], now: float) -> None:
+        super().__init__()
+        self.can = can
+        self.rescued = False
+        self.new = True  # it has received no picture, and no key frame was requested for it
+        self._undecodable: set[str] = set()
+        self._waiting_since = self._direct_since = now
+        self._retry_at = 0.0
+        self._retry_s = _FIRST_RETRY_S
+
+    def decodes(self, encoding: str) -> bool:
+        return encoding in self.can and encoding not in self._undecodable
+
+    def cannot_decode(self, encoding: str) -> None:
+        """The page has tried this encoding in vain."""
+        self._undecodable.add(encoding)
+
+    def offer_direct(self, frame: Frame, now: float) -> None:
+        """Offer one of the robot's own pictures; a page in the rescue stream returns at a key frame."""
+        if self.rescued and frame.keyframe and now >= self._retry_at and self.decodes(frame.encoding):
+            self.rescued = False
+            self._direct_since = now
+        if self.rescued:
+            return
+        was_waiting = self.waiting
+        self.offer(frame)
+        if not self.waiting:
+            self.new = False
+        elif not was_waiting:
+            self._waiting_since = now
+
+    def offer_rescue(self, frame: Frame) -> None:
+        """Offer a picture of the rescue stream: only the newest counts."""
+        if self.rescued:
+            self.wait_for_keyframe()
+            self.offer(frame)
+
+    def lost(self, now: float) -> None:
+        """A picture is missing on the way from the robot: the differences after it are of no use."""
+        if not self.rescued:
+            self._note_waiting(now)
+            self.wait_for_keyframe()
+
+    def refuse(self, now: float) -> None:
+        """The page asked for a key frame."""
+        if not self.rescued:
+            self._note_waiting(now)
+            self.not_drawn()
+
+    def rescue(self, now: float) -> None:
+        """Change to the rescue stream: because the page is slow, for a while; else until the next key frame."""
+        if self.overflowed:
+            self._retry_s = _FIRST_RETRY_S if now - self._direct_since > _RECOVERED_S else self._retry_s
+            self._retry_at = now + self._retry_s
+            self._retry_s = min(_LAST_RETRY_S, 2 * self._retry_s)
+        self.rescued = True
+        self.wait_for_keyframe()
+        self.overflowed = False
+
+    def waiting_s(self, now: float) -> float:
+        """How long it has waited for a key frame of the robot's own pictures."""
+        return now - self._waiting_since if self.waiting and not self.rescued else 0.0
+
+    def _note_waiting(self, now: float) -> None:
+        if not self.waiting:
+            self._waiting_since = now
+
+
+def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_rescue: bool) -> bool:
+    """Move viewers between the two streams; return whether to request a key frame (at most once a second).
+
+    A key frame costs all viewers and the robot's uplink. One is requested if most wait, or once for a viewer that is
+    new; a slow viewer among fast ones gets the rescue stream instead.
+    """
+    for viewer in viewers:
+        if can_rescue and not viewer.rescued and not viewer.decodes(encoding):
+            viewer.rescue(now)
+    direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
+    patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S
+    waiting = [viewer for viewer in direct if viewer.waiting and viewer.waiting_s(now) >= patience]
+    if encoding != "h264" or 2 * len(waiting) >= len(direct):
+        return 0 < len(direct) <= 2 * len(waiting)
+    for viewer in waiting:
+        if can_rescue and (viewer.overflowed or viewer.waiting_s(now) > _RESCUE_AFTER_S):
+            viewer.rescue(now)
+    new = [viewer for viewer in waiting if viewer.new]
+    return bool(new)

@@ -1,0 +1,99 @@
+"""Reads what surrounds a picture on the wire, without decoding the picture. Pure; imports neither cv2 nor PyAV."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, NamedTuple
+
+import msgspec
+
+from pebble.contract.packets import KEY_FRAME, PBVD, SEQUENCE_LIMIT, Picture, PictureKind
+from pebble.errors import PayloadError
+
+_HEADER_BYTES: Final = 19
+_SOI: Final = b"\xff\xd8"
+_LONGEST_STEP_MS: Final = 5000  # as pebble.media.decode: with more time in between, the number fits by chance
+_MILLISECONDS_FROM: Final = 1e11
+_LATEST_MS: Final = 253_402_300_800_000
+
+_KINDS: Final = {
+    PictureKind.JPEG: ("pbvd", True),
+    PictureKind.DELTA_JPEG: ("pbvd", False),
+    PictureKind.ZLIB_JPEG: ("pbvz", True),
+    PictureKind.ZLIB_DELTA_JPEG: ("pbvz", False),
+}
+
+
+class _JsonHead(msgspec.Struct):
+    id: Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
+    keyframe: bool
+    timestamp: float | None = None
+
+
+_json = msgspec.json.Decoder(_JsonHead)
+
+
+class PictureHeader(NamedTuple):
+    """``keyframe``: the picture needs none before it. ``frame`` and ``captured_ms`` are None where they are missing."""
+
+    encoding: str  # json | pbvd | pbvz | h264 | jpeg
+    keyframe: bool
+    frame: int | None
+    captured_ms: int | None
+
+
+def read_header(payload: bytes) -> PictureHeader | None:
+    """The header of a payload of any encoding; None if it is none of them."""
+    if payload.startswith(PBVD):
+        return _read_pbvd(payload)
+    if payload.startswith(_SOI):
+        return PictureHeader("jpeg", True, None, None)
+    return _read_json(payload) if payload[:1] in (b"{", b" ", b"\t", b"\r", b"\n") else None
+
+
+def follows(last: PictureHeader | None, header: PictureHeader) -> bool:
+    """Whether a receiver that has decoded ``last`` can decode this one: the rules of pebble.media.decode."""
+    if header.keyframe:
+        return True
+    if last is None or last.encoding != header.encoding or header.frame != _after(last):
+        return False
+    if last.captured_ms is None or header.captured_ms is None:
+        return last.captured_ms == header.captured_ms
+    return 0 <= header.captured_ms - last.captured_ms <= _LONGEST_STEP_MS
+
+
+def _after(last: PictureHeader) -> int | None:
+    if last.frame is None:
+        return None
+    return last.frame + 1 if last.encoding == "json" else (last.frame + 1) % SEQUENCE_LIMIT
+
+
+def _read_pbvd(payload: bytes) -> PictureHeader | None:
+    try:
+        head = Picture.unpack(payload[:_HEADER_BYTES])
+    except PayloadError:
+        return None
+    captured_ms = _plausible(head.captured_ms)
+    if head.kind == PictureKind.H264:
+        return PictureHeader("h264", bool(head.flags & KEY_FRAME), head.frame, captured_ms)
+    if head.kind not in _KINDS:
+        return None
+    encoding, keyframe = _KINDS[PictureKind(head.kind)]
+    return PictureHeader(encoding, keyframe, head.frame, captured_ms)
+
+
+def _read_json(payload: bytes) -> PictureHeader | None:
+    try:
+        head = _json.decode(payload)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError):
+        return None
+    return PictureHeader("json", head.keyframe, head.id, _milliseconds(head.timestamp))
+
+
+def _milliseconds(stamp: float | None) -> int | None:
+    if stamp is None or not 0 < stamp < _LATEST_MS:
+        return None
+    return _plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
+
+
+def _plausible(captured_ms: int) -> int | None:
+    return captured_ms if 0 < captured_ms < _LATEST_MS else None

@@ -1,0 +1,171 @@
+"""Requests one robot's pictures while pages watch them, and withdraws the request afterwards."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final, cast
+
+from pebble.client.viewer import Medium, Viewer
+from pebble.contract.identity import Direction
+from pebble.errors import PebbleError, TransportError
+from pebble.transports import Handler, QoS, Subscription, Transport
+from pebble.web.broker import Broker
+from pebble.web.robots import own_topic
+
+log = logging.getLogger(__name__)
+
+MAX_PAYLOAD: Final = 4 << 20
+_MAX_PENDING_BYTES: Final = 16 << 20  # received, and not yet taken by the event loop
+_CAPABILITIES_S: Final = 2.0
+_TOPICS: Final = {
+    "topic": Direction.OUTGOING,
+    "command_topic": Direction.INCOMING,
+    "flag_topic": Direction.INCOMING,
+}
+
+
+def offered(capabilities: dict[str, Any]) -> tuple[str, ...]:
+    """The encodings that may be requested; empty for robots that do not list any, whose requests name none."""
+    section = capabilities.get("video")
+    listed = section.get("encodings") if isinstance(section, dict) else None
+    return tuple(name for name in listed if isinstance(name, str)) if isinstance(listed, list) else ()
+
+
+def refusal(ref: str, capabilities: dict[str, Any]) -> str:
+    """Why this robot's pictures are not requested; empty if they may be.
+
+    Capabilities come from the network: one that names topics of another component is not believed at all.
+    """
+    if not capabilities:
+        return "it has published no capabilities yet"
+    section = capabilities.get("video")
+    if not isinstance(section, dict) or section.get("available") is not True:
+        return "it has no camera"
+    if section.get("controls") is not True:
+        return "its camera cannot be switched on from here"
+    for key, direction in _TOPICS.items():
+        if section.get(key) is not None and not own_topic(ref, section[key], direction):
+            return f"its capabilities name a topic for pictures that is not its own ({key})"
+    return ""
+
+
+class PictureSource:
+    """One robot's payloads, on the event loop. One task calls its coroutines."""
+
+    def __init__(self, broker: Broker, ref: str, receive: Callable[[bytes], None]) -> None:
+        self.ref = ref
+        self.encoding: str | None = None  # as requested
+        self.requested_at = float("-inf")
+        self._broker, self._receive = broker, receive
+        self._viewer: Viewer | None = None
+        self._topics: tuple[object, ...] = ()  # that the capabilities listed at the request
+        self._pending_bytes = 0
+        self._lock = threading.Lock()  # guards _pending_bytes
+
+    @property
+    def started(self) -> bool:
+        return self._viewer is not None
+
+    async def follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
+        """Request pictures, as these capabilities allow it; call it again and again. Raises PebbleError."""
+        topics = tuple(capabilities["video"].get(key) for key in _TOPICS)
+        if self._viewer is not None and topics != self._topics:
+            await self.withdraw()
+        if self._viewer is None:
+            self._viewer = await asyncio.to_thread(self._open)
+            self._topics = topics
+            await self._request(encoding)
+        elif encoding != self.encoding:
+            await self._request(encoding)
+        else:
+            await asyncio.to_thread(self._viewer.repeat_requests)
+
+    async def request_keyframe(self, encoding: str) -> None:
+        """Request a key frame in the present encoding; the viewer lets one pass each second."""
+        if self._viewer is not None:
+            known = encoding if encoding in offered(self._viewer.capabilities) else None
+            await asyncio.to_thread(self._viewer.request_keyframe, known)
+
+    async def withdraw(self) -> None:
+        """End the request."""
+        viewer, self._viewer = self._viewer, None
+        self.encoding, self.requested_at = None, float("-inf")
+        if viewer is not None:
+            await asyncio.to_thread(_close, viewer)
+
+    async def _request(self, encoding: str | None) -> None:
+        if self._viewer is None:
+            return
+        self.encoding, self.requested_at = encoding, time.monotonic()
+        try:
+            await asyncio.to_thread(self._viewer.request, "video", encoding)
+        except PebbleError:
+            await self.withdraw()
+            raise
+
+    def _open(self) -> Viewer:
+        """On a thread: it waits for the broker."""
+        transport = cast(Transport, _OwnTopics(self._broker.transport, self.ref))
+        viewer = Viewer(transport, self.ref, self._on_payload)
+        try:
+            viewer.wait_for_capabilities(_CAPABILITIES_S)
+            if reason := refusal(self.ref, viewer.capabilities):
+                raise PebbleError(reason)
+        except PebbleError:
+            viewer.close()
+            raise
+        return viewer
+
+    # -- a thread of the transport
+
+    def _on_payload(self, _medium: Medium, payload: bytes) -> None:
+        size = len(payload)
+        with self._lock:
+            if self._pending_bytes + size > _MAX_PENDING_BYTES:
+                return  # the event loop is far behind; what is missing is noticed by the numbers
+            self._pending_bytes += size
+        try:
+            self._broker.loop.call_soon_threadsafe(self._take, payload)
+        except RuntimeError:  # the loop has ended
+            return
+
+    def _take(self, payload: bytes) -> None:
+        with self._lock:
+            self._pending_bytes -= len(payload)
+        if self._viewer is not None:
+            self._receive(payload)
+
+
+class _OwnTopics:
+    """The part of a transport that a Viewer uses, limited to the topics of one component.
+
+    A robot's capabilities may change between being checked and being used.
+    """
+
+    def __init__(self, transport: Transport, ref: str) -> None:
+        self._transport, self._ref = transport, ref
+
+    def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False) -> bool:
+        self._check(topic, (Direction.INCOMING,))
+        return self._transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
+
+    def subscribe(
+        self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, echo: bool = True, direct: bool = False
+    ) -> Subscription:
+        self._check(filter_, tuple(Direction))
+        return self._transport.subscribe(filter_, handler, qos=qos, echo=echo, direct=direct)
+
+    def _check(self, topic: str, directions: tuple[Direction, ...]) -> None:
+        if not any(own_topic(self._ref, topic, direction) for direction in directions):
+            raise TransportError(f"{topic} is no topic of {self._ref}")
+
+
+def _close(viewer: Viewer) -> None:
+    try:
+        viewer.close()
+    except PebbleError as error:
+        log.warning("the pictures of %s: %s", viewer.base, error)

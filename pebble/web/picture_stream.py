@@ -1,0 +1,304 @@
+"""One robot's pictures on their way to the pages that show them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import struct
+import time
+from collections.abc import Callable
+from typing import Final
+
+from pebble.errors import PebbleError
+from pebble.media.rate_meter import RateMeter
+from pebble.web import rescue
+from pebble.web.broker import Broker
+from pebble.web.encoding_choice import BEST_FIRST, EncodingChoice
+from pebble.web.media_queue import NO_FRAME, Frame, ViewerQueue, assess
+from pebble.web.messages import PictureView
+from pebble.web.picture_header import PictureHeader, follows, read_header
+from pebble.web.picture_source import MAX_PAYLOAD, PictureSource, offered, refusal
+from pebble.web.rescue import RescuedPicture, RescueStream
+from pebble.web.robots import Robots
+
+log = logging.getLogger(__name__)
+
+Show = Callable[[str, PictureView], None]
+
+LINGER_S: Final = 5.0  # without viewers, before the request is withdrawn: a page that reloads is back by then
+_TICK_S: Final = 0.5
+_SILENT_S: Final = 2.0
+_SILENT_PERIODS: Final = 3.0
+_OWN_REQUEST_S: Final = 1.0  # a new encoding begins with a key frame: none is requested meanwhile
+_MAX_CHAIN: Final = 240  # pictures since a key frame
+_MAX_CHAIN_BYTES: Final = 8 << 20
+_HEAD: Final = struct.Struct(">IB")
+_RESCUE_HEAD: Final = struct.Struct(">IBQ")
+
+
+class PageViewer:
+    """One page's queue, and how its sender is woken."""
+
+    def __init__(self, can: frozenset[str]) -> None:
+        self.queue = ViewerQueue(can, time.monotonic())
+        self.wakeup = asyncio.Event()
+
+
+class PictureStream:
+    """Requests the pictures of one robot while it has viewers, and gives them to each viewer's queue.
+
+    ``task`` ends once the request is withdrawn; until then viewers may join again.
+    """
+
+    def __init__(self, broker: Broker, robots: Robots, ref: str, pinned: str, show: Show) -> None:
+        self.ref = ref
+        self.choice = EncodingChoice()
+        self.choice.pinned = pinned
+        self.viewers: set[PageViewer] = set()
+        self.refused = 0  # payloads that are no pictures, or too large
+        self.view = rest(pinned)  # as shown last
+        self._shown_at = float("-inf")
+        self._broker, self._robots, self._show = broker, robots, show
+        self._source = PictureSource(broker, ref, self.receive)
+        self._rescue = RescueStream(self._on_rescued)
+        self._meter = RateMeter()
+        self._last: PictureHeader | None = None  # of the newest picture, unless one is missing before it
+        self._encoding = ""  # of the newest picture
+        self._arrived_at: float | None = None
+        self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
+        self._chain_bytes = 0
+        self._seq = 0
+        self._empty_since = time.monotonic()
+        self._why = ""
+        self._wakeup = asyncio.Event()
+        self._closing = False
+        self.task = asyncio.create_task(self._run())
+
+    # -- pages
+
+    def join(self, viewer: PageViewer) -> None:
+        self.viewers.add(viewer)
+        self._wakeup.set()
+
+    def leave(self, viewer: PageViewer) -> None:
+        self.viewers.discard(viewer)
+        self._empty_since = time.monotonic()
+        self._wakeup.set()
+
+    def pin(self, encoding: str) -> None:
+        self.choice.pinned = encoding
+        self._wakeup.set()
+
+    def acknowledge(self, viewer: PageViewer, seq: int, what: int) -> None:
+        """Take a page's answer: 0 drawn, 1 a key frame is wanted, 2 this encoding cannot be decoded there."""
+        now = time.monotonic()
+        frame = viewer.queue.acknowledge(seq, now)
+        if what == 1 and (frame is not None or seq == NO_FRAME):
+            viewer.queue.refuse(now)
+        elif what == 2 and (frame is not None or seq == NO_FRAME):
+            viewer.queue.cannot_decode(self._encoding if frame is None else frame.encoding)
+        viewer.wakeup.set()
+        if what:
+            self._wakeup.set()
+
+    def chain(self) -> list[bytes]:
+        """The newest key frame and the differences since, if pictures are flowing."""
+        return list(self._chain) if self._flowing(time.monotonic()) else []
+
+    @property
+    def seq(self) -> int:
+        """The number of the newest frame."""
+        return self._seq
+
+    async def close(self) -> None:
+        """Withdraw the request now."""
+        self._closing = True
+        self._wakeup.set()
+        await self.task
+
+    # -- pictures
+
+    def receive(self, payload: bytes) -> None:
+        """Give a payload of the robot to all viewers. On the event loop."""
+        now = time.monotonic()
+        header = read_header(payload) if len(payload) <= MAX_PAYLOAD else None
+        if header is None:
+            self.refused += 1
+            self._last = None
+            return
+        self._note(payload, header, now)
+        fits = follows(self._last, header)
+        self._last = header if fits else None
+        self._extend_chain(payload, header, fits=fits)
+        self._rescue.feed(payload, keyframe=header.keyframe)
+        if fits:
+            self._offer(payload, header, now)
+        else:
+            self._skip(now)
+
+    def _note(self, payload: bytes, header: PictureHeader, now: float) -> None:
+        starts = self._arrived_at is None or header.encoding != self._encoding
+        self._meter.add(now, len(payload))
+        self._arrived_at, self._encoding = now, header.encoding
+        if starts:
+            self._wakeup.set()
+
+    def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
+        grown = self._chain_bytes + len(payload)
+        if header.keyframe:
+            self._chain, self._chain_bytes = [payload], len(payload)
+        elif fits and self._chain and len(self._chain) < _MAX_CHAIN and grown <= _MAX_CHAIN_BYTES:
+            self._chain.append(payload)
+            self._chain_bytes = grown
+        else:
+            self._chain, self._chain_bytes = [], 0
+
+    def _offer(self, payload: bytes, header: PictureHeader, now: float) -> None:
+        seq = self._next_seq()
+        frame = Frame(seq, _HEAD.pack(seq, 0) + payload, header.encoding, header.keyframe)
+        urgent = False
+        for viewer in self.viewers:
+            queue = viewer.queue
+            if queue.rescued or queue.decodes(header.encoding):
+                queue.offer_direct(frame, now)
+                viewer.wakeup.set()
+            urgent = urgent or (queue.waiting and not queue.rescued)
+        if urgent and header.encoding == "h264":
+            self._wakeup.set()
+
+    def _skip(self, now: float) -> None:
+        """A picture is missing before this one: it and what follows wait for a key frame."""
+        for viewer in self.viewers:
+            viewer.queue.lost(now)
+        self._wakeup.set()
+
+    def _on_rescued(self, picture: RescuedPicture) -> None:
+        seq = self._next_seq()
+        data = _RESCUE_HEAD.pack(seq, 1, picture.captured_ms) + picture.jpeg
+        frame = Frame(seq, data, "jpeg", keyframe=True)
+        for viewer in self.viewers:
+            viewer.queue.offer_rescue(frame)
+            viewer.wakeup.set()
+
+    def _next_seq(self) -> int:
+        self._seq = (self._seq + 1) % NO_FRAME  # NO_FRAME itself is no number
+        return self._seq
+
+    # -- the task: requests, key frames and what pages are shown about it
+
+    async def _run(self) -> None:
+        try:
+            while not self._over():
+                await self._step()
+        finally:
+            self._rescue.stop()
+            await self._source.withdraw()
+            self._show(self.ref, rest(self.choice.pinned))
+
+    def _over(self) -> bool:
+        """A request is not withdrawn while there is no broker: the robot would go on sending afterwards."""
+        idle = not self.viewers and time.monotonic() - self._empty_since >= LINGER_S
+        return self._closing or (idle and (self._broker.connected or not self._source.started))
+
+    async def _step(self) -> None:
+        started = time.monotonic()
+        self._report()
+        try:
+            await self._request()
+        except PebbleError as error:
+            self._why = str(error)
+        self._report()
+        await self._pause(started)
+
+    async def _pause(self, started: float) -> None:
+        """A step each half second; one that is needed earlier, a tenth of a second after the last one."""
+        await asyncio.sleep(max(0.0, started + _TICK_S / 5 - time.monotonic()))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._wakeup.wait(), max(0.001, started + _TICK_S - time.monotonic()))
+        self._wakeup.clear()
+
+    async def _request(self) -> None:
+        capabilities = self._robots.capabilities(self.ref)
+        self._why = refusal(self.ref, capabilities)
+        if self._why:
+            await self._source.withdraw()
+            return
+        encoding = self.choice.update(offered(capabilities), self._can(), time.monotonic())
+        if self.viewers:
+            await self._source.follow(capabilities, encoding)
+        await self._help_viewers()
+
+    def _can(self) -> list[frozenset[str]]:
+        """What each viewer decodes. For one that decodes nothing, what this server converts counts."""
+        converted = frozenset(name for name in BEST_FIRST if not rescue.unavailable(name))
+        return [viewer.queue.can & frozenset(BEST_FIRST) or converted for viewer in self.viewers]
+
+    async def _help_viewers(self) -> None:
+        """Request a key frame, or begin the rescue stream, if viewers need it."""
+        now = time.monotonic()
+        if not self._encoding:
+            return
+        can_rescue = not rescue.unavailable(self._encoding)
+        queues = [viewer.queue for viewer in self.viewers]
+        wanted = assess(queues, self._encoding, now, can_rescue=can_rescue)
+        if can_rescue and any(queue.rescued for queue in queues):
+            self._rescue.start(self._chain)
+        else:
+            self._rescue.stop()
+        if wanted and now - self._source.requested_at >= _OWN_REQUEST_S:
+            for queue in queues:
+                queue.new = False
+            await self._source.request_keyframe(self._encoding)
+
+    # -- what pages are shown
+
+    def _flowing(self, now: float) -> bool:
+        if self._arrived_at is None:
+            return False
+        rate = self._meter.rate(self._arrived_at)
+        return now - self._arrived_at <= max(_SILENT_S, _SILENT_PERIODS / rate if rate else 0.0)
+
+    def _report(self) -> None:
+        """Show what has changed, at most twice a second."""
+        now = time.monotonic()
+        if now - self._shown_at < _TICK_S:
+            return
+        view = self._make_view(now)
+        if view != self.view:
+            self.view, self._shown_at = view, now
+            self._show(self.ref, view)
+
+    def _make_view(self, now: float) -> PictureView:
+        state, why = self._state(now)
+        flowing = state == "flowing"
+        return PictureView(
+            state=state,
+            why=why,
+            encoding=self._encoding,
+            per_second=round(self._meter.rate(now), 1) if flowing else 0.0,
+            kbits=float(round(self._meter.bitrate(now) / 1000)) if flowing else 0.0,
+            viewers=len(self.viewers),
+            pinned=self.choice.pinned,
+        )
+
+    def _state(self, now: float) -> tuple[str, str]:
+        if self._why:
+            return "refused", self._why
+        if self._flowing(now):
+            return "flowing", self._rescue_problem()
+        if not self._broker.connected:
+            return "silent", f"the server cannot reach the broker: {self._broker.problem}"
+        if self._arrived_at is None:
+            return "starting", ""
+        return "silent", f"no picture for {int(now - self._arrived_at)} s"
+
+    def _rescue_problem(self) -> str:
+        lacking = sum(not viewer.queue.decodes(self._encoding) for viewer in self.viewers)
+        problem = rescue.unavailable(self._encoding)
+        return f"{lacking} of {len(self.viewers)} browsers cannot show it: {problem}" if problem and lacking else ""
+
+
+def rest(pinned: str) -> PictureView:
+    """What is shown of a robot whose pictures no page watches."""
+    return PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0, pinned=pinned)
