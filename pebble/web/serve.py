@@ -10,6 +10,8 @@ import uvicorn
 
 from pebble.errors import PebbleError
 from pebble.web.app import create_app
+from pebble.web.connections import MAX_CONNECTIONS, HttpProtocol, Listener, Loop, WebSocketProtocol
+from pebble.web.connections import MAX_CONNECTIONS, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.settings import WebSettings
 
 _LARGEST_MESSAGE = 64 * 1024
@@ -20,7 +22,8 @@ def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None)
     """Serve until SIGINT or SIGTERM; ``on_ready`` gets the address once it can be opened. Raises PebbleError."""
     listener = _listen(settings)
     try:
-        asyncio.run(_serve(settings, listener, on_ready))
+        with asyncio.Runner(loop_factory=Loop) as runner:
+            runner.run(_serve(settings, listener, on_ready))
     finally:
         listener.close()
     return 0
@@ -52,19 +55,20 @@ def _config(settings: WebSettings) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         date_header=False,
-        ws="websockets-sansio",
+        http=HttpProtocol,
+        ws=WebSocketProtocol,
         ws_per_message_deflate=False,  # pictures are compressed already: it would double the time they take
         ws_max_size=_LARGEST_MESSAGE,
         ws_ping_interval=2.0,
         ws_ping_timeout=4.0,
         timeout_graceful_shutdown=_END_S,
-        limit_concurrency=200,
+        limit_concurrency=MAX_CONNECTIONS + 1,  # the listener refuses them before
     )
 
 
 def _listen(settings: WebSettings) -> socket.socket:
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener = Listener(family)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((settings.host, settings.port))

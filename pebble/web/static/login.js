@@ -1,0 +1,50 @@
+/** The login page: sends user and password as JSON, and shows why they were refused. */
+
+const form = document.getElementById("login");
+const user = document.getElementById("user");
+const password = document.getElementById("password");
+const submit = document.getElementById("submit");
+const why = document.getElementById("why");
+
+/**
+ * Where to go after the login: the page of a robot that was asked for, else the fleet. Never to another site.
+ * @param {string} search the query of this page, `?next=/r/pebble/robots/goob`
+ * @returns {string}
+ */
+export function nextPage(search) {
+  const next = new URLSearchParams(search).get("next") ?? "";
+  return /^\/r\/[^\\\s]*$/.test(next) ? next : "/";
+}
+
+/**
+ * @returns {Promise<string>} why it was refused; "" if it was not
+ */
+async function logIn() {
+  let response;
+  try {
+    response = await fetch("/api/login", {
+      method: "POST",
+      headers: { "content-type": "application/json" },
+      body: JSON.stringify({ user: user.value.trim(), password: password.value }),
+    });
+  } catch {
+    return "No connection to the server";
+  }
+  const answer = await response.json().catch(() => ({}));
+  return response.ok ? "" : answer.why || `The server answers ${response.status}`;
+}
+
+form?.addEventListener("submit", async (event) => {
+  event.preventDefault();
+  submit.disabled = true;
+  why.textContent = "";
+  const refused = await logIn();
+  if (!refused) {
+    location.assign(nextPage(location.search));
+    return;
+  }
+  submit.disabled = false;
+  why.textContent = refused;
+  password.value = "";
+  password.focus();
+});
