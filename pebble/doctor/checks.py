@@ -22,9 +22,12 @@ from pebble.doctor import Finding, Level
 from pebble.doctor.broker_probe import REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
+from pebble.errors import PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.peers import fits_socket
 from pebble.transports.settings import MqttSettings
+from pebble.web.extra import require_packages
+from pebble.web.from_config import settings_of
 
 _LONGEST_SOCKET = "0123456789abcdef.sock"
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
@@ -54,8 +57,25 @@ def _robot(config: Config) -> Iterator[Finding]:
         yield serial_port(Path(str(line.serial.port)))
     yield from media(config, Path("/dev"))
     yield from loudspeaker(config)
+    yield from operator_page(config)
     for name, mqtt in _brokers(config):
         yield from broker(name, mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S))
+
+
+def operator_page(config: Config) -> Iterator[Finding]:
+    """Whether the page that the robot itself serves can start; whether it has users, only its own user can read."""
+    if not config.services.web_handler.enabled:
+        return
+    try:
+        settings = settings_of(config)
+        require_packages()
+    except PebbleError as error:
+        yield Finding(Level.FAIL, "operator page", str(error))  # which says what to do
+        return
+    if settings.login and settings.certificate is None:
+        yield Finding(Level.WARN, "operator page", "is not encrypted: passwords can be read", "pebble cert init")
+    else:
+        yield Finding(Level.OK, "operator page", f"port {settings.port} of {settings.host}")
 
 
 def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:

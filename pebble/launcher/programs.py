@@ -66,6 +66,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (services.mqtt_bridge.enabled, _service(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
         (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
         (services.soundboard_handler.enabled, _service(config, "soundboard_handler", Stage.CONNECTION)),
+        (services.web_handler.enabled, _web_handler(config)),
         *((True, _on_demand(config, name)) for name in config.on_demand_programs()),
     ]
     return tuple(program for enabled, program in table if enabled)
@@ -120,6 +121,19 @@ def _service(config: Config, name: str, stage: Stage, instance: str = "", **more
 def _av_daemon(config: Config) -> Program:
     section = config.services.av_daemon
     return _service(config, "av_daemon", Stage.DEVICE, preloaded=False, environment=section.env, folder=section.cwd)
+
+
+def _web_handler(config: Config) -> Program:
+    """The operator page; its module is above the launcher, which only starts it, and may miss what it imports."""
+    arguments, environment = (str(config.path),), config.services.web_handler.env
+    return Program(
+        "web_handler",
+        "pebble.web.robot_service",
+        arguments,
+        Stage.CONNECTION,
+        preloaded=False,
+        environment=environment,
+    )
 
 
 def _on_demand(config: Config, name: str) -> Program:

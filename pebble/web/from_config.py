@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pebble.config import Config, Mqtt
 from pebble.errors import ConfigError
+from pebble.fleet.people import People
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.web.settings import WebSettings
 
@@ -15,7 +16,7 @@ PEOPLE = "people.sqlite"  # in the state directory
 def settings_of(config: Config) -> WebSettings:
     """How ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
 
-    Whether there is a user, who is needed where ``login`` is true, is in the database ``people``, not in the config.
+    The user who is needed where ``login`` is true is in a database: :func:`require_user`.
     """
     web = config.web_interface
     if not web.local and web.tls.certificate is None and not web.plain_http:
@@ -38,6 +39,21 @@ def settings_of(config: Config) -> WebSettings:
         authority=web.tls.ca,
         plain_http_drive=web.plain_http_drive,
     )
+
+
+def require_user(settings: WebSettings) -> None:
+    """Raise ConfigError if a login is needed and there is no user."""
+    if not settings.login:
+        return
+    people = People(settings.people)
+    try:
+        if not people.list():
+            raise ConfigError(
+                f"web_interface.people: {settings.people} has no user: run "
+                f"`pebble web user add NAME --people {settings.people}` as the user who runs the robot"
+            )
+    finally:
+        people.close()
 
 
 def _broker(config: Config) -> Mqtt:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.config import load
+from pebble.config import load, parse
 from pebble.doctor import Finding, Level
 from pebble.doctor import checks as doctor
 from pebble.doctor.broker_probe import ProbeResult, connect_packet, probe
@@ -224,6 +224,21 @@ def test_the_connect_packet_follows_the_mqtt_specification() -> None:
 )
 def test_loopback(host: str, loopback: bool) -> None:
     assert doctor.is_loopback(host) is loopback
+
+
+@pytest.mark.parametrize(
+    ("web", "level", "text"),
+    [
+        ({"mqtt": {"host": "127.0.0.1"}}, Level.OK, "port 8080 of 127.0.0.1"),
+        ({}, Level.FAIL, "web_interface.mqtt.host: is missing"),
+        ({"mqtt": {"host": "b"}, "host": "0.0.0.0"}, Level.FAIL, "`pebble cert init` and `pebble web user add`"),
+        ({"mqtt": {"host": "b"}, "host": "0.0.0.0", "plain_http": True}, Level.WARN, "is not encrypted"),
+    ],
+)
+def test_the_operator_page_of_a_robot(web: dict[str, object], level: Level, text: str) -> None:
+    raw = {"robot": {"id": "goob"}, "services": {"web_handler": {"enabled": True}}, "web_interface": web}
+    (finding,) = doctor.operator_page(parse(raw, folder=Path("/nowhere"), env={}))
+    assert (finding.level, text in finding.text) == (level, True)
 
 
 def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:

@@ -1,0 +1,19 @@
+"""Whether the packages of the operator page are installed: they are an extra, which few machines need."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from pebble.errors import PebbleError
+
+_PACKAGES = ("cryptography", "starlette", "uvicorn", "websockets")
+
+
+def require_packages() -> None:
+    """Raise PebbleError with the command that installs them, unless they are here."""
+    missing = [name for name in _PACKAGES if find_spec(name) is None]
+    if missing:
+        raise PebbleError(
+            f"the operator page needs packages that are not installed ({', '.join(missing)}): "
+            "pip install 'pebble-robot[web]'"
+        )
