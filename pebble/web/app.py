@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import Lifespan
@@ -21,7 +21,6 @@ from starlette.websockets import WebSocket
 
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
-from pebble.fleet.roles import LOCAL, Session
 from pebble.web import login
 from pebble.web.control import Control
 from pebble.web.guard import Guard
@@ -120,14 +119,8 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
     )
 
 
-def session_of(connection: HTTPConnection) -> Session | None:
-    """The session of a request; without login that of the machine itself."""
-    settings: WebSettings = connection.app.state.settings
-    return login.session_of(connection) if settings.login else LOCAL
-
-
 async def _page(request: Request) -> Response:
-    if session_of(request) is None:
+    if login.session_of(request) is None:
         return Response(status_code=303, headers={"location": "/login", **_NO_STORE})
     return _static_of(request).answer("index.html", _NO_STORE)
 
@@ -159,7 +152,7 @@ async def _health(request: Request) -> Response:
 
 
 async def _snapshot(request: Request) -> Response:
-    if session_of(request) is None:
+    if login.session_of(request) is None:
         return PlainTextResponse("log in first", 401)
     picture = await request.app.state.media.snapshot(request.query_params.get("ref", ""))
     if picture is None:
@@ -169,7 +162,7 @@ async def _snapshot(request: Request) -> Response:
 
 async def _estop(request: Request) -> Response:
     """The way to stop that is left to a page whose control socket is down."""
-    session = session_of(request)
+    session = login.session_of(request)
     if session is None:
         return PlainTextResponse("log in first", 401)
     try:
@@ -182,17 +175,17 @@ async def _estop(request: Request) -> Response:
 
 
 async def _control(websocket: WebSocket) -> None:
-    session = session_of(websocket)
+    session = login.session_of(websocket)
     if session is None:
         await websocket.close(4401)
         return
     await websocket.accept()
-    await Control(websocket.app.state.server, websocket, session, lambda: session_of(websocket)).serve()
+    await Control(websocket.app.state.server, websocket, session, lambda: login.session_of(websocket)).serve()
 
 
 async def _media(websocket: WebSocket) -> None:
     ref = websocket.query_params.get("ref", "")
-    if session_of(websocket) is None or ref not in websocket.app.state.robots.components:
+    if login.session_of(websocket) is None or ref not in websocket.app.state.robots.components:
         await websocket.close(4401)
         return
     await websocket.accept()

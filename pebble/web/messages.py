@@ -47,7 +47,7 @@ class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
 
 
 class Lease(_FromPage, frozen=True, kw_only=True, tag="lease"):
-    """Request (``take``) or release the driver lease. ``over``: from somebody who is driving."""
+    """Request (``take``) or release the driver lease. ``over``: from a driver who is active."""
 
     ref: Ref
     take: bool
@@ -79,7 +79,7 @@ class EstopOp(_FromPage, frozen=True, kw_only=True, tag="estop"):
     """Emergency stop of one component, or of all (``ref`` ""), repeated by the server until it is confirmed."""
 
     ref: Ref
-    stop: Annotated[str, Meta(pattern="^[0-9a-f]{16}$")]  # new for every press
+    stop: Annotated[str, Meta(pattern="^[0-9a-f]{16}$", max_length=16)]  # new for every press
     why: Annotated[str, Meta(max_length=40)] = ""
 
 

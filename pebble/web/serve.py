@@ -11,7 +11,6 @@ import uvicorn
 from pebble.errors import PebbleError
 from pebble.web.app import create_app
 from pebble.web.connections import MAX_CONNECTIONS, HttpProtocol, Listener, Loop, WebSocketProtocol
-from pebble.web.connections import MAX_CONNECTIONS, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.settings import WebSettings
 
 _LARGEST_MESSAGE = 64 * 1024

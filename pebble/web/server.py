@@ -25,7 +25,7 @@ from pebble.contract import (
     codec,
 )
 from pebble.contract.identity import Identity, parse_topic
-from pebble.contract.payloads import DrivenRobot
+from pebble.contract.payloads import Driver
 from pebble.contract.payloads import Driving as DrivingPayload
 from pebble.errors import ConfigError, PayloadError
 from pebble.fleet.audit import Audit
@@ -268,9 +268,9 @@ class Server:
             return
         self.drive_changed.clear()
         self._announced_at = now
-        systems: dict[str, dict[str, DrivenRobot]] = {system: {} for system in self._announcing}
+        systems: dict[str, dict[str, Driver]] = {system: {} for system in self._announcing}
         for ref, lease in list(self.driving.leases.items())[:_ANNOUNCED]:
-            one = DrivenRobot(by=lease.tab.user, device=lease.tab.device, since=lease.since_ms)
+            one = Driver(by=lease.tab.user, device=lease.tab.device, since=lease.since_ms)
             systems.setdefault(ref.partition("/")[0], {})[ref] = one
         self._announcing = {system for system, robots in systems.items() if robots}  # the others: once more, empty
         for system, robots in systems.items():

@@ -1,0 +1,122 @@
+"""Generates docs/web-messages.md and the page's messages.d.ts from messages.py.
+
+Program: ``python -m pebble.web.messages_docs`` writes both; a test checks that they are current.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+from msgspec import inspect as types
+
+from pebble.web import messages
+
+_ROOT = Path(__file__).parents[2]
+DOCS = _ROOT / "docs" / "web-messages.md"
+DECLARATIONS = Path(__file__).parent / "static" / "messages.d.ts"
+
+_INTRODUCTION = """# Messages of the operator page
+
+Generated from `pebble/web/messages.py` by `python -m pebble.web.messages_docs`; edit that file, not this one.
+
+{about}
+"""
+_MEDIA = """## Media socket
+
+`/ws/media?ref=REF&can=ENCODING,…` carries the pictures of one component, in binary messages; numbers are big-endian.
+
+| from | message |
+|---|---|
+| server | `u32 number`, `u8 kind`, then kind 0: the payload as it came from the robot; \
+kind 1: a JPEG of the server's own, after `u64` epoch milliseconds of its capture, 0 if unknown |
+| page | `u32 number`, `u8 what`: 0 the frame is drawn, 1 a key frame is needed, 2 this browser cannot decode it |
+"""
+
+
+def markdown() -> str:
+    """docs/web-messages.md."""
+    about = (messages.__doc__ or "").partition("\n")[2].strip().partition("docs/web-messages.md")[0].strip()
+    parts = [_INTRODUCTION.format(about=f"{_summary(messages)} {about}".replace("``", "`"))]
+    parts += ["## From the page\n", *map(_section, get_args(messages.FromPage))]
+    parts += ["## From the server\n", *map(_section, get_args(messages.ToPage))]
+    parts += ["## Metrics of the server\n", *map(_section, _views())]
+    return "\n".join([*parts, _MEDIA])
+
+
+def declarations() -> str:
+    """messages.d.ts: one interface for each struct."""
+    parts = ["// Generated from pebble/web/messages.py by python -m pebble.web.messages_docs.\n"]
+    for struct in (*get_args(messages.FromPage), *get_args(messages.ToPage), messages.ShownOwner, *_views()):
+        info: Any = types.type_info(struct)
+        tag = [f'  op: "{info.tag}";'] if info.tag is not None else []
+        fields = [f"  {one.name}{'' if one.required else '?'}: {_script(one.type)};" for one in info.fields]
+        parts.append("\n".join([f"export interface {struct.__name__} {{", *tag, *fields, "}\n"]))
+    for name in ("FromPage", "ToPage"):
+        members = " | ".join(one.__name__ for one in get_args(getattr(messages, name)))
+        parts.append(f"export type {name} = {members};\n")
+    return "\n".join(parts)
+
+
+def _views() -> Iterator[type]:
+    """The values of the server's metrics, each after what it consists of."""
+    yield messages.OwnerState
+    yield from messages.SERVER_METRICS.values()
+
+
+def _section(struct: type) -> str:
+    info: Any = types.type_info(struct)
+    title = f"`{info.tag}`" if info.tag is not None else struct.__name__
+    rows = [f"| `{one.name}` | {_words(one.type)} | {'' if one.required else _default(one)} |" for one in info.fields]
+    table = ["| field | type | default |", "|---|---|---|", *rows, ""] if rows else []
+    return "\n".join([f"### {title}\n", inspect.cleandoc(struct.__doc__ or "").replace("``", "`"), "", *table])
+
+
+def _default(field: Any) -> str:
+    return f"`{json.dumps(field.default)}`"
+
+
+def _summary(thing: object) -> str:
+    return (inspect.getdoc(thing) or "").partition("\n")[0]
+
+
+def _words(kind: Any) -> str:
+    return _script(kind).replace("|", "or")
+
+
+def _script(kind: Any) -> str:
+    match kind:
+        case types.Metadata():
+            return _script(kind.type)
+        case types.StrType():
+            return "string"
+        case types.IntType() | types.FloatType():
+            return "number"
+        case types.BoolType():
+            return "boolean"
+        case types.NoneType():
+            return "null"
+        case types.UnionType():
+            return " | ".join(map(_script, kind.types))
+        case types.StructType():
+            return str(kind.cls.__name__)
+        case types.VarTupleType():
+            item = _script(kind.item_type)
+            return f"({item})[]" if "|" in item else f"{item}[]"
+        case types.TupleType():
+            return f"[{', '.join(map(_script, kind.item_types))}]"
+    return "any"
+
+
+def main() -> None:
+    """Write both files."""
+    DOCS.write_text(re.sub(r"\n{3,}", "\n\n", markdown()))
+    DECLARATIONS.write_text(declarations())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+// Generated from pebble/web/messages.py by python -m pebble.web.messages_docs.
+
+export interface Hello {
+  op: "hello";
+  version: string;
+  device?: string;
+  token?: string;
+  can?: string[];
+}
+
+export interface Echo {
+  op: "echo";
+  n: number;
+  t: number;
+}
+
+export interface Watch {
+  op: "watch";
+  ref: string;
+}
+
+export interface Lease {
+  op: "lease";
+  ref: string;
+  take: boolean;
+  over?: boolean;
+}
+
+export interface DriveOp {
+  op: "drive";
+  ref: string;
+  g: number;
+  t: number;
+  x?: number;
+  z?: number;
+  y?: number;
+  final?: boolean;
+}
+
+export interface StopOp {
+  op: "stop";
+  ref: string;
+}
+
+export interface EstopOp {
+  op: "estop";
+  ref: string;
+  stop: string;
+  why?: string;
+}
+
+export interface EstopEndOp {
+  op: "estop-end";
+  stop: string;
+}
+
+export interface EstopResetOp {
+  op: "estop-reset";
+  ref: string;
+  owners: ShownOwner[];
+}
+
+export interface EncodingOp {
+  op: "encoding";
+  ref: string;
+  encoding: string;
+}
+
+export interface PictureFromOp {
+  op: "picture-from";
+  ref: string;
+  source: string;
+}
+
+export interface Welcome {
+  op: "welcome";
+  server: string;
+  version: string;
+  user: string;
+  role: string;
+  rights: string[];
+  login: boolean;
+  token: string;
+  now: number;
+  drives?: boolean;
+}
+
+export interface Ping {
+  op: "ping";
+  n: number;
+  now: number;
+  round_trip_ms?: number;
+}
+
+export interface State {
+  op: "state";
+  now: number;
+  set: [string, string, any, number][];
+  gone?: string[];
+}
+
+export interface Logs {
+  op: "logs";
+  ref: string;
+  first: number;
+  lines: any[];
+}
+
+export interface Refused {
+  op: "refused";
+  cmd: string;
+  ref: string;
+  why: string;
+  g?: number;
+}
+
+export interface Bye {
+  op: "bye";
+  why: string;
+  again: boolean;
+}
+
+export interface ShownOwner {
+  owner: string;
+  boot: string;
+  count: number;
+}
+
+export interface OwnerState {
+  owner: string;
+  latched: boolean;
+  boot: string;
+  count: number;
+  by: string;
+  why: string;
+  since: number;
+  persisted: boolean | null;
+  reset_refused: string | null;
+}
+
+export interface Liveness {
+  online: boolean | null;
+  silent_s: number | null;
+  latency_ms: number | null;
+  whole_seconds: boolean;
+}
+
+export interface EstopView {
+  available: boolean;
+  latched: boolean;
+  by: string;
+  why: string;
+  since: number;
+  owners: OwnerState[];
+  sending: string;
+  sending_text: string;
+  stop: string;
+}
+
+export interface DriverView {
+  by: string;
+  device: string;
+  server: string;
+  you: boolean;
+  idle_s: number | null;
+}
+
+export interface PictureView {
+  state: string;
+  why: string;
+  encoding: string;
+  per_second: number;
+  kbits: number;
+  viewers: number;
+  pinned: string;
+}
+
+export interface PictureFrom {
+  source: string;
+}
+
+export interface BrokerView {
+  connected: boolean;
+  problem: string;
+  robots_omitted: number;
+}
+
+export type FromPage = Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp;
+
+export type ToPage = Welcome | Ping | State | Logs | Refused | Bye;
