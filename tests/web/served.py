@@ -1,0 +1,250 @@
+"""A server of the operator page in a thread, a page without a browser, and a robot that only records."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import uvicorn
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, codec
+from pebble.contract.payloads import EstopState, Heartbeat
+from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.web.connections import Loop
+from pebble.web.serve import _config, _listen
+from pebble.web.settings import WebSettings
+from tests.support import until
+
+HEARTBEAT_S = 0.25
+
+
+class Served:
+    """One server on a free loopback port; everything runs in this process, except the broker."""
+
+    def __init__(self, broker_port: int, **settings: Any) -> None:
+        given = {"port": 0, "server": "hall", **settings}
+        self.settings = WebSettings(broker=MqttSettings(host="127.0.0.1", port=broker_port), **given)
+        self._listener = _listen(self.settings)
+        self.port = int(self._listener.getsockname()[1])
+        self._uvicorn = uvicorn.Server(_config(self.settings))
+        self._thread = threading.Thread(target=self._run, name="served", daemon=True)
+
+    @property
+    def app(self) -> Any:
+        return self._uvicorn.config.app
+
+    @property
+    def version(self) -> str:
+        return str(self.app.state.version)
+
+    @property
+    def origin(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        assert until(lambda: self._uvicorn.started, 10), "the server did not start"
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._uvicorn.should_exit = True
+        self._thread.join(10)
+        self._listener.close()
+        assert not self._thread.is_alive(), "the server did not end"
+
+    def page(self, **options: Any) -> Page:
+        return Page(self, **options)
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=Loop) as runner:
+            runner.run(self._uvicorn.serve(sockets=[self._listener]))
+
+
+class Page:
+    """What a page's control socket does: hello, echoes, and whatever a test sends."""
+
+    def __init__(
+        self, served: Served, *, device: str = "test", token: str = "", version: str | None = None, cookie: str = ""
+    ) -> None:
+        headers = {"cookie": cookie} if cookie else None
+        self.state: dict[tuple[str, str], Any] = {}
+        self.refused: list[dict[str, Any]] = []
+        self.welcome: dict[str, Any] = {}
+        self.bye: dict[str, Any] = {}
+        self.closed = False
+        self.echoes = True  # False: as a page that stands still
+        self.echo_offset_ms = 0.0
+        self._socket: ClientConnection = connect(
+            f"ws://127.0.0.1:{served.port}/ws/control", origin=served.origin, additional_headers=headers, max_size=None
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        self.send("hello", version=served.version if version is None else version, device=device, token=token)
+        assert until(lambda: self.welcome or self.closed, 5)
+
+    def send(self, op: str, **fields: Any) -> None:
+        self._socket.send(json.dumps({"op": op, **fields}))
+
+    def send_raw(self, data: str | bytes) -> None:
+        self._socket.send(data)
+
+    def drive(self, ref: str, g: int, *, x: float = 0.0, z: float = 0.0, age_ms: float = 0.0, **more: Any) -> None:
+        self.send("drive", ref=ref, g=g, t=now_ms() - age_ms, x=x, z=z, **more)
+
+    def take(self, ref: str, *, over: bool = False) -> bool:
+        self.send("lease", ref=ref, take=True, over=over)
+        return until(lambda: self.value(ref, "web/driver", "you") is True, 3)
+
+    def value(self, ref: str, metric: str, field: str | None = None) -> Any:
+        value = self.state.get((ref, metric))
+        return value if field is None or value is None else value.get(field)
+
+    def knows(self, ref: str, timeout: float = 5.0) -> bool:
+        """Whether the component has become online."""
+        return until(lambda: self.value(ref, "web/liveness", "online") is True, timeout)
+
+    def ready(self) -> bool:
+        """Whether enough echoes were exchanged to drive."""
+        return until(lambda: self.state.get(("", "round trip"), -1) >= 0, 3)
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def abort(self) -> None:
+        """Vanish without a goodbye."""
+        self._socket.socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def _read(self) -> None:
+        try:
+            for text in self._socket:
+                self._take(json.loads(text))
+        except (ConnectionClosed, OSError):
+            pass
+        self.closed = True
+
+    def _take(self, message: dict[str, Any]) -> None:
+        match message["op"]:
+            case "ping":
+                self.state["", "round trip"] = message["round_trip_ms"]
+                if self.echoes:
+                    self.send("echo", n=message["n"], t=now_ms() + self.echo_offset_ms)
+            case "state":
+                self.state |= {(ref, metric): value for ref, metric, value, _ in message["set"]}
+                for ref in message["gone"]:
+                    self.state = {key: value for key, value in self.state.items() if key[0] != ref}
+            case "refused":
+                self.refused.append(message)
+            case "welcome":
+                self.welcome = message
+            case "bye":
+                self.bye = message
+
+
+def now_ms() -> float:
+    """The page's clock, which has nothing to do with the server's."""
+    return 1000 * time.monotonic() % 1e9 + 1e6
+
+
+class RecordingRobot:
+    """Publishes heartbeats and capabilities, and records what arrives; with ``latches`` it also takes stops."""
+
+    def __init__(self, broker_port: int, base: str, *, capabilities: dict[str, Any] | None = None) -> None:
+        self.base = base
+        self.received: list[tuple[float, str, Any]] = []
+        self.latched = False
+        self._count = 0
+        self._recent: list[str] = []
+        self._transport = create(
+            "mqtt", f"robot-{base.replace('/', '-')}", MqttSettings(host="127.0.0.1", port=broker_port)
+        )
+        self._transport.open()
+        self._transport.subscribe(f"{base}/incoming/#", self._receive, direct=True)
+        drive = {"available": True, "controls": True, "topic": f"{base}/incoming/drive-values", "arbitrates": True}
+        estop = {"available": True, "owners": ["serial"]}
+        value = {"drive": drive, "estop": estop} if capabilities is None else capabilities
+        if value:
+            payload = msgspec.json.encode({"schema": "pebble-capabilities/v1", "t": 1, "value": value})
+            self._transport.publish(CAPABILITIES.topic(base), payload, qos=QoS.DELIVERED, retain=True)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._beat, daemon=True)
+        self._thread.start()
+
+    def drives(self, since: float = 0.0) -> list[dict[str, Any]]:
+        """The drive commands that have arrived."""
+        topic = f"{self.base}/incoming/drive-values"
+        return [payload for at, name, payload in list(self.received) if name == topic and at >= since]
+
+    def topics(self) -> set[str]:
+        return {topic for _, topic, _ in list(self.received)}
+
+    def publish(self, metric: str, value: Any, *, retain: bool = False) -> None:
+        topic = f"{self.base}/outgoing/{metric}"
+        self._transport.publish(topic, msgspec.json.encode(value), qos=QoS.DELIVERED, retain=retain)
+
+    def silent(self) -> None:
+        """Stop the heartbeats."""
+        self._ending.set()
+        self._thread.join()
+
+    def close(self) -> None:
+        self._ending.set()
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def _beat(self) -> None:
+        while True:
+            payload = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()), online=True))
+            self._transport.publish(ONLINE.topic(self.base), payload, qos=QoS.DELIVERED, retain=True)
+            if self._ending.wait(HEARTBEAT_S):
+                return
+
+    def _receive(self, message: Message) -> None:
+        try:
+            payload = json.loads(message.payload)
+        except ValueError:
+            payload = message.payload
+        self.received.append((time.monotonic(), message.topic, payload))
+        if message.topic.endswith("/incoming/estop"):
+            self._stop(payload)
+        elif message.topic.endswith("/estop-reset") and payload.get("count") == self._count:
+            self.latched = False
+            self._publish_state("")
+
+    def _stop(self, payload: dict[str, Any]) -> None:
+        if payload["stop"] not in self._recent:
+            self.latched = True
+            self._count += 1
+            self._recent.insert(0, payload["stop"])
+        self._publish_state(payload.get("by", ""))
+
+    def _publish_state(self, by: str) -> None:
+        state = EstopState(
+            latched=self.latched,
+            boot="b",
+            count=self._count,
+            recent=self._recent[:8],
+            by=by,
+            why="",
+            since=1,
+            persisted=True,
+        )
+        topic = ESTOP_STATE.topic(self.base, owner="serial")
+        self._transport.publish(topic, codec.encode(ESTOP_STATE, state), qos=QoS.DELIVERED, retain=True)
