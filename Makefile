@@ -23,7 +23,7 @@ demo: .venv/.ready-demo
 	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS))
 
 test: check
-	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients node=nodejs ip=iproute2 tc=iproute2 nft=nftables
+	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
 	@$(VENV) tools/run_tests.py --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone"
 	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines"

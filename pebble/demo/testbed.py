@@ -10,7 +10,7 @@ import tempfile
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from types import TracebackType
@@ -220,13 +220,14 @@ class McuRobot(SimulatedRobot):
 
 
 class Testbed:
-    """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU.
+    """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU; or only those of ``names``.
 
     ``keep``: the folder with the logs stays after the demo.
     """
 
-    def __init__(self, ending: threading.Event) -> None:
+    def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS) -> None:
         self.keep = True
+        self._names = names
         self.folder = Path(tempfile.mkdtemp(prefix="pebble-demo-", dir=_temporary_folder()))
         self.robots: Sequence[SimulatedRobot] = ()
         self.remote_port = 0
@@ -251,12 +252,13 @@ class Testbed:
         for broker in (remote, local):
             broker.wait(self._ending)
         self.remote_port = remote.port
-        self.robots = [
-            RoomRobot("goob", self.folder, local.port, remote.port),
-            LinuxRobot("fred", self.folder, local.port, remote.port),
-            McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
-            McuRobot("benjr", self.folder, "ESP8266", remote.port),
-        ]
+        makers: dict[str, Callable[[], SimulatedRobot]] = {
+            "goob": lambda: RoomRobot("goob", self.folder, local.port, remote.port),
+            "fred": lambda: LinuxRobot("fred", self.folder, local.port, remote.port),
+            "minilamp": lambda: McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
+            "benjr": lambda: McuRobot("benjr", self.folder, "ESP8266", remote.port),
+        }
+        self.robots = [makers[name]() for name in self._names]
 
     def start_robots(self) -> None:
         """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""

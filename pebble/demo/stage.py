@@ -1,0 +1,156 @@
+"""Whole robots with the operator page and no scripted operator, for tests and measurements of the page."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from types import TracebackType
+from typing import Any, Self
+
+from pebble.demo.broker import BrokerKind
+from pebble.demo.operator import Operator
+from pebble.demo.page import PageServer
+from pebble.demo.programs import end_all
+from pebble.demo.testbed import ROBOTS, SimulatedRobot, Testbed
+from pebble.errors import PebbleError
+from pebble.simulation.trace import Entry
+
+_END_S = 2.5
+_DRIVABLE_S = 30.0
+_POLL_S = 0.02
+
+Changes = list[tuple[int, tuple[float, float]]]
+
+
+class Stage:
+    """The demo's brokers and the named robots (none: all four), and the page's server as a process of its own.
+
+    ``robots``, by name, are traced: ``entries()`` is what each MCU received and did, with time.monotonic_ns().
+    ``settings`` are fields of WebSettings. A context manager, for the main thread. Raises PebbleError.
+    """
+
+    def __init__(self, *names: str, **settings: Any) -> None:
+        self.robots: dict[str, SimulatedRobot] = {}
+        self._names, self._settings = names or ROBOTS, settings
+        self._ending = threading.Event()
+        self._testbed = Testbed(self._ending, self._names)
+        self._server: PageServer | None = None
+
+    def __enter__(self) -> Self:
+        try:
+            self._testbed.start_brokers(BrokerKind.MOSQUITTO)
+            self._server = self._start_server(0)
+            self._testbed.start_robots()
+            self.robots = {robot.name: robot for robot in self._testbed.robots}
+            self._server.wait(self._ending)
+            self._wait_until_drivable()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        if self._server is not None:
+            self.thaw_server()
+            end_all([self._server.program], _END_S)
+        self._testbed.keep = False
+        self._testbed.__exit__(kind, error, tb)
+
+    def _wait_until_drivable(self) -> None:
+        """Every robot is online, and its capabilities say that it drives."""
+        observer = Operator(self.broker_port, "stage")
+        observer.connect()
+        end = time.monotonic() + _DRIVABLE_S
+        try:
+            while not observer.ready(len(self._names)):
+                problems = self._testbed.unexpected_exits()
+                if problems or time.monotonic() > end:
+                    raise PebbleError("; ".join(problems) or "the robots did not become ready to drive")
+                time.sleep(_POLL_S)
+        finally:
+            observer.end()
+
+    @property
+    def server(self) -> PageServer:
+        if self._server is None:
+            raise PebbleError("the stage has not been entered")
+        return self._server
+
+    @property
+    def url(self) -> str:
+        """The address of the page, with a slash at the end."""
+        return self.server.url
+
+    @property
+    def broker_port(self) -> int:
+        """Of the operators' broker, on loopback."""
+        return self._testbed.remote_port
+
+    @property
+    def folder_of_logs(self) -> str:
+        return str(self._testbed.folder)
+
+    def ref(self, name: str) -> str:
+        return f"pebble/robots/{name}"
+
+    def robot_url(self, name: str) -> str:
+        return f"{self.url}r/{self.ref(name)}"
+
+    # -- the server's process
+
+    def kill_server(self) -> None:
+        os.kill(self.server.program.pid, signal.SIGKILL)
+        while not self.server.program.ended:
+            time.sleep(_POLL_S)
+
+    def freeze_server(self) -> None:
+        """SIGSTOP: its connections stay, and nothing answers."""
+        os.kill(self.server.program.pid, signal.SIGSTOP)
+
+    def thaw_server(self) -> None:
+        if not self.server.program.ended:
+            os.kill(self.server.program.pid, signal.SIGCONT)
+
+    def restart_server(self) -> None:
+        """Start it again at the same address; ends the old one if it runs."""
+        port = int(self.url.rpartition(":")[2].rstrip("/"))
+        end_all([self.server.program], _END_S)
+        self._server = self._start_server(port)
+        self._server.wait(self._ending)
+
+    def _start_server(self, port: int) -> PageServer:
+        settings = {"port": port, "server": "stage", **self._settings}
+        return PageServer(self._testbed.folder, self._testbed.remote_port, **settings)
+
+    # -- the motors
+
+    def motors(self, name: str) -> Changes:
+        """Every change of its motors, oldest first: monotonic ns, left and right."""
+        return [(entry.ns, entry.motors) for entry in self.robots[name].entries() if entry.motors is not None]
+
+    def wheels_turning(self, name: str, since_ns: int | None = None) -> bool:
+        """Whether its motors run now; with ``since_ns`` whether they have run at any time since then."""
+        changes = self.motors(name)
+        if since_ns is None:
+            return bool(changes) and _runs(changes, -1)
+        return any(_runs(changes, index) and _until(changes, index) > since_ns for index in range(len(changes)))
+
+    def last_motion_ns(self, name: str) -> int:
+        """When its motors were last switched off; now if they run, 0 if they have never run."""
+        changes = self.motors(name)
+        last = next((index for index in reversed(range(len(changes))) if _runs(changes, index)), None)
+        return 0 if last is None else _until(changes, last)
+
+    def lines(self, name: str) -> list[Entry]:
+        """What its MCU received, oldest first."""
+        return [entry for entry in self.robots[name].entries() if entry.event == "line"]
+
+
+def _runs(changes: Changes, index: int) -> bool:
+    return changes[index][1] != (0.0, 0.0)
+
+
+def _until(changes: Changes, index: int) -> int:
+    return changes[index + 1][0] if index + 1 < len(changes) else time.monotonic_ns()

@@ -1,0 +1,121 @@
+"""Pages in Debian's Chromium, in the sizes and themes that people use, and everything they complain of.
+
+Playwright's own waiting for an expression is stopped by the page's policy (CSP): use :meth:`Tab.until`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import pytest
+from playwright.sync_api import Browser, BrowserContext, CDPSession, Page
+
+from pebble.bench import chromium as program
+
+Size = Literal["desktop", "phone", "landscape", "small"]
+Theme = Literal["light", "dark"]
+
+SIZES: dict[Size, tuple[int, int]] = {
+    "desktop": (1280, 800),
+    "phone": (390, 844),
+    "landscape": (844, 390),
+    "small": (320, 640),
+}
+_OPEN_S = 15.0
+_VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
+  pebbleViolation(`${event.violatedDirective} ${event.blockedURI}`))"""
+_HIDE = """(hidden) => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
+  const state = hidden ? "hidden" : "visible";
+  Object.defineProperty(document, "visibilityState", { configurable: true, get: () => state });
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+@contextmanager
+def chromium(*flags: str) -> Iterator[Browser]:
+    """A headless browser. Skips the test without one, except where CI says that it must be there."""
+    problem = program.missing()
+    if problem is not None:
+        reason = f"{problem}; or `sh tools/debian-packages.sh chromium=chromium`"
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
+    with program.chromium(*flags) as browser:
+        yield browser
+
+
+@dataclass
+class Tab:
+    """One open page, and what it complained of."""
+
+    context: BrowserContext
+    page: Page
+    console: list[str] = field(default_factory=list)  # "type: text"
+    errors: list[str] = field(default_factory=list)  # exceptions that nothing caught
+    violations: list[str] = field(default_factory=list)  # of the content security policy
+
+    def until(self, condition: Callable[[], object] | str, timeout: float = 10.0) -> bool:
+        """Wait until ``condition()``, or a JavaScript expression, is true; assert on the result."""
+        end = time.monotonic() + timeout
+        while not (self.page.evaluate(condition) if isinstance(condition, str) else condition()):
+            if time.monotonic() > end:
+                return False
+            self.page.wait_for_timeout(10)  # not time.sleep: Playwright handles events meanwhile
+        return True
+
+    def test(self, name: str) -> Any:
+        """The locator of the elements with this ``data-test``."""
+        return self.page.locator(f'[data-test="{name}"]')
+
+    def cdp(self) -> CDPSession:
+        """Chromium's own protocol for this page."""
+        return self.context.new_cdp_session(self.page)
+
+    def freeze(self, *, frozen: bool = True) -> None:
+        """As a system does that suspends the tab."""
+        self.cdp().send("Page.setWebLifecycleState", {"state": "frozen" if frozen else "active"})
+
+    def hide(self, *, hidden: bool = True) -> None:
+        """As if another tab were in front: Playwright's pages are always visible."""
+        self.page.evaluate(_HIDE, hidden)
+
+    def blur(self) -> None:
+        """As if another window had the focus; Playwright's pages keep it."""
+        self.page.evaluate("() => dispatchEvent(new Event('blur'))")
+
+    def complaints(self) -> list[str]:
+        """Errors and warnings of any kind; a good test ends with none."""
+        bad = [line for line in self.console if line.startswith(("error", "warning"))]
+        return [*self.errors, *self.violations, *bad]
+
+
+@contextmanager
+def tab(
+    browser: Browser, url: str, size: Size = "desktop", theme: Theme = "light", *, script: str = "", **options: Any
+) -> Iterator[Tab]:
+    """Open ``url`` in a context of its own; ``script`` runs before the page's; ``options`` are those of a context."""
+    width, height = SIZES[size]
+    touch = size != "desktop"
+    usual = {"viewport": {"width": width, "height": height}, "has_touch": touch, "is_mobile": touch}
+    context = browser.new_context(**{**usual, "color_scheme": theme, **options})
+    try:
+        opened = _prepared(context, script)
+        opened.page.goto(url, timeout=1000 * _OPEN_S, wait_until="domcontentloaded")
+        yield opened
+    finally:
+        context.close()
+
+
+def _prepared(context: BrowserContext, script: str) -> Tab:
+    page = context.new_page()
+    opened = Tab(context, page)
+    page.on("console", lambda message: opened.console.append(f"{message.type}: {message.text}"))
+    page.on("pageerror", lambda error: opened.errors.append(str(error)))
+    page.expose_function("pebbleViolation", lambda text: opened.violations.append(text))
+    for one in (_VIOLATIONS, script):
+        page.add_init_script(one or ";")
+    return opened
