@@ -1,4 +1,4 @@
-"""Fixtures of the tests with a browser: one browser, and whole robots, for each module that asks for them.
+"""What the tests of one module share: a broker and a server; one browser, and whole robots.
 
 Not for the whole session: while Playwright runs, asyncio.run fails in this process.
 """
@@ -10,8 +10,23 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser
 
+from tests.support import Broker
 from tests.web.browser import chromium
+from tests.web.served import Served
 from tests.web.stage import Stage
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    running = Broker(tmp_path_factory.mktemp("broker"))
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def served(broker: Broker) -> Iterator[Served]:
+    with Served(broker.port) as running:
+        yield running
 
 
 @pytest.fixture(scope="module")
