@@ -1,0 +1,115 @@
+// Decodes access units of H.264 with WebCodecs, one picture for each.
+
+import { checkUnit, unseal } from "./access-unit.js";
+import { PayloadError, UnsupportedError } from "./errors.js";
+
+const HELD_MS = 150; // some decoders give a picture out only when the next one comes
+const FAILURES = 2; // key frames in a row that are whole and fail: this browser cannot decode them
+
+/** Like pebble.media.h264.H264Decoder; after an error the next unit has to be a key frame. */
+export class H264Decoder {
+  constructor() {
+    /** @type {VideoDecoder|null} */
+    this.decoder = null;
+    this.codec = "";
+    this.failures = 0;
+    this.units = 0;
+    /** @type {Map<number, any>} */
+    this.labels = new Map(); // of units that are being decoded, by timestamp
+    /** @type {Array<{frame: VideoFrame, label: any}>} */
+    this.made = [];
+    /** @type {Error|null} */
+    this.error = null;
+    this.wake = () => {};
+  }
+
+  /**
+   * The newest picture that is ready, with its label; null if the decoder holds it back. Throws PayloadError for what
+   * is damaged, UnsupportedError where this browser has no decoder.
+   * @param {Uint8Array} sealed
+   * @param {boolean} keyframe
+   * @param {any} label returned with the picture of this unit
+   */
+  async decode(sealed, keyframe, label) {
+    const unit = unseal(sealed);
+    const codec = checkUnit(unit, keyframe);
+    try {
+      await this.submit(unit, codec, label);
+      const made = await this.newest();
+      this.failures = 0;
+      return made;
+    } catch (error) {
+      this.close();
+      this.failures += keyframe ? 1 : 0;
+      if (this.failures >= FAILURES) throw new UnsupportedError(`h264: ${error}`);
+      throw error instanceof UnsupportedError ? error : new PayloadError(`h264: ${error}`);
+    }
+  }
+
+  close() {
+    if (this.decoder && this.decoder.state !== "closed") this.decoder.close();
+    this.decoder = null;
+    this.error = null;
+    this.labels.clear();
+    for (const { frame } of this.made.splice(0)) frame.close();
+  }
+
+  /** @param {Uint8Array} unit @param {string|null} codec of a key frame @param {any} label */
+  async submit(unit, codec, label) {
+    if (codec !== null && (this.decoder === null || codec !== this.codec)) await this.open(codec);
+    if (this.decoder === null) throw new PayloadError("no key frame yet");
+    const timestamp = this.units++;
+    this.labels.set(timestamp, label);
+    this.decoder.decode(new EncodedVideoChunk({ type: codec === null ? "delta" : "key", timestamp, data: unit }));
+  }
+
+  /** @param {string} codec */
+  async open(codec) {
+    this.close();
+    if (typeof VideoDecoder === "undefined") throw new UnsupportedError("this browser has no decoder for h264");
+    const config = { codec, optimizeForLatency: true }; // without a description: Annex B
+    if (!(await VideoDecoder.isConfigSupported(config)).supported) {
+      throw new UnsupportedError(`this browser cannot decode ${codec}`);
+    }
+    const decoder = new VideoDecoder({
+      output: (frame) => this.take(decoder, frame),
+      error: (error) => {
+        if (this.decoder === decoder) this.error = error;
+        this.wake();
+      },
+    });
+    decoder.configure(config);
+    this.decoder = decoder;
+    this.codec = codec;
+  }
+
+  /** @param {VideoDecoder} decoder @param {VideoFrame} frame */
+  take(decoder, frame) {
+    if (this.decoder !== decoder) {
+      frame.close();
+      return;
+    }
+    this.made.push({ frame, label: this.labels.get(frame.timestamp) });
+    this.labels.delete(frame.timestamp);
+    this.wake();
+  }
+
+  async newest() {
+    if (!this.made.length && !this.error) await this.ready(HELD_MS);
+    if (this.error) throw this.error;
+    const made = this.made.splice(0);
+    for (const { frame } of made.slice(0, -1)) frame.close();
+    return made.length ? made[made.length - 1] : null;
+  }
+
+  /** Wait for a picture, an error or the timeout. */
+  ready(/** @type {number} */ timeout) {
+    return new Promise((resolve) => {
+      const timer = setTimeout(resolve, timeout);
+      this.wake = () => {
+        clearTimeout(timer);
+        resolve(undefined);
+      };
+    });
+  }
+}

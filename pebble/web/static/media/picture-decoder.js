@@ -1,0 +1,136 @@
+// Decodes the payloads of one robot into bitmaps: pebble/media/decode.py for browsers, pixel by pixel the same.
+
+import { Sequence, inflate, readPayload } from "./decode.js";
+import { addDifference } from "./delta.js";
+import { PayloadError, UnsupportedError } from "./errors.js";
+import { H264Decoder } from "./h264.js";
+import { checkJpeg } from "./jpeg.js";
+
+// Neither a profile nor a turn may change a pixel: a difference would not fit any more.
+const AS_IT_IS = /** @type {const} */ ({ colorSpaceConversion: "none", premultiplyAlpha: "none" });
+
+/**
+ * @typedef {object} Decoded
+ * @property {ImageBitmap} bitmap the caller's own
+ * @property {string} encoding
+ * @property {boolean} key
+ * @property {number|null} frame
+ * @property {number|null} capturedMs
+ */
+
+/** Decodes payloads in any order and encoding; after a lost or damaged one nothing is shown until a key frame. */
+export class PictureDecoder {
+  constructor() {
+    this.sequence = new Sequence();
+    this.unsupported = false; // whether the last payload failed for lack of a decoder
+    this.h264 = new H264Decoder();
+    /** @type {OffscreenCanvasRenderingContext2D|null} */
+    this.context = null;
+    /** @type {ImageData|null} */
+    this.reference = null; // null: the canvas holds the picture that the next difference builds on
+  }
+
+  /**
+   * The picture of this payload; null if it is refused, or waits for a key frame or for its decoder. Never throws for a
+   * payload. One call at a time.
+   * @param {Uint8Array} bytes
+   * @returns {Promise<Decoded|null>}
+   */
+  async feed(bytes) {
+    this.unsupported = false;
+    try {
+      const payload = readPayload(bytes);
+      if (payload.packed) payload.body = await inflate(payload.body);
+      if (!this.sequence.admit(payload)) {
+        this.h264.close();
+        return null;
+      }
+      const decoded = payload.encoding === "h264" ? await this.unit(payload) : await this.jpeg(payload);
+      this.sequence.shown(payload);
+      return decoded;
+    } catch (error) {
+      this.h264.close();
+      this.sequence.refuse(error);
+      this.unsupported = error instanceof UnsupportedError;
+      if (!this.unsupported && !(error instanceof PayloadError)) throw error;
+      return null;
+    }
+  }
+
+  close() {
+    this.h264.close();
+    this.sequence.reset();
+  }
+
+  /** @param {import("./decode.js").Payload} payload */
+  async unit(payload) {
+    if (this.sequence.last === null) this.h264.close();
+    const made = await this.h264.decode(payload.body, payload.keyframe, labelOf(payload));
+    if (made === null) return null;
+    try {
+      return { bitmap: await createImageBitmap(made.frame), ...made.label };
+    } finally {
+      made.frame.close();
+    }
+  }
+
+  /** @param {import("./decode.js").Payload} payload */
+  async jpeg(payload) {
+    const picture = await decodeJpeg(payload.body);
+    if (payload.encoding === "jpeg") return { bitmap: picture, ...labelOf(payload) };
+    if (payload.keyframe) {
+      this.begin(picture);
+      return { bitmap: picture, ...labelOf(payload) };
+    }
+    return { bitmap: await this.add(picture), ...labelOf(payload) };
+  }
+
+  /** Let differences build on this picture. */
+  begin(/** @type {ImageBitmap} */ picture) {
+    const { width, height } = picture;
+    if (!this.context || this.context.canvas.width !== width || this.context.canvas.height !== height) {
+      const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+      if (!context) throw new UnsupportedError("this browser has no canvas for pictures");
+      this.context = context;
+    }
+    this.context.drawImage(picture, 0, 0);
+    this.reference = null;
+  }
+
+  /** @param {ImageBitmap} difference */
+  async add(difference) {
+    const { context } = this;
+    const { width, height } = difference;
+    if (!context || context.canvas.width !== width || context.canvas.height !== height) {
+      throw new PayloadError("a difference of another size than the picture it builds on");
+    }
+    const reference = this.reference ?? context.getImageData(0, 0, width, height);
+    context.drawImage(difference, 0, 0);
+    difference.close();
+    addDifference(reference.data, context.getImageData(0, 0, width, height).data);
+    this.reference = reference;
+    return createImageBitmap(reference);
+  }
+}
+
+/**
+ * A bitmap of a whole JPEG; throws PayloadError for anything else.
+ * @param {Uint8Array} bytes
+ * @returns {Promise<ImageBitmap>}
+ */
+export async function decodeJpeg(bytes) {
+  const { width, height, plain } = checkJpeg(bytes);
+  let bitmap;
+  try {
+    bitmap = await createImageBitmap(new Blob([/** @type {any} */ (plain)], { type: "image/jpeg" }), AS_IT_IS);
+  } catch (error) {
+    throw new PayloadError(`JPEG: ${error}`);
+  }
+  if (bitmap.width !== width || bitmap.height !== height) throw new PayloadError("JPEG: decoded to another size");
+  return bitmap;
+}
+
+/** @param {import("./decode.js").Payload} payload */
+function labelOf({ encoding, keyframe, frame, capturedMs }) {
+  return { encoding, key: keyframe, frame, capturedMs };
+}

@@ -1,0 +1,176 @@
+// The pictures of one robot on a page: a socket to the server, and a worker that decodes.
+
+const DRAWN = 0;
+const FIRST_WAIT_MS = 250;
+const LONGEST_WAIT_MS = 4000;
+const CODECS = ["avc1.42E01E", "avc1.640028"]; // baseline and high profile
+
+/**
+ * @typedef {object} Info about a picture
+ * @property {number} seq
+ * @property {string} encoding json | pbvd | pbvz | h264 | jpeg
+ * @property {number|null} capturedMs epoch time at the robot, by its clock
+ * @property {number|null} frame
+ * @property {number} width
+ * @property {number} height
+ * @property {boolean} key
+ * @property {boolean} rescue made by the server, because this page cannot decode or is too slow
+ */
+
+/**
+ * @typedef {object} State
+ * @property {string} ref the component whose pictures are shown; "" is none
+ * @property {"off"|"connecting"|"open"|"lost"} connection to the server
+ * @property {boolean} waiting for a key frame
+ * @property {boolean} rescue
+ * @property {string} encoding of the last picture
+ * @property {string} problem why the last picture was not drawn
+ */
+
+/** Shows the pictures of one component at a time. */
+export class Pictures {
+  /**
+   * @param {(bitmap: ImageBitmap, info: Info) => void} canvasDraw draws at once; the bitmap is closed afterwards
+   * @param {(state: State) => void} onChange called when the state has changed, not for each picture
+   */
+  constructor(canvasDraw, onChange) {
+    this.canvasDraw = canvasDraw;
+    this.onChange = onChange;
+    /** @type {State} */
+    this.state = { ref: "", connection: "off", waiting: false, rescue: false, encoding: "", problem: "" };
+    /** @type {WebSocket|null} */
+    this.socket = null;
+    /** @type {Worker|null} */
+    this.worker = null;
+    this.connection = 0; // numbers connections: what is left of an earlier one is not drawn
+    this.wait = FIRST_WAIT_MS;
+    this.timer = 0;
+  }
+
+  /** Which encodings this browser decodes. Tested, never guessed from its name. */
+  static async canDecode() {
+    const can = [];
+    if (await decodesH264()) can.push("h264");
+    if (typeof createImageBitmap === "function" && typeof DecompressionStream === "function") {
+      if (readsBack()) can.push("pbvz", "pbvd", "json");
+      can.push("jpeg");
+    }
+    return can;
+  }
+
+  /** Show the pictures of this component from now on. @param {string} ref */
+  show(ref) {
+    if (ref === this.state.ref) return;
+    this.disconnect();
+    this.change({ ref, connection: "connecting", waiting: false, rescue: false, encoding: "", problem: "" });
+    this.wait = FIRST_WAIT_MS;
+    this.connect();
+  }
+
+  stop() {
+    this.disconnect();
+    this.worker?.terminate();
+    this.worker = null;
+    this.change({ ref: "", connection: "off", waiting: false, rescue: false, encoding: "", problem: "" });
+  }
+
+  async connect() {
+    const connection = ++this.connection;
+    const can = await Pictures.canDecode();
+    if (connection !== this.connection) return; // stopped meanwhile
+    this.worker ??= this.startWorker();
+    const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+    const query = new URLSearchParams({ ref: this.state.ref, can: can.join(",") });
+    const socket = new WebSocket(`${scheme}//${location.host}/ws/media?${query}`);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => this.change({ connection: "open" });
+    socket.onmessage = ({ data }) => {
+      this.wait = FIRST_WAIT_MS;
+      this.worker?.postMessage({ connection, message: data }, [data]);
+    };
+    socket.onclose = () => {
+      if (connection === this.connection) this.lost();
+    };
+    this.socket = socket;
+  }
+
+  disconnect() {
+    clearTimeout(this.timer);
+    this.connection++;
+    this.socket?.close();
+    this.socket = null;
+  }
+
+  lost() {
+    this.socket = null;
+    this.change({ connection: "lost" });
+    this.timer = setTimeout(() => this.connect(), this.wait * (0.75 + 0.5 * Math.random()));
+    this.wait = Math.min(LONGEST_WAIT_MS, 2 * this.wait);
+  }
+
+  startWorker() {
+    const worker = new Worker(new URL("./video-worker.js", import.meta.url), { type: "module" });
+    worker.onmessage = ({ data }) => this.take(data);
+    worker.onerror = (event) => this.change({ problem: `pictures cannot be decoded here: ${event.message}` });
+    return worker;
+  }
+
+  /** Draw what the worker has made, and only then acknowledge it. @param {any} made */
+  take(made) {
+    const { bitmap } = made;
+    const current = made.connection === this.connection;
+    try {
+      if (current && bitmap) this.draw(bitmap, made);
+      else if (current) this.change({ waiting: made.what !== DRAWN, problem: made.problem });
+    } finally {
+      bitmap?.close();
+      if (current) this.acknowledge(made.seq, made.what);
+    }
+  }
+
+  /** @param {ImageBitmap} bitmap @param {any} made */
+  draw(bitmap, { seq, encoding, capturedMs, frame, key, rescue }) {
+    const { width, height } = bitmap;
+    this.change({ waiting: false, rescue, encoding, problem: "" });
+    this.canvasDraw(bitmap, { seq, encoding, capturedMs, frame, width, height, key, rescue });
+  }
+
+  /** @param {number} seq @param {number} what */
+  acknowledge(seq, what) {
+    if (this.socket?.readyState !== WebSocket.OPEN) return;
+    const answer = new DataView(new ArrayBuffer(5));
+    answer.setUint32(0, seq);
+    answer.setUint8(4, what);
+    this.socket.send(answer.buffer);
+  }
+
+  /** @param {Partial<State>} changes */
+  change(changes) {
+    const state = { ...this.state, ...changes };
+    const same = Object.entries(state).every(([key, value]) => /** @type {any} */ (this.state)[key] === value);
+    this.state = state;
+    if (!same) this.onChange(state);
+  }
+}
+
+async function decodesH264() {
+  if (typeof VideoDecoder === "undefined") return false; // plain http from another machine, for example
+  try {
+    const answers = await Promise.all(CODECS.map((codec) => VideoDecoder.isConfigSupported({ codec })));
+    return answers.every(({ supported }) => supported);
+  } catch {
+    return false;
+  }
+}
+
+/** Whether pixels that were drawn are read back as they were: some browsers add noise against tracking. */
+function readsBack() {
+  if (typeof OffscreenCanvas === "undefined") return false;
+  const context = new OffscreenCanvas(16, 16).getContext("2d", { willReadFrequently: true });
+  if (!context) return false;
+  const pixels = context.createImageData(16, 16);
+  for (let i = 0; i < pixels.data.length; i++) pixels.data[i] = i % 4 === 3 ? 255 : (i * 37) % 256;
+  context.putImageData(pixels, 0, 0);
+  const { data } = context.getImageData(0, 0, 16, 16);
+  return data.every((value, index) => value === pixels.data[index]);
+}
