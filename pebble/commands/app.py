@@ -26,10 +26,15 @@ COMMANDS = {
     "demo": "sim",
     "watch": "watch",
     "snapshot": "watch",
+    "web": "web",
+    "cert": "cert",
     "flash": "flash",
     "bench": "bench",
     "impair": "impair",
 }
+
+#: What prints its help when nothing follows.
+_GROUPS: tuple[list[str], ...] = ([], ["topic"], ["bench"], ["sim"], ["script"], ["cert"], ["web", "user"])
 
 _HELP = """Runs and inspects Pebble robots.
 
@@ -41,6 +46,8 @@ _HELP = """Runs and inspects Pebble robots.
     pebble estop goob.json     stop the robot until it is reset
     pebble script new follow   write a first program that moves a robot
     pebble watch goob.json     show its camera and play its microphone
+    pebble web goob.json       drive, stop and watch robots in a browser
+    pebble cert init NAME      make certificates, so that phones can, too
     pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine
     pebble impair              measure robots behind an impaired network
@@ -59,7 +66,7 @@ def _run(arguments: list[str]) -> int:
     app.callback(help=_HELP)(_options)
     for module in dict.fromkeys(COMMANDS[name] for name in wanted or COMMANDS):
         import_module(f"pebble.commands.{module}").register(app)
-    line = [*arguments, "--help"] if arguments in ([], ["topic"], ["bench"], ["sim"], ["script"]) else arguments
+    line = [*arguments, "--help"] if arguments in _GROUPS else arguments
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:

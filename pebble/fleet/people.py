@@ -81,14 +81,20 @@ class People:
 
     def add(self, name: str, password: str, role: Role) -> None:
         """Raises PeopleError."""
-        if not NAME.fullmatch(name):
-            raise PeopleError(f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
+        self.check_name(name)
         salt = secrets.token_bytes(16)
         values = (name, role.value, salt, _hash(_usable(password), salt))
         try:
             self._change("INSERT INTO people (name, role, salt, hash) VALUES (?, ?, ?, ?)", *values)
         except sqlite3.IntegrityError:
-            raise PeopleError(f"{name} exists already: change the password or the role, or remove {name}") from None
+            raise _exists(name) from None
+
+    def check_name(self, name: str) -> None:
+        """Raise PeopleError for a name that cannot be added."""
+        if not NAME.fullmatch(name):
+            raise PeopleError(f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
+        if self._rows("SELECT 1 FROM people WHERE name = ?", name):
+            raise _exists(name)
 
     def remove(self, name: str) -> None:
         """Ends the person's sessions, too. Raises PeopleError."""
@@ -193,6 +199,10 @@ class People:
     def _change_one(self, name: str, statement: str, *values: Any) -> None:
         if self._change(statement, *values) == 0:
             raise PeopleError(f"there is no {name!r}: `pebble web user list` lists the names")
+
+
+def _exists(name: str) -> PeopleError:
+    return PeopleError(f"{name} exists already: change the password or the role, or remove {name}")
 
 
 def _usable(password: str) -> str:

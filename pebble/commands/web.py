@@ -1,0 +1,215 @@
+"""``pebble web``: serves the operator page."""
+
+from __future__ import annotations
+
+import getpass
+import signal
+import socket
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import typer
+from typer.core import TyperGroup
+
+from pebble.client.connection import password as broker_password
+from pebble.client.url import settings_of as settings_of_url
+from pebble.commands import web_people
+from pebble.commands.options import CaCert, PasswordFile
+from pebble.commands.web_people import PEOPLE, TLS, PeopleOption, default_folder, opened
+from pebble.config import load
+from pebble.config.web import WebTls, is_loopback
+from pebble.errors import PebbleError
+from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY
+from pebble.fleet.people import NAME
+from pebble.runtime.connections import REMOTE_RECONNECT_S
+from pebble.transports import MqttSettings
+from pebble.web.extra import require_packages
+
+if TYPE_CHECKING:
+    from pebble.web.settings import WebSettings
+
+
+def serve(
+    config: Annotated[
+        Path | None, typer.Argument(help="A robot's config file: its broker, and web_interface.", show_default=False)
+    ] = None,
+    url: Annotated[
+        str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")
+    ] = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+    host: Annotated[
+        str | None,
+        typer.Option(help="Address to listen on; 0.0.0.0 is all of this machine. [default: 127.0.0.1]", metavar="HOST"),
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(help="TCP port; 0 is a free one. [default: 8080]", metavar="PORT", min=0, max=65535)
+    ] = None,
+    tls: Annotated[
+        Path | None, typer.Option(help="Folder with the certificates of `pebble cert init`.", metavar="FOLDER")
+    ] = None,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(help="A further host name by which browsers may address the page; repeatable.", metavar="NAME"),
+    ] = None,
+    people: PeopleOption = None,
+) -> int:
+    """Serve the operator page: drive, stop and watch robots in a browser, also on a phone.
+
+    On this machine it needs no login. For others it needs a certificate and a user; without them it does not start,
+    and prints the commands that make them.
+
+    \b
+        pebble web goob.json
+        pebble web --url mqtt://127.0.0.1
+        pebble web goob.json --host 0.0.0.0
+        pebble web user --help       who may use it
+        pebble web audit             who did what
+    """
+    if (config is None) == (url is None):
+        raise PebbleError("which robots is missing: name either a robot's config file or --url mqtt://BROKER")
+    require_packages()
+    folder = _tls_folder(tls)
+    options = {"host": host, "port": port, "names": tuple(name or ())}
+    if url is not None:
+        settings, plain = _of_url(_broker(url, password_file, ca_cert), options, folder), False
+    else:
+        settings, plain = _of_config(Path(str(config)), options, folder)
+    settings = replace(settings, people=people or settings.people)
+    if missing := _missing(settings, plain=plain):
+        _print_missing(settings, missing, folder or default_folder() / TLS)
+        return 2
+    return _run(settings)
+
+
+class _Group(TyperGroup):
+    """``pebble web CONFIG`` is ``pebble web serve CONFIG``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, args if args and args[0] in self.commands else ["serve", *args])
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(cls=_Group, help="Serve the operator page.", rich_markup_mode=None)
+    group.command("serve")(serve)
+    web_people.register(group)
+    app.add_typer(group, name="web")
+
+
+# -- settings
+
+
+def _broker(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
+    _, settings = settings_of_url(url, password=broker_password(password_file), ca_cert=ca_cert)
+    if not isinstance(settings, MqttSettings):
+        raise PebbleError("the operator page needs MQTT: use --url mqtt://HOST[:PORT] or mqtts://…")
+    return replace(settings, reconnect_max_s=REMOTE_RECONNECT_S)
+
+
+def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
+    from pebble.web.settings import WebSettings
+
+    given = {key: value for key, value in options.items() if value is not None}
+    settings = WebSettings(broker=broker, people=default_folder() / PEOPLE, **given)
+    folder = folder or _default_tls_folder(settings.host)
+    if folder is not None:
+        settings = replace(
+            settings, certificate=folder / SERVER_CERT, key=folder / SERVER_KEY, authority=folder / CA_CERT
+        )
+    return replace(settings, login=settings.certificate is not None or not is_loopback(settings.host))
+
+
+def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
+    """The settings, and whether the config allows plain http."""
+    from pebble.web.from_config import settings_of
+
+    config = load(file)
+    web = config.web_interface
+    given = {key: value for key, value in options.items() if value is not None}
+    given["names"] = (*web.names, *options["names"])
+    web = msgspec.structs.replace(web, **given)
+    if folder is None and web.tls.certificate is None and not web.plain_http:
+        folder = _default_tls_folder(web.host)
+    if folder is not None:
+        tls = WebTls(certificate=folder / SERVER_CERT, key=folder / SERVER_KEY, ca=folder / CA_CERT)
+        web = msgspec.structs.replace(web, tls=tls)
+    allowed = msgspec.structs.replace(web, plain_http=True)  # what is missing is reported with the commands for it
+    return settings_of(msgspec.structs.replace(config, web_interface=allowed)), web.plain_http
+
+
+def _tls_folder(folder: Path | None) -> Path | None:
+    """The folder as an absolute path. Raises PebbleError if it has no certificate."""
+    if folder is None:
+        return None
+    for file in (SERVER_CERT, SERVER_KEY):
+        if not (folder / file).is_file():
+            names = " ".join(_own_names())
+            raise PebbleError(f"--tls {folder} has no {file}: pebble cert init --folder {folder} {names}")
+    return folder.absolute()
+
+
+def _default_tls_folder(host: str) -> Path | None:
+    folder = default_folder() / TLS
+    return folder if not is_loopback(host) and (folder / SERVER_CERT).is_file() else None
+
+
+def _missing(settings: WebSettings, *, plain: bool) -> list[str]:
+    """Those of "certificate" and "user" that this address needs and does not have."""
+    if not settings.login:
+        return []
+    missing = [] if settings.certificate is not None or plain else ["certificate"]
+    with opened(settings.people) as database:
+        return missing if database.list() else [*missing, "user"]
+
+
+def _print_missing(settings: WebSettings, missing: list[str], folder: Path) -> None:
+    others = (
+        f"other machines reach {settings.host}" if not is_loopback(settings.host) else "a page with --tls has a login"
+    )
+    lines = [f"pebble: {others}, so the page needs a {' and a '.join(missing)}:"]
+    if "certificate" in missing:
+        lines.append(f"    pebble cert init --folder {folder} {' '.join(_own_names())}")
+    if "user" in missing:
+        lines.append(f"    pebble web user add {_me()} --role admin --people {settings.people}")
+    repeated = " ".join(sys.argv[1:])
+    tls = "" if "--tls" in repeated or "certificate" not in missing else f" --tls {folder}"
+    typer.echo("\n".join([*lines, f"    pebble {repeated}{tls}"]), err=True)
+
+
+def _own_names() -> list[str]:
+    """Names by which other machines probably reach this one."""
+    names = [f"{socket.gethostname().partition('.')[0].lower()}.local"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing; the kernel chooses the address of the way out
+            names.append(probe.getsockname()[0])
+        except OSError:
+            pass
+    return names
+
+
+def _me() -> str:
+    try:
+        user = getpass.getuser().lower()
+    except (KeyError, OSError):
+        user = ""
+    return user if NAME.fullmatch(user) else "alice"
+
+
+def _run(settings: WebSettings) -> int:
+    from pebble.web.serve import run
+
+    if hasattr(signal, "SIGHUP"):  # the terminal was closed: end as with Ctrl-C, which stops what pages move
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGINT))
+    return run(settings, on_ready=lambda url: _print_ready(settings, url))
+
+
+def _print_ready(settings: WebSettings, url: str) -> None:
+    typer.echo(f"The operator page is at {url} (Ctrl-C ends it)")
+    if settings.authority is not None and settings.authority.is_file():
+        typer.echo(f"Browsers must trust {url}ca.pem once; `pebble cert show` explains how")
+    elif settings.login and settings.certificate is None:
+        typer.echo("pebble: it is not encrypted: everybody on the network can read passwords and pictures", err=True)

@@ -1,0 +1,77 @@
+"""``pebble cert`` makes certificates, and overwrites none."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import pytest
+
+from tests.commands.command_line import Run
+
+
+@pytest.fixture(autouse=True)
+def state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return tmp_path / "state/pebble/web/tls"
+
+
+def test_init_prints_what_to_type_next_and_how_phones_trust_it(run: Run, state: Path) -> None:
+    assert run("cert", "init", "lab-pc.local", "192.168.1.20") == 0, run.err
+    lines = run.out.splitlines()
+    assert lines[0] == f"{state} has a certificate for lab-pc.local, 192.168.1.20."
+    assert lines[2] == f"    pebble web CONFIG --host 0.0.0.0 --tls {state}"
+    assert "https://lab-pc.local:8080/ca.pem" in run.out
+    assert sorted(path.name for path in state.iterdir()) == ["ca.key", "ca.pem", "server.key", "server.pem"]
+    assert stat.S_IMODE((state / "ca.key").stat().st_mode) == 0o600
+
+
+def test_init_overwrites_nothing(run: Run, tmp_path: Path) -> None:
+    assert run("cert", "init", "--folder", tmp_path / "a", "lab-pc.local") == 0
+    before = (tmp_path / "a/ca.pem").read_bytes()
+    assert run("cert", "init", "--folder", tmp_path / "a", "lab-pc.local") == 1
+    assert run.err.startswith(f"pebble: {tmp_path}/a/ca.pem exists: `pebble cert renew --folder {tmp_path}/a`")
+    assert (tmp_path / "a/ca.pem").read_bytes() == before
+
+
+def test_show_and_renew(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "tls"
+    run("cert", "init", "--folder", folder, "lab-pc.local", "::1")
+    assert run("cert", "show", "--folder", folder) == 0
+    before = run.out
+    assert f"{folder}/ca.pem\n    authority\n" in before
+    assert f"{folder}/server.pem\n    for lab-pc.local, ::1\n" in before
+    assert run("cert", "renew", "--folder", folder) == 0
+    assert run.out.startswith(f"{folder}/server.pem is for lab-pc.local, ::1 until ")
+    assert run("cert", "renew", "--folder", folder, "other.local") == 0
+    assert "is for other.local until" in run.out
+    run("cert", "show", "--folder", folder)
+    fingerprints = [
+        [line for line in text.splitlines() if line.startswith("    SHA-256")] for text in (before, run.out)
+    ]
+    assert fingerprints[0][0] == fingerprints[1][0]
+    assert fingerprints[0][1] != fingerprints[1][1]
+
+
+def test_mistakes(run: Run, tmp_path: Path) -> None:
+    assert run("cert", "init") == 2
+    assert run("cert", "init", "https://lab-pc.local") == 1
+    assert "is neither a host name nor an IP address" in run.err
+    assert run("cert", "show") == 1
+    assert run.err.endswith("No such file or directory; `pebble cert init` makes certificates\n")
+    assert run("cert", "renew", "--folder", tmp_path) == 1
+    assert run("cert", "init", "--folder", "/proc/pebble", "lab-pc.local") == 1
+    assert run.err == "pebble: /proc/pebble: No such file or directory\n"
+
+
+def test_cert_alone_prints_help(run: Run) -> None:
+    assert run("cert") == 0
+    assert "pebble cert init lab-pc.local 192.168.1.20" in run.out
+
+
+def test_without_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pebble.web.extra.find_spec", lambda name: None)
+    assert run("cert", "init", "lab-pc.local") == 1
+    assert run.err.endswith("pip install 'pebble-robot[web]'\n")
+    assert run.err.count("\n") == 1
