@@ -1,0 +1,79 @@
+// Makes the parts of the page and joins them.
+
+import { h, render } from "./vendor/preact.mjs";
+import { ControlSocket } from "./core/control-socket.js";
+import { Driver } from "./core/driver.js";
+import { Estop } from "./core/estop.js";
+import { Store } from "./core/store.js";
+import { App } from "./ui/app.js";
+import { Page } from "./ui/hooks.js";
+import { Connection, Route, Settings } from "./ui/models.js";
+import { Video } from "./ui/video-model.js";
+import { Pictures } from "./media/pictures.js";
+
+const version = document.querySelector("meta[name=pebble-version]")?.content ?? "";
+const store = new Store();
+const connection = new Connection(version);
+const route = new Route();
+const settings = new Settings();
+const video = new Video(store);
+
+function join(can) {
+  const socket = new ControlSocket({
+    store,
+    version,
+    can,
+    onOpen: () => driver.opened(),
+    onLost: () => driver.lost(),
+    onChange: () => connection.changed(),
+    onLogs: () => {},
+    onBye: (message) => {
+      connection.bye = message.again ? null : message;
+      connection.changed();
+    },
+    onRefused: (message) => {
+      driver.refused(message);
+      if (message.cmd !== "drive") connection.show(`Not done: ${message.why}`);
+    },
+  });
+  const estop = new Estop(socket);
+  const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
+  connection.socket = socket;
+  estop.onChange = () => connection.changed();
+  driver.pictureAge = () => (video.ref ? video.age().ms : null);
+  video.pictures = new Pictures(
+    (bitmap, info) => video.draw(bitmap, info),
+    (state) => video.report(state),
+  );
+  return { store, connection, route, settings, video, driver, estop, commands: commands(socket, driver, estop) };
+}
+
+/** Everything that widgets can ask for. */
+function commands(socket, driver, estop) {
+  return {
+    stop: (ref) => {
+      driver.interrupt();
+      estop.press(ref, ref ? "button" : "button, all");
+    },
+    endStop: (stop) => estop.end(stop),
+    reset: (ref, owners) => estop.reset(ref, owners),
+    take: (over) => driver.take(over),
+    release: () => driver.release(),
+    setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
+    setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
+    async logOut() {
+      const headers = { "content-type": "application/json" };
+      await fetch("/api/logout", { method: "POST", headers, body: "{}" }).catch(() => {});
+      location.assign("/login");
+    },
+  };
+}
+
+const page = join(await Pictures.canDecode());
+const follow = () => page.driver.select(route.ref);
+route.onChange(follow);
+page.driver.start();
+follow();
+render(h(Page.Provider, { value: page }, h(App)), document.getElementById("app"));
+page.connection.socket.connect();
+window.pebble = page; // for tests, and for people who look into it

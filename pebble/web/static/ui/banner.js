@@ -1,0 +1,242 @@
+// What must not be overlooked, below the header: stops, lost connections, and what was not done.
+
+import { RouteLink } from "./header.js";
+import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
+import { HoldButton, Icon, Why } from "./parts.js";
+import { clockTime, nameOf, roughly } from "./words.js";
+
+const NOTICE_MS = 6000;
+const NO_ANSWER_MS = 1500;
+const SHOWN_MS = 60_000; // a finished stop
+
+export function Banners({ at }) {
+  const { connection } = usePage();
+  useModel(connection);
+  return html`<div class="banners">
+    <div role="alert"><${ServerBanner} />${at && html`<${SilentBanner} at=${at} />`}</div>
+    <${StopBanners} at=${at} />
+    <${PressBanner} />
+    <${Notice} />
+  </div>`;
+}
+
+const Banner = ({ kind, icon, children }) => html`<div class=${`banner ${kind}`}>
+  <span class="banner-icon" aria-hidden="true">${icon}</span>
+  <div class="banner-text">${children}</div>
+</div>`;
+
+/** No server, no broker, an old page, or no encryption. */
+function ServerBanner() {
+  const { connection } = usePage();
+  const broker = useValue("", "web/broker");
+  const { bye, you } = connection;
+  if (bye) {
+    return html`<${Banner} kind="bad" icon="✖">
+      <p><b>The server has ended this connection:</b> ${bye.why}</p>
+      <button type="button" onClick=${() => location.reload()}>Connect again</button>
+    <//>`;
+  }
+  if (connection.state === "lost") return html`<${LostBanner} />`;
+  if (connection.isOld) {
+    return html`<${Banner} kind="bad" icon="✖">
+      <p><b>This page is older than the server.</b> Driving is off until it is loaded again.</p>
+      <button type="button" onClick=${() => location.reload()}>Reload</button>
+    <//>`;
+  }
+  if (broker && !broker.connected) {
+    return html`<${Banner} kind="bad" icon="✖">
+      <p><b>The server cannot reach the broker:</b> ${broker.problem || "no reason is known"}</p>
+    <//>`;
+  }
+  if (you && !you.drives) {
+    return html`<${Banner} kind="warn" icon="▲">
+      <p><b>This connection is not encrypted.</b> Driving is switched off; stopping works.</p>
+    <//>`;
+  }
+  return null;
+}
+
+function LostBanner() {
+  const { connection } = usePage();
+  useTick(1000);
+  const { lostAt, attempts } = connection.socket;
+  return html`<${Banner} kind="bad" icon="✖">
+    <p>
+      <b>No connection to the server since ${clockTime(lostAt)}.</b> What you drove stops by itself.
+      <span aria-hidden="true"> Retrying${attempts > 1 ? ` (${attempts})` : ""}…</span>
+    </p>
+  <//>`;
+}
+
+function SilentBanner({ at }) {
+  const { connection, store } = usePage();
+  useTick(1000);
+  const entry = useMetric(at, "web/liveness");
+  const heartbeat = useValue(at, "online");
+  if (!connection.isOpen || entry?.value?.online !== false) return null;
+  const { silent_s: silent } = entry.value;
+  const ms = silent === null ? null : 1000 * silent + entry.age;
+  const since = ms !== null ? store.now() - ms : Number.isFinite(heartbeat?.t) ? heartbeat.t : null;
+  return html`<${Banner} kind="bad" icon="✖">
+    <p>
+      <b>${nameOf(at)} is ${silent === null ? "offline" : "silent"}${since ? ` since ${clockTime(since)}` : ""}.</b>
+      ${ms !== null && html`<span aria-hidden="true"> Last heartbeat ${roughly(ms)} ago.</span>`}
+    </p>
+  <//>`;
+}
+
+/** One banner for the open component and a line for all others; on the fleet's screen one for each. */
+function StopBanners({ at }) {
+  const refs = useRefs().sort();
+  const others = refs.filter((ref) => ref !== at);
+  return html`<div class="stop-banners">
+    ${at && html`<${StopBanner} key=${at} at=${at} />`}
+    ${at ? html`<${AlsoStopped} refs=${others} />` : others.map((ref) => html`<${StopBanner} key=${ref} at=${ref} />`)}
+  </div>`;
+}
+
+function StopBanner({ at }) {
+  const { commands, connection } = usePage();
+  useModel(connection);
+  const entry = useMetric(at, "web/estop");
+  const view = entry?.value;
+  const [asked, ask] = useState(false);
+  const latched = view?.latched === true;
+  useEffect(() => {
+    if (!latched) ask(false);
+  }, [latched]);
+  if (!view) return null;
+  const progress = stopProgress(view, nameOf(at), entry.age);
+  if (!latched && !progress) return null;
+  const refused = (view.owners ?? []).map((one) => one.reset_refused).find(Boolean);
+  const why = resetReason(connection);
+  const id = `reset-${at}`;
+  return html`<div class=${`banner ${latched || progress?.kind === "bad" ? "stopped" : "warn"}`}>
+    <span class="banner-icon" aria-hidden="true">■</span>
+    <div class="banner-text">
+      <div role="alert">
+        ${latched && html`<p><b>${nameOf(at)} is stopped</b>${stopWords(view)}.</p>`}
+        ${progress && html`<p class="banner-more">${progress.text}</p>`}
+        ${latched && refused && html`<p class="banner-more"><b>Not reset:</b> ${refusedWords(refused)}.</p>`}
+      </div>
+      ${asked && html`<p>Reset ${nameOf(at)}? Look at the robot: is everybody clear?</p>`}
+      ${why && latched && html`<${Why} id=${id}>${why}<//>`}
+    </div>
+    <div class="banner-actions">
+      ${latched &&
+      !asked &&
+      html`<button type="button" disabled=${Boolean(why)} aria-describedby=${why ? id : undefined} onClick=${() => ask(true)}>
+        Reset ${nameOf(at)}…
+      </button>`}
+      ${latched &&
+      asked &&
+      html`<${HoldButton} disabled=${Boolean(why)} onHeld=${() => commands.reset(at, view.owners)}>Hold 1 s to reset<//>
+        <button type="button" onClick=${() => ask(false)}>Leave stopped</button>`}
+      ${view.sending === "old" &&
+      view.stop &&
+      html`<button type="button" onClick=${() => commands.endStop(view.stop)}>End the stop</button>`}
+    </div>
+  </div>`;
+}
+
+function stopWords(view) {
+  const by = view.by ? ` by ${view.by}` : "";
+  const since = view.since > 0 ? `, ${clockTime(view.since)}` : "";
+  return `${by}${since}${view.why ? ` (${view.why})` : ""}`;
+}
+
+/** What became of the stop that is, or was, sent. @returns {{kind: string, text: string} | null} */
+function stopProgress(view, name, age) {
+  const more = view.sending_text ? ` ${view.sending_text}` : "";
+  switch (view.sending) {
+    case "sent":
+      return { kind: age > NO_ANSWER_MS ? "bad" : "wait", text: `STOP is being sent to ${name}…${more}` };
+    case "confirmed":
+      return view.sending_text && age < SHOWN_MS ? { kind: "wait", text: `${name} ${view.sending_text}` } : null;
+    case "old":
+      return { kind: "wait", text: `${name} is stopped, but cannot be held: ${view.sending_text}. Zeros are sent to it.` };
+    case "not confirmed":
+      return { kind: "bad", text: `STOP NOT CONFIRMED by ${name}, and no longer sent.${more}` };
+    default:
+      return null;
+  }
+}
+
+const REFUSED = {
+  count: "another stop came after the one you saw",
+  boot: "it has started anew since then; look again",
+  old: "the reset arrived too late; try again",
+};
+
+const refusedWords = (refused) => REFUSED[refused] ?? String(refused);
+
+function resetReason(connection) {
+  if (!connection.isOpen) return "No connection to the server";
+  return connection.may("reset") ? "" : "Log in as driver to reset";
+}
+
+function AlsoStopped({ refs }) {
+  const stopped = useStopped(refs);
+  if (!stopped.length) return null;
+  return html`<div class="banner also">
+    <span class="banner-icon" aria-hidden="true">■</span>
+    <div class="banner-text links">
+      Also stopped: ${stopped.map((ref) => html`<${RouteLink} key=${ref} to=${ref}>${nameOf(ref)}<//>`)}
+    </div>
+  </div>`;
+}
+
+function useStopped(refs) {
+  const { store } = usePage();
+  const [, redraw] = useState(0);
+  const key = refs.join();
+  useEffect(() => {
+    const stops = refs.map((ref) => store.subscribe(ref, "web/estop", () => redraw((n) => n + 1)));
+    return () => stops.forEach((stop) => stop());
+  }, [store, key]);
+  return refs.filter((ref) => store.get(ref, "web/estop")?.value?.latched === true);
+}
+
+/** A stop that was pressed here and of which no robot shows anything yet. */
+function PressBanner() {
+  const { estop, store, connection } = usePage();
+  const { pressed } = estop;
+  const age = pressed ? Date.now() - pressed.at : Infinity;
+  useTick(age < SHOWN_MS ? 250 : 5000);
+  if (!pressed || age > SHOWN_MS) return null;
+  const known = store.refs().some((ref) => {
+    const view = store.get(ref, "web/estop")?.value;
+    return view && (view.stop === pressed.stop || (view.latched && age > NO_ANSWER_MS));
+  });
+  if (known && connection.isOpen) return null;
+  const whom = pressed.ref ? nameOf(pressed.ref) : "all robots";
+  if (age < NO_ANSWER_MS) {
+    return html`<${Banner} kind="warn" icon="■"><p role="alert">STOP of ${whom}: sent…</p><//>`;
+  }
+  if (!pressed.reached) {
+    return html`<${Banner} kind="bad" icon="✖">
+      <p role="alert">
+        <b>STOP of ${whom} DID NOT REACH the server.</b> Go to the robot, or use another way to stop it.
+      </p>
+    <//>`;
+  }
+  if (!connection.isOpen) {
+    return html`<${Banner} kind="warn" icon="■">
+      <p role="alert">STOP of ${whom} reached the server. Whether it has stopped cannot be seen from here.</p>
+    <//>`;
+  }
+  if (age > 10_000) return null;
+  return html`<${Banner} kind="bad" icon="■">
+    <p role="alert"><b>STOP of ${whom} is NOT CONFIRMED.</b> ${pressed.ref ? "" : "No robot has answered."}</p>
+  <//>`;
+}
+
+function Notice() {
+  const { connection } = usePage();
+  const { notice } = connection;
+  const shown = notice && performance.now() - notice.at < NOTICE_MS;
+  return html`<div role="status">
+    ${shown && html`<div class="banner note"><${Icon} name="info" /><div class="banner-text">${notice.text}</div></div>`}
+  </div>`;
+}
+

@@ -1,0 +1,175 @@
+// Driving: who may, why not, the stick, and how fast.
+
+import { html, useCalm, useEffect, useModel, usePage, useValue } from "./hooks.js";
+import { Card, HoldButton, Icon } from "./parts.js";
+import { Stick } from "./stick.js";
+import { driverName, nameOf } from "./words.js";
+
+export function DriveCard({ at }) {
+  return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive">
+    <${WhyLine} at=${at} />
+    <${DrivePad} at=${at} />
+    <${Keys} />
+    <${DriveSettings} at=${at} />
+  <//>`;
+}
+
+/** Why it cannot be driven now, and what can be done about it; or that it can. */
+export function WhyLine({ at }) {
+  const { driver } = usePage();
+  useModel(driver);
+  const view = useValue(at, "web/driver");
+  const reason = driver.reason();
+  const text = reason?.text ?? (view?.you ? `You are driving ${nameOf(at)}.` : "");
+  useWakeLock(view?.you === true);
+  return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
+    <p id="why-drive"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
+    <span class="sr" role="status">${useCalm(text)}</span>
+    <div class="why-actions">
+      <${ReasonAction} action=${reason?.action} />
+      ${view?.you && html`<button type="button" onClick=${() => driver.release()}>Release</button>`}
+    </div>
+    ${reason?.code === "lease" && view?.by && html`<p class="sr">${driverName(view)} has control.</p>`}
+  </div>`;
+}
+
+function ReasonAction({ action }) {
+  const { commands, driver } = usePage();
+  switch (action?.kind) {
+    case "take":
+      return html`<button type="button" class="primary" onClick=${() => commands.take(false)}>${action.label}</button>`;
+    case "take-over":
+      return html`<${HoldButton} onHeld=${() => commands.take(true)}>${action.label} <small>(hold 1 s)</small><//>`;
+    case "see":
+      return html`<button type="button" onClick=${() => see(driver)}>${action.label}</button>`;
+    case "login":
+      return html`<a class="button" href="/login">${action.label}</a>`;
+    case "reload":
+      return html`<button type="button" onClick=${() => location.reload()}>${action.label}</button>`;
+    default:
+      return null;
+  }
+}
+
+function see(driver) {
+  driver.inSight = true;
+  driver.changed();
+}
+
+/** The screen stays on while somebody drives, where browsers allow it. */
+function useWakeLock(wanted) {
+  useEffect(() => {
+    if (!wanted || !navigator.wakeLock) return undefined;
+    let lock = null;
+    let over = false;
+    navigator.wakeLock.request("screen").then(
+      (granted) => {
+        lock = granted;
+        if (over) lock.release();
+      },
+      () => {}, // the battery is low, or the page is hidden
+    );
+    return () => {
+      over = true;
+      lock?.release();
+    };
+  }, [wanted]);
+}
+
+/** The stick with what it asks for, in words. */
+export function DrivePad() {
+  const { driver } = usePage();
+  useModel(driver);
+  const { x, z } = driver.output;
+  const percent = (value) => `${Math.round(100 * Math.abs(value))} %`;
+  const forward = z === 0 ? "" : `${z > 0 ? "forward" : "back"} ${percent(z)}`;
+  const turn = x === 0 ? "" : `${x > 0 ? "right" : "left"} ${percent(x)}`;
+  const words = [forward, turn].filter(Boolean).join(" · ");
+  return html`<div class="pad">
+    <${Stick} driver=${driver} />
+    <p class="pad-words">${words || (driver.reason() ? "" : "drag the stick")}</p>
+  </div>`;
+}
+
+const KEYS = [
+  ["KeyQ", "Q"],
+  ["KeyW", "W"],
+  ["KeyE", "E"],
+  ["KeyA", "A"],
+  ["KeyS", "S"],
+  ["KeyD", "D"],
+];
+
+/** Hints: which keys drive. They light up while they are held. */
+function Keys() {
+  const { driver } = usePage();
+  useModel(driver);
+  return html`<div class="keys" aria-hidden="true">
+    <div class="key-grid">
+      ${KEYS.map(
+        ([code, letter]) => html`<kbd key=${code} class=${driver.inputs.keys.has(code) ? "on" : ""}>${letter}</kbd>`,
+      )}
+    </div>
+    <p><b>W A S D</b> or arrows drive,<br /><b>space</b> stops,<br /><b>Esc Esc</b> is STOP</p>
+  </div>`;
+}
+
+export function DriveSettings() {
+  const { driver } = usePage();
+  useModel(driver);
+  const { speed, turn, balance } = driver.sliders;
+  const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
+  const set = (name) => (event) => {
+    driver.sliders[name] = Number(event.currentTarget.value) / 100;
+    driver.changed();
+  };
+  return html`<div class="sliders">
+    <${Slider} name="Speed" value=${speed} min=${5} text=${`${Math.round(100 * speed)} %`} onInput=${set("speed")} />
+    <${Slider} name="Turn" value=${turn} min=${5} text=${`${Math.round(100 * turn)} %`} onInput=${set("turn")} />
+    <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set("balance")} />
+    <div class="aux">
+      <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>
+      <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
+      <${AuxButton} driver=${driver} value=${-1} label="Extra axis down">−<//>
+    </div>
+    <p class="pad-name"><${Icon} name="pad" />${driver.padName || "no gamepad: press one of its buttons"}</p>
+  </div>`;
+}
+
+function Slider({ name, value, min, max = 100, text, onInput }) {
+  return html`<label class="slider">
+    <span>${name}</span>
+    <input
+      type="range"
+      min=${min}
+      max=${max}
+      step="5"
+      value=${Math.round(100 * value)}
+      aria-valuetext=${text}
+      onInput=${onInput}
+    />
+    <output>${text}</output>
+  </label>`;
+}
+
+function AuxButton({ driver, value, label, children }) {
+  const reason = driver.reason();
+  const end = () => driver.hold(`aux ${value}`, 0);
+  useEffect(() => end, []);
+  return html`<button
+    type="button"
+    aria-label=${label}
+    disabled=${Boolean(reason) && !driver.gestureActive}
+    aria-describedby=${reason ? "why-drive" : undefined}
+    onPointerDown=${(event) => {
+      event.currentTarget.setPointerCapture(event.pointerId);
+      driver.hold(`aux ${value}`, value);
+    }}
+    onPointerUp=${end}
+    onPointerCancel=${end}
+    onLostPointerCapture=${end}
+    onContextMenu=${(event) => event.preventDefault()}
+  >
+    ${children}
+  </button>`;
+}

@@ -1,0 +1,209 @@
+// All components at a glance: who is there, who drives, what is stopped.
+
+import { RouteLink, Liveness } from "./header.js";
+import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
+import { Offers } from "./models.js";
+import { Icon, Live, StopButton } from "./parts.js";
+import { battery, charging, clockTime, driverName, inner, kindOf, nameOf, roughly, shortTime, typeOf } from "./words.js";
+
+const THUMBNAIL_MS = 1000;
+const SORTS = { name: "name", type: "type", battery: "battery" };
+
+export function Fleet() {
+  const { connection, settings, store } = usePage();
+  useModel(connection);
+  useModel(settings);
+  useTick(1000); // robots come and go
+  const refs = useRefs();
+  const [filter, setFilter] = useState("");
+  const online = refs.filter((ref) => isPresent(store, ref));
+  const away = refs.filter((ref) => !isPresent(store, ref) && !settings.forgotten.has(ref));
+  useEffect(() => {
+    online.forEach((ref) => settings.forgotten.has(ref) && settings.forget(ref, false));
+  }, [online.join()]);
+  const matches = (ref) => ref.toLowerCase().includes(filter.trim().toLowerCase());
+  const shown = sorted(store, online.filter(matches), settings.sort);
+  const shownAway = away.filter(matches).sort();
+  const total = online.length + away.length;
+  return html`<div class="fleet">
+    <div class="fleet-head">
+      <h1>${total === 0 ? "Robots" : `${total} ${total === 1 ? "robot" : "robots"}, ${online.length} online`}</h1>
+      ${total > 0 && html`<${FleetTools} filter=${filter} onFilter=${setFilter} />`}
+    </div>
+    ${total === 0 && html`<${Empty} />`}
+    ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
+    <ul class="fleet-cards">
+      ${shown.map((ref) => html`<li key=${ref}><${FleetCard} at=${ref} /></li>`)}
+    </ul>
+    ${shownAway.length > 0 &&
+    html`<section class="away" aria-labelledby="away-title">
+      <h2 id="away-title">Offline</h2>
+      <ul>
+        ${shownAway.map((ref) => html`<${AwayRow} key=${ref} at=${ref} />`)}
+      </ul>
+    </section>`}
+  </div>`;
+}
+
+/** Components of which it is not yet known whether they are there are shown as cards, too. */
+function isPresent(store, ref) {
+  const view = store.get(ref, "web/liveness");
+  if (!view) return true;
+  return view.value.online === true || (view.value.online === null && view.value.silent_s !== null);
+}
+
+function sorted(store, refs, by) {
+  const level = (ref) => Number(inner(store.get(ref, "charging-level")?.value) ?? Infinity);
+  const keys = { name: nameOf, type: (ref) => `${typeOf(ref)} ${nameOf(ref)}`, battery: (ref) => level(ref) };
+  const key = keys[by] ?? nameOf;
+  return [...refs].sort((a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : a < b ? -1 : 1));
+}
+
+function FleetTools({ filter, onFilter }) {
+  const { settings } = usePage();
+  return html`<div class="fleet-tools">
+    <input
+      type="search"
+      placeholder="Filter"
+      aria-label="Filter by name"
+      value=${filter}
+      onInput=${(event) => onFilter(event.currentTarget.value)}
+    />
+    <label class="field"
+      ><span>Sort by</span>
+      <select value=${settings.sort} onChange=${(event) => settings.set("sort", event.currentTarget.value)}>
+        ${Object.entries(SORTS).map(([value, text]) => html`<option key=${value} value=${value}>${text}</option>`)}
+      </select></label
+    >
+    <label class="check"
+      ><input
+        type="checkbox"
+        checked=${settings.thumbnails}
+        onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
+      /><span>Thumbnails</span></label
+    >
+  </div>`;
+}
+
+function Empty() {
+  const { connection } = usePage();
+  return html`<div class="empty">
+    <${Icon} name="robot" />
+    <p>
+      ${connection.state === "open"
+        ? "No robot has been seen yet. It appears here as soon as it is switched on and reaches the broker."
+        : "Connecting to the server…"}
+    </p>
+  </div>`;
+}
+
+const ICONS = { robots: "robot", towers: "tower", satellites: "satellite", people: "person", persons: "person" };
+
+/** @param {string} ref @returns {string} the icon of its type */
+export const iconOf = (ref) => ICONS[typeOf(ref)] ?? "thing";
+
+const TRANSPORTS = { mqtt: "MQTT", zenoh: "Zenoh", mcu: "MCU" };
+
+function FleetCard({ at }) {
+  const { commands, settings, connection } = usePage();
+  const offers = new Offers(at, useValue(at, "capabilities"));
+  const estop = useValue(at, "web/estop");
+  const picture = useValue(at, "web/picture");
+  const kind = TRANSPORTS[offers.transport] ?? offers.transport;
+  const name = nameOf(at);
+  return html`<article class=${`fleet-card ${estop?.latched ? "is-stopped" : ""}`} aria-label=${name}>
+    <div class="fleet-card-head">
+      <span class="badge"><${Icon} name=${iconOf(at)} /></span>
+      <div class="fleet-card-name">
+        <h2>${name}</h2>
+        <span class="dim">${[kindOf(at), kind].filter(Boolean).join(" · ")}</span>
+      </div>
+      <${Liveness} at=${at} />
+    </div>
+    ${settings.thumbnails && html`<${Thumbnail} at=${at} offers=${offers} picture=${picture} />`}
+    <ul class="facts">
+      <${BatteryFact} at=${at} online=${connection.isOpen} />
+      <${DriverFact} at=${at} offers=${offers} />
+      <${ScriptFact} at=${at} />
+      ${estop?.latched &&
+      html`<li class="fact bad">
+        <span aria-hidden="true">■</span><b>STOPPED</b>${estop.by ? ` by ${estop.by}` : ""}
+        ${estop.since > 0 ? ` ${clockTime(estop.since)}` : ""}
+      </li>`}
+    </ul>
+    <div class="fleet-card-actions">
+      <${RouteLink} to=${at} className="button primary" label=${`Open ${name}`}>Open<//>
+      <${StopButton} onStop=${() => commands.stop(at)} label=${`Emergency stop of ${name}`} className="stop-small">
+        <${Icon} name="stop" />Stop
+      <//>
+    </div>
+  </article>`;
+}
+
+function BatteryFact({ at, online }) {
+  const level = useMetric(at, "charging-level");
+  const status = useValue(at, "charging-status");
+  if (!level && !status) return null;
+  const isCharging = status?.value === true;
+  return html`<li class="fact">
+    <${Icon} name=${isCharging ? "charging" : "battery"} />
+    ${level && html`<${Live} entry=${level} online=${online}>${battery(level.value)}<//>`}
+    ${status && html`<span class="dim">${charging(status)}</span>`}
+  </li>`;
+}
+
+function DriverFact({ at, offers }) {
+  const view = useValue(at, "web/driver");
+  if (!offers.drives) return offers.known ? html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>` : null;
+  if (!view?.by) return html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
+  return html`<li class="fact">
+    <${Icon} name="wheel" />${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}
+  </li>`;
+}
+
+function ScriptFact({ at }) {
+  const status = useValue(at, "autonomy-status");
+  if (!status?.running) return null;
+  return html`<li class="fact"><${Icon} name="script" />script: ${String(status.file ?? "?")}</li>`;
+}
+
+/** One picture a second of what flows anyway: this never starts a camera. */
+function Thumbnail({ at, offers, picture }) {
+  const flowing = picture?.state === "flowing";
+  const [count, setCount] = useState(0);
+  useEffect(() => {
+    if (!flowing) return undefined;
+    const timer = setInterval(() => document.hidden || setCount((n) => n + 1), THUMBNAIL_MS);
+    return () => clearInterval(timer);
+  }, [flowing]);
+  if (!flowing) {
+    const text = offers.hasVideo ? "camera rests" : "no camera";
+    return html`<div class="thumbnail"><${Icon} name=${offers.hasVideo ? "camera" : "no-camera"} />${text}</div>`;
+  }
+  return html`<div class="thumbnail">
+    <img alt=${`What ${nameOf(at)} sees`} src=${`/api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`} />
+  </div>`;
+}
+
+function AwayRow({ at }) {
+  const { settings, store } = usePage();
+  const liveness = useMetric(at, "web/liveness");
+  const heartbeat = useValue(at, "online");
+  const level = useMetric(at, "charging-level");
+  const silent = liveness?.value?.silent_s;
+  const seen =
+    typeof silent === "number"
+      ? store.now() - 1000 * silent - liveness.age
+      : Number.isFinite(heartbeat?.t)
+        ? heartbeat.t
+        : null;
+  const since = seen === null ? "never seen" : `last seen ${shortTime(seen)} (${roughly(store.now() - seen)} ago)`;
+  return html`<li class="away-row">
+    <span class="badge dim"><${Icon} name=${iconOf(at)} /></span>
+    <span class="away-name"
+      ><${RouteLink} to=${at}>${nameOf(at)}<//> <span class="dim">${since}</span> ${level &&
+      html`<span class="dim">${battery(level.value)} then</span>`}</span
+    >
+    <button type="button" aria-label=${`Forget ${nameOf(at)}`} onClick=${() => settings.forget(at)}>Forget</button>
+  </li>`;
+}

@@ -1,0 +1,144 @@
+// The header of every screen: which robot, whether it is there, and STOP.
+
+import { html, useMetric, useModel, usePage, useRefs, useTick, useValue } from "./hooks.js";
+import { Route } from "./models.js";
+import { Icon, Live, StopButton } from "./parts.js";
+import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
+
+export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
+  const { commands, driver } = usePage();
+  const wide = layout === "desktop";
+  return html`<header class="top">
+    <div class="where">
+      ${at ? html`<${BackLink} />` : html`<${Brand} />`}
+      ${at && html`<${Picker} at=${at} />`}
+    </div>
+    ${at && wide && html`<${Vital} at=${at} />`}
+    <div class="top-space"></div>
+    ${wide && html`<${ConnectionState} />`}
+    ${layout === "immersive" &&
+    html`<button type="button" class="round" aria-expanded=${drawer} aria-label="Everything else" onClick=${onDrawer}>
+        <${Icon} name="menu" />
+      </button>
+      ${document.fullscreenElement &&
+      html`<button
+        type="button"
+        class="round"
+        aria-label="Leave full screen"
+        onClick=${() => document.exitFullscreen()}
+      >
+        <${Icon} name="small" />
+      </button>`}`}
+    ${(wide || !at) && html`<${Me} panel=${panel} onPanel=${onPanel} wide=${wide} />`}
+    ${at &&
+    html`<${StopButton}
+      onStop=${() => commands.stop(driver.ref)}
+      label=${`Emergency stop of ${nameOf(at)}`}
+      className="stop-one"
+    >
+      <${Icon} name="stop" />STOP
+    <//>`}
+    ${(wide || !at) &&
+    html`<${StopButton} onStop=${() => commands.stop("")} label="Emergency stop of all robots" className="stop-all">
+      <${Icon} name="stop" />STOP ALL
+    <//>`}
+  </header>`;
+}
+
+const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
+
+/** Follow a link to a component, or the fleet, without loading the page again. */
+export function RouteLink({ to, className, label, children }) {
+  const { route } = usePage();
+  const go = (event) => {
+    if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
+    event.preventDefault();
+    route.go(to);
+  };
+  return html`<a class=${className} href=${Route.path(to)} aria-label=${label} onClick=${go}>${children}</a>`;
+}
+
+const BackLink = () => html`<${RouteLink} to="" className="back" label="All robots"
+  ><${Icon} name="back" /><span>Fleet</span><//
+>`;
+
+function Picker({ at }) {
+  const { route } = usePage();
+  const refs = [...new Set([at, ...useRefs()])].sort();
+  return html`<label class="picker">
+    <span class="picker-name"><b>${nameOf(at)}</b><${Icon} name="down" /></span>
+    <span class="picker-state"><${Liveness} at=${at} /><${Volts} at=${at} /></span>
+    <select aria-label="Choose a robot" value=${at} onChange=${(event) => route.go(event.currentTarget.value)}>
+      ${refs.map(
+        (ref) => html`<option key=${ref} value=${ref}>
+          ${nameOf(ref)}${typeOf(ref) === "robots" ? "" : ` (${kindOf(ref)})`}
+        </option>`,
+      )}
+    </select>
+  </label>`;
+}
+
+function Volts({ at }) {
+  const level = useValue(at, "charging-level");
+  return level ? html`<span class="volts">${battery(level)}</span>` : null;
+}
+
+/** Whether a component is there, and how late its heartbeats are. @param {{at: string}} props */
+export function Liveness({ at }) {
+  const { connection } = usePage();
+  useModel(connection);
+  useTick(1000);
+  const entry = useMetric(at, "web/liveness");
+  const view = entry?.value;
+  if (!connection.isOpen) return html`<span class="state unknown"><i>○</i> unknown</span>`;
+  if (!view || view.online === null) return html`<span class="state unknown"><i>○</i> waiting</span>`;
+  if (view.online === false) {
+    const silent = view.silent_s === null ? "" : ` ${roughly(1000 * view.silent_s + entry.age)}`;
+    return html`<span class="state bad"><i>✖</i> ${view.silent_s === null ? "offline" : `silent${silent}`}</span>`;
+  }
+  const latency = view.whole_seconds || view.latency_ms === null ? "? ms" : span(view.latency_ms);
+  const why = view.whole_seconds ? "Its clock counts whole seconds: how late its heartbeats are is not known" : undefined;
+  return html`<span class="state ok" title=${why}
+    ><i>●</i> <span class="sr">online, heartbeats late by </span>${latency}</span
+  >`;
+}
+
+function Vital({ at }) {
+  const { connection } = usePage();
+  useModel(connection);
+  const level = useMetric(at, "charging-level");
+  const charging = useValue(at, "charging-status");
+  const view = useValue(at, "web/driver");
+  const online = connection.isOpen && useValue(at, "web/liveness")?.online !== false;
+  return html`<div class="vital">
+    ${level &&
+    html`<span class="chip"
+      ><${Icon} name=${charging?.value === true ? "charging" : "battery"} /><${Live} entry=${level} online=${online}
+        >${battery(level.value)}<//
+      ></span
+    >`}
+    ${view?.by && html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${whoDrives(view)}</span>`}
+  </div>`;
+}
+
+const whoDrives = (view) => (view.you ? "You drive" : `${driverName(view)} drives`);
+
+function ConnectionState() {
+  const { connection } = usePage();
+  useModel(connection);
+  const { socket, state } = connection;
+  if (state === "connecting") return html`<span class="chip plain">connecting…</span>`;
+  if (state === "lost") return html`<span class="chip plain bad">✖ no connection</span>`;
+  const round = socket.roundTripMs >= 0 ? ` · ${span(socket.roundTripMs)}` : "";
+  return html`<span class=${`chip plain ${socket.roundTripMs > 300 ? "late" : ""}`}>connected${round}</span>`;
+}
+
+function Me({ panel, onPanel, wide }) {
+  const { connection } = usePage();
+  useModel(connection);
+  const { you } = connection;
+  const text = you?.login ? `${you.user} (${you.role})` : "Settings";
+  return html`<button type="button" class="quiet me" aria-expanded=${panel} aria-label=${text} onClick=${onPanel}>
+    <${Icon} name=${you?.login ? "person" : "settings"} />${wide && html`<span>${text}</span>`}
+  </button>`;
+}

@@ -1,0 +1,114 @@
+// What every widget is made of: templates, the page's services, and values that follow the store.
+
+import { Component, createContext, h } from "../vendor/preact.mjs";
+import { useContext, useEffect, useReducer, useRef, useState } from "../vendor/hooks.mjs";
+import htm from "../vendor/htm.mjs";
+
+export { useContext, useEffect, useRef, useState };
+export const html = htm.bind(h);
+
+/** The services that main.js makes: store, connection, commands, driver, video, settings, route. */
+export const Page = createContext(null);
+
+/** @returns {any} the services of the page */
+export const usePage = () => useContext(Page);
+
+const useRedraw = () => useReducer((n) => n + 1, 0)[1];
+
+/** @param {string} ref @param {string} metric @returns {import("../core/store.js").Value | undefined} */
+export function useMetric(ref, metric) {
+  const { store } = usePage();
+  const redraw = useRedraw();
+  useEffect(() => {
+    redraw(); // it may have changed since it was drawn
+    return store.subscribe(ref, metric, redraw);
+  }, [store, ref, metric]);
+  return store.get(ref, metric);
+}
+
+/** @param {string} ref @param {string} metric @returns {any} the payload; undefined until there is one */
+export const useValue = (ref, metric) => useMetric(ref, metric)?.value;
+
+/** @returns {string[]} all components */
+export function useRefs() {
+  const { store } = usePage();
+  const redraw = useRedraw();
+  useEffect(() => {
+    redraw();
+    return store.subscribe(null, null, redraw);
+  }, [store]);
+  return store.refs();
+}
+
+/** @param {string} ref @returns {string[]} the metrics that were received of it */
+export function useMetrics(ref) {
+  const { store } = usePage();
+  const redraw = useRedraw();
+  useEffect(() => {
+    redraw();
+    return store.subscribe(ref, null, redraw);
+  }, [store, ref]);
+  return store.metrics(ref);
+}
+
+/** Draw again after each change of a model. @template T @param {T} model @returns {T} */
+export function useModel(model) {
+  const redraw = useRedraw();
+  useEffect(() => {
+    redraw();
+    return model.onChange(redraw);
+  }, [model]);
+  return model;
+}
+
+/** Draw again every ``ms``, for ages. @param {number} ms */
+export function useTick(ms) {
+  const redraw = useRedraw();
+  useEffect(() => {
+    const timer = setInterval(redraw, ms);
+    return () => clearInterval(timer);
+  }, [ms]);
+}
+
+/** @param {string} query @returns {boolean} whether the media query matches */
+export function useMedia(query) {
+  const redraw = useRedraw();
+  useEffect(() => {
+    const list = matchMedia(query);
+    list.addEventListener("change", redraw);
+    return () => list.removeEventListener("change", redraw);
+  }, [query]);
+  return matchMedia(query).matches;
+}
+
+/** A text that changes at most once a second, so that it can be read aloud. @param {string} text @returns {string} */
+export function useCalm(text) {
+  const [shown, show] = useState(text);
+  const changedAt = useRef(-Infinity);
+  useEffect(() => {
+    if (text === shown) return undefined;
+    const wait = Math.max(0, changedAt.current + 1000 - performance.now());
+    const timer = setTimeout(() => {
+      changedAt.current = performance.now();
+      show(text);
+    }, wait);
+    return () => clearTimeout(timer);
+  }, [text, shown]);
+  return shown;
+}
+
+/** A part of the page that may fail without the rest. */
+export class Boundary extends Component {
+  componentDidCatch(error) {
+    console.error(error);
+    this.setState({ error });
+  }
+
+  render({ children, what }, { error }) {
+    if (!error) return children;
+    return html`<p class="failed" role="alert">
+      ${what} failed: ${String(error.message ?? error)}
+      <button type="button" onClick=${() => this.setState({ error: null })}>Try again</button>
+    </p>`;
+  }
+}

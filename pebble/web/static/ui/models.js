@@ -1,0 +1,213 @@
+// What the page knows besides the store: its connection, its address, its settings, and the picture.
+
+import { inner, isObject } from "./words.js";
+
+/** Something that widgets follow. */
+export class Model {
+  constructor() {
+    /** @type {Set<() => void>} */
+    this.followers = new Set();
+  }
+
+  /** @param {() => void} fn @returns {() => void} unsubscribe */
+  onChange(fn) {
+    this.followers.add(fn);
+    return () => this.followers.delete(fn);
+  }
+
+  changed() {
+    for (const fn of [...this.followers]) fn();
+  }
+}
+
+/** The state of the control socket, and what the server last refused. */
+export class Connection extends Model {
+  constructor(version) {
+    super();
+    this.version = version;
+    this.socket = null; // set by main.js
+    this.bye = null;
+    /** @type {{text: string, at: number} | null} */
+    this.notice = null;
+  }
+
+  get state() {
+    return this.socket.state;
+  }
+
+  get you() {
+    return this.socket.you;
+  }
+
+  get isOpen() {
+    return this.state === "open";
+  }
+
+  /** The page was loaded before the server was updated. */
+  get isOld() {
+    return this.you !== null && this.you.version !== this.version;
+  }
+
+  may(right) {
+    return this.isOpen && (this.you?.rights ?? []).includes(right);
+  }
+
+  /** Show a text for a few seconds. @param {string} text */
+  show(text) {
+    this.notice = { text, at: performance.now() };
+    this.changed();
+    setTimeout(() => this.changed(), 6100);
+  }
+}
+
+/** Which component is open: "" is the fleet. */
+export class Route extends Model {
+  constructor() {
+    super();
+    addEventListener("popstate", () => this.changed());
+  }
+
+  get ref() {
+    const path = location.pathname;
+    if (!path.startsWith("/r/")) return "";
+    try {
+      return decodeURIComponent(path.slice(3));
+    } catch {
+      return "";
+    }
+  }
+
+  static path(ref) {
+    return ref ? `/r/${ref.split("/").map(encodeURIComponent).join("/")}` : "/";
+  }
+
+  go(ref) {
+    if (ref === this.ref) return;
+    history.pushState(null, "", Route.path(ref));
+    scrollTo(0, 0);
+    this.changed();
+  }
+}
+
+/** What is remembered in this browser. Private windows may refuse to remember anything. */
+export class Settings extends Model {
+  constructor() {
+    super();
+    this.theme = read("theme", "auto");
+    this.thumbnails = read("thumbnails", false) === true;
+    this.sort = read("sort", "name");
+    this.forgotten = new Set(list(read("forgotten", [])));
+    this.apply();
+  }
+
+  /** @param {"theme" | "thumbnails" | "sort"} name @param {any} value */
+  set(name, value) {
+    this[name] = value;
+    write(name, value);
+    this.apply();
+    this.changed();
+  }
+
+  apply() {
+    const root = document.documentElement;
+    if (this.theme === "light" || this.theme === "dark") root.dataset.theme = this.theme;
+    else delete root.dataset.theme;
+  }
+
+  forget(ref, forgotten = true) {
+    if (forgotten) this.forgotten.add(ref);
+    else this.forgotten.delete(ref);
+    write("forgotten", [...this.forgotten]);
+    this.changed();
+  }
+
+  /** Whether pictures of this component are wanted. @param {string} ref */
+  wantsVideo(ref) {
+    return read(`video ${ref}`, true) !== false;
+  }
+
+  setVideo(ref, wanted) {
+    write(`video ${ref}`, wanted);
+  }
+}
+
+/** Which cards of one component are closed or hidden. */
+export class CardView extends Model {
+  constructor(ref) {
+    super();
+    this.key = `cards ${ref}`;
+    const stored = read(this.key, {});
+    this.closed = new Set(list(stored?.closed));
+    this.hidden = new Set(list(stored?.hidden));
+  }
+
+  isClosed(id) {
+    return this.closed.has(id);
+  }
+
+  toggle(id) {
+    if (!this.closed.delete(id)) this.closed.add(id);
+    this.save();
+  }
+
+  hide(id) {
+    this.hidden.add(id);
+    this.save();
+  }
+
+  show(id) {
+    this.hidden.delete(id);
+    this.save();
+  }
+
+  save() {
+    write(this.key, { closed: [...this.closed], hidden: [...this.hidden] });
+    this.changed();
+  }
+}
+
+function read(name, otherwise) {
+  try {
+    return JSON.parse(localStorage.getItem(`pebble ${name}`) ?? "null") ?? otherwise;
+  } catch {
+    return otherwise;
+  }
+}
+
+function write(name, value) {
+  try {
+    localStorage.setItem(`pebble ${name}`, JSON.stringify(value));
+  } catch {
+    // there is no room, or this window remembers nothing
+  }
+}
+
+const list = (value) => (Array.isArray(value) ? value.filter((one) => typeof one === "string") : []);
+
+/** What a component offers, by its capabilities; a robot without any is assumed to have a camera. */
+export class Offers {
+  /** @param {string} ref @param {any} capabilities payload */
+  constructor(ref, capabilities) {
+    const value = inner(capabilities);
+    this.known = isObject(value);
+    this.value = this.known ? value : {};
+    this.assumed = !this.known && ref.split("/")[1] === "robots";
+  }
+
+  section(name) {
+    return isObject(this.value[name]) ? this.value[name] : {};
+  }
+
+  get drives() {
+    return this.section("drive").available === true;
+  }
+
+  get hasVideo() {
+    return this.assumed || this.section("video").available === true;
+  }
+
+  get transport() {
+    const kind = this.section("transport").kind;
+    return typeof kind === "string" ? kind : "";
+  }
+}

@@ -1,0 +1,117 @@
+// Small parts of many widgets.
+
+import { html, useEffect, useRef, useState, useTick } from "./hooks.js";
+import { roughly } from "./words.js";
+
+const ICONS = new URL("../icons.svg", import.meta.url).href;
+const GONE_MS = 10_000;
+
+/** @param {{name: string}} props */
+export const Icon = ({ name }) => html`<svg class="icon" aria-hidden="true"><use href=${`${ICONS}#${name}`} /></svg>`;
+
+/** A button that stops at the first touch, not when the finger is lifted, and with any finger. */
+export function StopButton({ onStop, label, children, className = "", describedBy }) {
+  const touchedAt = useRef(-Infinity);
+  return html`<span class="stop-area">
+    <button
+      type="button"
+      class=${`stop ${className}`}
+      aria-label=${label}
+      aria-describedby=${describedBy}
+      onPointerDown=${() => {
+        touchedAt.current = performance.now();
+        onStop();
+      }}
+      onClick=${() => performance.now() - touchedAt.current > 1500 && onStop()}
+      onContextMenu=${(event) => event.preventDefault()}
+    >
+      ${children}
+    </button>
+  </span>`;
+}
+
+const HOLD_MS = 1000;
+
+/** A button that has to be held for a second, by pointer or key. */
+export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy }) {
+  const [held, hold] = useState(false);
+  const done = useRef(onHeld);
+  done.current = onHeld;
+  useEffect(() => {
+    if (!held) return undefined;
+    const timer = setTimeout(() => {
+      hold(false);
+      done.current();
+    }, HOLD_MS);
+    return () => clearTimeout(timer);
+  }, [held]);
+  const end = () => hold(false);
+  const key = (event) => event.code === "Space" || event.code === "Enter";
+  return html`<button
+    type="button"
+    class=${`hold ${held ? "held" : ""} ${className}`}
+    disabled=${disabled}
+    aria-describedby=${describedBy}
+    onPointerDown=${(event) => {
+      if (event.button) return;
+      event.currentTarget.setPointerCapture(event.pointerId);
+      hold(true);
+    }}
+    onPointerUp=${end}
+    onPointerCancel=${end}
+    onLostPointerCapture=${end}
+    onBlur=${end}
+    onKeyDown=${(event) => key(event) && !event.repeat && hold(true)}
+    onKeyUp=${end}
+    onContextMenu=${(event) => {
+      event.preventDefault();
+      end();
+    }}
+  >
+    <span class="hold-fill" aria-hidden="true"></span><span class="hold-text">${children}</span>
+  </button>`;
+}
+
+/** The reason under a control that is off. */
+export const Why = ({ id, children }) => html`<span class="why" id=${id}>${children}</span>`;
+
+/**
+ * A value and how old it is: paler after two periods, and no longer shown as a value after ten seconds or three periods.
+ * @param {{entry?: import("../core/store.js").Value, online?: boolean, children: any}} props
+ */
+export function Live({ entry, online = true, children }) {
+  useTick(1000);
+  if (!entry) return html`<span class="dim">–</span>`;
+  const { age, period } = entry;
+  if (!online || (period && age > Math.max(GONE_MS, 3 * period))) {
+    return html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
+  }
+  const late = period && age > 2 * period + 250;
+  return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
+}
+
+/** @param {{title: string, id: string, icon?: string, aside?: any, children: any}} props */
+export function Card({ title, id, icon, aside, view, className = "", children }) {
+  const closed = view?.isClosed(id) ?? false;
+  return html`<section class=${`card ${className}`} aria-labelledby=${`${id}-title`} data-card=${id}>
+    <header class="card-head">
+      ${icon && html`<${Icon} name=${icon} />`}
+      <h2 id=${`${id}-title`}>${title}</h2>
+      ${aside}
+      ${view &&
+      html`<button
+          type="button"
+          class="quiet"
+          aria-expanded=${!closed}
+          aria-label=${`${closed ? "Open" : "Close"} ${title}`}
+          onClick=${() => view.toggle(id)}
+        >
+          <${Icon} name=${closed ? "down" : "up"} />
+        </button>
+        <button type="button" class="quiet" aria-label=${`Hide ${title}`} onClick=${() => view.hide(id)}>
+          <${Icon} name="close" />
+        </button>`}
+    </header>
+    ${!closed && html`<div class="card-body">${children}</div>`}
+  </section>`;
+}

@@ -1,0 +1,156 @@
+// One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
+
+import { CARDS, TABS } from "./cards.js";
+import { DriveCard, DrivePad, DriveSettings, WhyLine } from "./drive.js";
+import { Boundary, html, useEffect, useMetric, useModel, usePage, useState, useValue } from "./hooks.js";
+import { CardView, Offers } from "./models.js";
+import { Card, Icon } from "./parts.js";
+import { PictureSettings, Stage, useVideo } from "./video.js";
+import { nameOf } from "./words.js";
+
+export function Robot({ at, layout, drawer, onPanel }) {
+  const offers = new Offers(at, useValue(at, "capabilities"));
+  const [view] = useState(() => new CardView(at));
+  useModel(view);
+  const source = useValue(at, "web/picture-from")?.source || at;
+  const hasVideo = offers.hasVideo || source !== at;
+  const known = useKnown(at);
+  const video = useVideo(at, hasVideo && known ? source : "");
+  const parts = { at, offers, view, video: hasVideo ? video : null, source };
+  if (!known) return html`<${Unknown} at=${at} />`;
+  if (layout === "immersive") return html`<${Immersive} ...${parts} drawer=${drawer} onPanel=${onPanel} />`;
+  if (layout === "portrait") return html`<${Portrait} ...${parts} onPanel=${onPanel} />`;
+  return html`<${Desktop} ...${parts} />`;
+}
+
+/** Whether anything was received of it; the answer takes a moment after a reload. */
+function useKnown(at) {
+  const { store } = usePage();
+  const liveness = useMetric(at, "web/liveness");
+  return Boolean(liveness) || store.metrics(at).some((metric) => !metric.startsWith("web/"));
+}
+
+function Unknown({ at }) {
+  const { connection } = usePage();
+  useModel(connection);
+  const text = connection.isOpen ? `Nothing was received from ${at} yet.` : "Connecting to the server…";
+  return html`<div class="empty"><${Icon} name="robot" /><h1 class="sr">${nameOf(at)}</h1><p>${text}</p></div>`;
+}
+
+function Desktop({ at, offers, view, video, source }) {
+  const cards = wanted(offers, view);
+  const side = offers.drives ? null : video ? cards.shift() : null;
+  return html`<div class="robot">
+    <h1 class="sr">${nameOf(at)}</h1>
+    <div class=${`bench ${video ? "" : "no-picture"} ${offers.drives || side ? "" : "no-side"}`}>
+      ${video &&
+      html`<${Boundary} what="The picture"><${Stage} at=${at} video=${video} source=${source} offers=${offers} wide /><//>`}
+      ${offers.drives && html`<${Boundary} what="Driving"><${DriveCard} at=${at} offers=${offers} /><//>`}
+      ${side && html`<${CardOf} card=${side} at=${at} offers=${offers} view=${view} />`}
+    </div>
+    <div class="cards">
+      ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
+    </div>
+    <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
+  </div>`;
+}
+
+function Portrait({ at, offers, view, video, source, onPanel }) {
+  const [chosen, choose] = useState("");
+  const cards = wanted(offers, view);
+  const first = Boolean(video) || offers.drives;
+  const tabs = TABS.filter(({ id }) => (id === "drive" ? first : id === "more" || cards.some((card) => card.tab === id)));
+  const tab = tabs.some(({ id }) => id === chosen) ? chosen : tabs[0].id;
+  return html`<div class="robot">
+    <h1 class="sr">${nameOf(at)}</h1>
+    ${tab === "drive" &&
+    html`<div class="phone-drive">
+      ${video &&
+      html`<${Boundary} what="The picture"><${Stage} at=${at} video=${video} source=${source} offers=${offers} /><//>`}
+      ${offers.drives &&
+      html`<${Boundary} what="Driving">
+        <section class="phone-pad" aria-label="Drive">
+          <${WhyLine} at=${at} />
+          <${DrivePad} at=${at} />
+          <details class="more-drive">
+            <summary>Speed, turn, balance</summary>
+            <${DriveSettings} at=${at} />
+          </details>
+        </section>
+      <//>`}
+    </div>`}
+    <div class="cards">
+      ${cards
+        .filter((card) => card.tab === tab)
+        .map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
+      ${tab === "more" &&
+      html`${video &&
+        html`<${Card} id="picture" title="Picture" icon="camera"
+          ><${PictureSettings} at=${at} source=${source} offers=${offers}
+        /><//>`}
+        <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
+        <button type="button" class="wide" onClick=${onPanel}><${Icon} name="settings" />Settings and who I am</button>`}
+    </div>
+    <nav class="tabs" aria-label="Parts of this page">
+      ${tabs.map(
+        ({ id, title, icon }) => html`<button
+          key=${id}
+          type="button"
+          aria-current=${id === tab ? "page" : undefined}
+          onClick=${() => choose(id)}
+        >
+          <${Icon} name=${id === "drive" && !offers.drives ? "camera" : icon} />
+          <span>${id === "drive" && !offers.drives ? "Picture" : title}</span>
+        </button>`,
+      )}
+    </nav>
+  </div>`;
+}
+
+function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
+  const cards = wanted(offers, view);
+  return html`<div class="robot">
+    <h1 class="sr">${nameOf(at)}</h1>
+    ${video
+      ? html`<${Boundary} what="The picture"
+          ><${Stage} at=${at} video=${video} source=${source} offers=${offers} immersive
+        /><//>`
+      : html`<div class="stage"><p class="cover">no camera</p></div>`}
+    ${offers.drives &&
+    html`<${Boundary} what="Driving">
+      <div class="float-pad"><${DrivePad} at=${at} /></div>
+      <div class="float-why"><${WhyLine} at=${at} /></div>
+    <//>`}
+    ${drawer &&
+    html`<aside class="drawer" aria-label="Everything else">
+      ${offers.drives && html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${DriveSettings} at=${at} /><//>`}
+      ${video &&
+      html`<${Card} id="picture" title="Picture" icon="camera"
+        ><${PictureSettings} at=${at} source=${source} offers=${offers} video=${video}
+      /><//>`}
+      ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
+      <button type="button" class="wide" onClick=${onPanel}><${Icon} name="settings" />Settings and who I am</button>
+    </aside>`}
+  </div>`;
+}
+
+const wanted = (offers, view) => CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id));
+
+function CardOf({ card, at, offers, view }) {
+  return html`<${Card} id=${card.id} title=${card.title} icon=${card.icon} view=${view}>
+    <${Boundary} what=${card.title}><${card.body} at=${at} offers=${offers} /><//>
+  <//>`;
+}
+
+/** What is not on this page, and why. */
+function Missing({ at, offers, view, hasVideo }) {
+  const lacks = [!hasVideo && "camera", !offers.drives && offers.known && "driving"].filter(Boolean);
+  const hidden = CARDS.filter((card) => view.hidden.has(card.id));
+  if (!lacks.length && !hidden.length) return null;
+  return html`<div class="missing">
+    ${lacks.length > 0 && html`<span class="dim">Not on ${nameOf(at)}: ${lacks.join(", ")}.</span>`}
+    ${hidden.map(
+      (card) => html`<button key=${card.id} type="button" onClick=${() => view.show(card.id)}>Show ${card.title}</button>`,
+    )}
+  </div>`;
+}

@@ -1,0 +1,119 @@
+// What the component reports of itself, in words and numbers.
+
+import { html, useMetric, useModel, usePage, useTick, useValue } from "./hooks.js";
+import { Live } from "./parts.js";
+import { battery, charging, inner, isObject, number, plain, roughly, span } from "./words.js";
+
+export function Telemetry({ at }) {
+  const { connection } = usePage();
+  useModel(connection);
+  const online = connection.isOpen && useValue(at, "web/liveness")?.online !== false;
+  return html`<dl class="values">
+    <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
+    <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>
+    <${Heartbeat} at=${at} />
+    <${Row} at=${at} metric="sensors/imu" name="Roll, pitch" online=${online}>${attitude}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online}>${rate}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online}>${acceleration}<//>
+    <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online}>${touch}<//>
+    <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online}>${(value) => plain(inner(value))}<//>
+    <${Media} at=${at} online=${online} />
+    <${Services} at=${at} />
+  </dl>`;
+}
+
+function Row({ at, metric, name, online, children: words }) {
+  const entry = useMetric(at, metric);
+  if (!entry) return null;
+  return html`<div>
+    <dt>${name}</dt>
+    <dd><${Live} entry=${entry} online=${online}>${words(entry.value)}<//></dd>
+  </div>`;
+}
+
+function Heartbeat({ at }) {
+  useTick(500);
+  const entry = useMetric(at, "web/liveness");
+  const view = entry?.value;
+  if (!view) return null;
+  const age = view.silent_s === null ? null : 1000 * view.silent_s + entry.age;
+  const seen = age === null ? "none since the server started" : age < 1500 ? "within the last second" : `${roughly(age)} ago`;
+  const late = view.whole_seconds
+    ? "unknown: its clock counts whole seconds"
+    : view.latency_ms === null
+      ? "–"
+      : span(view.latency_ms);
+  return html`<div>
+      <dt>Heartbeat</dt>
+      <dd class=${view.online === false ? "bad" : ""}>${seen}</dd>
+    </div>
+    <div>
+      <dt>Latency</dt>
+      <dd>${late}</dd>
+    </div>`;
+}
+
+const degrees = (value) => `${number(value, 1)}°`;
+
+function attitude(payload) {
+  const angles = inner(payload)?.orientation_deg;
+  return `${degrees(angles?.roll)}, ${degrees(angles?.pitch)}`;
+}
+
+const rate = (payload) => `${number(inner(payload)?.gyro_dps?.z, 1)} °/s`;
+
+const acceleration = (payload) => `${number(inner(payload)?.accel_norm_g, 2)} g`;
+
+function touch(payload) {
+  const value = inner(payload);
+  return isObject(value) ? Object.values(value).slice(0, 8).map(plain).join(" · ") : plain(value);
+}
+
+function Media({ at, online }) {
+  const entry = useMetric(at, "media-status");
+  const streams = inner(entry?.value);
+  if (!isObject(streams)) return null;
+  return Object.entries(streams)
+    .slice(0, 8)
+    .map(
+      ([name, report]) => html`<div key=${name}>
+        <dt>${name.replaceAll("_", " ")}</dt>
+        <dd class=${report?.last_error ? "bad" : ""}>
+          ${online ? "" : "was: "}${report?.last_error ? `✖ ${report.last_error}` : mediaWords(report)}
+        </dd>
+      </div>`,
+    );
+}
+
+function mediaWords(report) {
+  if (!isObject(report)) return plain(report);
+  return report.running ? String(report.doing ?? "running") : "rests";
+}
+
+const SERVICE = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
+
+function Services({ at }) {
+  const services = inner(useValue(at, "status"))?.services;
+  if (!isObject(services)) return null;
+  return html`<div class="services">
+    <dt>Services</dt>
+    <dd>
+      <ul>
+        ${Object.entries(services)
+          .slice(0, 40)
+          .map(([name, one]) => {
+            const state = String(one?.state ?? one);
+            const bad = state === "failed" || state === "restarting";
+            return html`<li key=${name} class=${bad ? "bad" : ""}>
+              <i aria-hidden="true">${SERVICE[state] ?? "○"}</i> ${name}
+              <span class="dim">
+                ${state}${one?.restarts > 0 ? `, restarted ${one.restarts}×` : ""}${bad && one?.last_exit
+                  ? `, ${one.last_exit}`
+                  : ""}</span
+              >
+            </li>`;
+          })}
+      </ul>
+    </dd>
+  </div>`;
+}

@@ -1,0 +1,87 @@
+// The picture of one component: what was drawn last, and how old that is. The canvas outlives every layout.
+
+import { Model } from "./models.js";
+
+const STALE_MS = 500; // without a new picture, what is shown is no longer live
+const WRONG_MS = 1000; // a clock that is so far off is not believed
+
+/** Owner of the canvas and of the connection for pictures. */
+export class Video extends Model {
+  /** @param {import("../core/store.js").Store} store */
+  constructor(store) {
+    super();
+    this.store = store;
+    this.canvas = document.createElement("canvas");
+    this.canvas.width = 640;
+    this.canvas.height = 360;
+    this.context = this.canvas.getContext("2d");
+    this.ref = ""; // whose picture is shown
+    this.pictures = null; // set by main.js
+    this.forget();
+  }
+
+  forget() {
+    /** @type {any} */
+    this.info = null;
+    this.drawnAt = -Infinity;
+    this.interval = 0; // ms between pictures
+    this.state = null;
+  }
+
+  /** Show pictures of ``ref``; "" none. @param {string} ref */
+  show(ref) {
+    if (ref === this.ref) return;
+    this.ref = ref;
+    this.forget();
+    if (ref) this.pictures?.show(ref);
+    else this.pictures?.stop();
+    this.changed();
+  }
+
+  /** @param {CanvasImageSource & {width: number, height: number}} bitmap @param {any} info */
+  draw(bitmap, info) {
+    const { canvas } = this;
+    const width = bitmap.displayWidth ?? bitmap.width;
+    const height = bitmap.displayHeight ?? bitmap.height;
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    this.context.drawImage(bitmap, 0, 0);
+    const now = performance.now();
+    const since = now - this.drawnAt;
+    if (since < 10_000) this.interval = this.interval ? 0.8 * this.interval + 0.2 * since : since;
+    const first = this.info === null;
+    this.drawnAt = now;
+    this.info = info;
+    if (first) this.changed();
+  }
+
+  /** @param {any} state of Pictures */
+  report(state) {
+    this.state = state;
+    this.changed();
+  }
+
+  /** ms since the last picture arrived; Infinity: there was none. */
+  get sinceDrawn() {
+    return performance.now() - this.drawnAt;
+  }
+
+  get isStale() {
+    return this.sinceDrawn > Math.max(STALE_MS, 2.5 * this.interval);
+  }
+
+  /** How old the picture is in ms: since it was taken, or, if the component's clock is wrong, since it arrived. */
+  age() {
+    const captured = this.info?.capturedMs;
+    if (typeof captured === "number" && captured > 0 && this.clockIsRight) {
+      const ms = this.store.now() - captured;
+      if (ms > -WRONG_MS && ms < 3_600_000) return { ms: Math.max(0, ms), since: "taken" };
+    }
+    return { ms: this.sinceDrawn, since: "arrived" };
+  }
+
+  /** Heartbeats carry the component's clock: one that is more than a second off says nothing about pictures. */
+  get clockIsRight() {
+    const view = this.store.get(this.ref, "web/liveness")?.value;
+    return Boolean(view) && !view.whole_seconds && view.latency_ms !== null && view.latency_ms < WRONG_MS;
+  }
+}

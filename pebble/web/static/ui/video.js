@@ -1,0 +1,139 @@
+// The live picture: how old it is, how it comes, and where from.
+
+import { html, useEffect, useModel, usePage, useRef, useState, useTick, useRefs, useValue } from "./hooks.js";
+import { Offers } from "./models.js";
+import { Icon, Why } from "./parts.js";
+import { nameOf, span } from "./words.js";
+
+const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
+
+/** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
+export function useVideo(at, source) {
+  const { settings, video, driver } = usePage();
+  const [wanted, want] = useState(() => settings.wantsVideo(at));
+  useEffect(() => {
+    video.show(wanted ? source : "");
+    driver.changed();
+    return () => video.show("");
+  }, [source, wanted]);
+  return {
+    wanted,
+    toggle() {
+      settings.setVideo(at, !wanted);
+      want(!wanted);
+    },
+  };
+}
+
+export function Stage({ at, video: control, source, offers, wide = false, immersive = false }) {
+  const page = usePage();
+  const { video } = page;
+  useModel(video);
+  useTick(200);
+  const place = useRef(null);
+  useEffect(() => {
+    place.current.append(video.canvas);
+    return () => video.canvas.remove();
+  }, []);
+  const cover = useCover(control, source);
+  const stale = cover !== "";
+  video.canvas.setAttribute("role", "img");
+  video.canvas.setAttribute("aria-label", `What ${nameOf(source)} sees`);
+  return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Picture">
+    <div class="picture">
+      <div class="canvas" ref=${place}></div>
+      ${cover && html`<p class="cover">${cover}</p>`}
+      ${video.info && html`<span class="tag tag-how">${howWords(video, useValue(source, "web/picture"))}</span>`}
+      ${video.info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`}>${ageWords(video)}</span>`}
+      ${source !== at && html`<span class="tag tag-from">seen from ${nameOf(source)}</span>`}
+    </div>
+    ${!immersive &&
+    html`<div class="picture-bar">
+      <button type="button" onClick=${control.toggle}>
+        <${Icon} name=${control.wanted ? "no-camera" : "camera"} />${control.wanted ? "Stop video" : "Start video"}
+      </button>
+      <button type="button" onClick=${goFull} hidden=${!document.documentElement.requestFullscreen}>
+        <${Icon} name="full" />Full screen
+      </button>
+      ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
+    </div>`}
+  </section>`;
+}
+
+const goFull = () => document.documentElement.requestFullscreen().catch(() => {});
+
+/** Why there is no live picture; "" there is. */
+function useCover(control, source) {
+  const { connection, video } = usePage();
+  useModel(connection);
+  const view = useValue(source, "web/picture");
+  if (!control.wanted) return "Video is stopped";
+  const old = video.info ? ` · this picture is ${span(video.age().ms)} old` : "";
+  if (!connection.isOpen) return `No connection to the server${old}`;
+  if (video.info && !video.isStale) return "";
+  if (view?.state === "refused") return `No picture: ${view.why || "the robot refuses"}`;
+  if (video.info) return `The picture has stopped${old}`;
+  if (view?.why) return view.why;
+  return view?.state === "silent" ? "The camera sends nothing" : "Waiting for the first picture…";
+}
+
+function howWords({ info, interval }, view) {
+  const size = `${info.encoding ?? ""}${info.rescue ? " (converted)" : ""} ${info.width}×${info.height}`;
+  const rate = view?.per_second > 0 ? view.per_second : interval > 0 ? 1000 / interval : 0;
+  const bits = view?.kbits > 0 ? ` · ${Math.round(view.kbits)} kbit/s` : "";
+  return `${size} · ${rate.toFixed(rate < 9.5 ? 1 : 0)}/s${bits}`;
+}
+
+function ageWords(video) {
+  const { ms, since } = video.age();
+  return since === "taken" ? `${span(ms)} old` : `arrived ${span(ms)} ago`;
+}
+
+/** Encoding and source; they count for everybody who looks at this component. */
+export function PictureSettings({ at, source, offers, video }) {
+  const { commands, connection } = usePage();
+  useModel(connection);
+  const view = useValue(source, "web/picture");
+  const listed = offers.section("video").encodings;
+  const encodings = ENCODINGS.filter((one) => !Array.isArray(listed) || listed.includes(one) || one === view?.pinned);
+  const cameras = useCameras(at);
+  const why = !connection.isOpen ? "No connection to the server" : connection.may("drive") ? "" : "Log in as driver to change";
+  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
+  return html`<div class="picture-settings">
+    ${video &&
+    html`<button type="button" onClick=${video.toggle}>${video.wanted ? "Stop video" : "Start video"}</button>`}
+    <label class="field"
+      ><span>Encoding</span>
+      <select
+        value=${view?.pinned ?? ""}
+        ...${more}
+        onChange=${(event) => commands.setEncoding(source, event.currentTarget.value)}
+      >
+        <option value="">automatic</option>
+        ${encodings.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
+      </select></label
+    >
+    ${cameras.length > 0 &&
+    html`<label class="field"
+      ><span>Picture from</span>
+      <select
+        value=${source === at ? "" : source}
+        ...${more}
+        onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
+      >
+        <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
+        ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
+      </select></label
+    >`}
+    ${why && html`<${Why} id="why-picture">${why}<//>`}
+    ${view?.viewers > 1 && html`<span class="dim viewers">${view.viewers} viewers</span>`}
+  </div>`;
+}
+
+function useCameras(at) {
+  const { store } = usePage();
+  useTick(2000);
+  return useRefs()
+    .filter((ref) => ref !== at && new Offers(ref, store.get(ref, "capabilities")?.value).hasVideo)
+    .sort();
+}

@@ -1,0 +1,76 @@
+// How values are written for people. Everything of a robot is text, whatever type it claims to be.
+
+const time = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+const short = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit" });
+
+/** @param {string} ref @returns {string} the last level: what people call it */
+export const nameOf = (ref) => ref.slice(ref.lastIndexOf("/") + 1);
+
+/** @param {string} ref @returns {string} "robots", "towers", … */
+export const typeOf = (ref) => ref.split("/")[1] ?? "";
+
+/** @param {string} ref @returns {string} "robot", "tower", … */
+export const kindOf = (ref) => typeOf(ref).replace(/s$/, "");
+
+/** @param {number} ms epoch @returns {string} 12:03:41 */
+export const clockTime = (ms) => time.format(ms);
+
+/** @param {number} ms epoch @returns {string} 12:03 */
+export const shortTime = (ms) => short.format(ms);
+
+/** @param {number} ms @returns {string} 68 ms, 5.2 s, 18 min, 3 h, 2 days */
+export function span(ms) {
+  if (ms < 950) return `${Math.round(Math.max(0, ms))} ms`;
+  if (ms < 10_000) return `${(ms / 1000).toFixed(1)} s`;
+  if (ms < 120_000) return `${Math.round(ms / 1000)} s`;
+  if (ms < 7_200_000) return `${Math.round(ms / 60_000)} min`;
+  if (ms < 172_800_000) return `${Math.round(ms / 3_600_000)} h`;
+  return `${Math.round(ms / 86_400_000)} days`;
+}
+
+/** As ``span``, without parts of seconds: for what is drawn once a second. @param {number} ms @returns {string} */
+export const roughly = (ms) => (ms < 120_000 ? `${Math.max(0, Math.round(ms / 1000))} s` : span(ms));
+
+/** @param {unknown} value @param {number} digits @returns {string} "–" for what is no number */
+export const number = (value, digits) => (Number.isFinite(value) ? Number(value).toFixed(digits) : "–");
+
+/** @param {unknown} value @returns {value is Record<string, any>} */
+export const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);
+
+/** The payload without the envelope that most have. @param {unknown} payload @returns {any} */
+export const inner = (payload) => (isObject(payload) && "value" in payload ? payload.value : payload);
+
+/** @param {unknown} payload of charging-level @returns {string} 7.92 V, 81 % */
+export function battery(payload) {
+  const value = inner(payload);
+  const unit = isObject(payload) && typeof payload.unit === "string" ? payload.unit : "";
+  if (unit.toLowerCase() === "v") return `${number(value, 2)} V`;
+  return `${number(value, 1)}${unit ? ` ${unit}` : ""}`;
+}
+
+/** @param {unknown} payload of charging-status @returns {string} */
+export function charging(payload) {
+  const value = inner(payload);
+  return value === true ? "charging" : value === false ? "not charging" : "charging: unknown";
+}
+
+/** @param {any} view DriverView @returns {string} "bob (phone)", "bob at fair-1" */
+export function driverName(view) {
+  const device = view.device ? ` (${view.device})` : "";
+  return `${view.by}${device}${view.server ? ` at ${view.server}` : ""}`;
+}
+
+const MAX_TEXT = 400;
+
+/** One line for any JSON value. @param {unknown} value @returns {string} */
+export function plain(value) {
+  if (typeof value === "number") return Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(5)));
+  if (value === null || value === undefined) return "–";
+  if (typeof value !== "object") return cut(String(value));
+  if (Array.isArray(value)) return cut(`[${value.slice(0, 40).map(plain).join(", ")}]`);
+  return cut(Object.entries(value).slice(0, 40).map(([key, one]) => `${key} ${nested(one)}`).join(" · "));
+}
+
+const nested = (value) => (isObject(value) ? `{${plain(value)}}` : plain(value));
+
+const cut = (text) => (text.length > MAX_TEXT ? `${text.slice(0, MAX_TEXT)}…` : text);
