@@ -1,0 +1,256 @@
+"""What a page receives of a robot's pictures: freshness on slow connections, and never half of a row of differences."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from pebble.web.encoding_choice import EncodingChoice, best
+from pebble.web.media_queue import MAX_FRAMES, MAX_QUEUED_BYTES, NO_FRAME, Frame, MediaQueue, ViewerQueue, assess
+
+ALL = frozenset({"h264", "pbvz", "pbvd", "json", "jpeg"})
+
+
+def frame(seq: int, keyframe: bool = False, encoding: str = "pbvz", size: int = 100) -> Frame:
+    return Frame(seq, bytes(size), encoding, keyframe)
+
+
+def drained(queue: MediaQueue, now: float = 0.0) -> list[int]:
+    """Take and acknowledge everything."""
+    seqs = []
+    while (one := queue.take(now)) is not None:
+        queue.acknowledge(one.seq, now)
+        seqs.append(one.seq)
+    return seqs
+
+
+def test_it_begins_at_a_key_frame() -> None:
+    queue = MediaQueue()
+    for one in (frame(1), frame(2), frame(3, keyframe=True), frame(4)):
+        queue.offer(one)
+    assert drained(queue) == [3, 4]
+    assert queue.skipped == 2
+
+
+def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
+    queue = MediaQueue()
+    for seq in range(4):
+        queue.offer(frame(seq, keyframe=seq == 0))
+    assert [queue.take(0.0), queue.take(0.0), queue.take(0.0)] == [frame(0, keyframe=True), frame(1), None]
+    queue.acknowledge(0, 0.2)
+    assert queue.window == 1
+    assert queue.take(0.2) is None
+    queue.acknowledge(1, 0.3)
+    assert queue.take(0.3) == frame(2)
+    assert queue.take(0.3) is None
+    queue.acknowledge(2, 0.35)
+    assert queue.window == 2
+
+
+def test_an_overflow_skips_everything_up_to_the_next_key_frame() -> None:
+    queue = MediaQueue()
+    for seq in range(MAX_FRAMES + 3):
+        queue.offer(frame(seq, keyframe=seq == 0))
+    assert queue.waiting
+    assert queue.overflowed
+    assert queue.take(0.0) is None
+    queue.offer(frame(20, keyframe=True))
+    assert not queue.waiting
+    assert not queue.overflowed
+    assert drained(queue) == [20]
+
+
+def test_bytes_are_bounded_as_well() -> None:
+    queue = MediaQueue()
+    queue.offer(frame(0, keyframe=True, size=MAX_QUEUED_BYTES))
+    queue.offer(frame(1, size=1))
+    assert queue.waiting
+    queue.offer(frame(2, keyframe=True, size=MAX_QUEUED_BYTES))
+    assert drained(queue) == [2]
+
+
+def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
+    fast, slow = MediaQueue(), MediaQueue()
+    for queue, took in ((fast, 0.01), (slow, 0.5)):
+        queue.offer(frame(0, keyframe=True))
+        queue.take(0.0)
+        queue.acknowledge(0, took)
+        for one in (frame(1), frame(2), frame(3, keyframe=True)):
+            queue.offer(one)
+    assert drained(fast) == [1, 2, 3]
+    assert drained(slow) == [3]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_sent_can_always_be_decoded(seed: int) -> None:
+    """Whatever happens: after each frame comes the next one, or a key frame; and bounds hold."""
+    chance, queue, last, now, under_way = random.Random(seed), ViewerQueue(ALL, 0.0), None, 0.0, []
+    for seq in range(2000):
+        now += chance.random() / 10
+        queue.offer_direct(frame(seq, keyframe=chance.random() < 0.15, size=chance.randrange(1 << 20)), now)
+        if chance.random() < 0.02:
+            queue.lost(now)
+        while (one := queue.take(now)) is not None:
+            assert one.keyframe or one.seq == last + 1
+            last = one.seq
+            under_way.append(one.seq)
+        assert len(under_way) <= 2
+        while under_way and chance.random() < 0.4:
+            queue.acknowledge(under_way.pop(0), now)
+    assert queue.skipped < 2000
+
+
+def test_an_unknown_acknowledgement_is_ignored() -> None:
+    queue = MediaQueue()
+    queue.offer(frame(0, keyframe=True))
+    queue.take(0.0)
+    assert queue.acknowledge(7, 9.0) is None
+    assert queue.acknowledge(NO_FRAME, 9.0) is None
+    assert queue.acknowledge(0, 0.1) == frame(0, keyframe=True)
+    assert queue.acknowledge(0, 9.0) is None
+    assert queue.ack_s == 0.1
+
+
+def test_a_page_that_did_not_draw_waits_unless_a_key_frame_is_on_its_way() -> None:
+    queue = ViewerQueue(ALL, 0.0)
+    queue.offer_direct(frame(0, keyframe=True), 0.0)
+    queue.offer_direct(frame(1), 0.0)
+    queue.take(0.0)
+    queue.acknowledge(0, 0.0)
+    queue.refuse(0.0)
+    assert queue.waiting
+    queue.offer_direct(frame(2, keyframe=True), 0.1)
+    queue.take(0.1)
+    queue.refuse(0.1)
+    assert not queue.waiting
+
+
+# -- between viewers
+
+
+def viewers(count: int, *, waiting: int = 0, now: float = 0.0) -> list[ViewerQueue]:
+    """Of which the last ``waiting`` are too slow."""
+    made = [ViewerQueue(ALL, now) for _ in range(count)]
+    for index, viewer in enumerate(made):
+        viewer.offer_direct(frame(0, keyframe=True, encoding="h264"), now)
+        if index >= count - waiting:
+            overflow(viewer, now)
+    return made
+
+
+def overflow(viewer: ViewerQueue, now: float) -> None:
+    for seq in range(1, MAX_FRAMES + 3):
+        viewer.offer_direct(frame(seq, encoding="h264"), now)
+    assert viewer.overflowed
+
+
+def test_a_sole_viewer_and_half_of_them_get_a_key_frame() -> None:
+    assert assess(viewers(1, waiting=1), "h264", 0.1, can_rescue=True)
+    assert assess(viewers(2, waiting=1), "h264", 0.1, can_rescue=True)
+    assert not assess(viewers(2), "h264", 0.1, can_rescue=True)
+    assert not assess([], "h264", 0.1, can_rescue=True)
+
+
+def test_a_slow_viewer_among_fast_ones_gets_the_rescue_stream() -> None:
+    some = viewers(3, waiting=1)
+    assert not assess(some, "h264", 0.1, can_rescue=True)
+    assert [viewer.rescued for viewer in some] == [False, False, True]
+    assert not assess(viewers(3, waiting=1), "h264", 0.1, can_rescue=False)
+
+
+def test_it_returns_at_a_key_frame_later_and_later() -> None:
+    slow, now = viewers(1, waiting=1)[0], 0.0
+    for away in (10, 20, 40):
+        slow.rescue(now)
+        slow.offer_direct(frame(1, keyframe=True), now + away - 0.1)
+        assert slow.rescued
+        slow.offer_direct(frame(2), now + away)
+        assert slow.rescued
+        slow.offer_direct(frame(3, keyframe=True), now + away)
+        assert not slow.rescued
+        now += away + 1
+        overflow(slow, now)
+    now += 100  # in which it kept up
+    slow.rescue(now)
+    slow.offer_direct(frame(4, keyframe=True), now + 10)
+    assert not slow.rescued
+
+
+def test_a_new_viewer_among_others_gets_one_key_frame_and_then_the_rescue_stream() -> None:
+    some = viewers(4)
+    new = ViewerQueue(ALL, 1.0)
+    assert assess([*some, new], "h264", 1.0, can_rescue=True)
+    new.new = False  # it was requested
+    assert not assess([*some, new], "h264", 1.5, can_rescue=True)
+    assert not new.rescued
+    assess([*some, new], "h264", 3.0, can_rescue=True)
+    assert new.rescued
+    new.offer_direct(frame(9, keyframe=True, encoding="h264"), 3.5)
+    assert not new.rescued
+
+
+def test_jpegs_have_key_frames_of_their_own() -> None:
+    some = [ViewerQueue(ALL, 0.0)]
+    assert not assess(some, "pbvz", 0.5, can_rescue=True)
+    assert assess(some, "pbvz", 1.5, can_rescue=True)
+    assert not some[0].rescued
+
+
+def test_what_cannot_be_decoded_is_rescued_until_it_can() -> None:
+    viewer = ViewerQueue(frozenset({"json", "jpeg"}), 0.0)
+    assert not assess([viewer], "h264", 0.1, can_rescue=True)
+    assert viewer.rescued
+    viewer.offer_rescue(frame(1, keyframe=True, encoding="jpeg"))
+    viewer.offer_rescue(frame(2, keyframe=True, encoding="jpeg"))
+    assert drained(viewer) == [2]
+    viewer.offer_direct(frame(3, keyframe=True, encoding="h264"), 0.2)
+    assert viewer.rescued
+    viewer.offer_direct(frame(4, keyframe=True, encoding="json"), 0.3)
+    assert not viewer.rescued
+    viewer.cannot_decode("json")
+    assess([viewer], "json", 0.4, can_rescue=True)
+    assert viewer.rescued
+
+
+# -- the encoding
+
+OFFERED = ("json", "pbvd", "pbvz", "h264")
+
+
+@pytest.mark.parametrize(
+    ("viewers", "pinned", "wanted"),
+    [
+        ([ALL], "", "h264"),
+        ([ALL, ALL - {"h264"}], "", "pbvz"),
+        ([ALL - {"h264"}, ALL - {"pbvz"}], "", "pbvd"),
+        ([frozenset({"h264"}), frozenset({"json"})], "", "h264"),
+        ([ALL, frozenset({"json"})], "", "json"),
+        ([ALL], "json", "json"),
+        ([ALL], "jpeg", "h264"),
+    ],
+)
+def test_the_best_encoding_of_all(viewers: list[frozenset[str]], pinned: str, wanted: str) -> None:
+    assert best(OFFERED, viewers, pinned) == wanted
+
+
+def test_robots_that_list_no_encodings_send_what_they_send() -> None:
+    assert best((), [ALL]) is None
+    assert best((), [ALL], "json") is None
+    assert EncodingChoice().update((), [ALL], 0.0) is None
+
+
+def test_it_gets_worse_at_once_and_better_after_a_while() -> None:
+    choice, plain = EncodingChoice(), ALL - {"h264"}
+    assert choice.update(OFFERED, [ALL], 0.0) == "h264"
+    assert choice.update(OFFERED, [ALL, plain], 1.0) == "pbvz"
+    assert choice.update(OFFERED, [ALL], 2.0) == "pbvz"
+    assert choice.update(OFFERED, [], 3.0) == "pbvz"
+    assert choice.update(OFFERED, [ALL, plain], 4.0) == "pbvz"
+    assert choice.update(OFFERED, [ALL], 5.0) == "pbvz"
+    assert choice.update(OFFERED, [ALL], 10.0) == "h264"
+    choice.pinned = "json"
+    assert choice.update(OFFERED, [ALL], 10.1) == "json"
+    choice.pinned = ""
+    assert choice.update(("json", "pbvd"), [ALL], 10.2) == "json"
+    assert choice.update(("pbvd",), [ALL], 10.3) == "pbvd"
