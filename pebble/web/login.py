@@ -92,7 +92,7 @@ async def _page(request: Request) -> Response:
 async def _login(request: Request) -> Response:
     try:
         login = _decoder.decode(await request.body())
-    except (msgspec.MsgspecError, RecursionError):
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return _answer(400, "This needs a user and a password")
     audit, address = request.app.state.audit, _address(request)
     try:
