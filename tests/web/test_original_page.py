@@ -84,6 +84,7 @@ def test_both_pages_drive_look_and_switch(served: Served, robot: RecordingRobot,
         assert ours.take(BASE)
         ours.drive(BASE, 1, z=0.5)
         assert until(lambda: {"x": 0.0, "z": 0.5, "y": 0.0, "valid_ms": 400} in robot.drives())
+        ours.drive(BASE, 1)
         original.motion(0.4, 0.2)
         assert until(lambda: any(abs(one["x"] - 0.1) < 1e-9 and "valid_ms" not in one for one in robot.drives()))
         original.motion(0, 0)
@@ -97,7 +98,7 @@ def test_both_pages_drive_look_and_switch(served: Served, robot: RecordingRobot,
         assert ours.value(BASE, "web/driver", "you") is True
         assert not ours.closed
         ours.drive(BASE, 2, x=0.25)
-        assert until(lambda: {"x": 0.25, "z": 0.0, "y": 0.0, "valid_ms": 400} in robot.drives())
+        assert until(lambda: {"x": 0.25, "z": 0.0, "y": 0.0, "valid_ms": 400} in robot.drives()), ours.refused
 
 
 def test_its_fixed_client_name_does_not_disturb_ours(served: Served, broker, robot, original):
