@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import re
 from collections.abc import AsyncIterator
@@ -22,7 +23,7 @@ from starlette.websockets import WebSocket
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.web import login
-from pebble.web.control import Control
+from pebble.web.control import CHECK_S, Control
 from pebble.web.guard import Guard
 from pebble.web.messages import EstopOp
 from pebble.web.server import Server
@@ -190,4 +191,11 @@ async def _media(websocket: WebSocket) -> None:
         return
     await websocket.accept()
     can = frozenset(re.findall(r"[a-z0-9]+", websocket.query_params.get("can", ""))) & _ENCODINGS
-    await websocket.app.state.media.serve(websocket, ref, can)
+    serving = asyncio.ensure_future(websocket.app.state.media.serve(websocket, ref, can))
+    try:
+        while not (await asyncio.wait({serving}, timeout=CHECK_S))[0]:
+            if await asyncio.to_thread(login.session_of, websocket) is None:
+                return  # it was revoked
+    finally:
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
