@@ -145,7 +145,8 @@ def _sign(folder: Path, key: EllipticCurvePrivateKey, authority: x509.Certificat
 
     _check_permitted(folder, authority, hosts)
     own = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, hosts[0][:64])])
+    # no host name: OpenSSL applies the constraints for names to one that is an address
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "Pebble operator page")])
     names = [x509.DNSName(host) if _is_name(host) else x509.IPAddress(ipaddress.ip_address(host)) for host in hosts]
     public = authority.public_key()
     builder = (

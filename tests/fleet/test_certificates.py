@@ -58,6 +58,12 @@ def test_clients_that_trust_the_authority_accept_each_name(folder: Path, name: s
     assert connect(folder, name) == ""
 
 
+@pytest.mark.parametrize("name", ["192.168.1.20", "127.0.0.1", "::1", "8.8.8.8", "lab.local", "a.example.org"])
+def test_one_name_is_enough(tmp_path: Path, name: str) -> None:
+    init(tmp_path, [name])
+    assert connect(tmp_path, name) == ""
+
+
 @pytest.mark.parametrize("name", ["other.local", "192.168.1.21", "example.org"])
 def test_no_other_name_is_accepted(folder: Path, name: str) -> None:
     assert "mismatch" in connect(folder, name)

@@ -1,0 +1,309 @@
+"""Clients that send or read slowly, or connect too often, are refused; real sockets, a real uvicorn."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from pebble.fleet import certificates
+from pebble.web import connections
+from pebble.web.connections import HttpProtocol, Listener, Loop, WebSocketProtocol
+from tests.support import until
+
+LARGE = 8_000_000  # more than sockets buffer
+UPGRADE = (
+    b"GET /ws HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+)
+
+
+async def app(scope: Any, receive: Any, send: Any) -> None:
+    """``/large`` is large, ``/ws`` accepts and waits; all else says hello."""
+    if scope["type"] == "lifespan":
+        return
+    await receive()
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.accept"})
+        while (await receive())["type"] != "websocket.disconnect":
+            pass
+        return
+    body = b"x" * LARGE if scope["path"] == "/large" else b"hello"
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % len(body))]})
+    await send({"type": "http.response.body", "body": body})
+
+
+class Serving:
+    """The server in a thread of this process."""
+
+    def __init__(self, listener: Listener, **options: Any) -> None:
+        self.listener = listener
+        listener.bind(("127.0.0.1", 0))
+        self.port = listener.getsockname()[1]
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                http=HttpProtocol,
+                ws=WebSocketProtocol,
+                log_config=None,
+                lifespan="off",
+                timeout_keep_alive=1,
+                ws_ping_interval=0.3,
+                ws_ping_timeout=0.3,
+                **options,
+            )
+        )
+        self._server.capture_signals = _no_signals  # type: ignore[method-assign]
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        assert until(lambda: self._server.started)
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=Loop) as runner:
+            runner.run(self._server.serve(sockets=[self.listener]))
+
+    def connect(self, *, small: bool = False) -> socket.socket:
+        client = socket.socket()
+        if small:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", self.port))
+        client.settimeout(5)
+        return client
+
+    def close(self) -> None:
+        self._server.should_exit = True
+        self._thread.join(10)
+        self.listener.close()
+
+
+class _no_signals:  # noqa: N801 - stands for a context manager
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+
+@pytest.fixture
+def serve(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Serving]]:
+    for name, seconds in {"HANDSHAKE_S": 0.5, "HEAD_S": 0.5, "RESPONSE_S": 1.0, "FLUSH_S": 0.3}.items():
+        monkeypatch.setattr(connections, name, seconds)
+    running: list[Serving] = []
+
+    def start(**options: Any) -> Serving:
+        limits = {name: options.pop(name) for name in ("limit", "each") if name in options}
+        running.append(Serving(Listener(socket.AF_INET, **limits), **options))
+        return running[-1]
+
+    yield start
+    for one in running:
+        one.close()
+
+
+def is_closed(client: socket.socket) -> bool:
+    try:
+        while client.recv(65536):
+            pass
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        pass
+    return True
+
+
+def closes_within(client: socket.socket, least: float, most: float) -> bool:
+    """``least`` shows that it was this limit and no other one."""
+    start = time.monotonic()
+    return is_closed(client) and least <= time.monotonic() - start <= most
+
+
+def drip(client: socket.socket, parts: Iterable[bytes], pause: float = 0.02) -> float:
+    """Send one part after the other; after how many seconds the server closed the connection."""
+    start = time.monotonic()
+    try:
+        for part in parts:
+            client.sendall(part)
+            time.sleep(pause)
+    except (ConnectionError, TimeoutError):
+        return time.monotonic() - start
+    return float("inf")
+
+
+def get(client: socket.socket, path: str = "/") -> bytes:
+    client.sendall(b"GET %s HTTP/1.1\r\nHost: x\r\n\r\n" % path.encode())
+    answer = b""
+    while not answer.endswith(b"hello"):
+        answer += client.recv(65536)
+    return answer
+
+
+def test_a_connection_that_sends_nothing_is_closed(serve: Callable[..., Serving]) -> None:
+    assert closes_within(serve().connect(), 0.4, 2)
+
+
+def test_a_head_of_a_byte_now_and_then_is_closed(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    head = b"GET / HTTP/1.1\r\nHost: x\r\nX-Long: " + b"x" * 1000
+    assert 0.3 < drip(client, [bytes([byte]) for byte in head]) < 2
+
+
+def test_so_is_that_of_a_websocket(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    client.sendall(UPGRADE[:-2])
+    assert closes_within(client, 0.4, 2)
+
+
+def test_so_is_the_second_request_of_a_connection(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    for _ in range(3):
+        assert get(client).startswith(b"HTTP/1.1 200")
+    client.sendall(b"GET / HTTP/1.1\r\n")
+    assert 0.3 < drip(client, [b"X: y\r\n"] * 200) < 2
+
+
+def test_so_is_a_pipelined_one(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    client.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\nGET / HTTP/1.1\r\n")
+    assert closes_within(client, 0.2, 2.5)
+
+
+def test_an_idle_connection_is_closed(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    get(client)
+    assert closes_within(client, 0.6, 2.5)
+
+
+def test_a_slow_but_whole_request_is_answered(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    for part in (b"GET / HTTP/1.1\r\n", b"Host: x\r\n", b"\r\n"):
+        client.sendall(part)
+        time.sleep(0.1)
+    assert client.recv(65536).startswith(b"HTTP/1.1 200")
+
+
+def test_a_body_that_never_ends_is_given_up(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    client.sendall(b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n")
+    assert drip(client, [b"x"] * 400) < 4
+
+
+def test_a_client_that_does_not_read_is_given_up(serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    client = serving.connect(small=True)
+    client.sendall(b"GET /large HTTP/1.1\r\nHost: x\r\n\r\n")
+    assert until(lambda: serving.listener.connections == 1)
+    assert until(lambda: serving.listener.connections == 0, 4)
+    client.close()
+
+
+def test_so_is_one_that_asks_for_the_end_of_the_connection(serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    client = serving.connect(small=True)
+    client.sendall(b"GET /large HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+    assert until(lambda: serving.listener.connections == 1)
+    assert until(lambda: serving.listener.connections == 0, 4)
+    client.close()
+
+
+def test_an_open_websocket_is_not_limited_but_must_answer_pings(serve: Callable[..., Serving]) -> None:
+    client = serve().connect()
+    client.sendall(UPGRADE)
+    assert b" 101 " in client.recv(65536)
+    end = time.monotonic() + 2
+    while time.monotonic() < end:
+        ping = client.recv(65536)
+        assert ping[0] == 0x89
+        mask = bytes(4)
+        client.sendall(bytes([0x8A, 0x80 | ping[1]]) + mask + ping[2:])
+    assert closes_within(client, 0.1, 2)
+
+
+def test_a_websocket_that_pings_and_does_not_read_costs_no_memory(serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    client = serving.connect(small=True)
+    client.sendall(UPGRADE)
+    assert until(lambda: serving.listener.connections == 1)
+    ping = bytes([0x89, 0xFD]) + bytes(4) + b"x" * 125
+    drip(client, [ping * 100] * 100_000, 0)
+    assert until(lambda: serving.listener.connections == 0, 4)
+
+
+def test_connections_are_limited_and_the_next_one_is_served_when_one_ends(serve: Callable[..., Serving]) -> None:
+    serving = serve(limit=3)
+    clients = [serving.connect() for _ in range(3)]
+    for client in clients:
+        get(client)
+    for _ in range(20):
+        assert is_closed(serving.connect())
+    assert serving.listener.refused == 20
+    assert serving.listener.connections == 3
+    clients[0].close()
+    assert until(lambda: serving.listener.connections == 2)
+    assert get(serving.connect()).startswith(b"HTTP/1.1 200")
+
+
+def test_each_other_address_has_its_own_limit(serve: Callable[..., Serving], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "_is_loopback", lambda address: address == "127.0.0.1")
+    serving = serve(each=2)
+
+    def connect(address: str) -> socket.socket:
+        client = socket.socket()
+        client.bind((address, 0))
+        client.connect(("127.0.0.1", serving.port))
+        client.settimeout(5)
+        return client
+
+    held = [connect("127.0.0.2") for _ in range(2)]
+    for client in held:
+        get(client)
+    assert is_closed(connect("127.0.0.2"))
+    assert get(connect("127.0.0.3"))
+    local = [connect("127.0.0.1") for _ in range(5)]
+    assert all(get(client) for client in local)
+
+
+def test_a_flood_of_connections_leaves_nothing_behind(serve: Callable[..., Serving]) -> None:
+    serving = serve(limit=20)
+    for _ in range(300):
+        serving.connect().close()
+    assert until(lambda: serving.listener.connections == 0)
+    assert get(serving.connect()).startswith(b"HTTP/1.1 200")
+
+
+@pytest.fixture(scope="module")
+def tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tls")
+    certificates.init(folder, ["127.0.0.1"])
+    return folder
+
+
+def test_a_tls_handshake_that_does_not_end_is_closed(serve: Callable[..., Serving], tls: Path) -> None:
+    serving = serve(ssl_certfile=tls / "server.pem", ssl_keyfile=tls / "server.key")
+    silent, half = serving.connect(), serving.connect()
+    half.sendall(b"\x16\x03\x01\x02\x00\x01")
+    assert until(lambda: serving.listener.connections == 2)
+    assert closes_within(silent, 0.3, 2)
+    assert until(lambda: serving.listener.connections == 0)
+    with ssl.create_default_context(cafile=tls / "ca.pem").wrap_socket(
+        serving.connect(), server_hostname="127.0.0.1"
+    ) as client:
+        assert get(client).startswith(b"HTTP/1.1 200")
+        client.sendall(b"GET / HTTP/1.1\r\n")
+        assert closes_within(client, 0.3, 2)
+
+
+def test_garbage_is_answered_and_closed(serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    for garbage in (b"\x16\x03\x01\x02\x00\x01\x00", b"GET\r\n\r\n", b"\x00" * 100_000, b"GET / HTTP/1.1\r\n\r\n"):
+        client = serving.connect()
+        client.sendall(garbage)
+        assert is_closed(client)
+    assert until(lambda: serving.listener.connections == 0)
