@@ -21,6 +21,7 @@ COMMANDS = {
     "topics": "topics",
     "topic": "topic",
     "estop": "estop",
+    "drive": "drive",
     "script": "script",
     "sim": "sim",
     "demo": "sim",
@@ -43,6 +44,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble check goob.json     validate a config and summarise it
     pebble doctor goob.json    check that this machine is ready for the robot
     pebble up goob.json        run the robot
+    pebble drive goob.json     drive it with the keys of this terminal
     pebble estop goob.json     stop the robot until it is reset
     pebble script new follow   write a first program that moves a robot
     pebble watch goob.json     show its camera and play its microphone

@@ -106,7 +106,8 @@ def _parse(words: list[str]) -> tuple[str, str | None]:
     return verb, robots[0] if robots else None
 
 
-def _me() -> str:
+def me() -> str:
+    """Who gives this command, and from which machine: ``ann@desk``."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # no name for this user id
@@ -120,7 +121,7 @@ def _me() -> str:
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
-        sender = StopSender(new_name(), by=_me(), why=why, now=time.monotonic(), robots=robots, hold=hold)
+        sender = StopSender(new_name(), by=me(), why=why, now=time.monotonic(), robots=robots, hold=hold)
         report = _Report(sender)
         try:
             _publish(transport, sender)
@@ -243,7 +244,7 @@ def _reset(target: Target) -> int:
         _wait(lambda: robot.has_capabilities and len(robot.states) >= len(robot.owners))
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
-        reset = Reset(robot, _me())
+        reset = Reset(robot, me())
         _print_states(robot)
         if not reset.shown:
             return 0

@@ -1,0 +1,188 @@
+"""``pebble drive``: drives a robot with the keys of a terminal."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+import time
+from collections import deque
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pebble.client.connection import Target, connected, target_of
+from pebble.client.driver_lease import DriverLease
+from pebble.client.key_decoder import END, KeyDecoder
+from pebble.client.key_gesture import PERIOD_S, KeyGesture
+from pebble.client.terminal_driver import TerminalDriver
+from pebble.commands import show
+from pebble.commands.estop import me
+from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
+from pebble.media.in_flight import InFlight
+from pebble.transports import Message, QoS, State, Transport
+
+if TYPE_CHECKING:
+    from pebble.client.terminal_keys import Terminal
+
+_KEYS = """\
+W A S D or arrows drive, Q E grousers, space stops.
+! or Esc Esc is the emergency stop, Ctrl-C ends."""
+_SHOW_PERIOD_S = 0.1
+_STOP_S = 3.0  # so long an emergency stop is still sent after the terminal has ended
+_ARRIVED = 1000  # messages that wait to be handled
+_OVERHEAD = 32  # bytes of a message on the wire besides topic and payload
+
+RobotArgument = Annotated[
+    str,
+    typer.Argument(
+        help="A robot's config file, or with --url or --config its id.", metavar="ROBOT", show_default=False
+    ),
+]
+
+
+def drive(
+    robot: RobotArgument,
+    speed: Annotated[float, typer.Option(min=0.05, max=1, help="Throttle of a key, and speed of the grousers.")] = 0.6,
+    turn: Annotated[float, typer.Option(min=0.05, max=1, help="Steering of a key.")] = 0.8,
+    take_over: Annotated[bool, typer.Option("--take-over", help="Also from another driver.")] = False,
+    config: ConfigOption = None,
+    url: UrlOption = None,
+    remote: RemoteOption = False,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Drive a robot with the keys of this terminal.
+
+    W A S D or the arrows drive, Q and E move the grousers, space stops. ! or twice Escape is the emergency stop,
+    which only `pebble estop reset` ends. Ctrl-C ends.
+
+    A terminal repeats a key that is held and does not report its release, so a key counts as held for 0.4 s: the
+    robot moves on for so long after you let go, and halts briefly where the first repetition comes later than that.
+    Of several keys only the last one repeats. What interrupts a drive ends it: let go of all keys, then press again.
+
+    \b
+        pebble drive goob.json
+        pebble drive goob --url mqtt://127.0.0.1 --speed 0.3
+        pebble drive goob.json --remote --take-over
+    """
+    from pebble.client.terminal_keys import check_terminal, opened
+
+    check_terminal()
+    target = target_of(
+        robot, Target(config=config, url=url, remote=remote, password_file=password_file, ca_cert=ca_cert)
+    )
+    with connected(target) as (transport, names):
+        device = f"terminal on {socket.gethostname()}"
+        lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=me(), device=device)
+        heartbeat = target.remote or str(target.url).startswith("mqtt")  # within a robot there is none
+        driver = TerminalDriver(
+            names.base,
+            KeyGesture(speed, turn),
+            lease,
+            by=me(),
+            now=clock(),
+            take_over=take_over,
+            heartbeat=heartbeat,
+        )
+        loop = _Loop(transport, driver)
+        typer.echo(_KEYS)
+        with opened() as terminal:
+            return loop.run(terminal)
+
+
+def register(app: typer.Typer) -> None:
+    app.command("drive")(drive)
+
+
+def clock() -> float:
+    """Seconds that go on while the machine is suspended, where the system has such a clock."""
+    for name in ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"):  # of Linux; of macOS, whose time.monotonic() stands still
+        if hasattr(time, name):
+            return time.clock_gettime(getattr(time, name))
+    return time.monotonic()
+
+
+class _Loop:
+    """Passes keys and messages to the driver, and what it returns to the transport, every 50 ms."""
+
+    def __init__(self, transport: Transport, driver: TerminalDriver) -> None:
+        """Subscribes; on a slow network this takes seconds."""
+        self._transport, self._driver = transport, driver
+        self._decoder = KeyDecoder()
+        self._in_flight = InFlight(_OVERHEAD)
+        self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_ARRIVED)
+        self._shown, self._shown_at = "", float("-inf")
+        for filter_ in driver.filters:
+            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
+
+    def run(self, terminal: Terminal) -> int:
+        """Until a signal, Ctrl-D, or the end of the terminal."""
+        try:
+            while not terminal.ended:
+                self._step(terminal)
+                if terminal.suspended:
+                    self._halt(self._driver.suspend(clock()))
+                    terminal.stand_still()
+        finally:
+            self._halt(self._driver.leave(clock(), time.time()))
+            self._finish_stop()
+        return 0 if terminal.ended in ("SIGINT", END) else 1
+
+    def _take(self, message: Message) -> None:
+        self._arrived.append((message, clock(), time.time()))
+
+    def _step(self, terminal: Terminal) -> None:
+        due = self._decoder.due
+        data = terminal.read(PERIOD_S if due is None else min(PERIOD_S, due - clock()))
+        now = clock()
+        keys = self._decoder.feed(data, now)
+        if END in keys:
+            terminal.ended = END
+        self._driver.press(keys, now)
+        self._tick(now)
+        if keys or now - self._shown_at >= _SHOW_PERIOD_S:
+            self._show(terminal, now)
+
+    def _show(self, terminal: Terminal, now: float) -> None:
+        line = show.printable(self._driver.status())
+        self._shown_at = now
+        if line != self._shown:
+            self._shown = line
+            terminal.show(line)
+
+    def _tick(self, now: float) -> None:
+        while self._arrived:
+            self._driver.receive(*self._arrived.popleft())
+        self._in_flight.acknowledge(self._transport.outgoing.waiting)
+        late_s = self._in_flight.age_s(now)
+        if problem := self._problem():
+            self._in_flight.clear()
+        self._publish(self._driver.tick(now, time.time(), problem=problem, late_s=late_s), now)
+
+    def _publish(self, messages: list[Message], now: float) -> None:
+        for message in messages:
+            if self._transport.publish(message.topic, message.payload, qos=message.qos, urgent=True):
+                self._in_flight.sent(len(message.topic) + len(message.payload) + _OVERHEAD, now)
+            else:
+                self._driver.refused(now)
+
+    def _problem(self) -> str:
+        return "" if self._transport.state is State.CONNECTED else self._transport.problem or "it was lost"
+
+    def _halt(self, messages: list[Message]) -> None:
+        """Publish the last zero, and twice more, before this process ends or stands still."""
+        self._publish(messages, clock())
+        for _ in range(3 if messages else 0):
+            time.sleep(PERIOD_S)
+            self._tick(clock())
+
+    def _finish_stop(self) -> None:
+        """An emergency stop is not given up because the terminal has ended."""
+        end = clock() + _STOP_S
+        while self._driver.unconfirmed and clock() < end:
+            time.sleep(PERIOD_S)
+            self._tick(clock())
+        if self._driver.unconfirmed:
+            with suppress(OSError):  # that terminal is gone
+                typer.echo(f"pebble: the emergency stop of {self._driver.name} is NOT CONFIRMED", err=True)
