@@ -19,6 +19,7 @@ Medium = Literal["video", "audio"]
 _CONTROLS: dict[Medium, Channel] = {"video": VIDEO_CONTROL, "audio": AUDIO_CONTROL}
 _FLAGS: dict[Medium, Channel] = {"video": MQTT_VIDEO, "audio": MQTT_AUDIO}
 _REPEAT_S = 2.0  # without a payload before a request is repeated
+_FLAG_S = 0.2  # a retained flag arrives within this time of subscribing
 _JOIN_S = 0.4  # a stream that is already running delivers a payload within this time
 _KEYFRAME_S = 1.0
 
@@ -39,6 +40,7 @@ class Viewer:
         self._flags: dict[str, bool] = {}  # by topic: the retained value
         self._raised: set[Medium] = set()
         self._requested: set[Medium] = set()
+        self._subscribed_at: dict[Medium, float] = {}
         self._encodings: dict[Medium, str | None] = {}  # of each requested medium; None: as configured
         self._requested_at: dict[Medium, float] = {}
         self._received_at: dict[Medium, float] = {}
@@ -60,11 +62,12 @@ class Viewer:
             raise PebbleError(f"{self.base} cannot send {medium} as {encoding}, only as {', '.join(offered)}")
         if medium not in self._encodings:
             self._subscribe(medium)
+            self._subscribed_at[medium] = time.monotonic()
         self._requested_at[medium] = time.monotonic()  # before _encodings, whose keys another thread iterates over
         self._encodings[medium] = encoding
         if encoding is None and self._is_running(medium):
             return  # another operator has requested it: change nothing
-        if not self._flags.get(self.topic(medium, "flag_topic", _FLAGS[medium]), False):
+        if not self._is_raised(medium):
             self._raised.add(medium)
             self._set_flag(medium, up=True)
         self._send_request(medium)
@@ -105,6 +108,12 @@ class Viewer:
         while medium not in self._received_at and time.monotonic() < end:
             time.sleep(_JOIN_S / 20)
         return medium in self._received_at
+
+    def _is_raised(self, medium: Medium) -> bool:
+        flag, end = self.topic(medium, "flag_topic", _FLAGS[medium]), self._subscribed_at[medium] + _FLAG_S
+        while flag not in self._flags and time.monotonic() < end:
+            time.sleep(_FLAG_S / 20)
+        return self._flags.get(flag, False)
 
     def _set_flag(self, medium: Medium, *, up: bool) -> None:
         topic = self.topic(medium, "flag_topic", _FLAGS[medium])

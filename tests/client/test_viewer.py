@@ -119,3 +119,11 @@ def test_another_thread_may_repeat_requests_from_the_first_moment(robot: Robot, 
     while requesting.is_alive():  # for the 0.4 s in which it looks whether pictures come anyway
         viewer.repeat_requests()
     assert until(lambda: robot.requests == [b'{"enabled":true}'])
+
+
+def test_with_an_encoding_as_well_a_flag_that_was_up_stays_up(robot: Robot, viewer: Viewer) -> None:
+    robot.publish(FLAG, b"true", retain=True)
+    viewer.request("video", "h264")
+    viewer.close()
+    assert until(lambda: robot.requests[-1] == b'{"enabled":false}')
+    assert robot.flags == []
