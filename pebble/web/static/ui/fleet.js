@@ -4,7 +4,20 @@ import { RouteLink, Liveness } from "./header.js";
 import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
 import { Offers } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
-import { battery, charging, clockTime, driverName, inner, kindOf, nameOf, roughly, shortTime, typeOf } from "./words.js";
+import {
+  battery,
+  charging,
+  clockTime,
+  driverName,
+  inner,
+  isObject,
+  kindOf,
+  nameOf,
+  plain,
+  roughly,
+  shortTime,
+  typeOf,
+} from "./words.js";
 
 const THUMBNAIL_MS = 1000;
 const SORTS = { name: "name", type: "type", battery: "battery" };
@@ -25,9 +38,16 @@ export function Fleet() {
   const shown = sorted(store, online.filter(matches), settings.sort);
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
+  const robots = refs.filter((ref) => typeOf(ref) === "robots" && (online.includes(ref) || away.includes(ref)));
+  const others = total - robots.length;
   return html`<div class="fleet">
     <div class="fleet-head">
-      <h1>${total === 0 ? "Robots" : `${total} ${total === 1 ? "robot" : "robots"}, ${online.length} online`}</h1>
+      <h1>
+        ${total === 0
+          ? "Robots"
+          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}, ${robots.filter((ref) => online.includes(ref)).length} online`}
+        ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
+      </h1>
       ${total > 0 && html`<${FleetTools} filter=${filter} onFilter=${setFilter} />`}
     </div>
     ${total === 0 && html`<${Empty} />`}
@@ -54,8 +74,9 @@ function isPresent(store, ref) {
 
 function sorted(store, refs, by) {
   const level = (ref) => Number(inner(store.get(ref, "charging-level")?.value) ?? Infinity);
-  const keys = { name: nameOf, type: (ref) => `${typeOf(ref)} ${nameOf(ref)}`, battery: (ref) => level(ref) };
-  const key = keys[by] ?? nameOf;
+  const robotsFirst = (ref) => `${typeOf(ref) === "robots" ? 0 : 1} ${nameOf(ref)}`;
+  const keys = { name: robotsFirst, type: (ref) => `${typeOf(ref)} ${nameOf(ref)}`, battery: level };
+  const key = keys[by] ?? robotsFirst;
   return [...refs].sort((a, b) => (key(a) < key(b) ? -1 : key(a) > key(b) ? 1 : a < b ? -1 : 1));
 }
 
@@ -71,7 +92,7 @@ function FleetTools({ filter, onFilter }) {
     />
     <label class="field"
       ><span>Sort by</span>
-      <select value=${settings.sort} onChange=${(event) => settings.set("sort", event.currentTarget.value)}>
+      <select aria-label="Sort by" value=${settings.sort} onChange=${(event) => settings.set("sort", event.currentTarget.value)}>
         ${Object.entries(SORTS).map(([value, text]) => html`<option key=${value} value=${value}>${text}</option>`)}
       </select></label
     >
@@ -97,7 +118,7 @@ function Empty() {
   </div>`;
 }
 
-const ICONS = { robots: "robot", towers: "tower", satellites: "satellite", people: "person", persons: "person" };
+const ICONS = { robots: "robot", towers: "tower", satellites: "satellite", people: "person" };
 
 /** @param {string} ref @returns {string} the icon of its type */
 export const iconOf = (ref) => ICONS[typeOf(ref)] ?? "thing";
@@ -125,6 +146,7 @@ function FleetCard({ at }) {
       <${BatteryFact} at=${at} online=${connection.isOpen} />
       <${DriverFact} at=${at} offers=${offers} />
       <${ScriptFact} at=${at} />
+      ${typeOf(at) !== "robots" && html`<${StatusFact} at=${at} />`}
       ${estop?.latched &&
       html`<li class="fact bad">
         <span aria-hidden="true">■</span><b>STOPPED</b>${estop.by ? ` by ${estop.by}` : ""}
@@ -133,9 +155,10 @@ function FleetCard({ at }) {
     </ul>
     <div class="fleet-card-actions">
       <${RouteLink} to=${at} className="button primary" label=${`Open ${name}`}>Open<//>
-      <${StopButton} onStop=${() => commands.stop(at)} label=${`Emergency stop of ${name}`} className="stop-small">
+      ${offers.stops &&
+      html`<${StopButton} onStop=${() => commands.stop(at)} label=${`Emergency stop of ${name}`} className="stop-small">
         <${Icon} name="stop" />Stop
-      <//>
+      <//>`}
     </div>
   </article>`;
 }
@@ -165,6 +188,13 @@ function ScriptFact({ at }) {
   const status = useValue(at, "autonomy-status");
   if (!status?.running) return null;
   return html`<li class="fact"><${Icon} name="script" />script: ${String(status.file ?? "?")}</li>`;
+}
+
+/** In a word or two, what a component reports that is no robot. */
+function StatusFact({ at }) {
+  const status = inner(useValue(at, "status"));
+  if (!isObject(status)) return null;
+  return html`<li class="fact dim">${plain(Object.fromEntries(Object.entries(status).slice(0, 3)))}</li>`;
 }
 
 /** One picture a second of what flows anyway: this never starts a camera. */

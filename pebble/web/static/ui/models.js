@@ -202,6 +202,11 @@ export class Offers {
     return this.section("drive").available === true;
   }
 
+  /** Whether a stop means anything to it. */
+  get stops() {
+    return this.assumed || this.drives || Object.keys(this.section("estop")).length > 0;
+  }
+
   get hasVideo() {
     return this.assumed || this.section("video").available === true;
   }

@@ -83,10 +83,10 @@ export function Live({ entry, online = true, children }) {
   useTick(1000);
   if (!entry) return html`<span class="dim">–</span>`;
   const { age, period } = entry;
-  if (!online || (period && age > Math.max(GONE_MS, 3 * period))) {
+  if (!online || (period > 0 && age > Math.max(GONE_MS, 3 * period))) {
     return html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
   }
-  const late = period && age > 2 * period + 250;
+  const late = period > 0 && age > 2 * period + 250;
   return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 

@@ -39,19 +39,23 @@ function Unknown({ at }) {
 
 function Desktop({ at, offers, view, video, source }) {
   const cards = wanted(offers, view);
-  const side = offers.drives ? null : video ? cards.shift() : null;
+  const side = !offers.drives && video ? cards.shift() : null;
   return html`<div class="robot">
     <h1 class="sr">${nameOf(at)}</h1>
-    <div class=${`bench ${video ? "" : "no-picture"} ${offers.drives || side ? "" : "no-side"}`}>
-      ${video &&
-      html`<${Boundary} what="The picture"><${Stage} at=${at} video=${video} source=${source} offers=${offers} wide /><//>`}
+    <div class=${`bench ${offers.drives || side ? "" : "no-side"}`}>
+      <div class="bench-main">
+        ${video &&
+        html`<${Boundary} what="The picture"
+          ><${Stage} at=${at} video=${video} source=${source} offers=${offers} wide
+        /><//>`}
+        <div class="cards">
+          ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
+        </div>
+        <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
+      </div>
       ${offers.drives && html`<${Boundary} what="Driving"><${DriveCard} at=${at} offers=${offers} /><//>`}
       ${side && html`<${CardOf} card=${side} at=${at} offers=${offers} view=${view} />`}
     </div>
-    <div class="cards">
-      ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
-    </div>
-    <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
   </div>`;
 }
 

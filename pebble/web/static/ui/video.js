@@ -81,7 +81,8 @@ function howWords({ info, interval }, view) {
   const size = `${info.encoding ?? ""}${info.rescue ? " (converted)" : ""} ${info.width}×${info.height}`;
   const rate = view?.per_second > 0 ? view.per_second : interval > 0 ? 1000 / interval : 0;
   const bits = view?.kbits > 0 ? ` · ${Math.round(view.kbits)} kbit/s` : "";
-  return `${size} · ${rate.toFixed(rate < 9.5 ? 1 : 0)}/s${bits}`;
+  const viewers = view?.viewers > 1 ? ` · ${view.viewers} viewers` : "";
+  return `${size} · ${rate.toFixed(rate < 9.5 ? 1 : 0)}/s${bits}${viewers}`;
 }
 
 function ageWords(video) {
@@ -126,7 +127,6 @@ export function PictureSettings({ at, source, offers, video }) {
       </select></label
     >`}
     ${why && html`<${Why} id="why-picture">${why}<//>`}
-    ${view?.viewers > 1 && html`<span class="dim viewers">${view.viewers} viewers</span>`}
   </div>`;
 }
 

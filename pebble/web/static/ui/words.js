@@ -10,7 +10,7 @@ export const nameOf = (ref) => ref.slice(ref.lastIndexOf("/") + 1);
 export const typeOf = (ref) => ref.split("/")[1] ?? "";
 
 /** @param {string} ref @returns {string} "robot", "tower", … */
-export const kindOf = (ref) => typeOf(ref).replace(/s$/, "");
+export const kindOf = (ref) => (typeOf(ref) === "people" ? "person" : typeOf(ref).replace(/s$/, ""));
 
 /** @param {number} ms epoch @returns {string} 12:03:41 */
 export const clockTime = (ms) => time.format(ms);

@@ -1,0 +1,259 @@
+"""A server that shows the operator page in states given as data: for screenshots, and for tests of what people see.
+
+It speaks the control and media sockets as ``pebble web`` does, but there are no robots and no broker behind it.
+Run it to look at one: ``python -m tests.web.canned driving``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import struct
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from importlib.resources import files
+from typing import Any
+
+import msgspec
+import uvicorn
+from PIL import Image
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from pebble.contract.packets import Picture, PictureKind
+from pebble.web.app import StaticFiles
+from pebble.web.guard import CONTENT_SECURITY_POLICY
+from pebble.web.messages import FromPage
+from tests.support import ROOT, free_port, until
+
+PING_S = 0.5
+PICTURE_S = 0.1
+_decoder = msgspec.json.Decoder(FromPage)
+
+#: Component, metric, payload, and its age in ms.
+Value = tuple[str, str, Any, float]
+
+
+@dataclass(frozen=True)
+class State:
+    """One state of everything behind the page. ``values`` are made anew for each connection from the time in ms."""
+
+    path: str = "/"
+    values: Callable[[int], list[Value]] = field(default=lambda _now: [])
+    repeated: dict[str, float] = field(default_factory=dict)  # metrics that arrive again and again: seconds between
+    welcome: dict[str, Any] = field(default_factory=dict)  # instead of the usual one's fields
+    pictures: bool = True  # whether cameras send any
+    freezes: bool = False  # pictures end a moment after the first
+    silent: bool = False  # the server answers nothing any more once everything is shown
+
+
+class CannedServer:
+    """Serves the page on a free port of the loopback address, from its own thread."""
+
+    def __init__(self) -> None:
+        self.static = StaticFiles(files("pebble.web") / "static")
+        self.port = free_port()
+        self.state = State()
+        self.received: list[dict[str, Any]] = []  # what pages sent, without the answers to pings
+        self.posted: list[tuple[str, Any]] = []
+        self.reachable = True
+        self._changed: list[tuple[asyncio.Event, asyncio.AbstractEventLoop]] = []
+        app = Starlette(
+            routes=[
+                Route("/", self._page),
+                Route("/login", self._page),
+                Route("/r/{ref:path}", self._page),
+                Route("/static/{version}/{name:path}", self._static),
+                Route("/api/snapshot.jpg", self._snapshot),
+                Route("/api/{name}", self._post, methods=["POST"]),
+                WebSocketRoute("/ws/control", self._control),
+                WebSocketRoute("/ws/media", self._media),
+            ]
+        )
+        config = uvicorn.Config(app, "127.0.0.1", self.port, log_level="critical", ws_per_message_deflate=False)
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._server.run, daemon=True)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        self._thread.start()
+        assert until(lambda: self._server.started)
+
+    def close(self) -> None:
+        self._server.should_exit = self._server.force_exit = True
+        self._thread.join(5)
+
+    def show(self, state: State) -> None:
+        """What pages that connect from now on are shown."""
+        self.state = state
+        self.received.clear()
+        self.posted.clear()
+
+    def sent(self, op: str) -> list[dict[str, Any]]:
+        """What pages sent of one kind."""
+        return [message for message in list(self.received) if message["op"] == op]
+
+    # -- http
+
+    async def _page(self, _request: Request) -> Response:
+        return self.static.answer("index.html", _headers())
+
+    async def _static(self, request: Request) -> Response:
+        return self.static.answer(request.path_params["name"], _headers())
+
+    async def _snapshot(self, _request: Request) -> Response:
+        return Response(picture(0), media_type="image/jpeg", headers=_headers())
+
+    async def _post(self, request: Request) -> Response:
+        self.posted.append((request.path_params["name"], await request.json()))
+        return JSONResponse({})
+
+    # -- sockets
+
+    async def _control(self, websocket: WebSocket) -> None:
+        await websocket.accept()
+        state = self.state
+        hello = json.loads(await websocket.receive_text())
+        self._note(hello)
+        if state.silent and len(self.sent("hello")) > 1:
+            await _until_closed(websocket)
+            return
+        await self._send(websocket, self._welcome(state))
+        await self._send(websocket, _state(state.values(_now())))
+        tasks = [asyncio.ensure_future(self._ping(websocket)), asyncio.ensure_future(self._repeat(websocket, state))]
+        try:
+            while True:
+                self._note(json.loads(await websocket.receive_text()))
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _note(self, message: dict[str, Any]) -> None:
+        _decoder.decode(json.dumps(message))  # what the real server would refuse is an error here
+        if message["op"] != "echo":
+            self.received.append(message)
+
+    def _welcome(self, state: State) -> dict[str, Any]:
+        usual = {
+            "op": "welcome",
+            "server": "fair-1",
+            "version": self.static.version,
+            "user": "alice",
+            "role": "driver",
+            "rights": ["drive", "reset"],
+            "login": True,
+            "token": "canned",
+            "now": _now(),
+            "drives": True,
+        }
+        return usual | state.welcome
+
+    async def _ping(self, websocket: WebSocket) -> None:
+        number = 0
+        while self.state.silent is False or number < 3:
+            number += 1
+            await self._send(websocket, {"op": "ping", "n": number, "now": _now(), "round_trip_ms": 3.0})
+            await asyncio.sleep(PING_S)
+
+    async def _repeat(self, websocket: WebSocket, state: State) -> None:
+        due = dict.fromkeys(state.repeated, 0.0)
+        while not state.silent:
+            await asyncio.sleep(0.05)
+            now = time.monotonic()
+            metrics = {metric for metric, at in due.items() if now >= at}
+            due |= {metric: now + state.repeated[metric] for metric in metrics}
+            values = [value for value in state.values(_now()) if value[1] in metrics]
+            if values:
+                await self._send(websocket, _state(values))
+
+    async def _send(self, websocket: WebSocket, message: dict[str, Any]) -> None:
+        if websocket.application_state is WebSocketState.CONNECTED:
+            await websocket.send_text(json.dumps(message))
+
+    async def _media(self, websocket: WebSocket) -> None:
+        await websocket.accept()
+        state = self.state
+        with suppress(WebSocketDisconnect, RuntimeError):
+            for number in range(sys.maxsize):
+                if not state.pictures or (state.freezes and number == 3):
+                    await _until_closed(websocket)
+                    return
+                body = zlib.compress(picture(number))
+                packet = Picture(PictureKind.ZLIB_JPEG, number + 1, _now() - 40, body).pack()
+                await websocket.send_bytes(struct.pack(">IB", number, 0) + packet)
+                await websocket.receive_bytes()  # drawn
+                await asyncio.sleep(PICTURE_S)
+
+
+def _headers() -> dict[str, str]:
+    return {"content-security-policy": CONTENT_SECURITY_POLICY, "cache-control": "no-store"}
+
+
+async def _until_closed(websocket: WebSocket) -> None:
+    with suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            await websocket.receive()
+
+
+def _now() -> int:
+    return int(1000 * time.time())
+
+
+def _state(values: list[Value]) -> dict[str, Any]:
+    return {"op": "state", "now": _now(), "set": values, "gone": []}
+
+
+_pictures: list[bytes] = []
+
+
+def picture(number: int) -> bytes:
+    """One of a few JPEG pictures of the simulated world, as from a camera that turns to and fro."""
+    if not _pictures:
+        whole = Image.open(ROOT / "docs" / "simulated-world.jpg")
+        for offset in (0, 8, 16, 8):
+            part = whole.crop((offset, 60 + offset // 2, offset + 560, 375 + offset // 2)).resize((640, 360))
+            target = io.BytesIO()
+            part.save(target, "JPEG", quality=75)
+            _pictures.append(target.getvalue())
+    return _pictures[number // 10 % len(_pictures)]
+
+
+@contextmanager
+def serving(state: State | None = None) -> Iterator[CannedServer]:
+    """A server that ends with the block."""
+    server = CannedServer()
+    server.start()
+    if state is not None:
+        server.show(state)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def main() -> None:
+    from tests.web.states import STATES
+
+    with serving(replace(STATES[sys.argv[1]])) as server:
+        sys.stdout.write(f"{server.url}{server.state.path}\n")
+        sys.stdout.flush()
+        threading.Event().wait()
+
+
+if __name__ == "__main__":
+    main()
