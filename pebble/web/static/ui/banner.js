@@ -125,16 +125,24 @@ function StopBanner({ at }) {
     <div class="banner-actions">
       ${latched &&
       !asked &&
-      html`<button type="button" disabled=${Boolean(why)} aria-describedby=${why ? id : undefined} onClick=${() => ask(true)}>
+      html`<button
+        type="button"
+        data-test="reset"
+        disabled=${Boolean(why)}
+        aria-describedby=${why ? id : undefined}
+        onClick=${() => ask(true)}
+      >
         Reset ${nameOf(at)}…
       </button>`}
       ${latched &&
       asked &&
-      html`<${HoldButton} disabled=${Boolean(why)} onHeld=${() => commands.reset(at, view.owners)}>Hold 1 s to reset<//>
-        <button type="button" onClick=${() => ask(false)}>Leave stopped</button>`}
+      html`<${HoldButton} test="reset-hold" disabled=${Boolean(why)} onHeld=${() => commands.reset(at, view.owners)}
+          >Hold 1 s to reset<//
+        >
+        <button type="button" data-test="leave-stopped" onClick=${() => ask(false)}>Leave stopped</button>`}
       ${view.sending === "old" &&
       view.stop &&
-      html`<button type="button" onClick=${() => commands.endStop(view.stop)}>End the stop</button>`}
+      html`<button type="button" data-test="end-stop" onClick=${() => commands.endStop(view.stop)}>End the stop</button>`}
     </div>
   </div>`;
 }

@@ -85,6 +85,7 @@ function FleetTools({ filter, onFilter }) {
   return html`<div class="fleet-tools">
     <input
       type="search"
+      data-test="filter"
       placeholder="Filter"
       aria-label="Filter by name"
       value=${filter}
@@ -92,13 +93,14 @@ function FleetTools({ filter, onFilter }) {
     />
     <label class="field"
       ><span>Sort by</span>
-      <select aria-label="Sort by" value=${settings.sort} onChange=${(event) => settings.set("sort", event.currentTarget.value)}>
+      <select data-test="sort" aria-label="Sort by" value=${settings.sort} onChange=${(event) => settings.set("sort", event.currentTarget.value)}>
         ${Object.entries(SORTS).map(([value, text]) => html`<option key=${value} value=${value}>${text}</option>`)}
       </select></label
     >
     <label class="check"
       ><input
         type="checkbox"
+        data-test="thumbnails"
         checked=${settings.thumbnails}
         onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
       /><span>Thumbnails</span></label
@@ -132,7 +134,11 @@ function FleetCard({ at }) {
   const picture = useValue(at, "web/picture");
   const kind = TRANSPORTS[offers.transport] ?? offers.transport;
   const name = nameOf(at);
-  return html`<article class=${`fleet-card ${estop?.latched ? "is-stopped" : ""}`} aria-label=${name}>
+  return html`<article
+    class=${`fleet-card ${estop?.latched ? "is-stopped" : ""}`}
+    data-test=${`card-${name}`}
+    aria-label=${name}
+  >
     <div class="fleet-card-head">
       <span class="badge"><${Icon} name=${iconOf(at)} /></span>
       <div class="fleet-card-name">
@@ -156,7 +162,12 @@ function FleetCard({ at }) {
     <div class="fleet-card-actions">
       <${RouteLink} to=${at} className="button primary" label=${`Open ${name}`}>Open<//>
       ${offers.stops &&
-      html`<${StopButton} onStop=${() => commands.stop(at)} label=${`Emergency stop of ${name}`} className="stop-small">
+      html`<${StopButton}
+        test=${`stop-${name}`}
+        onStop=${() => commands.stop(at)}
+        label=${`Emergency stop of ${name}`}
+        className="stop-small"
+      >
         <${Icon} name="stop" />Stop
       <//>`}
     </div>
@@ -234,6 +245,6 @@ function AwayRow({ at }) {
       ><${RouteLink} to=${at}>${nameOf(at)}<//> <span class="dim">${since}</span> ${level &&
       html`<span class="dim">${battery(level.value)} then</span>`}</span
     >
-    <button type="button" aria-label=${`Forget ${nameOf(at)}`} onClick=${() => settings.forget(at)}>Forget</button>
+    <button type="button" data-test="forget" aria-label=${`Forget ${nameOf(at)}`} onClick=${() => settings.forget(at)}>Forget</button>
   </li>`;
 }

@@ -17,7 +17,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     <div class="top-space"></div>
     ${wide && html`<${ConnectionState} />`}
     ${layout === "immersive" &&
-    html`<button type="button" class="round" aria-expanded=${drawer} aria-label="Everything else" onClick=${onDrawer}>
+    html`<button type="button" class="round" data-test="drawer" aria-expanded=${drawer} aria-label="Everything else" onClick=${onDrawer}>
         <${Icon} name="menu" />
       </button>
       ${document.fullscreenElement &&
@@ -32,6 +32,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     ${(wide || !at) && html`<${Me} panel=${panel} onPanel=${onPanel} wide=${wide} />`}
     ${at &&
     html`<${StopButton}
+      test="stop-one"
       onStop=${() => commands.stop(driver.ref)}
       label=${`Emergency stop of ${nameOf(at)}`}
       className="stop-one"
@@ -39,7 +40,12 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
       <${Icon} name="stop" />STOP
     <//>`}
     ${(wide || !at) &&
-    html`<${StopButton} onStop=${() => commands.stop("")} label="Emergency stop of all robots" className="stop-all">
+    html`<${StopButton}
+      test="stop-all"
+      onStop=${() => commands.stop("")}
+      label="Emergency stop of all robots"
+      className="stop-all"
+    >
       <${Icon} name="stop" />STOP ALL
     <//>`}
   </header>`;
@@ -68,7 +74,7 @@ function Picker({ at }) {
   return html`<label class="picker">
     <span class="picker-name"><b>${nameOf(at)}</b><${Icon} name="down" /></span>
     <span class="picker-state"><${Liveness} at=${at} /><${Volts} at=${at} /></span>
-    <select aria-label="Choose a robot" value=${at} onChange=${(event) => route.go(event.currentTarget.value)}>
+    <select data-test="picker" aria-label="Choose a robot" value=${at} onChange=${(event) => route.go(event.currentTarget.value)}>
       ${refs.map(
         (ref) => html`<option key=${ref} value=${ref}>
           ${nameOf(ref)}${typeOf(ref) === "robots" ? "" : ` (${kindOf(ref)})`}
@@ -138,7 +144,7 @@ function Me({ panel, onPanel, wide }) {
   useModel(connection);
   const { you } = connection;
   const text = you?.login ? `${you.user} (${you.role})` : "Settings";
-  return html`<button type="button" class="quiet me" aria-expanded=${panel} aria-label=${text} onClick=${onPanel}>
+  return html`<button type="button" class="quiet me" data-test="settings" aria-expanded=${panel} aria-label=${text} onClick=${onPanel}>
     <${Icon} name=${you?.login ? "person" : "settings"} />${wide && html`<span>${text}</span>`}
   </button>`;
 }

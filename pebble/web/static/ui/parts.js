@@ -10,12 +10,13 @@ const GONE_MS = 10_000;
 export const Icon = ({ name }) => html`<svg class="icon" aria-hidden="true"><use href=${`${ICONS}#${name}`} /></svg>`;
 
 /** A button that stops at the first touch, not when the finger is lifted, and with any finger. */
-export function StopButton({ onStop, label, children, className = "", describedBy }) {
+export function StopButton({ onStop, label, children, className = "", describedBy, test }) {
   const touchedAt = useRef(-Infinity);
   return html`<span class="stop-area">
     <button
       type="button"
       class=${`stop ${className}`}
+      data-test=${test}
       aria-label=${label}
       aria-describedby=${describedBy}
       onPointerDown=${() => {
@@ -33,7 +34,7 @@ export function StopButton({ onStop, label, children, className = "", describedB
 const HOLD_MS = 1000;
 
 /** A button that has to be held for a second, by pointer or key. */
-export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy }) {
+export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy, test }) {
   const [held, hold] = useState(false);
   const done = useRef(onHeld);
   done.current = onHeld;
@@ -50,6 +51,7 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
   return html`<button
     type="button"
     class=${`hold ${held ? "held" : ""} ${className}`}
+    data-test=${test}
     disabled=${disabled}
     aria-describedby=${describedBy}
     onPointerDown=${(event) => {

@@ -32,6 +32,7 @@ export function SettingsPanel({ onClose }) {
           ([value, text]) => html`<label key=${value} class="check"
             ><input
               type="radio"
+              data-test=${`theme-${value}`}
               name="theme"
               checked=${settings.theme === value}
               onChange=${() => settings.set("theme", value)}
@@ -46,6 +47,7 @@ export function SettingsPanel({ onClose }) {
       <label class="check"
         ><input
           type="checkbox"
+          data-test="in-sight"
           checked=${driver.inSight}
           onChange=${(event) => {
             driver.inSight = event.currentTarget.checked;

@@ -46,6 +46,7 @@ export function Stick({ driver }) {
     ref=${element}
     class=${`stick ${dragged ? "dragged" : ""} ${driver.gestureActive ? "active" : ""}`}
     role="application"
+    data-test="stick"
     tabindex="0"
     aria-label="Drive stick: drag it, or use the keys W A S D"
     aria-disabled=${Boolean(reason)}

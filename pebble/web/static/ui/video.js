@@ -42,17 +42,17 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Picture">
     <div class="picture">
       <div class="canvas" ref=${place}></div>
-      ${cover && html`<p class="cover">${cover}</p>`}
+      ${cover && html`<p class="cover" data-test="cover">${cover}</p>`}
       ${video.info && html`<span class="tag tag-how">${howWords(video, useValue(source, "web/picture"))}</span>`}
       ${video.info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`}>${ageWords(video)}</span>`}
       ${source !== at && html`<span class="tag tag-from">seen from ${nameOf(source)}</span>`}
     </div>
     ${!immersive &&
     html`<div class="picture-bar">
-      <button type="button" onClick=${control.toggle}>
+      <button type="button" data-test="video" onClick=${control.toggle}>
         <${Icon} name=${control.wanted ? "no-camera" : "camera"} />${control.wanted ? "Stop video" : "Start video"}
       </button>
-      <button type="button" onClick=${goFull} hidden=${!document.documentElement.requestFullscreen}>
+      <button type="button" data-test="full-screen" onClick=${goFull} hidden=${!document.documentElement.requestFullscreen}>
         <${Icon} name="full" />Full screen
       </button>
       ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
@@ -102,10 +102,11 @@ export function PictureSettings({ at, source, offers, video }) {
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   return html`<div class="picture-settings">
     ${video &&
-    html`<button type="button" onClick=${video.toggle}>${video.wanted ? "Stop video" : "Start video"}</button>`}
+    html`<button type="button" data-test="video" onClick=${video.toggle}>${video.wanted ? "Stop video" : "Start video"}</button>`}
     <label class="field"
       ><span>Encoding</span>
       <select
+        data-test="encoding"
         value=${view?.pinned ?? ""}
         ...${more}
         onChange=${(event) => commands.setEncoding(source, event.currentTarget.value)}
@@ -118,6 +119,7 @@ export function PictureSettings({ at, source, offers, video }) {
     html`<label class="field"
       ><span>Picture from</span>
       <select
+        data-test="picture-from"
         value=${source === at ? "" : source}
         ...${more}
         onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
