@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.resources import files
-from importlib.resources.abc import Traversable
-from typing import Any
 
 import msgspec
 from starlette.applications import Starlette
@@ -28,49 +25,10 @@ from pebble.web.guard import Guard
 from pebble.web.messages import EstopOp
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
+from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles
 
-_TYPES = {
-    "css": "text/css; charset=utf-8",
-    "html": "text/html; charset=utf-8",
-    "js": "text/javascript; charset=utf-8",
-    "mjs": "text/javascript; charset=utf-8",
-    "svg": "image/svg+xml",
-    "webmanifest": "application/manifest+json",
-}
-_NO_STORE = {"cache-control": "no-store"}
-_FOREVER = {"cache-control": "public, max-age=31536000, immutable"}
 _ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
-_VERSION = "{version}"  # in the pages, replaced by that of the files
-
 _estop_decoder = msgspec.json.Decoder(EstopOp)
-
-
-class StaticFiles:
-    """The files of the page, read once: what is not among them cannot be requested."""
-
-    def __init__(self, root: Traversable) -> None:
-        self.files = dict(sorted(_read(root, "")))
-        digest = hashlib.sha256()
-        for name, content in self.files.items():
-            digest.update(f"{name}\0{len(content)}\0".encode() + content)
-        self.version = digest.hexdigest()[:12]
-
-    def answer(self, name: str, headers: dict[str, str]) -> Response:
-        content = self.files.get(name)
-        if content is None:
-            return PlainTextResponse("not found", 404)
-        suffix = name.rpartition(".")[2]
-        if suffix == "html":
-            content = content.replace(_VERSION.encode(), self.version.encode())
-        return Response(content, media_type=_TYPES[suffix], headers=headers)
-
-
-def _read(folder: Traversable, path: str) -> Any:
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            yield from _read(entry, f"{path}{entry.name}/")
-        elif entry.name.rpartition(".")[2] in _TYPES:
-            yield path + entry.name, entry.read_bytes()
 
 
 def create_app(settings: WebSettings) -> Starlette:
@@ -82,13 +40,9 @@ def create_app(settings: WebSettings) -> Starlette:
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         audit = Audit(settings.people)
         server = Server(settings, people, audit)
-        app.state.server, app.state.robots, app.state.broker = server, server.robots, server.broker
-        app.state.driving, app.state.stops, app.state.media, app.state.audit = (
-            server.driving,
-            server.stops,
-            server.media,
-            audit,
-        )
+        state = app.state
+        state.server, state.audit, state.driving, state.stops = server, audit, server.driving, server.stops
+        state.robots, state.broker, state.media = server.robots, server.broker, server.media
         await server.open()
         try:
             yield
@@ -97,7 +51,8 @@ def create_app(settings: WebSettings) -> Starlette:
             audit.close()
 
     app = _app(settings, lifespan)
-    app.state.settings, app.state.people, app.state.static, app.state.version = settings, people, static, static.version
+    app.state.settings, app.state.people = settings, people
+    app.state.static, app.state.version = static, static.version
     return app
 
 
@@ -122,15 +77,15 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
 
 async def _page(request: Request) -> Response:
     if login.session_of(request) is None:
-        return Response(status_code=303, headers={"location": "/login", **_NO_STORE})
-    return _static_of(request).answer("index.html", _NO_STORE)
+        return Response(status_code=303, headers={"location": "/login", **NO_STORE})
+    return _static_of(request).answer(request, "index.html", NO_STORE)
 
 
 async def _static(request: Request) -> Response:
     static = _static_of(request)
     name = request.path_params["name"]
     current = request.path_params["version"] == static.version and not name.endswith(".html")
-    return static.answer(name, _FOREVER) if current else PlainTextResponse("not found", 404)
+    return static.answer(request, name, FOREVER) if current else PlainTextResponse("not found", 404)
 
 
 def _static_of(request: Request) -> StaticFiles:
@@ -149,7 +104,7 @@ async def _authority(request: Request) -> Response:
 async def _health(request: Request) -> Response:
     """200 while there is a broker; says nothing else, because it needs no login."""
     connected = request.app.state.broker.connected
-    return PlainTextResponse("ok" if connected else "no broker", 200 if connected else 503, headers=_NO_STORE)
+    return PlainTextResponse("ok" if connected else "no broker", 200 if connected else 503, headers=NO_STORE)
 
 
 async def _snapshot(request: Request) -> Response:
@@ -157,8 +112,8 @@ async def _snapshot(request: Request) -> Response:
         return PlainTextResponse("log in first", 401)
     picture = await request.app.state.media.snapshot(request.query_params.get("ref", ""))
     if picture is None:
-        return PlainTextResponse("no picture flows", 404, headers=_NO_STORE)
-    return Response(picture, media_type="image/jpeg", headers=_NO_STORE)
+        return PlainTextResponse("no picture flows", 404, headers=NO_STORE)
+    return Response(picture, media_type="image/jpeg", headers=NO_STORE)
 
 
 async def _estop(request: Request) -> Response:

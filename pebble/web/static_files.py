@@ -1,0 +1,67 @@
+"""The files of the page, read once: what is not among them cannot be requested."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import re
+from collections.abc import Iterator
+from importlib.resources.abc import Traversable
+
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+
+NO_STORE = {"cache-control": "no-store"}
+FOREVER = {"cache-control": "public, max-age=31536000, immutable"}
+
+_TYPES = {
+    "css": "text/css; charset=utf-8",
+    "html": "text/html; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "mjs": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+    "webmanifest": "application/manifest+json",
+}
+_VERSION = b"{version}"  # in the pages, replaced by that of the files
+_COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
+
+
+class StaticFiles:
+    """All files below one folder. ``version`` is another one after any change; it is part of their addresses."""
+
+    def __init__(self, root: Traversable) -> None:
+        self.files = dict(sorted(_read(root, "")))
+        digest = hashlib.sha256()
+        for name, content in self.files.items():
+            digest.update(f"{name}\0{len(content)}\0".encode() + content)
+        self.version = digest.hexdigest()[:12]
+        for name in self.files:
+            if name.endswith(".html"):
+                self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
+        self._packed = {name: gzip.compress(content, 9, mtime=0) for name, content in self.files.items()}
+
+    def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
+        """The file ``name``, compressed if the browser takes that; 404 if there is none."""
+        if name not in self.files:
+            return PlainTextResponse("not found", 404)
+        headers = {**headers, "vary": "accept-encoding"}
+        packed = "gzip" in request.headers.get("accept-encoding", "")
+        content = self._packed[name] if packed else self.files[name]
+        if packed:
+            headers["content-encoding"] = "gzip"
+        return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
+
+
+def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
+    for entry in folder.iterdir():
+        suffix = entry.name.rpartition(".")[2]
+        if entry.is_dir():
+            yield from _read(entry, f"{path}{entry.name}/")
+        elif suffix in _TYPES:
+            content = entry.read_bytes()
+            yield path + entry.name, without_comments(content) if suffix in ("css", "js", "mjs") else content
+
+
+def without_comments(source: bytes) -> bytes:
+    """Blank the lines that are only comments: a tenth less to send, and every line keeps its number."""
+    return _COMMENTS.sub(lambda found: "\n" * found[0].count("\n"), source.decode()).encode()
