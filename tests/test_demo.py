@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+import urllib.error
+import urllib.request
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -95,9 +98,24 @@ def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None 
     return demos[-1]
 
 
+def page_of(demo: Demo) -> str:
+    """The address of the operator page, once it was printed."""
+    printed = re.compile(r"in a browser: (http://127.0.0.1:\d+/)\n").findall
+    assert until(lambda: printed(demo.output), START_S), demo.output
+    return str(printed(demo.output)[0])
+
+
+def requested(url: str) -> str:
+    with urllib.request.urlopen(url, timeout=5) as answer:
+        return str(answer.read().decode())
+
+
 @pytest.mark.parametrize("broker", ["MOSQUITTO", "EMBEDDED"])
 def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Path, broker: str) -> None:
     demo = start(demos, temporary, f"{SHORTEST_S}, broker=BrokerKind.{broker}")
+    page = page_of(demo)
+    assert re.findall(r"https?:|//", requested(page)) == []  # everything it loads is on its own server
+    assert until(lambda: requested(f"{page}healthz") == "ok")
     assert demo.process.wait(START_S + SHORTEST_S + SLOW_S + END_S) == 0, demo.output
     media, _, driven = demo.output.partition("Measured by the MCUs")
     driven, _, script = driven.partition("Measured by goob's MCU, room and loudspeaker")
@@ -105,6 +123,8 @@ def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Pat
     assert script.count("ok ") == 6, demo.output
     # two robots; four encodings of pictures, two of sound
     assert media.partition("Received by the operator")[2].count("ok ") >= 12, demo.output
+    with pytest.raises(urllib.error.URLError):
+        requested(page)
     for event in ("STARTS: apriltag-follow", "TAKES OVER: drives goob", "LETS GO", "GIVES BACK", "ENDS"):
         assert f"operator {event}" in demo.output
     assert " zenoh " in demo.output
@@ -146,10 +166,26 @@ def test_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(demo
     assert demo.folders() == []
 
 
+def test_without_the_packages_of_the_page_everything_else_goes_on(demos: list[Demo], temporary: Path) -> None:
+    code = """
+import sys
+import pebble.web.extra as extra
+extra.find_spec = lambda name: None if name == "starlette" else object()
+import pebble.demo.main as main
+sys.exit(main.run())
+"""
+    demos.append(Demo(temporary, code))
+    assert until(lambda: "forward, stop" in demos[0].output, START_S), demos[0].output
+    lines = [line for line in demos[0].output.splitlines() if "starlette" in line]
+    assert lines == ["Without the operator page, which needs packages that are not installed (starlette): "
+                     "pip install 'pebble-robot[web]'"]  # fmt: skip
+    assert not any("pebble.web" in line for line in demos[0].leftovers())
+
+
 def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Path) -> None:
     demo = start(demos, temporary, "")
     assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
-    assert len(demo.leftovers()) >= 12  # the demo, two brokers, four MCUs, two launchers and what they launched
+    assert len(demo.leftovers()) >= 13  # the demo, two brokers, four MCUs, two launchers with their programs, the page
     demo.process.kill()
     demo.process.wait(10)
     assert until(lambda: demo.leftovers() == [], END_S), demo.leftovers()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -22,6 +23,7 @@ _REPEAT_S = 2.0  # without a payload before a request is repeated
 _FLAG_S = 0.2  # a retained flag arrives within this time of subscribing
 _JOIN_S = 0.4  # a stream that is already running delivers a payload within this time
 _KEYFRAME_S = 1.0
+_SENT = 20
 
 
 class Viewer:
@@ -35,6 +37,7 @@ class Viewer:
     def __init__(self, transport: Transport, base: str, on_payload: Callable[[Medium, bytes], None]) -> None:
         self.base = base
         self.capabilities: dict[str, Any] = {}
+        self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is from others
         self._transport, self._on_payload = transport, on_payload
         self._has_capabilities = threading.Event()
         self._flags: dict[str, bool] = {}  # by topic: the retained value
@@ -87,6 +90,11 @@ class Viewer:
             self._keyframe_at = now
             self._send("video", MediaRequest(enabled=True, encoding=encoding, keyframe=True))
 
+    def hand_over(self, medium: Medium) -> None:
+        """Leave a medium to another operator who has requested it, too: :meth:`close` does not withdraw it."""
+        self._requested.discard(medium)
+        self._raised.discard(medium)
+
     def close(self) -> None:
         """Withdraw the requests, and lower the flags that were down before."""
         for medium in list(self._requested):
@@ -122,7 +130,9 @@ class Viewer:
 
     def _send(self, medium: Medium, request: MediaRequest) -> None:
         topic = self.topic(medium, "command_topic", _CONTROLS[medium])
-        self._transport.publish(topic, codec.encode(_CONTROLS[medium], request), qos=QoS.DELIVERED)
+        payload = codec.encode(_CONTROLS[medium], request)
+        self.sent.append(payload)
+        self._transport.publish(topic, payload, qos=QoS.DELIVERED)
 
     def topic(self, medium: Medium, key: str, channel: Channel) -> str:
         """The effective topic that capabilities list under ``key``, else the channel's own."""

@@ -106,7 +106,8 @@ class EmergencyStop:
         if self._keep_driving(_IN_VAIN_S):
             return []
         self._take(sender)
-        resets = {base: Reset(robot, self._by) for base, robot in self._robots.items()}
+        mine = {base: robot for base, robot in self._robots.items() if not self._stopped_by_another(robot)}
+        resets = {base: Reset(robot, self._by) for base, robot in mine.items()}
         reset_at = time.monotonic()
         for reset in resets.values():
             self._publish(reset.messages())
@@ -127,7 +128,13 @@ class EmergencyStop:
                 ended,
             )
             for robot in robots
+            if robot.base in resets
         ]
+
+    def _stopped_by_another(self, robot: RobotEstop) -> bool:
+        """A person's stop is the person's to reset."""
+        stop = robot.stopped_by
+        return stop is not None and stop.by != self._by
 
     def _keep_driving(self, seconds: float) -> bool:
         """Repeat a drive command; True if the demo ends."""

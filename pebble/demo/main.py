@@ -7,8 +7,9 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -21,10 +22,13 @@ from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
 from pebble.demo.operator import Operator
+from pebble.demo.page import PageServer
 from pebble.demo.steps import ROUND_S, SCRIPT, CompletedStep, assess
 from pebble.demo.testbed import ROBOTS, Testbed
 from pebble.demo.view import Result, View, show_media_results, show_results
 from pebble.errors import PebbleError
+from pebble.web.extra import require_packages
+from pebble.web.settings import DEFAULT_PORT
 
 SHORTEST_S = ROUND_S + emergency.DURATION_S + takeover.DURATION_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
@@ -32,6 +36,15 @@ _MEDIA_START_S = 2.0  # from the first request to the first picture, with some t
 _POLL_S = 0.1
 _REPORTED_S = 0.3  # an MCU reports ten times a second: the end of a step is reported a little later
 _SLOW_S = 15.0  # how much longer the first round may take: a script drives as fast as its machine permits
+
+
+class _Observed(NamedTuple):
+    """The results of the steps and of the media, all other problems, and the names of robots that people drove."""
+
+    results: list[Result]
+    media: list[MediaResult]
+    problems: list[str]
+    left_alone: set[str]
 
 
 def run(seconds: float | None = None, *, broker: BrokerKind | None = None, console: Console | None = None) -> int:
@@ -46,10 +59,10 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         raise PebbleError(f"one round of driving takes {SHORTEST_S:.0f} s: give it at least that many seconds")
     kind = broker or best_kind()
     with _ending_on_signals() as ending, Testbed(ending) as testbed:
-        results, media, problems = _run_demo(testbed, kind, seconds, ending, console)
+        results, media, problems, left_alone = _run_demo(testbed, kind, seconds, ending, console)
         with_media = [robot.name for robot in testbed.robots if robot.has_media]
         if seconds is not None:
-            problems += _steps_not_done(testbed, results)
+            problems += _steps_not_done(testbed, results, left_alone)
         if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
             problems += _encodings_not_checked(with_media, media)
         problems += [f"{result.robot}, {result.step}: {wrong}" for result in results for wrong in result.wrong]
@@ -57,6 +70,8 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         testbed.keep = bool(problems)
         show_media_results(console, with_media, media)
         show_results(console, ROBOTS, results, problems)
+        if left_alone:
+            console.print(f"Left to people at the page, and not judged meanwhile: {', '.join(sorted(left_alone))}.")
         if problems:
             console.print(f"Logs, configs and traces: {testbed.folder}", soft_wrap=True)
     return 1 if problems else 0
@@ -64,8 +79,8 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
 
 def _run_demo(
     testbed: Testbed, kind: BrokerKind, seconds: float | None, ending: threading.Event, console: Console
-) -> tuple[list[Result], list[MediaResult], list[str]]:
-    """Set up, drive and observe. Returns the results of the steps and of the media, and all other problems."""
+) -> _Observed:
+    """Set up, drive and observe."""
     console.print(f"Two brokers ({kind}): a remote one, and the one that Fred carries.")
     testbed.start_brokers(kind)
     console.print("Goob on Zenoh and Fred on MQTT, each with a simulated motor MCU, camera and microphone;")
@@ -73,24 +88,52 @@ def _run_demo(
         "Goob also with an inertial sensor that describes itself, a loudspeaker and scripts, in a room with tags."
     )
     console.print("MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on simulated pins.")
+    url = _start_page(testbed, ending, console)
     testbed.start_robots()
     operator = Operator(testbed.remote_port)
     operator.connect()
     media_check = MediaCheck(testbed.remote_port, [robot.name for robot in testbed.robots if robot.has_counter])
     try:
-        with View(console, operator, media_check, testbed.robots, ending) as view:
+        with View(console, operator, media_check, testbed.robots, ending, url) as view:
             if not _discovered(operator, view, ending):
-                return [], [], [] if ending.is_set() else [*_not_ready(operator), *testbed.unexpected_exits()]
-            operator.begin()
-            media_check.begin([seen for seen in operator.discovery.all_robots() if seen.offers("video")])
+                problems = [] if ending.is_set() else [*_not_ready(operator), *testbed.unexpected_exits()]
+                return _Observed([], [], problems, set())
+            for_visitors = bool(url) and seconds is None
+            operator.begin(f"the robots are yours: {url}" if for_visitors else "")
+            filmed = [seen for seen in operator.discovery.all_robots() if seen.offers("video")]
+            media_check.begin(filmed, once=for_visitors)
             results = _watch(testbed, operator, view, math.inf if seconds is None else seconds, ending)
         problems = testbed.unexpected_exits()
         if not ending.is_set():  # a demo that is ended early may not have received everything
             problems += _without_imu(testbed, operator)
-        return results, list(media_check.results), problems
+        return _Observed(results, list(media_check.results), problems, operator.left_alone)
     finally:
         media_check.end()
         operator.end()
+
+
+def _start_page(testbed: Testbed, ending: threading.Event, console: Console) -> str:
+    """Returns its address; empty without the packages that it needs."""
+    try:
+        require_packages()
+    except PebbleError as error:
+        what, _, remedy = str(error).partition(" needs ")
+        console.print(f"Without {what}, which needs {remedy}", highlight=False, markup=False, soft_wrap=True)
+        return ""
+    page = _usual_or_free(testbed, ending)
+    console.print(f"See and drive them in a browser: {page.url}", highlight=False, soft_wrap=True)
+    return page.url
+
+
+def _usual_or_free(testbed: Testbed, ending: threading.Event) -> PageServer:
+    """The page at its usual port, or at a free one if another program has that."""
+    with suppress(PebbleError):
+        usual = testbed.start_page(DEFAULT_PORT)
+        usual.wait(ending)
+        return usual
+    page = testbed.start_page()
+    page.wait(ending)
+    return page
 
 
 def _discovered(operator: Operator, view: View, ending: threading.Event) -> bool:
@@ -157,12 +200,15 @@ def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | Com
     return assess(completed, list(robot.mcu_reports), robot.entries(), stop_s=robot.stop_s, has_lights=has_lights)
 
 
-def _steps_not_done(testbed: Testbed, results: list[Result]) -> list[str]:
+def _steps_not_done(testbed: Testbed, results: list[Result], left_alone: set[str]) -> list[str]:
+    """Of robots that nobody took from the operator."""
     driven = {(result.robot, result.step) for result in results}
     steps = [*(step.name for step in SCRIPT), emergency.NAME]
     wanted = [(name, step) for name in ROBOTS for step in steps]
     wanted += [(robot.name, following.NAME) for robot in testbed.robots if robot.has_scripts]
-    return [f"{name}, {step}: not done" for name, step in wanted if (name, step) not in driven]
+    return [
+        f"{name}, {step}: not done" for name, step in wanted if (name, step) not in driven and name not in left_alone
+    ]
 
 
 def _encodings_not_checked(names: Sequence[str], media: list[MediaResult]) -> list[str]:

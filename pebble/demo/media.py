@@ -1,4 +1,7 @@
-"""Receives every robot's pictures and sound in one encoding after another, and assesses them."""
+"""Receives every robot's pictures and sound in one encoding after another, and assesses them.
+
+A robot has one encoding for everybody: while a person watches or listens to it, it is left as that person chose.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +16,25 @@ import numpy as np
 from pebble.client.discovery import DiscoveredRobot
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
+from pebble.contract import AUDIO_CONTROL, VIDEO_CONTROL, Channel, codec
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
-from pebble.demo.media_assessment import MediaResult, Samples, ShownPicture, assess_pictures, assess_rate, assess_sound
+from pebble.demo.media_assessment import (
+    MediaResult,
+    Samples,
+    ShownPicture,
+    assess_pictures,
+    assess_rate,
+    assess_sound,
+    watched,
+)
 from pebble.demo.testbed import CAMERA_FPS
-from pebble.errors import PebbleError
+from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.scene import read_counter
 from pebble.media.sound import ReceivedSound
 from pebble.media.speech import PERIOD_S as SPEECH_PERIOD_S
 from pebble.media.speech import Speech
-from pebble.transports import MqttSettings, Transport, create
+from pebble.transports import Message, MqttSettings, Transport, create
 
 VIDEO_TURN_S = 4.0  # for each encoding of the pictures
 _SWITCH_S = 1.5  # until the next encoding has certainly arrived; not assessed
@@ -32,6 +44,7 @@ _STEP_S = 0.1
 _GAP_MS = 15.0  # less than the shortest chunk
 _CAPABILITIES_TIMEOUT_S = 5.0
 _PICTURES, _SOUNDS, _RESULTS = 1000, 5000, 200  # upper limits of what is stored
+_CONTROLS: dict[Medium, Channel] = {"video": VIDEO_CONTROL, "audio": AUDIO_CONTROL}
 
 
 class MediaRecorder(MediaReceiver):
@@ -41,8 +54,29 @@ class MediaRecorder(MediaReceiver):
         super().__init__(transport, base)
         self.problem = ""
         self.audio_rate = 0
+        self.watched: set[Medium] = set()  # that others have requested
         self._shown: deque[tuple[str, ShownPicture]] = deque(maxlen=_PICTURES)
         self._stretch: deque[ReceivedSound] = deque(maxlen=_SOUNDS)
+
+    def watch_requests(self) -> None:
+        """Notice the requests of others from now on; to be called once the capabilities are known."""
+        for medium, channel in _CONTROLS.items():
+            topic = self.viewer.topic(medium, "command_topic", channel)
+            self._transport.subscribe(topic, partial(self._requested, medium, channel))
+
+    def _requested(self, medium: Medium, channel: Channel, message: Message) -> None:
+        if message.payload in self.viewer.sent:
+            self.viewer.sent.remove(message.payload)
+            return
+        try:
+            request = codec.decode(channel, message.payload)
+        except PayloadError:
+            return
+        if request.enabled:
+            self.watched.add(medium)
+            self.viewer.hand_over(medium)
+        else:
+            self.watched.discard(medium)
 
     def take_pictures(self, encoding: str) -> list[ShownPicture]:
         """The pictures of ``encoding`` since the last call."""
@@ -89,12 +123,13 @@ class MediaCheck:
         self.rounds = 0
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
         self._robots: Sequence[DiscoveredRobot] = ()
+        self._once = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
-    def begin(self, robots: Sequence[DiscoveredRobot]) -> None:
-        """Start requesting media from these robots; returns at once."""
-        self._robots = robots
+    def begin(self, robots: Sequence[DiscoveredRobot], *, once: bool = False) -> None:
+        """Start requesting media from these robots, one round after another or ``once``; returns at once."""
+        self._robots, self._once = robots, once
         self._thread.start()
 
     def end(self) -> None:
@@ -111,6 +146,7 @@ class MediaCheck:
         self.recorders = {robot.name: MediaRecorder(self._transport, robot.base) for robot in self._robots}
         for recorder in self.recorders.values():
             self._try(recorder, partial(recorder.wait_for_capabilities, _CAPABILITIES_TIMEOUT_S))
+            recorder.watch_requests()
         sounds = threading.Thread(target=self._cycle, args=("audio", ALL_SOUND, _AUDIO_TURN_S), daemon=True)
         sounds.start()
         self._cycle("video", ALL_VIDEO, VIDEO_TURN_S)
@@ -129,10 +165,13 @@ class MediaCheck:
                     return
                 self.results.extend(self._assess(medium, name, encoding) for name in self.recorders)
             self.rounds += medium == "video"
+            if self._once:
+                return
 
     def _ask(self, medium: Medium, encoding: str) -> None:
         for recorder in self.recorders.values():
-            self._try(recorder, partial(recorder.viewer.request, medium, encoding))
+            if medium not in recorder.watched:
+                self._try(recorder, partial(recorder.viewer.request, medium, encoding))
 
     def _try(self, recorder: MediaRecorder, act: partial[None]) -> None:
         try:
@@ -151,7 +190,8 @@ class MediaCheck:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             for recorder in self.recorders.values():
-                recorder.poll()
+                if not recorder.watched:
+                    recorder.poll()
             if self._stopping.wait(min(left, _STEP_S)):
                 return True
         return False
@@ -159,6 +199,8 @@ class MediaCheck:
     def _assess(self, medium: Medium, name: str, encoding: str) -> MediaResult:
         recorder = self.recorders[name]
         capabilities = recorder.viewer.capabilities.get(medium, {})
+        if medium in recorder.watched:
+            return watched(name, encoding)
         if recorder.problem:
             return MediaResult(name, encoding, "", (recorder.problem,))
         if medium == "video":

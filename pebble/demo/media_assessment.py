@@ -36,6 +36,12 @@ class MediaResult:
     encoding: str
     measured: str
     wrong: tuple[str, ...]
+    judged: bool = True
+
+
+def watched(robot: str, encoding: str) -> MediaResult:
+    """A person has chosen the encoding meanwhile, so that nothing can be said of this one."""
+    return MediaResult(robot, encoding, "watched from the page", (), judged=False)
 
 
 def assess_pictures(

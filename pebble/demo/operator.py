@@ -1,4 +1,7 @@
-"""A scripted operator: discovers robots on a broker, drives them through the same steps, and overrules a script."""
+"""A scripted operator: discovers robots on a broker, drives them through the same steps, and overrules a script.
+
+It yields to people: a robot that is driven or was stopped from the operator page is left alone until the step after.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,11 @@ from pebble.demo.emergency import CompletedStop, EmergencyStop
 from pebble.demo.following import CompletedFollow
 from pebble.demo.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
 from pebble.demo.takeover import TakeOver
+from pebble.demo.visitors import Visitors
 from pebble.transports import Message, MqttSettings, QoS, create
 
 STOP = Drive()
+NAME = "the demo's operator"
 _COMPLETED = 1000  # finished steps that wait to be assessed
 _EVENTS = 100  # that wait to be shown
 
@@ -25,16 +30,20 @@ _EVENTS = 100  # that wait to be shown
 class Operator:
     """Drives on its own thread and connection.
 
-    ``activity`` and ``events`` (monotonic seconds and a line) are for display; ``completed`` collects finished steps.
+    ``activity`` and ``events`` (monotonic seconds and a line) are for display; ``completed`` collects finished steps,
+    and ``left_alone`` the names of robots of which people had the control meanwhile.
     """
 
     def __init__(self, port: int, name: str = "pebble-demo-operator") -> None:
-        self.discovery = Discovery()
-        self.activity = "discovering robots"
+        self.discovery, self.visitors = Discovery(), Visitors()
+        self.left_alone: set[str] = set()
         self.rounds = 0
         self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when (monotonic)
         self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
         self.completed: deque[CompletedStep | CompletedStop | CompletedFollow] = deque(maxlen=_COMPLETED)
+        self._doing = "discovering robots"
+        self._step_began = 0.0
+        self._yours = ""
         self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._drive, name=name, daemon=True)
@@ -49,8 +58,16 @@ class Operator:
         now = time.monotonic()
         return sum(robot.ready(now) for robot in self.discovery.all_robots()) >= wanted
 
-    def begin(self) -> None:
-        """Start driving all robots discovered so far, round after round."""
+    @property
+    def activity(self) -> str:
+        """What it does, and which robots it leaves alone."""
+        now = time.monotonic()
+        others = [f"{robot.name} {why}" for robot in self.discovery.all_robots() if (why := self._taken(robot, now))]
+        return "; ".join([self._doing, *others])
+
+    def begin(self, yours: str = "") -> None:
+        """Start driving all robots discovered so far, round after round; with ``yours`` only once, and then show it."""
+        self._yours = yours
         self._thread.start()
 
     def end(self) -> None:
@@ -62,14 +79,32 @@ class Operator:
 
     def _receive(self, message: Message) -> None:
         self.discovery.receive(message, time.monotonic(), time.time())
+        self.visitors.receive(message, time.monotonic())
+
+    # -- people at the page
+
+    def _taken(self, robot: DiscoveredRobot, now: float) -> str:
+        """Why people have the control of it now; empty: they have not."""
+        if driver := self.visitors.driver(robot.base, now):
+            return f"is driven by {driver}"
+        stop = robot.stopped_by
+        return "" if stop is None or stop.by == NAME else f"is stopped by {stop.by or 'unknown'}"
+
+    def _mine(self, robot: DiscoveredRobot) -> bool:
+        """Whether it may be driven in the present step."""
+        now = time.monotonic()
+        if not self._taken(robot, now) and not self.visitors.driven_since(robot.base, self._step_began, now):
+            return True
+        self.left_alone.add(robot.name)
+        return False
 
     # -- the operator's thread
 
     def _drive(self) -> None:
         robots = self.discovery.all_robots()
-        while not self._stopping.is_set():
+        while not self._stopping.is_set() and not (self._yours and self.rounds):
             for step in SCRIPT:
-                self._perform(step, robots)
+                self._perform(step, self._begin(step.name, robots))
                 if self._stopping.is_set():
                     break
             else:
@@ -77,11 +112,17 @@ class Operator:
                     self._stop_once(robots)
                     self._take_over_once(robots)
                 self.rounds += 1
-        self._send(STOP, robots)
-        self.activity = "disconnecting"
+        if not self._stopping.is_set():
+            self._doing = self._yours
+            self._stopping.wait()
+        self._send(STOP, self._begin("disconnecting", robots))
+
+    def _begin(self, step: str, robots: list[DiscoveredRobot]) -> list[DiscoveredRobot]:
+        """The robots that take part in the next step."""
+        self._doing, self._step_began = step, time.monotonic()
+        return [robot for robot in robots if self._mine(robot)]
 
     def _perform(self, step: Step, robots: list[DiscoveredRobot]) -> None:
-        self.activity = step.name
         began = due = released = time.monotonic()
         self._switch_lights(step, robots)
         while due < began + step.drive_s:
@@ -93,36 +134,46 @@ class Operator:
         if step.sends_stop:
             self._send(STOP, robots)
             released = time.monotonic()
-        self.activity = f"{step.name}: observing"
+        self._doing = f"{step.name}: observing"
         if self._stopping.wait(step.rest_s):
             return
-        self.completed.extend(CompletedStep(robot.name, step, began, released, time.monotonic()) for robot in robots)
+        ended = time.monotonic()
+        self.completed.extend(
+            CompletedStep(robot.name, step, began, released, ended) for robot in robots if self._mine(robot)
+        )
 
     def _stop_once(self, robots: list[DiscoveredRobot]) -> None:
         """Stop all robots, try to drive them, and reset them."""
-        self.activity = EMERGENCY_STOP
+        robots = self._begin(EMERGENCY_STOP, robots)
         emergency = EmergencyStop(
-            self._transport, lambda drive: self._send(drive, robots), self._stopping.wait, by="the demo's operator"
+            self._transport, lambda drive: self._send(drive, robots), self._stopping.wait, by=NAME
         )
         subscription = self._transport.subscribe(ALL_OUTGOING, emergency.receive)  # brings retained capabilities again
-        self.completed.extend(emergency.perform(robots))
+        completed = emergency.perform(robots)
         subscription.close()
+        mine = {robot.name for robot in robots if self._mine(robot)}
+        self.completed.extend(one for one in completed if one.robot in mine)
 
     def _take_over_once(self, robots: list[DiscoveredRobot]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
-        for robot in robots:
-            if robot.offers("autonomy") and not self._stopping.is_set():
+        for robot in self._begin("scripts", [robot for robot in robots if robot.offers("autonomy")]):
+            if not self._stopping.is_set():
                 drive = partial(self._send, robots=[robot])
-                completed = TakeOver(self._transport, robot, drive, self._stopping.wait, self._note).perform()
+                wait = partial(self._wait_with, robot)
+                completed = TakeOver(self._transport, robot, drive, wait, self._note).perform()
                 self.completed.extend([completed] if completed else [])
 
+    def _wait_with(self, robot: DiscoveredRobot, seconds: float) -> bool:
+        """True if the demo ends, or a person has taken this robot."""
+        return self._stopping.wait(seconds) or not self._mine(robot)
+
     def _note(self, what: str, text: str) -> None:
-        self.activity = f"{what}: {text}"
+        self._doing = f"{what}: {text}"
         self.events.append((time.monotonic(), f"operator {what}: {text}"))
 
     def _send(self, drive: Drive, robots: list[DiscoveredRobot]) -> None:
         payload = codec.encode(DRIVE, drive)
-        for robot in robots:
+        for robot in filter(self._mine, robots):
             self.commands[robot.base] = drive, time.monotonic()
             self._publish(robot.drive_topic, payload)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import sys
 import threading
 from pathlib import Path
@@ -13,7 +12,6 @@ import msgspec
 from pebble.demo.programs import Program
 from pebble.web.extra import require_packages
 from pebble.web.program import Ready
-from pebble.web.settings import DEFAULT_PORT
 
 _HOST = "127.0.0.1"
 _START_S = 15.0  # it takes a while to import on a small machine
@@ -42,14 +40,3 @@ class PageServer:
 
     def _read(self) -> None:
         self._answer.append(self.program.reports.readline())
-
-
-def usual_port() -> int:
-    """The page's usual port if it is free, else 0."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
-        try:
-            probe.bind((_HOST, DEFAULT_PORT))
-        except OSError:
-            return 0
-    return DEFAULT_PORT

@@ -36,15 +36,14 @@ class Stage:
         self._names, self._settings = names or ROBOTS, settings
         self._ending = threading.Event()
         self._testbed = Testbed(self._ending, self._names)
-        self._server: PageServer | None = None
 
     def __enter__(self) -> Self:
         try:
             self._testbed.start_brokers(BrokerKind.MOSQUITTO)
-            self._server = self._start_server(0)
+            self._testbed.start_page(**self._settings)
             self._testbed.start_robots()
             self.robots = {robot.name: robot for robot in self._testbed.robots}
-            self._server.wait(self._ending)
+            self.server.wait(self._ending)
             self._wait_until_drivable()
         except BaseException:
             self.__exit__(None, None, None)
@@ -52,9 +51,8 @@ class Stage:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        if self._server is not None:
+        if self._testbed.page is not None:
             self.thaw_server()
-            end_all([self._server.program], _END_S)
         self._testbed.keep = False
         self._testbed.__exit__(kind, error, tb)
 
@@ -74,9 +72,9 @@ class Stage:
 
     @property
     def server(self) -> PageServer:
-        if self._server is None:
+        if self._testbed.page is None:
             raise PebbleError("the stage has not been entered")
-        return self._server
+        return self._testbed.page
 
     @property
     def url(self) -> str:
@@ -117,12 +115,7 @@ class Stage:
         """Start it again at the same address; ends the old one if it runs."""
         port = int(self.url.rpartition(":")[2].rstrip("/"))
         end_all([self.server.program], _END_S)
-        self._server = self._start_server(port)
-        self._server.wait(self._ending)
-
-    def _start_server(self, port: int) -> PageServer:
-        settings = {"port": port, "server": "stage", **self._settings}
-        return PageServer(self._testbed.folder, self._testbed.remote_port, **settings)
+        self._testbed.start_page(**{**self._settings, "port": port}).wait(self._ending)
 
     # -- the motors
 

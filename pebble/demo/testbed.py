@@ -20,6 +20,7 @@ import msgspec
 
 from pebble.demo.broker import Broker, BrokerKind
 from pebble.demo.following import Outcome
+from pebble.demo.page import PageServer
 from pebble.demo.programs import Program, end_all
 from pebble.demo.room import CLIP_S, Room, write_clip
 from pebble.simulation.loudspeaker import playbacks
@@ -231,6 +232,7 @@ class Testbed:
         self.folder = Path(tempfile.mkdtemp(prefix="pebble-demo-", dir=_temporary_folder()))
         self.robots: Sequence[SimulatedRobot] = ()
         self.remote_port = 0
+        self.page: PageServer | None = None
         self._ending = ending
         self._brokers: list[Program] = []
 
@@ -238,7 +240,8 @@ class Testbed:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """End the robots first, while the brokers that they report offline to still run."""
+        """End the page before the robots, and these while the brokers that they report offline to still run."""
+        end_all([] if self.page is None else [self.page.program], _REST_END_S)
         end_all((robot.launcher for robot in self.robots if robot.launcher is not None), _ROBOTS_END_S)
         end_all((mcu for robot in self.robots for mcu in robot.mcus), _REST_END_S)
         end_all(self._brokers, _REST_END_S)
@@ -260,6 +263,11 @@ class Testbed:
         }
         self.robots = [makers[name]() for name in self._names]
 
+    def start_page(self, port: int = 0, **settings: Any) -> PageServer:
+        """Start the operator page's server; the caller waits for it. Raises PebbleError."""
+        self.page = PageServer(self.folder, self.remote_port, port, **{"server": "demo", **settings})
+        return self.page
+
     def start_robots(self) -> None:
         """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
         for robot in self.robots:
@@ -267,7 +275,8 @@ class Testbed:
 
     def unexpected_exits(self) -> list[str]:
         """The processes that should still run and do not."""
-        programs = [*self._brokers, *(program for robot in self.robots for program in robot.programs)]
+        page = [] if self.page is None else [self.page.program]
+        programs = [*self._brokers, *page, *(program for robot in self.robots for program in robot.programs)]
         return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
 
 

@@ -36,7 +36,8 @@ Result: TypeAlias = StepResult | StopResult | FollowResult
 class View:
     """Shows the robots while they run; call ``update`` at any rate.
 
-    ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make.
+    ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make. ``url`` of the operator page
+    stays above the table.
     """
 
     def __init__(
@@ -46,7 +47,9 @@ class View:
         media: MediaCheck,
         robots: Sequence[SimulatedRobot],
         ending: threading.Event,
+        url: str = "",
     ) -> None:
+        self._url = url
         self._console, self._operator, self._media = console, operator, media
         self._robots, self._ending = robots, ending
         self._began = time.monotonic()
@@ -72,7 +75,8 @@ class View:
         if self._live is not None:
             tables = [_table(some) for some in _side_by_side(rows, self._console)]
             last = Text.assemble(activity, ("   Ctrl-C ends it", "dim"), no_wrap=True, overflow="ellipsis")
-            self._live.update(Group(*tables, last), refresh=True)
+            address = [Text(f"Operator page: {self._url}", style="bold")] if self._url else []
+            self._live.update(Group(*address, *tables, last), refresh=True)
         elif now - self._printed_at >= _LINE_PERIOD_S:
             self._printed_at = now
             for line in (activity, *("  ".join(["       ", *row.values()]) for row in rows)):
@@ -169,7 +173,9 @@ def show_media_results(console: Console, robots: Sequence[str], results: Sequenc
 def _media_cell(results: Sequence[MediaResult]) -> str:
     if not results:
         return "not done"
-    worst = max(results, key=lambda result: len(result.wrong))
+    worst = max(results, key=lambda result: (len(result.wrong), result.judged))
+    if not worst.judged:
+        return worst.measured
     return f"{'FAILED' if worst.wrong else 'ok'}  {worst.measured}"
 
 
