@@ -53,6 +53,7 @@ def _config(settings: WebSettings) -> uvicorn.Config:
         log_level="warning",
         access_log=False,
         server_header=False,
+        proxy_headers=False,  # else any local program chooses the address by which logins are counted
         date_header=False,
         http=HttpProtocol,
         ws=WebSocketProtocol,

@@ -29,8 +29,8 @@ class Served:
     """One server on a free loopback port; everything runs in this process, except the broker."""
 
     def __init__(self, broker_port: int, **settings: Any) -> None:
-        given = {"port": 0, "server": "hall", **settings}
-        self.settings = WebSettings(broker=MqttSettings(host="127.0.0.1", port=broker_port), **given)
+        broker = MqttSettings(host="127.0.0.1", port=broker_port)
+        self.settings = WebSettings(**{"broker": broker, "port": 0, "server": "hall", **settings})
         self._listener = _listen(self.settings)
         self.port = int(self._listener.getsockname()[1])
         self._uvicorn = uvicorn.Server(_config(self.settings))
