@@ -1,8 +1,8 @@
 """What a page and the server send each other on the control socket: JSON text, one struct per ``op``.
 
-``ref`` is a component's base topic, ``pebble/robots/goob``; "" is the server itself. Page clocks (``t``) are milliseconds
-of ``performance.now()``; server stamps (``now``) are epoch milliseconds. docs/web-messages.md and the page's
-``messages.d.ts`` are generated from these structs.
+``ref`` is a component's base topic, ``pebble/robots/goob``; "" is the server itself. Page clocks (``t``) are
+milliseconds of ``performance.now()``; server stamps (``now``) are epoch milliseconds. docs/web-messages.md and the
+page's ``messages.d.ts`` are generated from these structs.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class Ping(_ToPage, frozen=True, kw_only=True, tag="ping"):
 
 
 class State(_ToPage, frozen=True, kw_only=True, tag="state"):
-    """The newest value of everything that changed: ``[ref, metric, value, age in ms]``; ``gone`` are removed components.
+    """The newest value of everything that changed: ``[ref, metric, value, age in ms]``; ``gone``: removed components.
 
     Metrics are those of the contract, with their payload as JSON, and some of the server's own, below ``web/``.
     """

@@ -7,23 +7,13 @@ import logging
 import secrets
 import socket
 import time
-from collections import deque
+from collections.abc import Coroutine
 from contextlib import suppress
+from typing import Any
 
 import msgspec
 
-from pebble.contract import (
-    CHARGING_LEVEL,
-    CHARGING_STATUS,
-    DRIVE,
-    DRIVING,
-    IMU,
-    LOGS,
-    TOUCH_SENSORS,
-    WHEEL_ODOMETRY,
-    Channel,
-    codec,
-)
+from pebble.contract import CAPABILITIES, DRIVE, DRIVING, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Driver
 from pebble.contract.payloads import Driving as DrivingPayload
@@ -31,12 +21,13 @@ from pebble.errors import ConfigError, PayloadError
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
-from pebble.transports import Message, Subscription
+from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.broker import Broker
 from pebble.web.driving import Command, Driving
 from pebble.web.media import MediaHub
-from pebble.web.robots import FLEET, LOG_LINES, SYNONYMS, WATCHED, Robots, own_topic
+from pebble.web.open_components import OpenComponents
+from pebble.web.robots import FLEET, SYNONYMS, Robots
 from pebble.web.settings import WebSettings
 from pebble.web.stops import Stops
 
@@ -45,17 +36,7 @@ log = logging.getLogger(__name__)
 TICK_S = 0.05
 _REFRESH_S = 0.25
 _ANNOUNCE_S = 1.0
-_KEEP_S = 5.0  # so long the metrics of a component are still received after the last page has closed it
 _ANNOUNCED = 64  # robots in one announcement
-
-#: Channels whose effective topic capabilities may name, below ``telemetry``.
-_TELEMETRY: dict[str, Channel] = {
-    "touch_topic": TOUCH_SENSORS,
-    "charging_topic": CHARGING_STATUS,
-    "charging_level_topic": CHARGING_LEVEL,
-    "wheel_odometry_topic": WHEEL_ODOMETRY,
-    "imu_topic": IMU,
-}
 
 
 def clock() -> float:
@@ -74,10 +55,8 @@ class Server:
         self.broker = Broker(settings.broker)
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
         self.media = MediaHub(self.broker, self.robots)
+        self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         self.drive_changed: set[str] = set()
-        self._watching: dict[str, int] = {}  # how many pages have a component open
-        self._subscribed: dict[str, list[Subscription]] = {}  # what is received of it
-        self._extra: dict[str, frozenset[str]] = {}  # its effective topics, as subscribed
         self._tasks: set[asyncio.Task[None]] = set()
         self._announced_at = float("-inf")
         self._announcing: set[str] = set()  # systems of the robots in the last announcement
@@ -102,9 +81,9 @@ class Server:
         await self.media.close()
         await self.broker.close()
 
-    def spawn(self, work: object) -> None:
-        """Run a coroutine until it ends or the server does."""
-        task = asyncio.ensure_future(work)  # type: ignore[call-overload]
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run it until it ends or the server does."""
+        task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -113,15 +92,10 @@ class Server:
     def _receive(self, message: Message, now: float) -> None:
         self.robots.receive(message, now)
         self.stops.receive(message, clock())
-        address = parse_topic(message.topic)
-        if address is not None:
-            self._after(address.identity.base)
-
-    def _after(self, ref: str) -> None:
-        """What follows from a change of a component: new topics, and messages of stops."""
         self._send(self.stops.tick(clock()))
-        if ref in self._subscribed and self._effective(ref) != self._extra.get(ref):
-            self.spawn(self._subscribe(ref))
+        address = parse_topic(message.topic)
+        if address is not None and address.metric == CAPABILITIES.metric:
+            self.open_components.update(address.identity.base)
 
     def _announced(self, message: Message, _now: float) -> None:
         """Another server drives robots."""
@@ -192,59 +166,14 @@ class Server:
 
     def watch(self, ref: str) -> None:
         """A page has opened this component."""
-        self._watching[ref] = self._watching.get(ref, 0) + 1
-        if ref not in self._subscribed and _is_base(ref):
-            self._subscribed[ref] = []
+        if _is_base(ref):
+            self.open_components.open(ref)
             self._show_picture_from(ref)
-            self.robots.logs[ref] = deque(maxlen=LOG_LINES)
-            self.spawn(self._subscribe(ref))
 
     def unwatch(self, ref: str) -> None:
         """A page has closed it."""
-        self._watching[ref] -= 1
-        if not self._watching[ref]:
-            del self._watching[ref]
-            self.broker.loop.call_later(_KEEP_S, lambda: self.spawn(self._unsubscribe(ref)))
-
-    async def _subscribe(self, ref: str) -> None:
-        extra = self._extra[ref] = self._effective(ref)
-        filters = {channel.filter(ref): None for channel in WATCHED if channel is not LOGS}
-        filters |= {LOGS.filter(ref): None} | dict.fromkeys(extra)
-        names = dict(self._named(ref))
-
-        def take(message: Message, now: float) -> None:
-            channel = names.get(message.topic)
-            if channel is None:
-                self.robots.receive(message, now)
-            else:
-                self.robots.receive_as(ref, channel.metric, message, now)
-
-        done = self._subscribed[ref]
-        known = {subscription.filter for subscription in done}
-        for filter_ in filters:
-            if filter_ not in known and ref in self._subscribed:
-                done.append(await self.broker.subscribe(filter_, take))
-
-    async def _unsubscribe(self, ref: str) -> None:
-        if ref in self._watching or ref not in self._subscribed:
-            return
-        self.robots.logs.pop(ref, None)
-        self._extra.pop(ref, None)
-        for subscription in self._subscribed.pop(ref):
-            await self.broker.unsubscribe(subscription)
-
-    def _effective(self, ref: str) -> frozenset[str]:
-        return frozenset(topic for topic, channel in self._named(ref) if topic != channel.topic(ref))
-
-    def _named(self, ref: str) -> list[tuple[str, Channel]]:
-        """The topics of telemetry that the capabilities name, if they are the component's own."""
-        telemetry = self.robots.capabilities(ref).get("telemetry")
-        listed = telemetry if isinstance(telemetry, dict) else {}
-        return [
-            (str(listed[key]), channel)
-            for key, channel in _TELEMETRY.items()
-            if own_topic(ref, listed.get(key), "outgoing")
-        ]
+        if _is_base(ref):
+            self.open_components.close(ref)
 
     # -- what is due
 
