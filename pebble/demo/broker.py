@@ -33,9 +33,9 @@ class BrokerKind(StrEnum):
 class Broker:
     """A running broker; the caller ends its ``program``."""
 
-    def __init__(self, name: str, kind: BrokerKind, folder: Path, extra: Sequence[str] = ()) -> None:
-        """``extra``: more lines for mosquitto's configuration; amqtt has none."""
-        self.port = free_port()
+    def __init__(self, name: str, kind: BrokerKind, folder: Path, extra: Sequence[str] = (), port: int = 0) -> None:
+        """``extra``: more lines for mosquitto's configuration; amqtt has none. ``port`` 0 is a free one."""
+        self.port = port or free_port()
         mosquitto = kind is BrokerKind.MOSQUITTO
         command = mosquitto_command(self.port, folder / name, extra) if mosquitto else _amqtt(self.port)
         self.program = Program(name, command, folder / f"{name}.log")

@@ -12,7 +12,7 @@ from typing import Any, Self
 from pebble.demo.broker import BrokerKind
 from pebble.demo.operator import Operator
 from pebble.demo.page import PageServer
-from pebble.demo.programs import end_all
+from pebble.demo.programs import Program, end_all
 from pebble.demo.testbed import ROBOTS, SimulatedRobot, Testbed
 from pebble.errors import PebbleError
 from pebble.simulation.trace import Entry
@@ -99,9 +99,7 @@ class Stage:
     # -- the server's process
 
     def kill_server(self) -> None:
-        os.kill(self.server.program.pid, signal.SIGKILL)
-        while not self.server.program.ended:
-            time.sleep(_POLL_S)
+        _kill(self.server.program)
 
     def freeze_server(self) -> None:
         """SIGSTOP: its connections stay, and nothing answers."""
@@ -116,6 +114,23 @@ class Stage:
         port = int(self.url.rpartition(":")[2].rstrip("/"))
         end_all([self.server.program], _END_S)
         self._testbed.start_page(**{**self._settings, "port": port}).wait(self._ending)
+
+    # -- the broker's process
+
+    def kill_broker(self) -> None:
+        _kill(self._testbed.remote_broker)
+
+    def freeze_broker(self) -> None:
+        """SIGSTOP: its connections stay, and what is sent to it arrives after it was thawed."""
+        os.kill(self._testbed.remote_broker.pid, signal.SIGSTOP)
+
+    def thaw_broker(self) -> None:
+        if not self._testbed.remote_broker.ended:
+            os.kill(self._testbed.remote_broker.pid, signal.SIGCONT)
+
+    def restart_broker(self) -> None:
+        """Start it again at the same address, without retained messages; ends the old one if it runs."""
+        self._testbed.restart_remote_broker()
 
     # -- the motors
 
@@ -139,6 +154,12 @@ class Stage:
     def lines(self, name: str) -> list[Entry]:
         """What its MCU received, oldest first."""
         return [entry for entry in self.robots[name].entries() if entry.event == "line"]
+
+
+def _kill(program: Program) -> None:
+    os.kill(program.pid, signal.SIGKILL)
+    while not program.ended:
+        time.sleep(_POLL_S)
 
 
 def _runs(changes: Changes, index: int) -> bool:

@@ -268,6 +268,18 @@ class Testbed:
         self.page = PageServer(self.folder, self.remote_port, port, **{"server": "demo", **settings})
         return self.page
 
+    @property
+    def remote_broker(self) -> Program:
+        """The operators' broker."""
+        return self._brokers[0]
+
+    def restart_remote_broker(self) -> None:
+        """Start another one at the same port, without the old one's retained messages. Raises PebbleError."""
+        end_all([self.remote_broker], _REST_END_S)
+        broker = Broker("remote-broker", BrokerKind.MOSQUITTO, self.folder, port=self.remote_port)
+        self._brokers[0] = broker.program
+        broker.wait(self._ending)
+
     def start_robots(self) -> None:
         """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
         for robot in self.robots:
