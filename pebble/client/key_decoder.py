@@ -57,9 +57,7 @@ def _first(data: bytes) -> tuple[int, str | None]:
         return 0, None
     if data[1] in b"[O":
         return _sequence(data)
-    if data[1] == _ESC or chr(data[1]) in "! ":
-        return 1, ESCAPE  # pressed fast one after the other: neither may be lost
-    return 2, None  # Alt and a character
+    return 1, ESCAPE  # Escape may be an emergency stop: Alt and a character count as Escape and that character
 
 
 def _sequence(data: bytes) -> tuple[int, str | None]:

@@ -44,7 +44,7 @@ class KeyGesture:
         self.last = ZERO  # the newest command
         self._speed, self._turn = speed, turn
         self._held: dict[str, tuple[int, float]] = {}  # by axis: the direction, and when its key last arrived
-        self._key_at = _NEVER  # when any key that moves anything last arrived
+        self._key_at = _NEVER  # when a key that moves anything last arrived, or a gesture was interrupted
         self._sent_at = self._updated_at = _NEVER
         self._burst = False
         self._repeats: list[float] = []
@@ -83,7 +83,7 @@ class KeyGesture:
 
         ``repeat``: the zero is sent twice more; not if another driver may have begun.
         """
-        self.must_release = True
+        self.must_release, self._key_at = True, now  # the pause is one in which keys were read
         self._held.clear()
         zero = self._end(FINAL_ZERO, now) if self.active else []
         if not repeat:

@@ -21,6 +21,7 @@ LATE_S = 0.6  # commands that take longer are not sent
 SLOW_S, SLOW_SPEED = 0.3, 0.4  # from this round trip on, the speed is limited
 SILENT_S = 1.5
 TWICE_S = 0.6  # between two presses of Escape
+RESET_S = 0.6  # a robot that was reset refuses its drivers until they have paused for 0.5 s
 
 _TOPICS = 64  # of one robot that are remembered
 _HEARD = (ESTOP_STATE, CAPABILITIES, ONLINE, CHARGING_LEVEL, AUTONOMY_STATUS)
@@ -51,7 +52,7 @@ class TerminalDriver:
         self._discovery = Discovery()
         self._robot = self._discovery.robots[base] = DiscoveredRobot(base, self.name)
         self._began = now
-        self._escape_at = float("-inf")
+        self._escape_at = self._latched_at = float("-inf")
         self._reason = "connecting"
         self._connected = False
         self._known: dict[str, Message] = {}  # the robot's newest messages, for an emergency stop that begins later
@@ -187,9 +188,12 @@ class TerminalDriver:
             state = robot.stopped_by
             by = "unknown" if state is None else state.by or "unknown"
             why = f" ({state.why})" if state is not None and state.why else ""
+            self._latched_at = now
             return f"stopped by {by}{why}: pebble estop reset {self.name}"
         if self.stopping is not None and not self.stopping.finished:
             return "emergency stop"
+        if now - self._latched_at < RESET_S:
+            return "it was reset a moment ago"
         if not robot.estop.has_capabilities:
             return f"{self.name} has not published what it can do"
         drive = robot.capabilities.get("drive", {})

@@ -19,7 +19,8 @@ from pebble.client.key_decoder import ALONE_S, KeyDecoder
         (b"\x1b\x1b\x1b[A", ["escape", "escape", "up"]),
         (b"\x1b!", ["escape", "!"]),
         (b"\x1b ", ["escape", "space"]),
-        (b"\x1bw", []),  # Alt and W
+        (b"\x1bw", ["escape", "w"]),  # or Alt and W
+        (b"w\x1b\x1bw", ["w", "escape", "escape", "w"]),
         (b"\x1b[1;2A", []),  # shift and an arrow
         (b"\x1b[5~w", ["w"]),
         (b"\x1b[[Aw", ["w"]),  # the first function key of the Linux console

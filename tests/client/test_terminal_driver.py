@@ -248,6 +248,9 @@ def test_a_robot_that_was_reset_is_driven_again() -> None:
     assert not cab.moves()
     reset = json.dumps({"boot": "00000000", "count": 1}).encode()
     cab.receive(*cab.robot.take([Message(f"{GOOB}/incoming/estop-reset", reset)]))
+    assert cab.run(0.5, "w") == []
+    assert "it was reset a moment ago" in cab.status
+    cab.run(0.2)
     assert cab.moves()
     cab.driver.press(["!"], cab.now)
     cab.run(0.1)

@@ -140,7 +140,7 @@ def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) 
     assert robot.latched
     assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
     latch = robot.robot.owners[0].latch
-    assert (latch.by, latch.why, latch.count) == (estop._me()[:32], "dog", 1)
+    assert (latch.by, latch.why, latch.count) == (estop.me()[:32], "dog", 1)
     assert json.loads(robot.commands[1].payload)["valid_ms"] == 0
 
 

@@ -1,0 +1,404 @@
+"""``pebble drive`` in a real terminal, with a real broker and MiniLAMP's firmware on simulated motors."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.simulation.trace import read_trace
+from pebble.transports import Message, MqttSettings, create
+from tests.commands.command_line import Run
+from tests.support import ROOT, Broker, Child, gone, until
+
+BASE = "pebble/robots/minilamp"
+VALID_S = 0.4  # of a command
+BUSY_S = 0.35  # what a busy machine may add
+ZERO, FINAL = {"x": 0, "z": 0, "y": 0}, {"x": 0, "z": 0, "y": 0, "valid_ms": 0}
+
+
+class Lamp:
+    """A simulated MiniLAMP: its own firmware, and what its motors really do."""
+
+    def __init__(self, folder: Path, broker: Broker) -> None:
+        self.commands: list[tuple[float, Any]] = []  # when they reached the broker
+        self.announced: list[Any] = []
+        self.stops = 0
+        self._trace = folder / "trace"
+        self._transport = create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)).open()
+        self.capabilities = threading.Event()
+        self._transport.subscribe(f"{BASE}/#", self._take)
+        self._transport.subscribe("+/servers/+/outgoing/driving", self._take)
+        command = [*(sys.executable, "-m", "pebble.simulation.networked"), *("--kind", "minilamp")]
+        address = [*("--broker", f"127.0.0.1:{broker.port}"), *("--trace", str(self._trace))]
+        self._process = Child([*command, *address], cwd=ROOT, stderr=subprocess.DEVNULL)
+        assert self.capabilities.wait(20)
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.wait(10)
+        self._transport.close()
+
+    def publish(self, topic: str, body: object) -> None:
+        assert self._transport.publish(topic, json.dumps(body).encode(), qos=1)
+
+    @property
+    def motors(self) -> list[tuple[float, tuple[float, float]]]:
+        """When the motors changed, by the monotonic clock, and to what."""
+        return [(one.ns / 1e9, one.motors) for one in read_trace(self._trace) if one.motors is not None]
+
+    @property
+    def moving(self) -> bool:
+        changes = self.motors
+        return bool(changes) and changes[-1][1] != (0.0, 0.0)
+
+    def halted_after(self, moment: float) -> float:
+        """How long the motors went on after ``moment``."""
+        assert until(lambda: not self.moving, 5), (moment, self.commands[-10:], self.motors[-5:])
+        return self.motors[-1][0] - moment
+
+    def moved_since(self, moment: float) -> bool:
+        return any(at > moment and speeds != (0.0, 0.0) for at, speeds in self.motors)
+
+    def _take(self, message: Message) -> None:
+        metric = message.topic.rpartition("/")[2]
+        if metric == "drive-values":
+            self.commands.append((time.monotonic(), json.loads(message.payload)))
+        elif metric == "driving":
+            self.announced.append(json.loads(message.payload)["robots"])
+        elif message.topic.endswith("incoming/estop"):
+            self.stops += 1
+        elif metric == "capabilities":
+            self.capabilities.set()
+
+
+class Seat:
+    """A process in a terminal of its own, whose keys can be held as a terminal repeats them."""
+
+    def __init__(self, *command: str) -> None:
+        self.master, slave = pty.openpty()
+        self.mode = termios.tcgetattr(slave)
+        self._slave = slave  # open: so the mode can be read after the process has ended
+        self.process = subprocess.Popen(
+            ["setsid", "--ctty", *command], cwd=ROOT, stdin=slave, stdout=slave, stderr=slave, env=os.environ | SHELL
+        )
+        self._held = b""
+        self._shown = b""
+        self._ending = threading.Event()
+        self._threads = [threading.Thread(target=job, daemon=True) for job in (self._read, self._repeat)]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        self._ending.set()
+        for thread in self._threads:
+            thread.join()
+        for descriptor in (self.master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait(10)
+
+    def hang_up(self) -> None:
+        """Close the terminal, as its window does."""
+        self._ending.set()
+        for thread in self._threads:
+            thread.join()
+        os.close(self._slave)
+        os.close(self.master)
+        self.master = self._slave = -1
+
+    def type(self, keys: bytes) -> None:
+        os.write(self.master, keys)
+
+    def hold(self, key: bytes) -> None:
+        """Repeat a key, as a terminal does after its first delay; b"" lets go."""
+        self._held = key
+
+    def sees(self, text: str, timeout: float = 15.0) -> bool:
+        return until(lambda: text in self.shown, timeout)
+
+    @property
+    def shown(self) -> str:
+        return self._shown.decode(errors="replace")
+
+    def forget(self) -> None:
+        self._shown = b""
+
+    @property
+    def restored(self) -> bool:
+        return termios.tcgetattr(self._slave) == self.mode
+
+    def _read(self) -> None:
+        while not self._ending.is_set():
+            if select.select([self.master], [], [], 0.05)[0]:
+                try:
+                    self._shown += os.read(self.master, 65536)
+                except OSError:
+                    return
+
+    def _repeat(self) -> None:
+        while not self._ending.wait(0.03):
+            if self._held:
+                os.write(self.master, self._held)
+
+
+SHELL = {"PS1": "$ ", "TERM": "xterm", "COLUMNS": "200", "HISTFILE": "/dev/null"}
+Drive = Callable[..., Seat]
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    broker = Broker(tmp_path)
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def lamp(tmp_path: Path, broker: Broker) -> Iterator[Lamp]:
+    lamp = Lamp(tmp_path, broker)
+    yield lamp
+    lamp.close()
+
+
+@pytest.fixture
+def drive(broker: Broker, lamp: Lamp) -> Iterator[Drive]:
+    seats: list[Seat] = []
+
+    def start(*options: str, shell: bool = False) -> Seat:
+        url = f"mqtt://127.0.0.1:{broker.port}"
+        command = [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", url, *options]
+        if shell:
+            seats.append(Seat("bash", "--norc", "-i"))
+            seats[-1].type(" ".join(command).encode() + b"\n")
+        else:
+            seats.append(Seat(*command))
+        assert seats[-1].sees("ready"), seats[-1].shown
+        return seats[-1]
+
+    yield start
+    for seat in seats:
+        seat.close()
+
+
+def driving(seat: Seat, lamp: Lamp, key: bytes = b"w") -> None:
+    """Press ``key``, and again where a stall of a busy machine has ended the gesture."""
+    end = time.monotonic() + 20
+    while not (lamp.moving and "driving x" in seat.shown):
+        assert time.monotonic() < end, seat.shown
+        seat.hold(b"")
+        time.sleep(0.5)
+        seat.forget()
+        seat.hold(key)
+        until(lambda: lamp.moving and "driving x" in seat.shown, 2)
+
+
+def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: Lamp) -> None:
+    seat = drive("--speed", "0.5")
+    before = time.monotonic()
+    driving(seat, lamp)
+    time.sleep(1.0)
+    seat.hold(b"")
+    assert lamp.halted_after(time.monotonic()) < 0.4 + BUSY_S
+    assert seat.sees("ready")
+    sent = [command for at, command in lamp.commands if at > before]
+    assert sent[0] == {"x": 0, "z": 0.5, "y": 0, "valid_ms": 400}
+    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [ZERO] * 3)
+    assert 15 <= len([command for command in sent if command["z"]]) <= 45
+    assert lamp.announced[0][BASE]["device"].startswith("terminal on ")
+    seat.type(b"\x03")
+    assert seat.process.wait(5) == 0
+    assert seat.restored
+    assert until(lambda: lamp.announced[-1] == {})
+
+
+def test_an_arrow_and_ctrl_d(drive: Drive, lamp: Lamp) -> None:
+    seat = drive()
+    driving(seat, lamp, b"\x1b[D")
+    assert lamp.motors[-1][1][0] < lamp.motors[-1][1][1]
+    seat.hold(b"")
+    pressed = time.monotonic()
+    seat.type(b"\x04")
+    assert lamp.halted_after(pressed) < BUSY_S
+    assert (seat.process.wait(5), seat.restored) == (0, True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT, signal.SIGQUIT])
+def test_a_signal_stops_the_robot_at_once(drive: Drive, lamp: Lamp, number: signal.Signals) -> None:
+    seat = drive()
+    driving(seat, lamp)
+    seat.process.send_signal(number)
+    assert lamp.halted_after(time.monotonic()) < BUSY_S
+    assert seat.process.wait(5) == (0 if number == signal.SIGINT else 1)
+    assert seat.restored
+    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3)
+
+
+def test_a_terminal_that_is_closed_stops_the_robot_at_once(drive: Drive, lamp: Lamp) -> None:
+    seat = drive()
+    driving(seat, lamp)
+    seat.hang_up()
+    assert lamp.halted_after(time.monotonic()) < BUSY_S
+    assert seat.process.wait(5) == 1
+
+
+def test_a_killed_process_leaves_a_robot_that_stops_by_itself(drive: Drive, lamp: Lamp) -> None:
+    seat = drive()
+    driving(seat, lamp)
+    seat.process.kill()
+    assert lamp.halted_after(time.monotonic()) < VALID_S + BUSY_S
+
+
+@pytest.mark.parametrize("stall", [0.6, 2.0])
+def test_after_a_stall_a_key_that_is_still_held_moves_nothing(drive: Drive, lamp: Lamp, stall: float) -> None:
+    seat = drive()
+    driving(seat, lamp)
+    seat.process.send_signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    assert lamp.halted_after(stopped) < VALID_S + BUSY_S
+    time.sleep(max(0.0, stopped + stall - time.monotonic()))
+    seat.forget()
+    resumed = time.monotonic()
+    seat.process.send_signal(signal.SIGCONT)
+    assert seat.sees("let go first")
+    time.sleep(1.0)
+    assert not lamp.moved_since(resumed)
+    seat.hold(b"")
+    assert seat.sees("ready")
+    driving(seat, lamp)
+
+
+def test_ctrl_z_stops_the_robot_and_what_follows_needs_a_new_key(drive: Drive, lamp: Lamp) -> None:
+    seat = drive(shell=True)
+    driving(seat, lamp)
+    seat.hold(b"")
+    seat.type(b"w\x1a")
+    pressed = time.monotonic()
+    assert lamp.halted_after(pressed) < BUSY_S
+    assert seat.sees("Stopped")
+    assert [command for _, command in lamp.commands[-3:]] == [FINAL] * 3
+    seat.forget()
+    resumed = time.monotonic()
+    seat.type(b"fg\n")
+    assert seat.sees("ready"), seat.shown
+    assert not lamp.moved_since(resumed)
+    driving(seat, lamp)
+    seat.hold(b"")
+    seat.forget()
+    seat.type(b"\x03")
+    assert seat.sees("$ ")
+    seat.type(b"stty -a\n")
+    assert seat.sees(" icanon"), "the shell has its own mode again"
+
+
+def test_space_stops_at_once(drive: Drive, lamp: Lamp) -> None:
+    seat = drive()
+    driving(seat, lamp)
+    seat.hold(b"")
+    seat.type(b" ")
+    assert lamp.halted_after(time.monotonic()) < BUSY_S
+    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3)
+
+
+@pytest.mark.parametrize("keys", [b"!", b"\x1b\x1b"])
+def test_an_emergency_stop_latches(drive: Drive, lamp: Lamp, run: Run, broker: Broker, keys: bytes) -> None:
+    seat = drive()
+    driving(seat, lamp)
+    seat.type(keys)
+    pressed = time.monotonic()
+    assert lamp.halted_after(pressed) < BUSY_S
+    assert seat.sees("stopped by ")
+    time.sleep(1.0)
+    assert (lamp.moved_since(pressed + BUSY_S), seat.process.poll()) == (False, None)
+    seat.hold(b"")
+    url = f"--url=mqtt://127.0.0.1:{broker.port}"
+    assert run("estop", "reset", "minilamp", url) == 0
+    seat.forget()
+    assert seat.sees("ready"), seat.shown
+    driving(seat, lamp)
+
+
+def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(drive: Drive, lamp: Lamp) -> None:
+    seat = drive()
+    seat.type(b"!\x04")
+    assert seat.process.wait(10) == 0
+    assert lamp.stops >= 1
+    assert "NOT CONFIRMED" not in seat.shown.rpartition("\n")[2]
+
+
+def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, lamp: Lamp) -> None:
+    fair = "pebble/servers/fair-1/outgoing/driving"
+    ending = threading.Event()
+
+    def announce() -> None:
+        while not ending.wait(0.5):
+            robots = {BASE: {"by": "bob", "device": "phone", "since": int(1000 * began)}}
+            lamp.publish(fair, {"t": int(1000 * time.time()), "robots": robots})
+
+    began = time.time()
+    thread = threading.Thread(target=announce, daemon=True)
+    thread.start()
+    try:
+        url_options = ("--take-over",)
+        seat = drive(*url_options)
+        driving(seat, lamp)
+        seat.hold(b"")
+        began = time.time() + 60  # bob takes it back
+        assert seat.sees("bob (phone) at fair-1 is driving")
+        resumed = time.monotonic()
+        time.sleep(0.6)
+        seat.hold(b"w")
+        time.sleep(0.6)
+        assert not lamp.moved_since(resumed + VALID_S)
+    finally:
+        ending.set()
+        thread.join()
+
+
+def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, broker: Broker) -> None:
+    seat = drive()
+    driving(seat, lamp)
+    seat.forget()
+    broker.stop()
+    assert seat.sees("no connection: ")
+    assert lamp.halted_after(time.monotonic()) < VALID_S + 1.0
+    seat.hold(b"")
+    broker.start()
+    seat.forget()
+    assert seat.sees("ready", 30)
+    driving(seat, lamp)
+
+
+@pytest.mark.parametrize("stream", ["stdin", "stdout"])
+def test_without_a_terminal_there_is_one_line(stream: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1"],
+        cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=20,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.startswith("pebble: driving by keys needs a terminal; ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_an_unreachable_broker_is_reported_before_the_terminal_is_changed() -> None:
+    seat = Seat(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1:1")
+    try:
+        assert seat.process.wait(20) == 1
+        assert seat.sees("cannot connect to mqtt://127.0.0.1:1")
+        assert seat.restored
+    finally:
+        seat.close()
+    assert gone(seat.process.pid)
