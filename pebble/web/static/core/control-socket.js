@@ -5,6 +5,7 @@ import { PING_TIMEOUT_MS } from "./reasons.js";
 const FIRST_DELAY_MS = 250;
 const LONGEST_DELAY_MS = 4000;
 const CHECK_MS = 250;
+const CONNECT_MS = 8000; // a phone far from its access point needs seconds for TCP, TLS and the handshake
 const TOKEN = "pebble-token"; // restores the driver lease after a reload
 
 /** @typedef {{store: any, version: string, can: string[], onOpen?: () => void, onLost?: () => void,
@@ -99,7 +100,8 @@ export class ControlSocket {
   }
 
   check() {
-    if (this.socket && performance.now() - this.heardAt > PING_TIMEOUT_MS) this.restart();
+    const limit = this.state === "open" ? PING_TIMEOUT_MS : CONNECT_MS;
+    if (this.socket && performance.now() - this.heardAt > limit) this.restart();
   }
 
   lost(code) {
