@@ -30,7 +30,7 @@ LINGER_S: Final = 5.0  # without viewers, before the request is withdrawn: a pag
 _TICK_S: Final = 0.5
 _SILENT_S: Final = 2.0
 _SILENT_PERIODS: Final = 3.0
-_OWN_REQUEST_S: Final = 1.0  # a new encoding begins with a key frame: none is requested meanwhile
+_CHANGE_S: Final = 1.0  # a new encoding begins with a key frame within this time: viewers need no help meanwhile
 _MAX_CHAIN: Final = 240  # pictures since a key frame
 _MAX_CHAIN_BYTES: Final = 8 << 20
 _HEAD: Final = struct.Struct(">IB")
@@ -239,14 +239,15 @@ class PictureStream:
         now = time.monotonic()
         if not self._encoding:
             return
-        can_rescue = not rescue.unavailable(self._encoding)
+        changing = now - self._source.requested_at < _CHANGE_S
+        can_rescue = not changing and not rescue.unavailable(self._encoding)
         queues = [viewer.queue for viewer in self.viewers]
         wanted = assess(queues, self._encoding, now, can_rescue=can_rescue)
         if can_rescue and any(queue.rescued for queue in queues):
             self._rescue.start(self._chain)
         else:
             self._rescue.stop()
-        if wanted and now - self._source.requested_at >= _OWN_REQUEST_S:
+        if wanted and not changing:
             for queue in queues:
                 queue.new = False
             await self._source.request_keyframe(self._encoding)

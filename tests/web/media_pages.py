@@ -1,36 +1,19 @@
-"""A small web server for pages that test the modules of pebble/web/static/media, and the browser that opens them."""
+"""A small web server for pages that test the modules of pebble/web/static/media."""
 
 from __future__ import annotations
 
 import itertools
 import struct
-import tempfile
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
-
-import pytest
 
 from tests.support import ROOT
 
 STATIC = ROOT / "pebble" / "web" / "static"
 PAGES = Path(__file__).parent / "pages"
-CHROMIUM = Path("/usr/bin/chromium")
-ARGUMENTS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 _TYPES = {".js": "text/javascript", ".html": "text/html"}
-
-needs_chromium = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"{CHROMIUM} is not installed")
 
 
 class MediaPages:
@@ -83,16 +66,3 @@ class MediaPages:
         request.send_header("content-length", str(len(data or b"")))
         request.end_headers()
         request.wfile.write(data or b"")
-
-
-@contextmanager
-def chromium() -> Iterator[Any]:
-    """Debian's Chromium without a window."""
-    from playwright.sync_api import sync_playwright
-
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        browser = playwright.chromium.launch_persistent_context(
-            folder, executable_path=str(CHROMIUM), args=ARGUMENTS, headless=True
-        )
-        yield browser
-        browser.close()

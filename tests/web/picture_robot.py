@@ -16,7 +16,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
-from pebble.transports import Message, QoS
+from pebble.transports import Message, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from pebble.web.broker import Broker
 from pebble.web.media import MediaHub
@@ -43,11 +43,18 @@ def capabilities(video: dict[str, Any]) -> bytes:
 class PictureRobot:
     """Sends a moving scene as requested: its camera runs while the flag is up and a request is active."""
 
-    def __init__(self, video: dict[str, Any] = VIDEO, *, fps: float = 15, size: tuple[int, int] = (160, 120)) -> None:
+    def __init__(
+        self,
+        video: dict[str, Any] = VIDEO,
+        *,
+        fps: float = 15,
+        size: tuple[int, int] = (160, 120),
+        transport: Transport | None = None,
+    ) -> None:
+        """``transport``: one that is open; without it on a network of its own, ``hub``."""
         self.hub = MemoryHub()
-        self.transport = MemoryTransport("robot", self.hub).open()
+        self.transport = transport or MemoryTransport("robot", self.hub).open()
         self.published: list[Message] = []  # by others, to the robot
-        self.everything: list[Message] = []  # on the whole network
         self.frames = self.bytes = 0
         self.payloads: list[bytes] = []
         self._default = video.get("encoding", "json")

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from playwright.sync_api import Browser
 
 from pebble.contract.packets import Picture, PictureKind
 from pebble.media.decode import VideoDecoder
@@ -21,9 +22,8 @@ from pebble.media.json_video import JsonPicture
 from pebble.media.scene import Scene, noise, read_counter
 from pebble.media.video import make_encoder
 from tests.support import ROOT
-from tests.web.media_pages import MediaPages, chromium, needs_chromium
-
-pytestmark = needs_chromium
+from tests.web.browser import tab
+from tests.web.media_pages import MediaPages
 
 EXACT = ("json", "pbvd", "pbvz")
 T0 = 1_710_969_600_000
@@ -37,12 +37,10 @@ def pages() -> Iterator[MediaPages]:
 
 
 @pytest.fixture(scope="module")
-def page(pages: MediaPages) -> Iterator[Any]:
-    with chromium() as browser:
-        page = browser.new_page()
-        page.goto(f"{pages.url}/pixels.html")
-        page.wait_for_function("() => window.ready === true")
-        yield page
+def page(pages: MediaPages, browser: Browser) -> Iterator[Any]:
+    with tab(browser, f"{pages.url}/pixels.html") as one:
+        assert one.until("window.ready === true")
+        yield one.page
 
 
 @pytest.fixture
