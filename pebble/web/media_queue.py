@@ -14,6 +14,8 @@ from typing import Final
 
 WINDOW: Final = 2  # frames sent and not acknowledged
 SLOW_ACK_S: Final = 0.15  # with acknowledgements later than this the window is 1
+#: More frames may be under way if they are small: they delay nothing, and a distant page would get too few of them.
+SMALL_WINDOW, SMALL_BYTES = 8, 4096
 MAX_FRAMES: Final = 4
 MAX_QUEUED_BYTES: Final = 4 << 20
 NO_FRAME: Final = 0xFFFF_FFFF  # the number in an acknowledgement of no frame
@@ -64,7 +66,7 @@ class MediaQueue:
 
     def take(self, now: float) -> Frame | None:
         """The frame to send now; None if there is none, or too many are under way."""
-        if not self._queue or len(self._under_way) >= self.window:
+        if not self._queue or not self._may_send(len(self._queue[0].data)):
             return None
         frame = self._queue.popleft()
         self._under_way[frame.seq] = (now, frame)
@@ -88,6 +90,13 @@ class MediaQueue:
         under_way = [frame for _, frame in self._under_way.values()]
         if not any(frame.keyframe for frame in (*under_way, *self._queue)):
             self.wait_for_keyframe()
+
+    def _may_send(self, size: int) -> bool:
+        under_way = len(self._under_way)
+        if under_way < self.window:
+            return True
+        total = size + sum(len(frame.data) for _, frame in self._under_way.values())
+        return under_way < SMALL_WINDOW and total <= SMALL_BYTES
 
     def _begin_at(self, frame: Frame) -> None:
         """A page that keeps up receives what came before as well; another one only what is newest."""

@@ -348,7 +348,7 @@ async def test_a_slow_page_gets_key_frames_and_a_fast_one_everything() -> None:
             for seq, _, _ in slow.frames[acknowledged : acknowledged + 1]:
                 slow.say(seq, 0)
                 acknowledged += 1
-        assert len(slow.frames) - acknowledged <= 2
+        assert len(slow.frames) - acknowledged <= 8
         assert None not in decoded(fast.direct())
         assert None not in decoded(slow.direct())
         assert 5 < len(slow.frames) < len(fast.frames) / 2
@@ -426,7 +426,7 @@ async def test_a_slow_page_among_fast_ones_is_rescued_and_costs_no_key_frame() -
     async with serving(robot) as server:
         fast = [server.open(Page()) for _ in range(3)]
         slow = server.open(Page(answer=None))
-        await until(lambda: len(slow.frames) == 2)
+        await until(lambda: len(slow.frames) >= 2)
         await asyncio.sleep(1.1)
         before = [request for request in robot.requests if request.get("keyframe")]
         await asyncio.sleep(1.0)
@@ -445,7 +445,7 @@ async def test_a_page_that_fails_to_decode_is_rescued() -> None:
         page, other = server.open(Page(answer=2)), server.open(Page())
         await until(lambda: len(page.rescued()) > 2)
         await until(lambda: len(other.direct()) > 10)
-        assert len(page.direct()) <= 2
+        assert len(page.direct()) <= 8
 
 
 @on_loop

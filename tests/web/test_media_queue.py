@@ -12,7 +12,7 @@ from pebble.web.media_queue import MAX_FRAMES, MAX_QUEUED_BYTES, NO_FRAME, Frame
 ALL = frozenset({"h264", "pbvz", "pbvd", "json", "jpeg"})
 
 
-def frame(seq: int, keyframe: bool = False, encoding: str = "pbvz", size: int = 100) -> Frame:
+def frame(seq: int, keyframe: bool = False, encoding: str = "pbvz", size: int = 3000) -> Frame:
     return Frame(seq, bytes(size), encoding, keyframe)
 
 
@@ -46,6 +46,18 @@ def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
     assert queue.take(0.3) is None
     queue.acknowledge(2, 0.35)
     assert queue.window == 2
+
+
+def test_more_are_under_way_if_they_are_small() -> None:
+    queue = MediaQueue()
+    for seq in range(20):
+        queue.offer(frame(seq, keyframe=True, size=500))
+        queue.take(0.0)
+    assert len(queue._under_way) == 8
+    queue.acknowledge(0, 1.0)
+    queue.offer(frame(20, keyframe=True, size=2000))
+    assert queue.window == 1
+    assert queue.take(1.0) is None
 
 
 def test_an_overflow_skips_everything_up_to_the_next_key_frame() -> None:
