@@ -30,9 +30,9 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.contract.packets import Picture, PictureKind
-from pebble.web.app import StaticFiles
 from pebble.web.guard import CONTENT_SECURITY_POLICY
 from pebble.web.messages import FromPage
+from pebble.web.static_files import StaticFiles
 from tests.support import ROOT, free_port, until
 
 PING_S = 0.5
@@ -107,11 +107,11 @@ class CannedServer:
 
     # -- http
 
-    async def _page(self, _request: Request) -> Response:
-        return self.static.answer("index.html", _headers())
+    async def _page(self, request: Request) -> Response:
+        return self.static.answer(request, "index.html", _headers())
 
     async def _static(self, request: Request) -> Response:
-        return self.static.answer(request.path_params["name"], _headers())
+        return self.static.answer(request, request.path_params["name"], _headers())
 
     async def _snapshot(self, _request: Request) -> Response:
         return Response(picture(0), media_type="image/jpeg", headers=_headers())

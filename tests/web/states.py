@@ -223,7 +223,7 @@ STATES: dict[str, State] = {
         ),
         LIVE,
     ),
-    "lost": State(GOOB_PATH, changed(fleet, MINE), silent=True),
+    "lost": State(GOOB_PATH, changed(fleet, MINE), silent=True, freezes=True),
     "no-broker": State(
         GOOB_PATH,
         changed(

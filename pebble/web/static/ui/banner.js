@@ -12,12 +12,12 @@ const SHOWN_MS = 60_000; // a finished stop
 export function Banners({ at }) {
   const { connection } = usePage();
   useModel(connection);
-  return html`<div class="banners">
+  return html`<section class="banners" aria-label="What to know now">
     <div role="alert"><${ServerBanner} />${at && html`<${SilentBanner} at=${at} />`}</div>
     <${StopBanners} at=${at} />
     <${PressBanner} />
     <${Notice} />
-  </div>`;
+  </section>`;
 }
 
 const Banner = ({ kind, icon, children }) => html`<div class=${`banner ${kind}`}>

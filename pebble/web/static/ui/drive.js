@@ -8,26 +8,30 @@ import { driverName, nameOf } from "./words.js";
 export function DriveCard({ at }) {
   return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive">
     <${WhyLine} at=${at} />
-    <${DrivePad} at=${at} />
+    <${DrivePad} />
     <${Keys} />
-    <${DriveSettings} at=${at} />
+    <${Speed} />
+    <${DriveSettings} />
   <//>`;
 }
 
 /** Why it cannot be driven now, and what can be done about it; or that it can. */
 export function WhyLine({ at }) {
-  const { driver } = usePage();
+  const { connection, driver } = usePage();
   useModel(driver);
   const view = useValue(at, "web/driver");
+  const mine = useModel(connection).isOpen && view?.you === true;
   const reason = driver.reason();
-  const text = reason?.text ?? (view?.you ? `You are driving ${nameOf(at)}.` : "");
-  useWakeLock(view?.you === true);
+  // the banner says why
+  const why = reason?.code === "broker" ? "The server cannot reach the broker" : reason?.text;
+  const text = why ?? (mine ? `You are driving ${nameOf(at)}.` : "");
+  useWakeLock(mine);
   return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
-    <p id="why-drive"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
+    <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
     <span class="sr" role="status">${useCalm(text)}</span>
     <div class="why-actions">
       <${ReasonAction} action=${reason?.action} />
-      ${view?.you && html`<button type="button" onClick=${() => driver.release()}>Release</button>`}
+      ${mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
     </div>
     ${reason?.code === "lease" && view?.by && html`<p class="sr">${driverName(view)} has control.</p>`}
   </div>`;
@@ -37,11 +41,15 @@ function ReasonAction({ action }) {
   const { commands, driver } = usePage();
   switch (action?.kind) {
     case "take":
-      return html`<button type="button" class="primary" onClick=${() => commands.take(false)}>${action.label}</button>`;
+      return html`<button type="button" class="primary" data-test="take" onClick=${() => commands.take(false)}>
+        ${action.label}
+      </button>`;
     case "take-over":
-      return html`<${HoldButton} onHeld=${() => commands.take(true)}>${action.label} <small>(hold 1 s)</small><//>`;
+      return html`<${HoldButton} test="take-over" onHeld=${() => commands.take(true)}
+        >${action.label} <small>(hold 1 s)</small><//
+      >`;
     case "see":
-      return html`<button type="button" onClick=${() => see(driver)}>${action.label}</button>`;
+      return html`<button type="button" data-test="see" onClick=${() => see(driver)}>${action.label}</button>`;
     case "login":
       return html`<a class="button" href="/login">${action.label}</a>`;
     case "reload":
@@ -114,19 +122,28 @@ function Keys() {
   </div>`;
 }
 
-export function DriveSettings() {
-  const { driver } = usePage();
-  useModel(driver);
-  const { speed, turn, balance } = driver.sliders;
-  const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
-  const set = (name) => (event) => {
+function set(driver, name) {
+  return (event) => {
     driver.sliders[name] = Number(event.currentTarget.value) / 100;
     driver.changed();
   };
+}
+
+export function Speed() {
+  const { driver } = usePage();
+  const { speed } = useModel(driver).sliders;
+  const text = `${Math.round(100 * speed)} %`;
+  return html`<${Slider} name="Speed" value=${speed} min=${5} text=${text} onInput=${set(driver, "speed")} />`;
+}
+
+/** How the inputs are scaled, and the extra axis. */
+export function DriveSettings() {
+  const { driver } = usePage();
+  const { turn, balance } = useModel(driver).sliders;
+  const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
   return html`<div class="sliders">
-    <${Slider} name="Speed" value=${speed} min=${5} text=${`${Math.round(100 * speed)} %`} onInput=${set("speed")} />
-    <${Slider} name="Turn" value=${turn} min=${5} text=${`${Math.round(100 * turn)} %`} onInput=${set("turn")} />
-    <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set("balance")} />
+    <${Slider} name="Turn" value=${turn} min=${5} text=${`${Math.round(100 * turn)} %`} onInput=${set(driver, "turn")} />
+    <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
     <div class="aux">
       <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>
       <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
@@ -141,6 +158,7 @@ function Slider({ name, value, min, max = 100, text, onInput }) {
     <span>${name}</span>
     <input
       type="range"
+      data-test=${name.toLowerCase()}
       min=${min}
       max=${max}
       step="5"
@@ -158,6 +176,7 @@ function AuxButton({ driver, value, label, children }) {
   useEffect(() => end, []);
   return html`<button
     type="button"
+    data-test=${`aux${value > 0 ? "+" : "-"}`}
     aria-label=${label}
     disabled=${Boolean(reason) && !driver.gestureActive}
     aria-describedby=${reason ? "why-drive" : undefined}

@@ -93,7 +93,12 @@ function FleetTools({ filter, onFilter }) {
     />
     <label class="field"
       ><span>Sort by</span>
-      <select data-test="sort" aria-label="Sort by" value=${settings.sort} onChange=${(event) => settings.set("sort", event.currentTarget.value)}>
+      <select
+        data-test="sort"
+        aria-label="Sort by"
+        value=${settings.sort}
+        onChange=${(event) => settings.set("sort", event.currentTarget.value)}
+      >
         ${Object.entries(SORTS).map(([value, text]) => html`<option key=${value} value=${value}>${text}</option>`)}
       </select></label
     >
@@ -165,7 +170,7 @@ function FleetCard({ at }) {
       html`<${StopButton}
         test=${`stop-${name}`}
         onStop=${() => commands.stop(at)}
-        label=${`Emergency stop of ${name}`}
+        label=${`Stop: emergency stop of ${name}`}
         className="stop-small"
       >
         <${Icon} name="stop" />Stop
@@ -245,6 +250,13 @@ function AwayRow({ at }) {
       ><${RouteLink} to=${at}>${nameOf(at)}<//> <span class="dim">${since}</span> ${level &&
       html`<span class="dim">${battery(level.value)} then</span>`}</span
     >
-    <button type="button" data-test="forget" aria-label=${`Forget ${nameOf(at)}`} onClick=${() => settings.forget(at)}>Forget</button>
+    <button
+      type="button"
+      data-test="forget"
+      aria-label=${`Forget ${nameOf(at)}`}
+      onClick=${() => settings.forget(at)}
+    >
+      Forget
+    </button>
   </li>`;
 }

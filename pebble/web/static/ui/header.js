@@ -17,7 +17,14 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     <div class="top-space"></div>
     ${wide && html`<${ConnectionState} />`}
     ${layout === "immersive" &&
-    html`<button type="button" class="round" data-test="drawer" aria-expanded=${drawer} aria-label="Everything else" onClick=${onDrawer}>
+    html`<button
+        type="button"
+        class="round"
+        data-test="drawer"
+        aria-expanded=${drawer}
+        aria-label="Everything else"
+        onClick=${onDrawer}
+      >
         <${Icon} name="menu" />
       </button>
       ${document.fullscreenElement &&
@@ -34,7 +41,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     html`<${StopButton}
       test="stop-one"
       onStop=${() => commands.stop(driver.ref)}
-      label=${`Emergency stop of ${nameOf(at)}`}
+      label=${`STOP: emergency stop of ${nameOf(at)}`}
       className="stop-one"
     >
       <${Icon} name="stop" />STOP
@@ -43,7 +50,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     html`<${StopButton}
       test="stop-all"
       onStop=${() => commands.stop("")}
-      label="Emergency stop of all robots"
+      label="STOP ALL: emergency stop of all robots"
       className="stop-all"
     >
       <${Icon} name="stop" />STOP ALL
@@ -64,7 +71,7 @@ export function RouteLink({ to, className, label, children }) {
   return html`<a class=${className} href=${Route.path(to)} aria-label=${label} onClick=${go}>${children}</a>`;
 }
 
-const BackLink = () => html`<${RouteLink} to="" className="back" label="All robots"
+const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: all robots"
   ><${Icon} name="back" /><span>Fleet</span><//
 >`;
 
@@ -74,7 +81,12 @@ function Picker({ at }) {
   return html`<label class="picker">
     <span class="picker-name"><b>${nameOf(at)}</b><${Icon} name="down" /></span>
     <span class="picker-state"><${Liveness} at=${at} /><${Volts} at=${at} /></span>
-    <select data-test="picker" aria-label="Choose a robot" value=${at} onChange=${(event) => route.go(event.currentTarget.value)}>
+    <select
+      data-test="picker"
+      aria-label="Choose a robot"
+      value=${at}
+      onChange=${(event) => route.go(event.currentTarget.value)}
+    >
       ${refs.map(
         (ref) => html`<option key=${ref} value=${ref}>
           ${nameOf(ref)}${typeOf(ref) === "robots" ? "" : ` (${kindOf(ref)})`}
@@ -115,7 +127,7 @@ function Vital({ at }) {
   const level = useMetric(at, "charging-level");
   const charging = useValue(at, "charging-status");
   const view = useValue(at, "web/driver");
-  const online = connection.isOpen && useValue(at, "web/liveness")?.online !== false;
+  const online = useValue(at, "web/liveness")?.online !== false && connection.isOpen;
   return html`<div class="vital">
     ${level &&
     html`<span class="chip"
@@ -123,7 +135,7 @@ function Vital({ at }) {
         >${battery(level.value)}<//
       ></span
     >`}
-    ${view?.by && html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${whoDrives(view)}</span>`}
+    ${connection.isOpen && view?.by && html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${whoDrives(view)}</span>`}
   </div>`;
 }
 
@@ -144,7 +156,14 @@ function Me({ panel, onPanel, wide }) {
   useModel(connection);
   const { you } = connection;
   const text = you?.login ? `${you.user} (${you.role})` : "Settings";
-  return html`<button type="button" class="quiet me" data-test="settings" aria-expanded=${panel} aria-label=${text} onClick=${onPanel}>
+  return html`<button
+    type="button"
+    class="quiet me"
+    data-test="settings"
+    aria-expanded=${panel}
+    aria-label=${text}
+    onClick=${onPanel}
+  >
     <${Icon} name=${you?.login ? "person" : "settings"} />${wide && html`<span>${text}</span>`}
   </button>`;
 }

@@ -1,12 +1,12 @@
 // One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
 
 import { CARDS, TABS } from "./cards.js";
-import { DriveCard, DrivePad, DriveSettings, WhyLine } from "./drive.js";
+import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, html, useEffect, useMetric, useModel, usePage, useState, useValue } from "./hooks.js";
 import { CardView, Offers } from "./models.js";
 import { Card, Icon } from "./parts.js";
 import { PictureSettings, Stage, useVideo } from "./video.js";
-import { nameOf } from "./words.js";
+import { nameOf, typeOf } from "./words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
   const offers = new Offers(at, useValue(at, "capabilities"));
@@ -75,10 +75,11 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
       html`<${Boundary} what="Driving">
         <section class="phone-pad" aria-label="Drive">
           <${WhyLine} at=${at} />
-          <${DrivePad} at=${at} />
-          <details class="more-drive">
-            <summary>Speed, turn, balance</summary>
-            <${DriveSettings} at=${at} />
+          <${DrivePad} />
+          <${Speed} />
+          <details class="more-drive" open=${!video}>
+            <summary data-test="more-drive">Turn, balance, extra axis</summary>
+            <${DriveSettings} />
           </details>
         </section>
       <//>`}
@@ -100,6 +101,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
         ({ id, title, icon }) => html`<button
           key=${id}
           type="button"
+          data-test=${`tab-${id}`}
           aria-current=${id === tab ? "page" : undefined}
           onClick=${() => choose(id)}
         >
@@ -122,12 +124,12 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
       : html`<div class="stage"><p class="cover">no camera</p></div>`}
     ${offers.drives &&
     html`<${Boundary} what="Driving">
-      <div class="float-pad"><${DrivePad} at=${at} /></div>
+      <div class="float-pad"><${DrivePad} /></div>
       <div class="float-why"><${WhyLine} at=${at} /></div>
     <//>`}
     ${drawer &&
     html`<aside class="drawer" aria-label="Everything else">
-      ${offers.drives && html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${DriveSettings} at=${at} /><//>`}
+      ${offers.drives && html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${DriveSettings} /><//>`}
       ${video &&
       html`<${Card} id="picture" title="Picture" icon="camera"
         ><${PictureSettings} at=${at} source=${source} offers=${offers} video=${video}
@@ -148,7 +150,7 @@ function CardOf({ card, at, offers, view }) {
 
 /** What is not on this page, and why. */
 function Missing({ at, offers, view, hasVideo }) {
-  const lacks = [!hasVideo && "camera", !offers.drives && offers.known && "driving"].filter(Boolean);
+  const lacks = typeOf(at) !== "robots" ? [] : [!hasVideo && "camera", !offers.drives && offers.known && "driving"].filter(Boolean);
   const hidden = CARDS.filter((card) => view.hidden.has(card.id));
   if (!lacks.length && !hidden.length) return null;
   return html`<div class="missing">

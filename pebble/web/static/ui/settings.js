@@ -20,10 +20,10 @@ export function SettingsPanel({ onClose }) {
   }, []);
   const key = (event) => event.key === "Escape" && onClose();
   return html`<dialog open class="panel" ref=${panel} tabindex="-1" aria-labelledby="settings-title" onKeyDown=${key}>
-    <header class="card-head">
+    <div class="card-head">
       <h2 id="settings-title">Settings</h2>
       <button type="button" class="quiet" aria-label="Close settings" onClick=${onClose}><${Icon} name="close" /></button>
-    </header>
+    </div>
     <${WhoAmI} />
     <fieldset>
       <legend>Colours</legend>

@@ -25,7 +25,7 @@ export function Stick({ driver }) {
     event.preventDefault();
     element.current.focus({ preventScroll: true });
     if (dragged) return driver.interrupt(); // a second finger
-    if (event.button || driver.reason() || !driver.stickStart(event.pointerId)) return undefined;
+    if (event.button || driver.reason() || !driver.stickStart(event.pointerId, event.timeStamp)) return undefined;
     element.current.setPointerCapture(event.pointerId);
     setPointer(event.pointerId);
     return move(event);

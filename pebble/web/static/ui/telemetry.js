@@ -7,7 +7,7 @@ import { battery, charging, inner, isObject, number, plain, roughly, span } from
 export function Telemetry({ at }) {
   const { connection } = usePage();
   useModel(connection);
-  const online = connection.isOpen && useValue(at, "web/liveness")?.online !== false;
+  const online = useValue(at, "web/liveness")?.online !== false && connection.isOpen;
   return html`<dl class="values">
     <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
     <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>

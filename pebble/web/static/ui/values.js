@@ -4,6 +4,7 @@ import { html, useMetric, useMetrics, useTick } from "./hooks.js";
 import { inner, plain, roughly } from "./words.js";
 
 const MOST = 120;
+const LONG = 90; // characters
 
 export function Values({ at }) {
   const metrics = useMetrics(at)
@@ -20,8 +21,11 @@ function ValueRow({ at, metric }) {
   useTick(1000);
   const entry = useMetric(at, metric);
   if (!entry) return null;
+  const text = plain(inner(entry.value));
+  const age = html`<small>${roughly(entry.age)} ago</small>`;
+  const long = html`<details><summary>${text.slice(0, LONG / 2)}… ${age}</summary>${text}</details>`;
   return html`<div>
     <dt>${metric}</dt>
-    <dd>${plain(inner(entry.value))} <small class="dim">${roughly(entry.age)} ago</small></dd>
+    <dd>${text.length > LONG ? long : html`${text} ${age}`}</dd>
   </div>`;
 }

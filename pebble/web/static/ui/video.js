@@ -39,7 +39,7 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   const stale = cover !== "";
   video.canvas.setAttribute("role", "img");
   video.canvas.setAttribute("aria-label", `What ${nameOf(source)} sees`);
-  return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Picture">
+  return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Live picture">
     <div class="picture">
       <div class="canvas" ref=${place}></div>
       ${cover && html`<p class="cover" data-test="cover">${cover}</p>`}
@@ -52,7 +52,12 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
       <button type="button" data-test="video" onClick=${control.toggle}>
         <${Icon} name=${control.wanted ? "no-camera" : "camera"} />${control.wanted ? "Stop video" : "Start video"}
       </button>
-      <button type="button" data-test="full-screen" onClick=${goFull} hidden=${!document.documentElement.requestFullscreen}>
+      <button
+        type="button"
+        data-test="full-screen"
+        hidden=${!document.documentElement.requestFullscreen}
+        onClick=${goFull}
+      >
         <${Icon} name="full" />Full screen
       </button>
       ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
@@ -102,7 +107,9 @@ export function PictureSettings({ at, source, offers, video }) {
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   return html`<div class="picture-settings">
     ${video &&
-    html`<button type="button" data-test="video" onClick=${video.toggle}>${video.wanted ? "Stop video" : "Start video"}</button>`}
+    html`<button type="button" data-test="video" onClick=${video.toggle}>
+      ${video.wanted ? "Stop video" : "Start video"}
+    </button>`}
     <label class="field"
       ><span>Encoding</span>
       <select

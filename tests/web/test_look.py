@@ -1,0 +1,217 @@
+"""What people see in every state of the page: pictures in build/page, accessibility, sizes, and distances to STOP.
+
+``python tools/contact_sheets.py`` puts the pictures together, and a person looks at them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import pytest
+from playwright.sync_api import Browser, Page
+
+from tests.support import ROOT
+from tests.web.browser import Size, Tab, Theme, tab
+from tests.web.canned import CannedServer, serving
+from tests.web.states import STATES
+
+PICTURES = ROOT / "build" / "page"
+AXE = ROOT / ".venv" / "axe" / "axe.min.js"
+WIDTHS: dict[Size, tuple[int, ...]] = {
+    "desktop": (1280, 844),
+    "phone": (390, 320),
+    "landscape": (844,),
+    "small": (320,),
+}
+
+pytestmark = pytest.mark.timeout(180)
+
+
+def _nothing(_page: Page) -> None:
+    pass
+
+
+def _press(*selectors: str) -> Callable[[Page], None]:
+    def act(page: Page) -> None:
+        for selector in selectors:
+            page.locator(selector).first.click()
+
+    return act
+
+
+def _drive(page: Page) -> None:
+    page.keyboard.down("KeyW")
+    page.keyboard.down("KeyD")
+
+
+class Screen(NamedTuple):
+    """One picture: a state of the server, and what a person does then."""
+
+    name: str
+    state: str
+    act: Callable[[Page], None] = _nothing
+    sizes: tuple[Size, ...] = ("desktop", "phone")
+
+
+ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
+#: Text that shows that a state has been reached, where it takes a while.
+WHEN = {
+    "fleet": "4 robots",
+    "fleet-stopped": "is stopped",
+    "fleet-empty": "No robot has been seen",
+    "fleet-lost": "No connection to the server since",
+    "lost": "No connection to the server since",
+    "free": "Take control",
+    "taken": "Take over from bob",
+    "viewer": "Log in as driver",
+    "stopped": "Also stopped",
+    "stop-sent": "is being sent",
+    "stop-old": "cannot be held",
+    "not-confirmed": "NOT CONFIRMED",
+    "no-broker": "connection refused",
+    "silent": "goob is silent since",
+    "old-picture": "I can see the robot",
+    "no-picture": "There is no picture yet",
+    "old-page": "older than the server",
+    "plain-http": "not encrypted",
+    "tower": "pbvz 640×360",
+    "other-camera": "seen from tower-1",
+}
+SCREENS = [
+    *(
+        Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
+        for name in STATES
+    ),
+    Screen("driving-now", "driving", _drive, ("desktop",)),
+    Screen("thumbnails", "fleet", _press(".check")),
+    Screen("settings", "driving", _press(".me"), ("desktop",)),
+    Screen("reset-asked", "stopped", _press(".banner-actions button")),
+    Screen("sensors", "driving", _press(".tabs button:nth-child(2)"), ("phone",)),
+    Screen("more", "driving", _press(".tabs button:nth-child(3)"), ("phone",)),
+    Screen("settings", "driving", _press(".tabs button:nth-child(3)", ".wide"), ("phone",)),
+    Screen("drawer", "driving", _press(".round"), ("landscape",)),
+    Screen("small", "driving", sizes=("small",)),
+]
+CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[CannedServer]:
+    with serving() as canned:
+        yield canned
+
+
+@pytest.fixture(scope="module")
+def axe() -> str:
+    if not AXE.exists():
+        missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
+        missing(f"{AXE} is missing: python tools/fetch_vendor.py --axe {AXE.parent}")
+    return AXE.read_text()
+
+
+@pytest.fixture(params=CASES, ids=lambda case: f"{case[0].name}-{case[1]}")
+def case(request: pytest.FixtureRequest) -> tuple[Screen, Size]:
+    chosen: tuple[Screen, Size] = request.param
+    return chosen
+
+
+def test_screen(server: CannedServer, browser: Browser, axe: str, case: tuple[Screen, Size]) -> None:
+    screen, size = case
+    state = STATES[screen.state]
+    server.show(state)
+    with tab(browser, server.url + state.path, size) as opened:
+        _wait(opened, WHEN.get(screen.state, ""))
+        screen.act(opened.page)
+        problems = _measured(opened.page, size)
+        for theme in ("light", "dark"):
+            _show(opened, theme)
+            opened.page.screenshot(path=PICTURES / f"{screen.name}-{size}-{theme}.png")
+            problems += [f"{theme}: {violation}" for violation in _violations(opened.page, axe)]
+        assert problems + opened.complaints() == []
+
+
+def _wait(opened: Tab, text: str) -> None:
+    shown = f"() => !!window.pebble?.connection.you && document.body.innerText.includes({text!r})"
+    assert opened.until(shown), f"{text!r} is not shown"
+    if text not in ("There is no picture yet", "goob is silent since"):
+        opened.until("() => !pebble.video.ref || !!pebble.video.info", 5)
+
+
+def _show(opened: Tab, theme: Theme) -> None:
+    opened.page.emulate_media(color_scheme=theme, reduced_motion="reduce")
+    opened.page.wait_for_timeout(120)
+
+
+def _violations(page: Page, axe: str) -> list[str]:
+    page.evaluate(axe)
+    found: list[Any] = page.evaluate("async () => (await axe.run()).violations")
+    return [f"{one['id']}: {node['html'][:200]}" for one in found for node in one["nodes"]]
+
+
+TAPPABLE = "button, a[href], select, input, summary, [role=application]"
+_SMALL = """(selector) => [...document.querySelectorAll(selector)]
+  .map((one) => one.matches("[type=checkbox], [type=radio]") ? one.closest("label") : one)
+  .filter((one) => one.checkVisibility() && one.getBoundingClientRect().bottom > 0)
+  .map((one) => [one.outerHTML.slice(0, 120), one.getBoundingClientRect()])
+  .filter(([, box]) => box.width < 43.9 || box.height < 43.9)
+  .map(([html, box]) => `too small, ${box.width.toFixed(0)}x${box.height.toFixed(0)}: ${html}`)"""
+#: At any position of scrolling, the 24 px around STOP belong to nothing that can be tapped.
+_NEAR = """([selector, offset]) => {
+  scrollTo(0, offset);
+  const found = new Set();
+  for (const stop of document.querySelectorAll(".stop")) {
+    const box = stop.getBoundingClientRect();
+    if (box.bottom < 0 || box.top > innerHeight) continue;
+    for (let x = box.left - 23; x <= box.right + 23; x += 5) {
+      for (const y of [box.top - 23, box.top - 12, box.top - 2, box.bottom + 2, box.bottom + 12, box.bottom + 23]) {
+        const hit = document.elementFromPoint(x, y)?.closest(selector);
+        if (hit && hit !== stop) found.add(`near ${stop.textContent}: ${hit.outerHTML.slice(0, 120)}`);
+      }
+    }
+    for (let y = box.top; y <= box.bottom; y += 5) {
+      for (const x of [box.left - 23, box.left - 12, box.left - 2, box.right + 2, box.right + 12, box.right + 23]) {
+        const hit = document.elementFromPoint(x, y)?.closest(selector);
+        if (hit && hit !== stop) found.add(`near ${stop.textContent}: ${hit.outerHTML.slice(0, 120)}`);
+      }
+    }
+  }
+  return [...found];
+}"""
+#: Without scrolling, nothing that can be tapped is even drawn there.
+_DRAWN_NEAR = """(selector) => {
+  scrollTo(0, 0);
+  const found = [];
+  for (const stop of document.querySelectorAll(".stop")) {
+    const a = stop.getBoundingClientRect();
+    for (const other of document.querySelectorAll(selector)) {
+      const b = other.getBoundingClientRect();
+      if (other === stop || !other.checkVisibility() || b.bottom <= 0) continue;
+      const x = Math.max(b.left - a.right, a.left - b.right, 0);
+      const y = Math.max(b.top - a.bottom, a.top - b.bottom, 0);
+      const text = `${Math.hypot(x, y).toFixed(0)} px from ${stop.textContent}: ${other.outerHTML.slice(0, 120)}`;
+      if (Math.hypot(x, y) < 23.9) found.push(text);
+    }
+  }
+  return found;
+}"""
+_TOO_WIDE = "() => document.documentElement.scrollWidth > innerWidth"
+
+
+def _measured(page: Page, size: Size) -> list[str]:
+    before = page.viewport_size
+    assert before is not None
+    problems: list[str] = []
+    for width in WIDTHS[size]:
+        page.set_viewport_size({"width": width, "height": before["height"]})
+        page.wait_for_timeout(60)
+        problems += [f"{width} px: scrolls sideways"] * page.evaluate(_TOO_WIDE)
+        problems += [
+            f"{width} px: {text}" for text in page.evaluate(_SMALL, TAPPABLE) + page.evaluate(_DRAWN_NEAR, TAPPABLE)
+        ]
+        for offset in (0, 40, 90, 150, 230):
+            problems += [f"{width} px: {text}" for text in page.evaluate(_NEAR, [TAPPABLE, offset])]
+    page.set_viewport_size(before)
+    page.evaluate("() => scrollTo(0, 0)")
+    return problems
