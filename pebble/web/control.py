@@ -18,6 +18,7 @@ from pebble.client.estop_states import Reset
 from pebble.fleet.roles import Session, rights
 from pebble.web import messages as m
 from pebble.web.driving import Tab
+from pebble.web.pace import Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
 from pebble.web.robots import Interest
 from pebble.web.server import Server, clock, encode
@@ -27,6 +28,7 @@ log = logging.getLogger(__name__)
 FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
 CHECK_S = 5.0  # between two looks at whether the session still exists
+_WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
 _RELOAD = "This page is older than the server: reload it"
 
@@ -52,6 +54,7 @@ class Control:
         self._tab = Tab(secrets.token_urlsafe(12), session.user, "")
         self._interest = Interest(lambda: self._wake.set())
         self._wake = asyncio.Event()
+        self._pace = Pace(time.monotonic())
         self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
         self._drives = True
         self._why_not = ""  # why this page may not drive at all
@@ -65,7 +68,11 @@ class Control:
             self._begin(await asyncio.wait_for(self._receive(), HELLO_S))
             sender = asyncio.ensure_future(self._send_all())
             while not sender.done():
-                self._handle(await self._receive())
+                op = await self._receive()
+                wait_s = self._pace.take(_WATCH_COST if isinstance(op, m.Watch) else 1, time.monotonic())
+                if wait_s:
+                    await asyncio.sleep(wait_s)
+                self._handle(op)
         except Leave as reason:
             await self._leave(reason)
         except TimeoutError:
@@ -164,7 +171,7 @@ class Control:
             case m.EstopOp():
                 self._server.stop(op.ref, op.stop, self._session, self._tab.device, op.why)
             case m.EstopEndOp():
-                self._server.stops.end(op.stop)
+                self._end_stop(op.stop)
             case m.EstopResetOp():
                 self._reset(op)
             case m.Watch():
@@ -203,6 +210,12 @@ class Control:
         component = self._server.robots.components.get(op.ref)
         if component is not None and (component.drives() or not component.capabilities):
             self._server.publish(self._server.driving.stop(op.ref, clock()))
+
+    def _end_stop(self, name: str) -> None:
+        """One's own, or with the right to reset: a viewer must not end the stop of another person."""
+        user = self._server.stops.user(name)
+        if user is not None and (user == self._session.user or self._may("reset", "estop-end", "")):
+            self._server.stops.end(name)
 
     def _reset(self, op: m.EstopResetOp) -> None:
         component = self._server.robots.components.get(op.ref)

@@ -91,10 +91,12 @@ class Server:
 
     def _receive(self, message: Message, now: float) -> None:
         self.robots.receive(message, now)
-        self.stops.receive(message, clock())
-        self._send(self.stops.tick(clock()))
         address = parse_topic(message.topic)
-        if address is not None and address.metric == CAPABILITIES.metric:
+        if address is None:
+            return
+        self.stops.receive(message, clock(), known=address.identity.base in self.robots.components)
+        self._send(self.stops.tick(clock()))
+        if address.metric == CAPABILITIES.metric:
             self.open_components.update(address.identity.base)
 
     def _announced(self, message: Message, _now: float) -> None:
@@ -135,7 +137,8 @@ class Server:
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
-        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=self.robots.components.values()))
+        known = self.robots.components.values()
+        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, user=session.user))
         self._show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
 
@@ -189,6 +192,7 @@ class Server:
                 if now >= refresh_at:
                     refresh_at = now + _REFRESH_S
                     self.robots.refresh(time.monotonic())
+                    self._show_broker()
                 self._announce(now)
 
     def _announce(self, now: float) -> None:

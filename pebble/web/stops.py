@@ -14,7 +14,8 @@ from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.robots import Component, own_topic
 
-MAX_STOPS = 32  # that are being sent at once; beyond, the oldest is no longer sent
+MAX_STOPS = 64  # that are being sent at once; beyond, the oldest is no longer sent
+MAX_EACH = 16  # of them by one user: the stops of another one are not ended by too many
 _SHOWN_S = 60.0  # so long pages see how a finished stop ended
 
 _SENDING = {
@@ -32,17 +33,18 @@ class Stops:
     def __init__(self) -> None:
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
+        self._users: dict[str, str] = {}  # who has pressed each of them
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
 
-    def press(self, ref: str, name: str, *, by: str, why: str, now: float, known: Iterable[Component]) -> list[Message]:
+    def press(
+        self, ref: str, name: str, *, by: str, why: str, now: float, known: Iterable[Component], user: str = ""
+    ) -> list[Message]:
         """Stop one robot, or all if ``ref`` is "". ``known`` are the components from which messages were received."""
         if name in self._senders:
             return []
-        while len(self._senders) >= MAX_STOPS:
-            oldest = next(iter(self._senders))
-            self._senders.pop(oldest)[0].end()
+        self._make_room(user)
         sender = StopSender(name, by=by, why=why, now=now, robots=[ref] if ref else None)
-        self._senders[name] = sender, now
+        self._senders[name], self._users[name] = (sender, now), user
         for component in known:
             if not ref or component.ref == ref:
                 for message in component.known.values():
@@ -56,12 +58,18 @@ class Stops:
             sender.end()
             self.changed |= set(sender.robots)
 
-    def receive(self, message: Message, now: float) -> None:
-        """Take a message of any robot."""
+    def user(self, name: str) -> str | None:
+        """Who has pressed this stop; None if it is not known here."""
+        return self._users.get(name)
+
+    def receive(self, message: Message, now: float, *, known: bool = True) -> None:
+        """Take a message of a robot. One that is not ``known`` is not stopped with all: there may be any number."""
         address = parse_topic(message.topic)
         if address is None:
             return
         for sender, began in self._senders.values():
+            if not known and address.identity.base not in sender.robots:
+                continue
             if not sender.finished or now - began < COLLECT_S:
                 sender.receive(message, now)
         self.changed.add(address.identity.base)
@@ -73,7 +81,7 @@ class Stops:
             messages += [one for one in sender.tick(now) if _own(one.topic, sender)]
             self.changed |= {ref for ref, stop in sender.robots.items() if self._shown.get(ref) != _progress(stop)}
             if sender.finished and now - began > _SHOWN_S:
-                del self._senders[name]
+                self._remove(name)
                 self.changed |= set(sender.robots)
         return messages
 
@@ -94,6 +102,18 @@ class Stops:
             sending_text=text,
             stop=name,
         )
+
+    def _make_room(self, user: str) -> None:
+        own = [name for name in self._senders if self._users[name] == user]
+        own.sort(key=lambda name: not self._senders[name][0].finished)  # stable: else the oldest first
+        for name in own[: max(0, len(own) - MAX_EACH + 1)]:
+            self._remove(name)
+        while len(self._senders) >= MAX_STOPS:
+            self._remove(next(iter(self._senders)))
+
+    def _remove(self, name: str) -> None:
+        self._senders.pop(name)[0].end()
+        del self._users[name]
 
     def _newest(self, ref: str) -> tuple[str, RobotStop | None]:
         for name, (sender, _) in reversed(self._senders.items()):

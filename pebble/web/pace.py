@@ -1,0 +1,19 @@
+"""Bounds the work that one page can ask of the server: a page beyond it is read more slowly. Pure."""
+
+from __future__ import annotations
+
+PER_S = 100.0  # a page that drives sends 25 messages a second
+BURST = 200.0
+
+
+class Pace:
+    """A bucket of ``BURST`` that fills by ``PER_S``."""
+
+    def __init__(self, now: float) -> None:
+        self._left, self._at = BURST, now
+
+    def take(self, cost: float, now: float) -> float:
+        """How many seconds to wait before this is done."""
+        self._left = min(BURST, self._left + PER_S * (now - self._at)) - cost
+        self._at = now
+        return max(0.0, -self._left / PER_S)
