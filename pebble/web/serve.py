@@ -83,5 +83,6 @@ def _listen(settings: WebSettings) -> socket.socket:
 def url_of(settings: WebSettings, listener: socket.socket) -> str:
     """The address that a browser on this machine opens, or the name by which others reach it."""
     host = settings.names[0] if settings.names else settings.host
-    shown = f"[{host}]" if ":" in host else host
-    return f"{'https' if settings.certificate else 'http'}://{shown}:{listener.getsockname()[1]}/"
+    shown = f"[{host}]" if host.count(":") > 1 else host
+    port = "" if ":" in host and shown == host else f":{listener.getsockname()[1]}"  # a name may have its own port
+    return f"{'https' if settings.certificate else 'http'}://{shown}{port}/"
