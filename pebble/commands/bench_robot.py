@@ -75,8 +75,8 @@ def startup(
 ) -> int:
     """How fast a robot starts: first heartbeat, all services ready, first drive command executed.
 
-    And how fast an operator or a service that connects later receives all retained messages. Every launch is a new
-    simulated robot. Needs mosquitto.
+    And how fast an operator or a service that connects later receives all retained messages, and how long an operator
+    waits for the first picture in each encoding. Every launch is a new simulated robot. Needs mosquitto.
 
     \b
         pebble bench startup

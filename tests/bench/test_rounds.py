@@ -62,6 +62,9 @@ def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output, "find_spec", lambda _name: None)
 
 
+_MEASURED = ("first heartbeat", "picture, json, at rest")
+
+
 def test_startup_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     launches = iter([1.0, 2.0, None, 3.0, 4.0])
 
@@ -73,12 +76,16 @@ def test_startup_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         )
 
     monkeypatch.setattr(startup, "launch", launch)
+    monkeypatch.setattr(startup.first_picture, "measure", lambda _kind: {("json", "at rest"): 500.0})
+    monkeypatch.setattr(startup, "MEASURES", [one for one in startup.MEASURES if one.name in _MEASURED])
     assert startup.run(startup.StartupPlan(rounds=3, output=tmp_path), Console(file=io.StringIO())) == 0
     results = load(tmp_path / "startup.json")
     assert {cell.variant: cell.rounds for cell in results.cells if cell.measure == "first heartbeat"} == {
         "mqtt": [[1.0], [3.0]],
         "zenoh": [[2.0], [4.0]],
     }
+    pictures = [cell for cell in results.cells if cell.measure == "picture, json, at rest"]
+    assert {cell.variant: cell.rounds for cell in pictures} == {"mqtt": [[500.0]], "zenoh": [[500.0]]}
     assert results.assessment[0] == "1 of 3 rounds failed and were left out; round 2: zenoh: no heartbeat"
 
 
