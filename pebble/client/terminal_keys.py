@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import select
 import shutil
@@ -132,8 +131,10 @@ def check_terminal() -> None:
         raise PebbleError(
             "driving by keys needs a terminal; a program publishes with `pebble topic pub drive-values`, or is a script"
         )
-    if importlib.util.find_spec("termios") is None:
-        raise PebbleError("driving by keys needs a terminal of Linux or macOS: use `pebble web` here")
+    try:
+        import termios  # noqa: F401
+    except ImportError:
+        raise PebbleError("driving by keys needs a terminal of Linux or macOS: use `pebble web` here") from None
 
 
 @contextmanager

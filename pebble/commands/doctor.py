@@ -11,7 +11,6 @@ import typer
 
 from pebble.config import load
 from pebble.doctor import Finding, Level
-from pebble.doctor.checks import run_checks
 
 _COLOURS = {Level.OK: typer.colors.GREEN, Level.WARN: typer.colors.YELLOW, Level.FAIL: typer.colors.RED}
 _INDENT = " " * 6
@@ -28,6 +27,8 @@ def doctor(
         pebble doctor
         pebble doctor configs/goob.json
     """
+    from pebble.doctor.checks import run_checks  # of Linux only
+
     counts = dict.fromkeys(Level, 0)
     for finding in run_checks(None if config is None else load(config)):
         counts[finding.level] += 1

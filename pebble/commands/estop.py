@@ -110,7 +110,7 @@ def me() -> str:
     """Who gives this command, and from which machine: ``ann@desk``."""
     try:
         user = getpass.getuser()
-    except (KeyError, OSError):  # no name for this user id
+    except (ImportError, KeyError, OSError):  # no name for this user id, or no such ids
         user = "unknown"
     return f"{user}@{socket.gethostname()}"
 

@@ -106,12 +106,13 @@ def snapshot(
 
 @contextmanager
 def _receiver(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Iterator[MediaReceiver]:
-    from pebble.client.local_camera import LocalReceiver
     from pebble.client.media_receiver import MediaReceiver
 
     target = _target(robot, url, password_file, ca_cert)
     with connected(target) as (transport, names):
         if target.config is not None and not target.remote:
+            from pebble.client.local_camera import LocalReceiver  # its shared memory is of Linux only
+
             typer.echo(f"pebble: {robot} names no remote broker: this machine's camera, without sound", err=True)
             receiver: MediaReceiver = LocalReceiver(transport, names.base, target.config)
         else:

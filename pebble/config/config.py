@@ -141,7 +141,11 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
     robot = f"{zlib.crc32(base.encode()):08x}"
     if by_login := env.get("XDG_RUNTIME_DIR"):
         return Path(by_login, "pebble", robot)
-    return Path(env.get("TMPDIR", "/tmp"), f"pebble-{os.getuid()}", robot)  # noqa: S108 - 0700 and checked when made
+    return Path(env.get("TMPDIR", "/tmp"), f"pebble-{_user_id()}", robot)  # noqa: S108 - 0700 and checked when made
+
+
+def _user_id() -> int:
+    return os.getuid() if hasattr(os, "getuid") else 0  # Windows has none, and a temporary folder for each user
 
 
 def default_state_folder(base: str, env: Mapping[str, str]) -> Path:

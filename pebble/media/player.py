@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import select
@@ -74,8 +73,7 @@ class Player:
         words = filled(self._command, rate=chunk.rate, channels=chunk.channels, device=self._device)
         self._format, self._started_at = (chunk.rate, chunk.channels), now
         source, sink = os.pipe()
-        with suppress(OSError):  # costs latency only
-            fcntl.fcntl(sink, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        _shorten(sink)
         os.set_blocking(sink, False)
         try:
             process = subprocess.Popen(words, stdin=source, stdout=subprocess.DEVNULL)
@@ -137,6 +135,15 @@ class Player:
             except subprocess.TimeoutExpired:
                 then()
         process.wait()
+
+
+def _shorten(pipe: int) -> None:
+    """Let little sound wait in a pipe, where the system can; otherwise it is heard later."""
+    with suppress(ImportError, OSError):  # Windows has no fcntl
+        import fcntl
+
+        if hasattr(fcntl, "F_SETPIPE_SZ"):  # Linux only
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
 
 def _exit(process: subprocess.Popen[bytes]) -> str:

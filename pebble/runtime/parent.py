@@ -50,13 +50,13 @@ def die_with_launcher() -> None:
         sys.exit(1)
 
 
-def end_with_parent(number: int = signal.SIGKILL) -> None:
-    """Have the kernel send this process ``number`` when the thread that started it has ended."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+def end_with_parent(number: int | None = None) -> None:
+    """Have the kernel send this process ``number``, SIGKILL unless given, when the thread that started it has ended."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL if number is None else number)
 
 
-def tied_to_parent(command: Sequence[str], number: signal.Signals = signal.SIGKILL) -> list[str]:
-    """Extend ``command`` so that the process gets ``number`` when the thread that starts it has ended.
+def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None) -> list[str]:
+    """Extend ``command`` so that the process gets ``number``, else SIGKILL, when the thread that starts it has ended.
 
     This holds from a few milliseconds after the start on, when setpriv has asked the kernel for it.
     Raises FileNotFoundError if there is no such program. Not by ``preexec_fn``: between fork and exec, Python 3.11.2
@@ -64,7 +64,8 @@ def tied_to_parent(command: Sequence[str], number: signal.Signals = signal.SIGKI
     """
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])
-    return ["setpriv", "--pdeathsig", number.name.removeprefix("SIG"), "--", *command]
+    name = (signal.SIGKILL if number is None else number).name.removeprefix("SIG")
+    return ["setpriv", "--pdeathsig", name, "--", *command]
 
 
 def launcher_runs(run_dir: Path) -> bool:

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from pebble.simulation.trace import read_trace
-from pebble.transports import Message, MqttSettings, create
+from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run
 from tests.support import ROOT, Broker, Child, gone, until
 
@@ -52,7 +52,7 @@ class Lamp:
         self._transport.close()
 
     def publish(self, topic: str, body: object) -> None:
-        assert self._transport.publish(topic, json.dumps(body).encode(), qos=1)
+        assert self._transport.publish(topic, json.dumps(body).encode(), qos=QoS.DELIVERED)
 
     @property
     def motors(self) -> list[tuple[float, tuple[float, float]]]:

@@ -56,6 +56,32 @@ class Refused(Lost):
     """The broker refused our CONNECT, or closed the connection instead of answering."""
 
 
+class _Poll:
+    """Waits until ``sock`` is readable or has an error, or (with ``write``) writable, or ``wake`` is readable."""
+
+    def __init__(self, sock: int, wake: int, *, write: bool) -> None:
+        self._sock, self._wake, self._write = sock, wake, write
+        self._poll = select.poll() if hasattr(select, "poll") else None  # Windows has none
+        if self._poll is not None:
+            self._poll.register(sock, select.POLLIN | (select.POLLOUT if write else 0))
+            self._poll.register(wake, select.POLLIN)
+
+    def wait(self, seconds: float) -> tuple[bool, bool, bool]:
+        """Which of the three: readable, writable, woken."""
+        if self._poll is None:
+            return self._select(seconds)
+        events = dict(self._poll.poll(ceil(seconds * 1000)))
+        seen = events.get(self._sock, 0)
+        return bool(seen & ~select.POLLOUT), bool(seen & select.POLLOUT), bool(events.get(self._wake))
+
+    def _select(self, seconds: float) -> tuple[bool, bool, bool]:
+        try:
+            ready = select.select([self._sock, self._wake], [self._sock] if self._write else [], [self._sock], seconds)
+        except (OSError, ValueError):  # closed meanwhile: reading it says so
+            return True, False, False
+        return self._sock in ready[0] + ready[2], bool(ready[1]), self._wake in ready[0]
+
+
 def ignore(_messages: list[Message]) -> None:
     """Discard messages: for :meth:`Connection.pump` before a connection is accepted, and at its end."""
 
@@ -199,17 +225,14 @@ class Connection:
             if sock is None:
                 raise Lost(self._disconnect_reason or f"{self.where} closed the connection")
             blocked = self._client.want_write()
-            poll = select.poll()
-            poll.register(sock.fileno(), select.POLLIN | (select.POLLOUT if blocked else 0))
-            poll.register(self._wake_read.fileno(), select.POLLIN)
+            poll = _Poll(sock.fileno(), self._wake_read.fileno(), write=blocked)
             wait = 0.0 if self._more else min(timeout, self._ping_due_in())
-        events = dict(poll.poll(ceil(max(wait, 0.0) * 1000)))
-        if events.pop(self._wake_read.fileno(), 0):
+        readable, writable, woken = poll.wait(max(wait, 0.0))
+        if woken:
             self._wake_read.recv(4096)
-        seen = next(iter(events.values()), 0)
-        if blocked and seen & select.POLLOUT:
+        if writable:
             self._answered_at = time.monotonic()  # the other side's TCP accepted some: slow, but alive
-        return bool(seen & ~select.POLLOUT)
+        return readable
 
     def _check_silence(self) -> None:
         if not self._accepted:

@@ -5,18 +5,24 @@ Neither class is locked: their connection is.
 
 from __future__ import annotations
 
-import fcntl
 import itertools
 import socket
 import struct
 import sys
-import termios
 import threading
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 
 from pebble.transports.base import Message, QoS
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows has neither
+    _can_measure = False
+else:
+    _can_measure = True
 
 BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
@@ -222,8 +228,13 @@ class InFlightTable:
 
 
 def unconfirmed_bytes(sock: socket.socket) -> int:
-    """Bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ)."""
+    """Bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
+
+    0 where the system does not say.
+    """
     size = bytearray(4)
+    if not _can_measure:
+        return 0
     with suppress(OSError, ValueError):  # closed, or no TCP
         fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, size)
     return int.from_bytes(size, sys.byteorder)

@@ -1,0 +1,109 @@
+"""What operators use runs without what only Linux has: modules, system calls and signals are hidden from our code.
+
+This is no substitute for a Mac or a Windows machine; it finds what would not even start there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.commands.test_estop import LiveRobot
+from tests.support import ROOT, Broker, Child, free_port, until
+
+ELSEWHERE = [sys.executable, str(ROOT / "tests" / "fakes" / "other_platform.py")]
+MODULES = (
+    *(f"pebble.commands.{name}" for name in ("topic", "estop", "watch", "web", "cert", "drive", "topics", "check")),
+    *("pebble.web.app", "pebble.web.serve", "pebble.transports.mqtt.transport", "pebble.client.media_receiver"),
+)
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("b"))
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[LiveRobot]:
+    robot = LiveRobot(broker.port, "serial")
+    yield robot
+    robot.close()
+
+
+def elsewhere(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*ELSEWHERE, *arguments], cwd=ROOT, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=60
+    )
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_it_can_be_imported(module: str) -> None:
+    done = elsewhere("import", module)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_is_hidden_is_missed() -> None:
+    """Else the other tests would prove nothing."""
+    assert "No module named 'fcntl'" in elsewhere("import", "pebble.launcher.forked").stderr
+
+
+@pytest.mark.parametrize(
+    "line", [("--help",), ("topic", "--help"), ("web", "--help"), ("drive", "--help"), ("check", "configs/goob.json")]
+)
+def test_a_command_without_a_network(line: tuple[str, ...]) -> None:
+    done = elsewhere(*line)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout
+
+
+def test_messages_are_published_and_received(broker: Broker, robot: LiveRobot) -> None:
+    where = ("--url", f"mqtt://127.0.0.1:{broker.port}", "-r", robot.id)
+    assert elsewhere("topic", "pub", "drive-values", '{"z": 0.5}', *where).returncode == 0
+    assert until(lambda: robot.count("drive-values") == 1)
+    done = elsewhere("topic", "echo", "capabilities", "--raw", "-n", "1", *where)
+    assert json.loads(done.stdout)["value"]["estop"]["owners"] == ["serial"]
+
+
+def test_a_robot_is_stopped(broker: Broker, robot: LiveRobot) -> None:
+    done = elsewhere("estop", robot.id, "--url", f"mqtt://127.0.0.1:{broker.port}")
+    assert (done.returncode, done.stderr, robot.latched) == (0, "", True)
+
+
+def test_driving_by_keys_says_where_it_works() -> None:
+    terminal, side = pty.openpty()
+    done = subprocess.run(
+        [*ELSEWHERE, "drive", "goob", "--url", "mqtt://127.0.0.1:1"],
+        cwd=ROOT, stdin=side, stdout=side, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    os.close(side)
+    os.close(terminal)
+    assert done.stderr == "pebble: driving by keys needs a terminal of Linux or macOS: use `pebble web` here\n"
+
+
+def test_the_operator_page_is_served(broker: Broker, tmp_path: Path) -> None:
+    port = free_port()
+    options = ("--url", f"mqtt://127.0.0.1:{broker.port}", "--port", str(port), "--people", str(tmp_path / "people"))
+    page = Child([*ELSEWHERE, "web", *options], cwd=ROOT, stdout=subprocess.DEVNULL)
+    try:
+        assert until(lambda: healthy(port), 20)
+    finally:
+        page.terminate()
+        page.wait(10)
+
+
+def healthy(port: int) -> bool:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=2) as answer:
+            return bool(answer.status == 200)
+    except OSError:
+        return False
