@@ -13,10 +13,12 @@ from dataclasses import dataclass
 from typing import Final
 
 WINDOW: Final = 2  # frames sent and not acknowledged
-SLOW_ACK_S: Final = 0.15  # with acknowledgements later than this the window is 1
+#: With an acknowledgement later than the first the window is 1, until one is earlier than the second.
+SLOW_ACK_S, FAST_ACK_S = 0.15, 0.12
 #: More frames may be under way if they are small: they delay nothing, and a distant page would get too few of them.
 SMALL_WINDOW, SMALL_BYTES = 8, 4096
 MAX_FRAMES: Final = 4
+SLOW_FRAMES: Final = 1  # JPEG encodings on a slow connection: the next key frame is near, and shows what is newer
 MAX_QUEUED_BYTES: Final = 4 << 20
 NO_FRAME: Final = 0xFFFF_FFFF  # the number in an acknowledgement of no frame
 
@@ -44,13 +46,10 @@ class MediaQueue:
         self.waiting = True  # for a key frame
         self.overflowed = False  # waiting because the page is too slow
         self.skipped = 0
+        self.window = WINDOW
         self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
         self._queue: deque[Frame] = deque()
         self._under_way: dict[int, tuple[float, Frame]] = {}
-
-    @property
-    def window(self) -> int:
-        return WINDOW if self.ack_s <= SLOW_ACK_S else 1
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame, or skip it."""
@@ -58,8 +57,11 @@ class MediaQueue:
             self._begin_at(frame)
         elif self.waiting:
             self.skipped += 1
-        elif len(self._queue) < MAX_FRAMES and self._queued_bytes() + len(frame.data) <= MAX_QUEUED_BYTES:
+        elif self._has_room(frame):
             self._queue.append(frame)
+        elif self._skips_early(frame):
+            self.waiting = True  # what is in the queue is still sent
+            self.skipped += 1
         else:
             self.overflowed = True
             self.wait_for_keyframe(1)
@@ -77,6 +79,10 @@ class MediaQueue:
         sent_at, frame = self._under_way.pop(seq, (0.0, None))
         if frame is not None:
             self.ack_s = now - sent_at
+            if self.ack_s > SLOW_ACK_S:
+                self.window = 1
+            elif self.ack_s < FAST_ACK_S:
+                self.window = WINDOW
         return frame
 
     def wait_for_keyframe(self, skipped: int = 0) -> None:
@@ -97,6 +103,13 @@ class MediaQueue:
             return True
         total = size + sum(len(frame.data) for _, frame in self._under_way.values())
         return under_way < SMALL_WINDOW and total <= SMALL_BYTES
+
+    def _has_room(self, frame: Frame) -> bool:
+        limit = SLOW_FRAMES if self._skips_early(frame) else MAX_FRAMES
+        return len(self._queue) < limit and self._queued_bytes() + len(frame.data) <= MAX_QUEUED_BYTES
+
+    def _skips_early(self, frame: Frame) -> bool:
+        return self.window < WINDOW and frame.encoding != "h264"
 
     def _begin_at(self, frame: Frame) -> None:
         """A page that keeps up receives what came before as well; another one only what is newest."""

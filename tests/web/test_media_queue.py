@@ -94,6 +94,20 @@ def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
     assert drained(slow) == [3]
 
 
+def test_a_slow_page_gets_few_differences_and_the_next_key_frame_soon() -> None:
+    queue = MediaQueue()
+    queue.offer(frame(0, keyframe=True))
+    queue.take(0.0)
+    queue.acknowledge(0, 0.3)
+    for one in (frame(1), frame(2), frame(3), frame(4)):
+        queue.offer(one)
+    assert queue.waiting
+    assert not queue.overflowed
+    assert drained(queue, 0.3) == [1]
+    queue.offer(frame(5, keyframe=True))
+    assert drained(queue, 0.4) == [5]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_what_is_sent_can_always_be_decoded(seed: int) -> None:
     """Whatever happens: after each frame comes the next one, or a key frame; and bounds hold."""
