@@ -520,6 +520,29 @@ def test_connections_are_bounded(hall: Hall, driver: Page) -> None:
     assert not driver.closed
 
 
+def test_a_flood_of_stops_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
+    def count() -> int:
+        return len([one for one in everything.messages if one.topic == "pebble/robots/off/incoming/estop"])
+
+    with hall.page("driver") as page, hall.page("viewer") as mallory:
+        page.send("estop", ref="pebble/robots/off", stop="00000000000000ff")
+        assert until(count)
+        with suppress(ConnectionClosed):
+            for number in range(300):
+                mallory.send("estop", ref=f"pebble/robots/w{number}", stop=f"{number:016x}")
+            mallory.send("estop-end", stop="00000000000000ff")
+        time.sleep(1)
+        before = count()
+        assert until(lambda: count() >= before + 2, 3), "it is no longer sent"
+        assert until(lambda: [one["why"] for one in mallory.refused] == ["The role viewer may not do this"])
+        page.send("estop-end", stop="00000000000000ff")
+        time.sleep(0.7)
+        before = count()
+        time.sleep(0.7)
+        assert count() == before
+    assert hall.works()
+
+
 # -- guessing
 
 

@@ -1,0 +1,309 @@
+"""What an attacker tries who may publish at the broker, and a page that floods the server."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import time
+import urllib.request
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from tests.commands.command_line import program
+from tests.support import Broker, until
+from tests.web.attacker import Everything
+from tests.web.served import Page, RecordingRobot
+
+GOOB = "pebble/robots/goob"
+VICTIM = "pebble/robots/victim"
+EVIL = "pebble/robots/evil"
+MB = 1024 * 1024
+
+
+class ServerProcess:
+    """``pebble web`` as a process of its own, whose memory can be measured."""
+
+    def __init__(self, broker_port: int, folder: Path) -> None:
+        url = f"mqtt://127.0.0.1:{broker_port}"
+        self._process = program("web", "--url", url, "--port", "0", "--people", folder / "people.sqlite")
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        self.port = int(line.split()[5].rstrip("/").rpartition(":")[2])
+        self.origin = f"http://127.0.0.1:{self.port}"
+        with urllib.request.urlopen(f"{self.origin}/") as page:
+            found = re.search(r'name="pebble-version" content="(\w+)"', page.read().decode())
+        assert found is not None
+        self.version = found[1]
+
+    def page(self, **options: Any) -> Page:
+        return Page(self, **options)  # type: ignore[arg-type]
+
+    def memory(self) -> int:
+        """Resident bytes."""
+        status = Path(f"/proc/{self._process.pid}/status").read_text()
+        return 1024 * int(status.partition("VmRSS:")[2].split()[0])
+
+    def close(self) -> str:
+        """End it; what it wrote to stderr."""
+        self._process.send_signal(signal.SIGINT)
+        assert self._process.wait(20) == 130
+        assert self._process.stderr is not None
+        return self._process.stderr.read()
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """What clients subscribe to, by the broker's own words."""
+    return tmp_path / "mosquitto.log"
+
+
+@pytest.fixture
+def broker(tmp_path: Path, log: Path) -> Iterator[Broker]:
+    log.touch()
+    log.chmod(0o666)
+    running = Broker(tmp_path, f"log_dest file {log}", "log_type subscribe")
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def server(broker: Broker, tmp_path: Path) -> Iterator[ServerProcess]:
+    running = ServerProcess(broker.port, tmp_path)
+    yield running
+    written = running.close()
+    assert "Traceback" not in written, written
+
+
+def flood(port: int, messages: Iterable[tuple[str, bytes]]) -> int:
+    """Publish everything with QoS 0, as fast as the broker takes it."""
+    count = 0
+    with socket.create_connection(("127.0.0.1", port), 30) as client:
+        client.sendall(b"\x10\x10\x00\x04MQTT\x04\x02\x00\x00\x00\x04evil")
+        assert client.recv(4) == b"\x20\x02\x00\x00"
+        for topic, payload in messages:
+            body = len(topic).to_bytes(2, "big") + topic.encode() + payload
+            client.sendall(b"\x30" + _length(len(body)) + body)
+            count += 1
+        client.sendall(b"\xc0\x00")
+        assert client.recv(2) == b"\xd0\x00", "the broker has taken everything"
+    return count
+
+
+def _length(number: int) -> bytes:
+    """MQTT's: seven bits in a byte."""
+    encoded = b""
+    while number > 127:
+        encoded += bytes([number % 128 | 128])
+        number //= 128
+    return encoded + bytes([number])
+
+
+def subscriptions(log: Path) -> set[str]:
+    """All filters of the server."""
+    return set(re.findall(r"pebble-web-\S+ [012] (\S+)", log.read_text()))
+
+
+def drives(page: Page, robot: RecordingRobot) -> bool:
+    """Whether the page can still take the lease, move the robot and stop it."""
+    assert page.knows(robot.base, 10)
+    assert page.ready()
+    assert page.take(robot.base)
+    gesture = int(time.monotonic() * 1000) % 1_000_000
+    since = time.monotonic()
+    end = since + 5
+    while time.monotonic() < end and not any(one["z"] for one in robot.drives(since)):
+        page.drive(robot.base, gesture, z=0.5)
+        time.sleep(0.05)
+    page.drive(robot.base, gesture)
+    moved = any(one["z"] for one in robot.drives(since))
+    return moved and until(lambda: robot.drives()[-1]["z"] == 0, 3)
+
+
+def online(t: int = 1) -> bytes:
+    return b'{"t":%d,"online":true}' % t
+
+
+def many_topics() -> Iterator[tuple[str, bytes]]:
+    """100,000 topics: components, and metrics, owners and devices of one component."""
+    for number in range(60_000):
+        yield f"pebble/robots/x{number}/outgoing/online", online()
+    state = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "x", "why": "", "since": 1}
+    payload = json.dumps({**state, "persisted": True, "reset_refused": None}).encode()
+    for number in range(20_000):
+        yield f"{GOOB}/outgoing/estop/o{number}", payload
+    for number in range(20_000):
+        yield f"pebble/robots/y{number}/outgoing/status", b'{"value":{}}'
+
+
+def test_a_hundred_thousand_topics(server: ServerProcess, broker: Broker) -> None:
+    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page:
+        assert drives(page, robot)
+        before = server.memory()
+        assert flood(broker.port, many_topics()) == 100_000
+        assert until(lambda: page.value("", "web/broker", "robots_omitted") > 1000, 30)
+        assert until(lambda: drives(page, robot), 60)
+        assert server.memory() - before < 60 * MB
+        with server.page() as another:
+            assert another.knows(VICTIM)
+            assert len({ref for ref, _ in another.state}) <= 502
+
+
+def test_large_and_odd_values(server: ServerProcess, broker: Broker) -> None:
+    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page:
+        page.send("watch", ref=VICTIM)
+        assert drives(page, robot)
+        before = server.memory()
+        sizes = (10, 60_000, 70_000, 1_000_000)
+        large = (
+            (f"pebble/robots/z{number}/outgoing/{metric}", b'{"value":"' + b"x" * sizes[number % 4] + b'"}')
+            for number in range(600)
+            for metric in ("status", "capabilities")
+        )
+        flood(broker.port, large)
+        flood(broker.port, ((f"{VICTIM}/outgoing/{metric}", payload) for payload in ODD for metric in METRICS))
+        time.sleep(1)
+        assert until(lambda: server.memory() - before < 120 * MB, 10)
+        assert not page.closed, page.bye
+        assert drives(page, robot)
+
+
+METRICS = ("status", "charging-status", "sensors/imu", "wheel-odometry", "logs", "mcu/x/describe", "autonomy-status")
+ODD = (
+    b"",
+    b"{",
+    b"\xff\xfe",
+    b'"\xff"',
+    b'{"value":"\xff"}',
+    b'{"value":NaN}',
+    b'{"t":Infinity,"value":{}}',
+    b'{"t":1e999}',
+    b'{"value":"\\ud800"}',
+    b'{"value":1}{"value":2}',
+    b'{"value":1} trailing',
+    b'{"value":' + b"[" * 30_000 + b"]" * 30_000 + b"}",
+    b"[" * 60_000,
+    b'{"value":' * 6000 + b"1" + b"}" * 6000,
+    b'{"value":1,"value":{"value":null}}',
+    b'{"__proto__":{"x":1}}',
+    b"null",
+    b"[]",
+    b"1",
+    b'"<script>alert(1)</script>"',
+    b"\x00",
+    b'{"value":"\x00"}',
+    b"9" * 60_000,
+    b'{"t":' + b"9" * 5000 + b"}",
+)
+
+
+def strict(text: str | bytes) -> Any:
+    """JSON as browsers read it: without NaN, and with numbers of any length."""
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse, parse_int=str, parse_float=str)
+
+
+def test_whatever_robots_publish_pages_receive_json(server: ServerProcess, broker: Broker) -> None:
+    url, hello = f"ws://127.0.0.1:{server.port}/ws/control", {"op": "hello", "version": server.version}
+    with (
+        RecordingRobot(broker.port, VICTIM) as robot,
+        connect(url, origin=server.origin, max_size=None) as page,  # type: ignore[arg-type]
+    ):
+        page.send(json.dumps(hello))
+        page.send(json.dumps({"op": "watch", "ref": VICTIM}))
+        time.sleep(1)
+        flood(broker.port, ((f"{VICTIM}/outgoing/{metric}", payload) for payload in ODD for metric in METRICS))
+        robot.publish("status", {"value": {"last": 1}})
+        end = time.monotonic() + 20
+        received = [strict(page.recv(timeout=5))]
+        while time.monotonic() < end and '"last"' not in json.dumps(received[-1]):
+            received.append(strict(page.recv(timeout=5)))
+            if received[-1]["op"] == "ping":
+                page.send(json.dumps({"op": "echo", "n": int(received[-1]["n"]), "t": 1}))
+        assert '"last"' in json.dumps(received[-1])
+
+
+def test_capabilities_that_name_other_topics(server: ServerProcess, broker: Broker, log: Path) -> None:
+    recorder = Everything(broker.port)
+    with RecordingRobot(broker.port, VICTIM) as victim, server.page() as page:
+        assert page.knows(VICTIM)
+        foreign = [
+            f"{VICTIM}/incoming/drive-values",
+            f"{VICTIM}/incoming/estop-reset",
+            "pebble/robots/evil/incoming/../../victim/incoming/drive-values",
+            "pebble/robots/evil/outgoing/online",
+            "pebble/robots/evil/incoming/",
+            "pebble/robots/evil/incoming/#",
+            "pebble/robots/evil/incoming/+",
+            "pebble/robots/evil2/incoming/drive-values",
+            "$SYS/x",
+            "#",
+            "+/+/+/incoming/drive-values",
+            "",
+            7,
+            ["a"],
+            {"a": 1},
+        ]
+        for number, topic in enumerate(foreign):
+            outgoing = topic.replace("incoming", "outgoing") if isinstance(topic, str) else topic
+            value = {
+                "drive": {"available": True, "controls": True, "topic": topic, "arbitrates": True},
+                "estop": {"available": True, "owners": ["serial"], "topic": topic, "reset_topic": topic},
+                "telemetry": {
+                    f"{key}_topic": outgoing
+                    for key in ("touch", "charging", "charging_level", "wheel_odometry", "imu", "online")
+                },
+                "video": {"available": True, "topic": outgoing, "command_topic": topic, "flag_topic": topic},
+                "media": {"video": {"available": True, "topic": outgoing, "flag": topic}},
+                "autonomy": {"available": True, "topic": topic, "command_topic": topic},
+                "lights": {"available": True, "topic": topic},
+            }
+            with RecordingRobot(broker.port, EVIL, capabilities=value) as evil:
+                assert page.knows(EVIL)
+                assert until(lambda value=value: page.value(EVIL, "capabilities", "value") == value), topic
+                page.send("watch", ref=EVIL)
+                page.send("lease", ref=EVIL, take=True)
+                page.drive(EVIL, number + 1, z=0.5)
+                page.send("stop", ref=EVIL)
+                page.send("estop", ref=EVIL, stop=f"{number:016x}")
+                owners = [{"owner": "serial", "boot": "b", "count": number}]
+                page.send("estop-reset", ref=EVIL, owners=owners)
+                page.send("encoding", ref=EVIL, encoding="json")
+                assert until(lambda evil=evil: any(name.endswith("/estop") for name in evil.topics()))
+                page.send("estop-end", stop=f"{number:016x}")
+                page.send("watch", ref="")
+        time.sleep(0.5)
+        assert victim.received == []
+        published = recorder.incoming()
+        assert published
+        assert {topic for topic in published if not topic.startswith(f"{EVIL}/incoming/")} == set()
+        filters = subscriptions(log)
+        assert {one for one in filters if one.startswith("+/+/+/outgoing/")}
+        own = f"{EVIL}/outgoing/"
+        odd = {one for one in filters if not one.startswith(("+/+/+/outgoing/", own))}
+        assert odd == set()
+        assert not {one for one in filters if one.endswith(("/outgoing/#", "/outgoing/+"))}
+    recorder.close()
+
+
+def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker: Broker, log: Path) -> None:
+    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page, server.page() as mallory:
+        assert drives(page, robot)
+        before = server.memory()
+        with suppress(ConnectionClosed):
+            for number in range(3000):
+                mallory.send("watch", ref=f"pebble/robots/w{number}")
+        time.sleep(1)
+        assert drives(page, robot)
+        assert server.memory() - before < 40 * MB
+        assert len(subscriptions(log)) < 3000
