@@ -74,5 +74,5 @@ clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-.venv/.ready-%: pyproject.toml tools/setup.sh tools/fetch_micropython.py
+.venv/.ready-%: pyproject.toml tools/setup.sh tools/fetch_npm.py tools/npm.py
 	@sh tools/setup.sh $*

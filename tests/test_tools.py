@@ -45,7 +45,7 @@ def registry() -> Iterator[tuple[str, list[str]]]:
 def fetch(folder: Path, registry: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "NPM_CONFIG_REGISTRY": registry, "no_proxy": "127.0.0.1"}
     environment.pop("npm_config_registry", None)
-    command = [sys.executable, ROOT / "tools" / "fetch_micropython.py", folder]
+    command = [sys.executable, ROOT / "tools" / "fetch_npm.py", folder, "micropython"]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
 
 
@@ -59,7 +59,7 @@ def test_a_micropython_that_is_another_one_is_refused(tmp_path: Path, registry: 
 
 
 def test_one_that_is_there_is_not_fetched_again() -> None:
-    assert fetch(ROOT / ".venv" / "micropython", f"http://127.0.0.1:{free_port()}").returncode == 0
+    assert fetch(ROOT / ".venv", f"http://127.0.0.1:{free_port()}").returncode == 0
 
 
 def test_no_registry_is_one_line(tmp_path: Path) -> None:

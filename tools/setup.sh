@@ -58,10 +58,10 @@ say "installing Pebble and its dependencies for '$extra' into .venv; the first t
     fail "pip could not install the dependencies, see above"
 }
 
-# The real MicroPython for Node.js, and type stubs of each board's own modules. The ports' stubs
+# Programs in JavaScript that tests use, and type stubs of each board's own modules. The ports' stubs
 # contradict each other, so each has its own folder.
-fetch_micropython() {
-    .venv/bin/python tools/fetch_micropython.py .venv/micropython || fail "without it the firmware cannot be tested"
+fetch_for_tests() {
+    .venv/bin/python tools/fetch_npm.py .venv || fail "without it not everything can be tested"
     for port in samd esp32 esp8266; do
         stubs=.venv/stubs/$port
         [ -d "$stubs/micropython_${port}_stubs-$stubs_version.dist-info" ] && continue
@@ -74,6 +74,6 @@ fetch_micropython() {
         }
     done
 }
-[ "$extra" != dev ] || fetch_micropython
+[ "$extra" != dev ] || fetch_for_tests
 touch ".venv/.ready-$extra"
 [ "$extra" != dev ] || touch .venv/.ready-demo .venv/.ready-bench # it includes the others

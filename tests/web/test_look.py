@@ -107,7 +107,7 @@ def server() -> Iterator[CannedServer]:
 def axe() -> str:
     if not AXE.exists():
         missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
-        missing(f"{AXE} is missing: python tools/fetch_vendor.py --axe {AXE.parent}")
+        missing(f"{AXE} is missing: python tools/fetch_npm.py .venv axe")
     return AXE.read_text()
 
 

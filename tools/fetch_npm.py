@@ -1,0 +1,68 @@
+"""Downloads what only tests use from npm's registry, each into a folder of its own unless it is there.
+
+fetch_npm.py FOLDER [NAME …]       all of them, or those named, into FOLDER/NAME
+"""
+
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import npm
+
+
+class Package(NamedTuple):
+    """What is taken from one package; ``sha512`` is npm's own "integrity" of this version."""
+
+    name: str
+    version: str
+    sha512: str
+    files: tuple[str, ...]
+    purpose: str
+
+
+PACKAGES = {
+    "micropython": Package(
+        "@micropython/micropython-webassembly-pyscript",
+        "1.29.0-6",
+        "kLwGPJFsLY/2aUPmzZxpvauFSmKc0SlJWVvvEttULR0poVQ6W9HV//1fUJyxrGWAxCVDw9aYqJ0LAog0ZLjYVA==",
+        ("micropython.mjs", "micropython.wasm", "package.json"),
+        "MicroPython for Node.js",
+    ),
+    "axe": Package(
+        "axe-core",
+        "4.14.1",
+        "FHfa+lmNjQZfJz1q8wKqIDwC6DExcHt/pkjNQb09a3NPjCKg2rhu5qb2S4r76ASyFNNtuFooJpZe37OgudVGtQ==",
+        ("axe.min.js",),
+        "axe-core, which checks the operator page for accessibility",
+    ),
+    "typescript": Package(
+        "typescript",
+        "5.9.3",
+        "jl1vZzPDinLr9eUt3J/t7V6FgNEw9QjvBPdysz9KfQDD41fQrC2Y4vKQdiaUpFT4bXlb1RHhLpp8wtm6M5TgSw==",
+        ("lib/tsc.js", "lib/_tsc.js", "lib/lib.*", "package.json"),
+        "TypeScript, which checks the types of the operator page",
+    ),
+}
+
+
+def main(folder: Path, names: list[str]) -> None:
+    for name in names or PACKAGES:
+        get(PACKAGES[name], folder / name)
+
+
+def get(package: Package, folder: Path) -> None:
+    there = folder / "version"
+    if there.exists() and there.read_text() == package.version:
+        return
+    print(f"pebble: fetching {package.purpose}")
+    content = npm.tarball(package.name, package.version, package.sha512)
+    for wanted in package.files:
+        for path, file in npm.members(content, wanted).items():
+            target = folder / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(file)
+    there.write_text(package.version)  # last: an interrupted run is repeated
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])
