@@ -56,6 +56,8 @@ def declarations() -> str:
         tag = [f'  op: "{info.tag}";'] if info.tag is not None else []
         fields = [f"  {one.name}{'' if one.required else '?'}: {_script(one.type)};" for one in info.fields]
         parts.append("\n".join([f"export interface {struct.__name__} {{", *tag, *fields, "}\n"]))
+    metrics = [f'  "{name}": {view.__name__};' for name, view in messages.SERVER_METRICS.items()]
+    parts.append("\n".join(["export interface Metrics {", *metrics, "}\n"]))
     for name in ("FromPage", "ToPage"):
         members = " | ".join(one.__name__ for one in get_args(getattr(messages, name)))
         parts.append(f"export type {name} = {members};\n")

@@ -185,6 +185,15 @@ export interface BrokerView {
   robots_omitted: number;
 }
 
+export interface Metrics {
+  "web/liveness": Liveness;
+  "web/estop": EstopView;
+  "web/driver": DriverView;
+  "web/picture": PictureView;
+  "web/picture-from": PictureFrom;
+  "web/broker": BrokerView;
+}
+
 export type FromPage = Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp;
 
 export type ToPage = Welcome | Ping | State | Logs | Refused | Bye;
