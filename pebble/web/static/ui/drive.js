@@ -182,7 +182,7 @@ function AuxButton({ driver, value, label, children }) {
     aria-describedby=${reason ? "why-drive" : undefined}
     onPointerDown=${(event) => {
       event.currentTarget.setPointerCapture(event.pointerId);
-      driver.hold(`aux ${value}`, value);
+      driver.hold(`aux ${value}`, value, event.timeStamp);
     }}
     onPointerUp=${end}
     onPointerCancel=${end}
