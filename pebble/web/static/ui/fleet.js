@@ -152,7 +152,7 @@ function FleetCard({ at }) {
       </div>
       <${Liveness} at=${at} />
     </div>
-    ${settings.thumbnails && html`<${Thumbnail} at=${at} offers=${offers} picture=${picture} />`}
+    ${settings.thumbnails && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
       <${DriverFact} at=${at} offers=${offers} />
@@ -214,7 +214,7 @@ function StatusFact({ at }) {
 }
 
 /** One picture a second of what flows anyway: this never starts a camera. */
-function Thumbnail({ at, offers, picture }) {
+function Thumbnail({ at, picture }) {
   const flowing = picture?.state === "flowing";
   const [count, setCount] = useState(0);
   useEffect(() => {
@@ -223,8 +223,7 @@ function Thumbnail({ at, offers, picture }) {
     return () => clearInterval(timer);
   }, [flowing]);
   if (!flowing) {
-    const text = offers.hasVideo ? "camera rests" : "no camera";
-    return html`<div class="thumbnail"><${Icon} name=${offers.hasVideo ? "camera" : "no-camera"} />${text}</div>`;
+    return html`<div class="thumbnail"><${Icon} name="camera" />camera rests</div>`;
   }
   return html`<div class="thumbnail">
     <img alt=${`What ${nameOf(at)} sees`} src=${`/api/snapshot.jpg?ref=${encodeURIComponent(at)}&n=${count}`} />

@@ -63,7 +63,9 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
   const [chosen, choose] = useState("");
   const cards = wanted(offers, view);
   const first = Boolean(video) || offers.drives;
-  const tabs = TABS.filter(({ id }) => (id === "drive" ? first : id === "more" || cards.some((card) => card.tab === id)));
+  const tabOf = (card) => (card.tab === "sensors" && first && !offers.drives ? "drive" : card.tab);
+  const has = (id) => (id === "drive" ? first : id === "more" || cards.some((card) => tabOf(card) === id));
+  const tabs = TABS.filter(({ id }) => has(id));
   const tab = tabs.some(({ id }) => id === chosen) ? chosen : tabs[0].id;
   return html`<div class="robot">
     <h1 class="sr">${nameOf(at)}</h1>
@@ -86,7 +88,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
     </div>`}
     <div class="cards">
       ${cards
-        .filter((card) => card.tab === tab)
+        .filter((card) => tabOf(card) === tab)
         .map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
       ${tab === "more" &&
       html`${video &&

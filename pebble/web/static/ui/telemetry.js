@@ -104,13 +104,11 @@ function Services({ at }) {
           .map(([name, one]) => {
             const state = String(one?.state ?? one);
             const bad = state === "failed" || state === "restarting";
+            const more = [one?.restarts > 0 && `restarted ${one.restarts}×`, bad && one?.last_exit].filter(Boolean);
             return html`<li key=${name} class=${bad ? "bad" : ""}>
-              <i aria-hidden="true">${SERVICE[state] ?? "○"}</i> ${name}
-              <span class="dim">
-                ${state}${one?.restarts > 0 ? `, restarted ${one.restarts}×` : ""}${bad && one?.last_exit
-                  ? `, ${one.last_exit}`
-                  : ""}</span
-              >
+              <i aria-hidden="true">${SERVICE[state] ?? "○"}</i>
+              <span>${name.replaceAll("_", " ")}</span>
+              <span class="service-state">${[state, ...more].join(", ")}</span>
             </li>`;
           })}
       </ul>

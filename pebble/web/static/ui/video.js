@@ -72,10 +72,12 @@ function useCover(control, source) {
   const { connection, video } = usePage();
   useModel(connection);
   const view = useValue(source, "web/picture");
+  const online = useValue(source, "web/liveness")?.online;
   if (!control.wanted) return "Video is stopped";
   const old = video.info ? ` · this picture is ${span(video.age().ms)} old` : "";
   if (!connection.isOpen) return `No connection to the server${old}`;
   if (video.info && !video.isStale) return "";
+  if (online === false) return `${nameOf(source)} is silent${old}`;
   if (view?.state === "refused") return `No picture: ${view.why || "the robot refuses"}`;
   if (video.info) return `The picture has stopped${old}`;
   if (view?.why) return view.why;
