@@ -57,6 +57,7 @@ class Tab:
     console: list[str] = field(default_factory=list)  # "type: text"
     errors: list[str] = field(default_factory=list)  # exceptions that nothing caught
     violations: list[str] = field(default_factory=list)  # of the content security policy
+    _debugger: CDPSession | None = None
 
     def until(self, condition: Callable[[], object] | str, timeout: float = 10.0) -> bool:
         """Wait until ``condition()``, or a JavaScript expression, is true; assert on the result."""
@@ -75,9 +76,19 @@ class Tab:
         """Chromium's own protocol for this page."""
         return self.context.new_cdp_session(self.page)
 
-    def freeze(self, *, frozen: bool = True) -> None:
-        """As a system does that suspends the tab."""
-        self.cdp().send("Page.setWebLifecycleState", {"state": "frozen" if frozen else "active"})
+    def freeze(self) -> None:
+        """Its script stands still until ``thaw``, as in a tab that the system suspends.
+
+        Page.setWebLifecycleState has no effect on the pages of Chromium 156: they are always visible.
+        """
+        self._debugger = self.cdp()
+        self._debugger.send("Debugger.enable")
+        self._debugger.send("Debugger.pause")
+
+    def thaw(self) -> None:
+        if self._debugger is not None:
+            self._debugger.detach()
+        self._debugger = None
 
     def hide(self, *, hidden: bool = True) -> None:
         """As if another tab were in front: Playwright's pages are always visible."""

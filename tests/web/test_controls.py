@@ -1,0 +1,451 @@
+"""Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot.
+
+Robots on Zenoh (goob), on MQTT (fred) and on microcontrollers (minilamp, benjr).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import Browser, Locator
+
+from pebble.contract.payloads import Heartbeat
+from tests.web.browser import tab
+from tests.web.console import BACK, FORWARD, KEYS, LEFT, REST, RIGHT, Console, Wheels, Wire, console, pad, used
+from tests.web.stage import Stage
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+
+
+@pytest.fixture(scope="module")
+def wire(stage: Stage) -> Iterator[Wire]:
+    running = Wire(stage)
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
+def _lamp_page(browser: Browser, stage: Stage) -> Iterator[Console]:
+    with console(browser, stage, "minilamp") as opened:
+        yield opened
+
+
+@pytest.fixture
+def at_lamp(_lamp_page: Console) -> Iterator[Console]:
+    """Minilamp's page: it has no camera, so it is ready at once."""
+    with used(_lamp_page) as ready:
+        yield ready
+
+
+@pytest.fixture(scope="module")
+def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
+    with console(browser, stage, "benjr", theme="dark") as opened:
+        yield opened
+
+
+@pytest.fixture
+def at_benjr(_benjr_page: Console) -> Iterator[Console]:
+    """Benjr's page, in the dark: its motors have more speeds than on and off."""
+    with used(_benjr_page) as ready:
+        yield ready
+
+
+# -- keys
+
+
+@pytest.mark.parametrize("name", ["goob", "fred", "minilamp", "benjr"])
+def test_each_key_turns_the_wheels_while_it_is_held(browser: Browser, stage: Stage, name: str) -> None:
+    with console(browser, stage, name) as opened, used(opened) as robot:
+        for key, wheels in KEYS.items():
+            assert robot.drive(key, wheels=wheels), (key, robot.wheels, robot.reason)
+            robot.let_go()
+            assert robot.rests(), key
+
+
+def test_two_keys_are_mixed_and_opposite_ones_rest(at_benjr: Console) -> None:
+    assert at_benjr.drive("KeyW", "KeyD", wheels=(1, 0))
+    at_benjr.let_go()
+    assert at_benjr.rests()
+    assert at_benjr.drive()
+    at_benjr.down("KeyS")
+    assert at_benjr.rests()
+    assert at_benjr.press_anew()
+
+
+@pytest.mark.parametrize(("key", "button", "y"), [("KeyQ", "aux+", 0.6), ("KeyE", "aux-", -0.6)])
+def test_the_extra_axis_has_keys_and_buttons(at_lamp: Console, wire: Wire, key: str, button: str, y: float) -> None:
+    def newest() -> float:
+        return float((wire.last("minilamp/incoming/drive-values") or {}).get("y", 0.0))
+
+    at_lamp.down(key)
+    assert at_lamp.tab.until(lambda: newest() == y, 2)
+    at_lamp.let_go()
+    assert at_lamp.tab.until(lambda: newest() == 0, 2)
+    at_lamp.test(button).hover()
+    at_lamp.page.mouse.down()
+    assert at_lamp.tab.until(lambda: newest() == y, 2)
+    at_lamp.page.mouse.up()
+    assert at_lamp.tab.until(lambda: newest() == 0, 2)
+
+
+# -- sliders and stick
+
+SLIDERS = {"speed": "60", "turn": "60", "balance": "0"}
+
+
+@pytest.mark.parametrize(
+    ("slider", "value", "key", "speeds"),
+    [
+        ("speed", "30", "KeyW", (0.3, 0.3)),
+        ("speed", "100", "KeyS", (-1.0, -1.0)),
+        ("turn", "25", "KeyD", (0.25, -0.25)),
+        ("balance", "50", "KeyW", (0.6, 0.3)),
+        ("balance", "-50", "KeyW", (0.3, 0.6)),
+    ],
+)
+def test_a_slider_scales_what_the_wheels_do(
+    at_benjr: Console, slider: str, value: str, key: str, speeds: tuple[float, float]
+) -> None:
+    at_benjr.test(slider).fill(value)
+    assert at_benjr.drive(key, wheels=KEYS[key])
+    assert at_benjr.tab.until(lambda: at_benjr.speeds == pytest.approx(speeds, abs=0.01), 1), at_benjr.speeds
+    at_benjr.let_go()
+    at_benjr.test(slider).fill(SLIDERS[slider])
+
+
+def test_arrow_keys_on_a_slider_move_the_slider_only(at_benjr: Console) -> None:
+    at_benjr.test("speed").focus()
+    at_benjr.down("ArrowRight")
+    assert at_benjr.stays_at_rest(0.2)
+    assert at_benjr.test("speed").input_value() == "65"
+    at_benjr.test("speed").fill("60")
+
+
+@pytest.mark.parametrize(("x", "y", "wheels"), [(0, -1, FORWARD), (0, 1, BACK), (-1, 0, LEFT), (1, 0, RIGHT)])
+def test_the_stick_follows_the_mouse(at_benjr: Console, x: int, y: int, wheels: Wheels) -> None:
+    at_benjr.test("stick").hover()
+    left, top, size = at_benjr.place("stick")
+    at_benjr.page.mouse.down()
+    assert at_benjr.stays_at_rest(0.1)
+    at_benjr.page.mouse.move(left + 0.4 * x * size, top + 0.4 * y * size, steps=3)
+    assert at_benjr.turns(wheels)
+    at_benjr.page.mouse.move(left + 3 * x * size, top + 3 * y * size)
+    assert at_benjr.wheels == wheels
+    at_benjr.page.mouse.up()
+    assert at_benjr.rests()
+
+
+# -- gamepads
+
+
+def test_a_gamepad_drives_once_it_was_seen_in_neutral(at_lamp: Console) -> None:
+    at_lamp.pads(pad(z=1))
+    assert at_lamp.stays_at_rest()
+    at_lamp.pads(pad())
+    at_lamp.page.wait_for_timeout(120)
+    at_lamp.pads(pad(z=1))
+    assert at_lamp.turns(FORWARD)
+    at_lamp.pads(pad(x=-1))
+    assert at_lamp.turns(LEFT)
+    at_lamp.pads(pad(0.05, -0.05))
+    assert at_lamp.rests()
+
+
+def _pad_drives(at_lamp: Console, *more: dict[str, object]) -> None:
+    at_lamp.pads(pad(), *more)
+    at_lamp.page.wait_for_timeout(120)
+    at_lamp.pads(pad(z=1), *more)
+    assert at_lamp.turns(FORWARD)
+
+
+def test_a_gamepad_that_is_disconnected_while_it_is_deflected_stops(at_lamp: Console) -> None:
+    _pad_drives(at_lamp)
+    at_lamp.pads(None)
+    assert at_lamp.rests()
+    at_lamp.pads(None, pad(z=1))
+    assert at_lamp.stays_at_rest()
+    _pad_drives(at_lamp)
+
+
+def test_a_deflected_gamepad_whose_time_stands_still_is_given_up(at_lamp: Console) -> None:
+    _pad_drives(at_lamp)
+    began = time.monotonic()
+    assert at_lamp.rests(6)
+    assert time.monotonic() - began > 2.5
+    assert at_lamp.reason in ("pad", "release")
+    at_lamp.pads(pad(z=1))
+    assert at_lamp.stays_at_rest()
+    _pad_drives(at_lamp)
+
+
+def test_of_two_gamepads_the_attack_3_drives(at_lamp: Console) -> None:
+    _pad_drives(at_lamp, pad(z=-1, name="another"))
+    second = pad(name="Logitech Attack 3")
+    at_lamp.pads(pad(z=1), second)
+    assert at_lamp.rests()
+    at_lamp.pads(pad(z=1), {**second, "axes": [0, 1]})
+    assert at_lamp.turns(BACK)
+
+
+def test_the_buttons_of_a_gamepad_stop(at_lamp: Console, wire: Wire) -> None:
+    _pad_drives(at_lamp)
+    at_lamp.pads(pad(0, 1, 0))
+    assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    assert not wire.latched("minilamp")
+    _pad_drives(at_lamp)
+    at_lamp.pads(pad(0, 1, 8, 9))
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.rests()
+
+
+# -- stops
+
+
+def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wire: Wire) -> None:
+    assert at_lamp.drive()
+    at_lamp.page.keyboard.press("Space")
+    assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    assert not wire.latched("minilamp")
+    assert at_lamp.press_anew()
+
+
+def _escape_twice(element: Locator) -> None:
+    element.press("Escape")
+    element.press("Escape")
+
+
+def _touch(element: Locator) -> None:
+    element.hover()
+    element.page.mouse.down()
+
+
+STOPS: dict[str, Callable[[Console], None]] = {
+    "Ctrl+Space": lambda robot: robot.page.keyboard.press("Control+Space"),
+    "Escape twice": lambda robot: _escape_twice(robot.page.locator("body")),
+    "Escape twice, in a list": lambda robot: _escape_twice(robot.test("picker")),
+    "STOP": lambda robot: robot.test("stop-one").click(),
+    "STOP, by key": lambda robot: robot.test("stop-one").press("Enter"),
+    "STOP, as soon as it is touched": lambda robot: _touch(robot.test("stop-one")),
+}
+
+
+@pytest.mark.parametrize("how", STOPS)
+def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wire, how: str) -> None:
+    assert at_lamp.drive()
+    STOPS[how](at_lamp)
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.rests()
+    assert at_lamp.because("stopped", within=2)
+    at_lamp.let_go()
+    at_lamp.down("KeyW")
+    assert at_lamp.stays_at_rest()
+
+
+def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(
+    browser: Browser, stage: Stage, at_lamp: Console, wire: Wire
+) -> None:
+    assert at_lamp.drive()
+    at_lamp.test("stop-all").click()
+    assert at_lamp.tab.until(lambda: all(wire.latched(name) for name in stage.robots), 3)
+    assert at_lamp.rests()
+    at_lamp.let_go()
+    at_lamp.test("reset").click()
+    at_lamp.test("leave-stopped").click()
+    at_lamp.test("reset").click()
+    at_lamp.test("reset-hold").click()
+    at_lamp.hold_button("reset-hold", 0.5)
+    assert wire.latched("minilamp")
+    at_lamp.hold_button("reset-hold")
+    assert at_lamp.tab.until(lambda: not wire.latched("minilamp"), 3)
+    assert all(wire.latched(name) for name in ("goob", "fred", "benjr"))
+    assert at_lamp.press_anew()
+    for name in ("goob", "fred", "benjr"):
+        at_lamp.page.evaluate(
+            "([ref, view]) => window.pebble.commands.reset(ref, view.owners)",
+            [stage.ref(name), at_lamp.state("web/estop", stage.ref(name))],
+        )
+    assert at_lamp.tab.until(lambda: not any(wire.latched(name) for name in stage.robots), 3)
+
+
+# -- control
+
+
+def test_a_release_stops_the_wheels(at_lamp: Console) -> None:
+    assert at_lamp.drive()
+    at_lamp.test("release").click()
+    assert at_lamp.rests()
+    assert at_lamp.because("free", within=2)
+    at_lamp.let_go()
+    at_lamp.down("KeyW")
+    assert at_lamp.stays_at_rest()
+
+
+def test_a_second_tab_stops_by_the_space_bar_and_takes_over_by_a_hold(
+    browser: Browser, stage: Stage, at_lamp: Console
+) -> None:
+    with console(browser, stage, "minilamp") as second:
+        assert second.because("lease")
+        second.down("KeyW")
+        assert second.stays_at_rest(0.2)
+        second.let_go()
+        assert at_lamp.drive()
+        second.page.keyboard.press("Space")
+        assert at_lamp.rests()
+        assert at_lamp.stays_at_rest()
+        at_lamp.let_go()
+        assert at_lamp.drive()
+        second.test("take-over").click()
+        assert not second.because("", within=0.3)
+        second.hold_button("take-over")
+        assert at_lamp.rests()
+        assert second.because("", within=3)
+        assert second.press_anew()
+        second.test("release").click()
+        assert at_lamp.because("free", within=3)
+        assert at_lamp.stays_at_rest()  # its key is still held
+        at_lamp.test("take").click()
+        assert at_lamp.because("", "release", within=3)
+        assert at_lamp.stays_at_rest()
+        assert at_lamp.press_anew()
+        assert second.tab.complaints() == []
+
+
+# -- pictures
+
+
+def test_the_camera_runs_while_its_picture_is_shown(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with console(browser, stage, "fred") as robot, used(robot):
+        assert robot.tab.until(lambda: wire.camera("fred"), 5)
+        robot.test("encoding").select_option("json")
+        assert robot.tab.until(
+            lambda: wire.last("fred/incoming/front-camera") == {"enabled": True, "encoding": "json"}, 5
+        )
+        assert robot.tab.until("window.pebble.video.info?.encoding === 'json'")
+        robot.test("encoding").select_option("")
+        assert robot.tab.until("window.pebble.video.info?.encoding === 'h264'")
+        robot.test("video").click()
+        assert robot.tab.until("window.pebble.video.ref === ''", 1)
+        assert robot.because("", within=1)  # without a picture that is wanted none is too old
+        assert robot.press_anew()
+        assert robot.tab.until(lambda: wire.last("fred/incoming/front-camera") == {"enabled": False}, 8)
+        assert robot.tab.until(lambda: wire.last("fred/incoming/flags/mqtt-video") == {"value": False}, 1)
+        robot.test("video").click()
+        assert robot.tab.until("window.pebble.video.info !== null")
+        assert wire.last("fred/incoming/flags/mqtt-video") == {"value": True}
+
+
+def test_a_robot_shows_the_picture_of_another_which_must_be_new(at_lamp: Console, stage: Stage, wire: Wire) -> None:
+    at_lamp.page.evaluate(
+        "([ref, source]) => window.pebble.commands.setPictureFrom(ref, source)", [at_lamp.ref, stage.ref("goob")]
+    )
+    assert at_lamp.tab.until("window.pebble.video.info !== null")
+    assert at_lamp.tab.until(lambda: wire.camera("goob"), 5)
+    at_lamp.take()
+    assert at_lamp.drive()
+    wire.publish("goob/incoming/flags/mqtt-video", {"value": False}, retain=True)
+    assert at_lamp.because("picture", within=6)
+    assert at_lamp.rests()
+    at_lamp.test("see").click()
+    assert at_lamp.stays_at_rest()  # its key is still held
+    assert at_lamp.press_anew()
+    wire.publish("goob/incoming/flags/mqtt-video", {"value": True}, retain=True)
+    assert at_lamp.tab.until("window.pebble.video.age().ms < 1000")
+    at_lamp.test("picture-from").select_option(stage.ref("fred"))
+    assert at_lamp.tab.until(lambda: at_lamp.page.evaluate("window.pebble.video.ref") == stage.ref("fred"), 3)
+    assert at_lamp.tab.until("window.pebble.video.info !== null")
+    at_lamp.test("picture-from").select_option("")
+    assert at_lamp.tab.until("window.pebble.video.ref === ''", 3)
+
+
+def test_full_screen_has_stop_and_can_be_left(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with console(browser, stage, "goob", theme="dark") as robot, used(robot):
+        robot.test("full-screen").click()
+        assert robot.tab.until("document.fullscreenElement !== null", 3)
+        assert robot.drive()
+        robot.test("stop-one").click()
+        assert robot.tab.until(lambda: wire.latched("goob"), 2)
+        assert robot.rests()
+        robot.page.get_by_label("Leave full screen").click()
+        assert robot.tab.until("document.fullscreenElement === null", 3)
+        robot.take()
+
+
+# -- the fleet
+
+
+def test_the_fleet_stops_robots_and_never_starts_a_camera(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with tab(browser, stage.url) as fleet:
+        assert fleet.until(lambda: fleet.page.locator(".fleet-card").count() == 4)
+        asked = len(wire.received)
+        fleet.test("thumbnails").check()
+        fleet.test("card-fred").hover()
+        fleet.test("stop-benjr").click()
+        assert fleet.until(lambda: wire.latched("benjr"), 2)
+        assert not wire.latched("fred")
+        names = "[...document.querySelectorAll('.fleet-card h2')].map((one) => one.textContent).join()"
+        assert fleet.page.evaluate(names) == "benjr,fred,goob,minilamp"
+        fleet.test("sort").select_option("battery")
+        assert fleet.until(f"{names} !== 'benjr,fred,goob,minilamp'", 2)
+        fleet.test("filter").fill("RED")
+        assert fleet.until(f"{names} === 'fred'", 2)
+        assert not [one for one in wire.received[asked:] if one[0].endswith("/front-camera") and one[1]["enabled"]]
+        fleet.test("card-fred").get_by_role("link").click()
+        assert fleet.until("window.pebble.driver.ref === 'pebble/robots/fred'", 2)
+        assert fleet.complaints() == []
+
+
+def test_an_offline_robot_can_be_forgotten_until_it_is_back(browser: Browser, stage: Stage, wire: Wire) -> None:
+    wire.publish("old/outgoing/online", Heartbeat(t=1_700_000_000_000, online=False), retain=True)
+    with tab(browser, stage.url) as fleet:
+        assert fleet.until(lambda: fleet.test("forget").count() == 1)
+        fleet.test("forget").click()
+        assert fleet.until(lambda: fleet.test("forget").count() == 0, 2)
+        wire.publish("old/outgoing/online", Heartbeat(t=int(1000 * time.time()), online=True))
+        assert fleet.until(lambda: fleet.test("card-old").count() == 1, 3)
+        assert fleet.complaints() == []
+    wire.publish("old/outgoing/online", None, retain=True)
+
+
+def test_the_settings_change_the_colours_and_end_a_gesture(at_lamp: Console) -> None:
+    colour = "getComputedStyle(document.body).backgroundColor"
+    light = at_lamp.page.evaluate(colour)
+    assert at_lamp.drive()
+    at_lamp.test("settings").click()
+    assert at_lamp.rests()
+    at_lamp.test("theme-dark").check()
+    assert at_lamp.page.evaluate(colour) != light
+    at_lamp.test("in-sight").check()
+    assert at_lamp.page.evaluate("window.pebble.driver.inSight")
+    at_lamp.test("in-sight").uncheck()
+    at_lamp.test("theme-light").check()
+    assert at_lamp.page.evaluate(colour) == light
+    at_lamp.page.keyboard.press("Escape")
+    assert at_lamp.tab.until("document.querySelector('dialog[open]') === null", 2)
+    assert at_lamp.press_anew()
+
+
+# -- without a mouse
+
+
+def test_the_tab_key_reaches_every_control_and_space_on_a_button_also_stops(at_lamp: Console) -> None:
+    at_lamp.page.evaluate("document.activeElement.blur()")
+    focusable = "a[href], button:enabled, input:enabled, select:enabled, summary, [tabindex='0']"
+    count = at_lamp.page.evaluate(
+        "(all) => [...document.querySelectorAll(all)].filter((one) => one.checkVisibility()).length", focusable
+    )
+    at_lamp.page.evaluate("window.reached = new Set()")
+    for _ in range(count + 2):
+        at_lamp.page.keyboard.press("Tab")
+        at_lamp.page.evaluate("window.reached.add(document.activeElement)")
+    assert at_lamp.page.evaluate("window.reached.delete(document.body) || true")
+    assert at_lamp.page.evaluate("window.reached.size") == count
+    at_lamp.test("release").focus()
+    assert at_lamp.drive()
+    at_lamp.page.keyboard.press("Space")
+    assert at_lamp.rests()
+    assert at_lamp.because("free", within=2)
+    assert at_lamp.wheels == REST
