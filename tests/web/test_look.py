@@ -53,6 +53,7 @@ class Screen(NamedTuple):
     state: str
     act: Callable[[Page], None] = _nothing
     sizes: tuple[Size, ...] = ("desktop", "phone")
+    hold: Callable[[Page], None] = _nothing  # after the measurements, which change the window's size
 
 
 ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
@@ -84,7 +85,7 @@ SCREENS = [
         Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
         for name in STATES
     ),
-    Screen("driving-now", "driving", _drive, ("desktop",)),
+    Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
     Screen("thumbnails", "fleet", _press(".check")),
     Screen("settings", "driving", _press(".me"), ("desktop",)),
     Screen("reset-asked", "stopped", _press(".banner-actions button")),
@@ -125,6 +126,7 @@ def test_screen(server: CannedServer, browser: Browser, axe: str, case: tuple[Sc
         _wait(opened, WHEN.get(screen.state, ""))
         screen.act(opened.page)
         problems = _measured(opened.page, size)
+        screen.hold(opened.page)
         for theme in ("light", "dark"):
             _show(opened, theme)
             opened.page.screenshot(path=PICTURES / f"{screen.name}-{size}-{theme}.png")
