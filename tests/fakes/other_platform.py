@@ -19,9 +19,9 @@ ATTRIBUTES = {
     "os": (
         "eventfd eventfd_read eventfd_write EFD_CLOEXEC EFD_NONBLOCK fork forkpty openpty getuid geteuid getgid "
         "getegid getgroups getpgid setpgid setsid killpg ttyname uname sysconf mkfifo chown fchown fchmod pread pwrite "
-        "preadv pwritev memfd_create MFD_CLOEXEC pidfd_open posix_spawn register_at_fork sched_getaffinity sched_setaffinity "
-        "sched_yield nice getpriority setpriority set_blocking get_blocking wait3 wait4 WNOHANG O_CLOEXEC O_NOCTTY "
-        "O_NONBLOCK O_DIRECTORY O_NOFOLLOW pipe2 statvfs getloadavg sendfile copy_file_range"
+        "preadv pwritev memfd_create MFD_CLOEXEC pidfd_open posix_spawn register_at_fork sched_getaffinity "
+        "sched_setaffinity sched_yield nice getpriority setpriority set_blocking get_blocking wait3 wait4 WNOHANG "
+        "O_CLOEXEC O_NOCTTY O_NONBLOCK O_DIRECTORY O_NOFOLLOW pipe2 statvfs getloadavg sendfile copy_file_range"
     ),
     "select": "epoll poll",
     "signal": (
