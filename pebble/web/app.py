@@ -7,6 +7,7 @@ import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.resources import files
+from urllib.parse import quote
 
 import msgspec
 from starlette.applications import Starlette
@@ -77,7 +78,8 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
 
 async def _page(request: Request) -> Response:
     if login.session_of(request) is None:
-        return Response(status_code=303, headers={"location": "/login", **NO_STORE})
+        wanted = "" if request.url.path == "/" else f"?next={quote(request.url.path)}"
+        return Response(status_code=303, headers={"location": f"/login{wanted}", **NO_STORE})
     return _static_of(request).answer(request, "index.html", NO_STORE)
 
 
@@ -123,7 +125,7 @@ async def _estop(request: Request) -> Response:
         return PlainTextResponse("log in first", 401)
     try:
         op = _estop_decoder.decode(await request.body())
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         return PlainTextResponse(str(error), 400)
     address = "" if request.client is None else request.client.host
     request.app.state.server.stop(op.ref, op.stop, session, "", op.why, address)

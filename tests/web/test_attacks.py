@@ -480,6 +480,28 @@ def test_the_picture_socket_takes_no_nonsense(hall: Hall, driver: Page) -> None:
     assert hall.works()
 
 
+@pytest.mark.parametrize(
+    "body", [b"", b"\xff", b"{", b"[" * 16_000, b"null", b'{"op":"estop","ref":"\xff"}', b"x" * 17_000]
+)
+def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes) -> None:
+    headers = {"origin": hall.served.origin, "content-type": "application/json"}
+    before = len(everything.incoming())
+    with hall.client("admin") as client:
+        for path in hall.routes(Route, "POST"):
+            if path != "/api/logout":
+                assert client.post(path, content=body, headers=headers).status_code in (400, 413, 429), path
+    assert len(everything.incoming()) == before
+
+
+def test_the_login_leads_back_to_the_page_that_was_asked_for(hall: Hall) -> None:
+    with hall.client() as client:
+        assert client.get(f"/r/{GOOB}").headers["location"] == f"/login?next=/r/{GOOB}"
+        assert client.get("/").headers["location"] == "/login"
+        assert client.get("/r/%0d%0aset-cookie:%20x=y").status_code == 404
+        odd = client.get("/r/%22%3E//evil.test?x=y&next=//evil.test")
+        assert odd.headers["location"] == "/login?next=/r/%22%3E//evil.test"
+
+
 # -- slow and many
 
 
