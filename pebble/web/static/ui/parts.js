@@ -23,7 +23,7 @@ export function StopButton({ onStop, label, children, className = "", describedB
         touchedAt.current = performance.now();
         onStop();
       }}
-      onClick=${() => performance.now() - touchedAt.current > 1500 && onStop()}
+      onClick=${(event) => (event.detail === 0 || performance.now() - touchedAt.current > 1500) && onStop()}
       onContextMenu=${(event) => event.preventDefault()}
     >
       ${children}
