@@ -1,6 +1,6 @@
 /** Ties inputs, gesture and control socket together: from events of the browser to drive commands. */
 
-import { Gesture, PERIOD_MS } from "./gesture.js";
+import { Gesture, PERIOD_MS, STALL_MS } from "./gesture.js";
 import { DRIVE_KEYS, Inputs } from "./inputs.js";
 import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
 
@@ -28,6 +28,8 @@ export class Driver {
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
     this.padStopped = false;
+    this.updatedAt = -Infinity;
+    this.latchedAt = -Infinity; // when the component was last seen stopped
     this.clockBase = Date.now() - performance.now();
     /** @type {Set<() => void>} */
     this.watchers = new Set();
@@ -37,10 +39,10 @@ export class Driver {
   /** Listen to the window; to be called once. */
   start() {
     addEventListener("keydown", (event) => this.keyDown(event), true);
-    addEventListener("keyup", (event) => this.inputs.keyUp(event.code) && this.update(), true);
-    for (const name of ["blur", "pagehide", "freeze"]) addEventListener(name, () => this.interrupt());
-    document.addEventListener("freeze", () => this.interrupt());
-    document.addEventListener("visibilitychange", () => document.hidden && this.interrupt());
+    addEventListener("keyup", (event) => this.keyUp(event), true);
+    for (const name of ["blur", "pagehide"]) addEventListener(name, () => this.leave());
+    document.addEventListener("freeze", () => this.leave());
+    document.addEventListener("visibilitychange", () => document.hidden && this.leave());
     document.addEventListener("contextmenu", () => this.interrupt());
     screen.orientation?.addEventListener?.("change", () => this.interrupt());
     addEventListener("gamepaddisconnected", () => this.inputs.padGone());
@@ -54,6 +56,7 @@ export class Driver {
     this.gesture.repeats = []; // they would be sent to the other one
     this.ref = ref;
     this.inSight = false;
+    this.latchedAt = -Infinity;
     this.socket.send({ op: "watch", ref });
     this.changed();
   }
@@ -97,6 +100,7 @@ export class Driver {
       fromKeys: this.inputs.fromKeys,
       liveness: value("web/liveness"),
       estop: value("web/estop"),
+      freeForMs: performance.now() - this.latchedAt,
       capabilities: value("capabilities")?.value ?? {},
       driver: value("web/driver"),
       script: value("autonomy-status"),
@@ -132,8 +136,15 @@ export class Driver {
     this.changed();
   }
 
-  stickStart(pointer) {
-    return this.inputs.stickStart(pointer);
+  /** The window has lost the keyboard, or the page is hidden. */
+  leave() {
+    this.inputs.leave();
+    this.interrupt();
+  }
+
+  /** @param {number} pointer @param {number} at performance.now() of the event @returns {boolean} whether it moves the stick */
+  stickStart(pointer, at = performance.now()) {
+    return !isOld(at) && this.inputs.stickStart(pointer);
   }
 
   /** @param {number} x @param {number} z each -1..1; ignored after the gesture was interrupted */
@@ -147,9 +158,9 @@ export class Driver {
     this.update();
   }
 
-  /** A button for the auxiliary axis. @param {string} name @param {number} value 0: released */
-  hold(name, value) {
-    this.inputs.hold(name, value);
+  /** A button for the auxiliary axis. @param {string} name @param {number} value 0: released @param {number} at as above */
+  hold(name, value, at = performance.now()) {
+    if (!value || !isOld(at)) this.inputs.hold(name, value);
     this.update();
   }
 
@@ -163,7 +174,13 @@ export class Driver {
     return () => this.watchers.delete(watcher);
   }
 
+  keyUp(event) {
+    if (isMeta(event)) this.leave();
+    else if (this.inputs.keyUp(event.code)) this.update();
+  }
+
   keyDown(event) {
+    if (isMeta(event)) this.leave(); // macOS does not report which keys are released while it is held
     if (event.code === "Escape" && !event.repeat) {
       if (performance.now() - this.escapeAt < TWICE_MS) this.latch("Escape twice");
       this.escapeAt = performance.now();
@@ -173,14 +190,16 @@ export class Driver {
       if (!event.repeat) this.latch("Ctrl+Space");
       return;
     }
-    if (event.ctrlKey || event.altKey || event.metaKey || event.target.matches?.(TYPING)) return;
+    if (event.target.matches?.(TYPING)) return;
     if (event.code === "Space") {
       if (!event.target.matches?.("button, [role=button], summary, a")) event.preventDefault();
       this.space();
-    } else if (DRIVE_KEYS.has(event.code) && this.ref && !event.target.matches?.("input[type=range], [role=radio]")) {
+    } else if (event.ctrlKey || event.altKey || event.metaKey) {
+      // a shortcut of the browser
+    } else if (DRIVE_KEYS.has(event.code) && this.ref && !isOwn(event)) {
       event.preventDefault();
       if (document.querySelector("dialog[open]")) return;
-      this.inputs.keyDown(event.code, event.repeat);
+      this.inputs.keyDown(event.code, event.repeat || isOld(event.timeStamp));
       this.update();
     }
   }
@@ -191,14 +210,18 @@ export class Driver {
   }
 
   tick() {
-    const drift = Date.now() - performance.now() - this.clockBase;
-    if (Math.abs(drift) > SUSPENDED_MS) {
-      this.clockBase += drift; // this machine was suspended, or its clock was set
-      this.interrupt();
-      this.socket.restart();
-    }
+    if (this.gesture.active && document.querySelector("dialog[open]")) this.interrupt();
     this.readPad();
     this.update();
+  }
+
+  /** Where the page's clock stands still while the machine is suspended, only the other one shows it. */
+  checkClock(now) {
+    const drift = Date.now() - now - this.clockBase;
+    if (Math.abs(drift) <= SUSPENDED_MS) return;
+    this.clockBase += drift;
+    this.leave();
+    this.socket.restart();
   }
 
   readPad() {
@@ -217,11 +240,18 @@ export class Driver {
   }
 
   update() {
+    const now = performance.now();
+    if (now - this.updatedAt > STALL_MS) this.leave(); // the page stood still: releases may have been lost
+    this.updatedAt = now;
+    this.checkClock(now);
+    if (this.store.get(this.ref, "web/estop")?.value.latched) this.latchedAt = now;
     const situation = this.ref ? this.situation() : null;
     const why = situation && driveReason({ ...situation, mustRelease: false });
     const slow = this.socket.roundTripMs >= SLOW_MS ? SLOW_SPEED : 1;
     const vector = this.inputs.vector({ ...this.sliders, speed: Math.min(this.sliders.speed, slow) });
-    this.gesture.update(vector, situation !== null && why === null, performance.now());
+    const { neutral, waiting } = this.inputs;
+    this.gesture.update(vector, situation !== null && why === null, now, neutral, waiting.size > 0);
+    if (this.gesture.mustRelease) this.inputs.clearKeys();
     this.output = this.gesture.active ? vector : { x: 0, z: 0, y: 0 };
     this.changed();
   }
@@ -234,4 +264,18 @@ export class Driver {
     this.shown = shown;
     for (const watcher of this.watchers) watcher();
   }
+}
+
+/** Whether an event has waited for a page that stood still: perhaps the key was released long ago. */
+function isOld(at) {
+  return performance.now() - at > STALL_MS;
+}
+
+function isMeta(event) {
+  return event.key === "Meta" || event.key === "OS";
+}
+
+/** Arrows move a slider that has the focus; letters drive also then. */
+function isOwn(event) {
+  return event.code.startsWith("Arrow") && event.target.matches?.("input[type=range], input[type=radio]");
 }

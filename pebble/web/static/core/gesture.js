@@ -32,17 +32,19 @@ export class Gesture {
    * @param {Vector} vector what the inputs ask for now
    * @param {boolean} allowed whether anything may be moved now
    * @param {number} now milliseconds
+   * @param {boolean} neutral whether everything is released: the vector is also 0 while opposite keys are held
+   * @param {boolean} waits whether something is held that may not begin a gesture
    */
-  update(vector, allowed, now) {
-    const moving = vector.x !== 0 || vector.z !== 0 || vector.y !== 0;
+  update(vector, allowed, now, neutral = isZero(vector), waits = false) {
+    const moving = !isZero(vector);
     const stalled = now - this.updatedAt > STALL_MS;
     this.updatedAt = now;
     if (this.active && (stalled || !allowed)) this.interrupt(now);
     else if (this.active && !moving) this.end(now, false);
     else if (this.active) this.step(vector, now);
-    else if (!moving) this.mustRelease = false;
-    else if (!allowed) this.mustRelease = true;
-    else if (!this.mustRelease) this.begin(vector, now);
+    else if (neutral) this.mustRelease = false;
+    else if (!allowed || waits) this.mustRelease = true;
+    else if (moving && !this.mustRelease) this.begin(vector, now);
     this.repeat(now);
   }
 
@@ -104,6 +106,10 @@ export class Gesture {
 
 /** @type {Vector} */
 export const ZERO = Object.freeze({ x: 0, z: 0, y: 0 });
+
+function isZero({ x, z, y }) {
+  return x === 0 && z === 0 && y === 0;
+}
 
 function round(value) {
   return Math.round(value * 1000) / 1000;

@@ -19,6 +19,8 @@ export class Inputs {
   constructor() {
     /** @type {Set<string>} */
     this.keys = new Set();
+    /** @type {Set<string>} keys that are held, but count only after they were released */
+    this.waiting = new Set();
     /** @type {Map<string, number>} value of each button that is held on the page, by name */
     this.held = new Map();
     this.stick = { x: 0, z: 0 };
@@ -34,13 +36,19 @@ export class Inputs {
   /** @param {string} code @param {boolean} repeat @returns {boolean} whether the key drives */
   keyDown(code, repeat) {
     if (!DRIVE_KEYS.has(code)) return false;
-    if (!repeat) this.keys.add(code); // a repetition is of a key that was held before, perhaps in another window
+    if (!repeat) {
+      this.waiting.delete(code);
+      this.keys.add(code);
+    } else if (!this.keys.has(code)) this.waiting.add(code); // it was held before, perhaps in another window
     return true;
   }
 
-  /** @param {string} code */
+  /** @param {string} code @returns {boolean} whether the key was held */
   keyUp(code) {
-    return this.keys.delete(code);
+    const known = this.waiting.delete(code) || this.keys.has(code);
+    this.keys.delete(code);
+    if (!this.keys.size) this.waiting.clear(); // the release of the others may have been lost
+    return known;
   }
 
   /** @param {number} pointer @returns {boolean} whether the stick is free for it */
@@ -95,13 +103,31 @@ export class Inputs {
     this.padArmed = this.padFrozen = false;
   }
 
-  /** Forget what is held: it counts again after it was released. */
+  /** What is held counts again after it was released. */
   clear() {
-    this.keys.clear();
+    this.clearKeys();
     this.held.clear();
     this.stickEnd();
     this.pad = { x: 0, z: 0, y: 0 };
     this.padArmed = false;
+  }
+
+  clearKeys() {
+    for (const code of this.keys) this.waiting.add(code);
+    this.keys.clear();
+  }
+
+  /** The keyboard belongs to another window now: releases will not be seen. */
+  leave() {
+    this.clear();
+    this.waiting.clear();
+  }
+
+  /** Whether everything is released, as far as is known. A gamepad that is not armed may never be neutral. */
+  get neutral() {
+    const { stick, pad } = this;
+    const still = !stick.x && !stick.z && !pad.x && !pad.z && !pad.y;
+    return still && !this.keys.size && !this.waiting.size && !this.held.size;
   }
 
   /** Whether a key, or the gamepad, asks for motion: these need the focus of the window. */

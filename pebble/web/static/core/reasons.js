@@ -5,6 +5,7 @@ const PICTURE_OLD_MS = 2000;
 export const SLOW_MS = 300; // from this round trip on, the speed is limited
 const LATE_MS = 600;
 export const SLOW_SPEED = 0.4;
+const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 0.5 s
 
 /** @typedef {{code: string, text: string, action?: {label: string, kind: "take"|"take-over"|"see"|"login"|"reload"}}} Reason */
 
@@ -21,6 +22,7 @@ export const SLOW_SPEED = 0.4;
  * @property {boolean} fromKeys whether a key or the gamepad is used
  * @property {{online: boolean|null, silent_s: number|null}|undefined} liveness
  * @property {{latched: boolean, by: string}|undefined} estop
+ * @property {number} freeForMs since it was seen stopped
  * @property {Record<string, any>} capabilities
  * @property {{by: string, device: string, server: string, you: boolean}|undefined} driver
  * @property {{running?: boolean, file?: string}|undefined} script
@@ -54,6 +56,7 @@ function pageReason(s) {
 function robotReason(s) {
   if (!s.liveness || s.liveness.online === false) return reason("silent", silence(s));
   if (s.estop?.latched) return reason("stopped", `Stopped by ${s.estop.by || "unknown"}`);
+  if (s.freeForMs < RESET_MS) return reason("reset", "It was just reset: wait a moment");
   const drive = s.capabilities.drive;
   if (drive?.available !== true || drive.controls === false) return reason("no-drive", `${s.name} does not drive`);
   return null;
