@@ -1,6 +1,7 @@
 // The newest value of every component and metric, and who wants to know when it changes. No framework, no DOM.
 
 const STEP_MS = 50; // subscribers are called at most this often, and at most once per animation frame
+const SYNCS = 60; // half a minute of pings
 const INTERVALS = 5; // between updates, from which the period of a value is estimated
 
 /** One value. Ages are measured by a clock that nothing sets. */
@@ -48,7 +49,10 @@ export class Store {
     this.clock = clock;
     this.soon = soon;
     this.offset = Date.now() - clock();
-    this.bestRoundTrip = Infinity;
+    /** @type {number[]} */
+    this.offsets = [];
+    /** @type {number[]} */
+    this.roundTrips = [];
     /** @type {Map<string, Map<string, Value>>} */
     this.components = new Map();
     /** @type {Map<string, Set<() => void>>} */
@@ -127,17 +131,16 @@ export class Store {
   }
 
   /**
-   * Take the server's clock from a message. The quickest one is the most exact; jumps of a clock are followed.
+   * Take the server's clock from a message. One that is late makes the server's clock look slow, never fast: of the
+   * newest messages the one that looks fastest counts.
    * @param {number} serverNow epoch ms @param {number} [roundTripMs] of the connection; negative: unknown
    */
   sync(serverNow, roundTripMs = -1) {
-    const roundTrip = roundTripMs < 0 ? 1000 : roundTripMs;
-    const offset = serverNow + roundTrip / 2 - this.clock();
-    this.bestRoundTrip *= 1.02; // clocks drift: older measurements count less
-    if (roundTrip <= this.bestRoundTrip || Math.abs(offset - this.offset) > 1000 + roundTrip) {
-      this.bestRoundTrip = roundTrip;
-      this.offset = offset;
-    }
+    this.offsets.push(serverNow - this.clock());
+    if (roundTripMs >= 0) this.roundTrips.push(roundTripMs);
+    if (this.offsets.length > SYNCS) this.offsets.shift();
+    if (this.roundTrips.length > SYNCS) this.roundTrips.shift();
+    this.offset = Math.max(...this.offsets) + (this.roundTrips.length ? Math.min(...this.roundTrips) / 2 : 0);
   }
 
   /** @param {string} key */

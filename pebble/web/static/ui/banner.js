@@ -142,7 +142,9 @@ function StopBanner({ at }) {
         <button type="button" data-test="leave-stopped" onClick=${() => ask(false)}>Leave stopped</button>`}
       ${view.sending === "old" &&
       view.stop &&
-      html`<button type="button" data-test="end-stop" onClick=${() => commands.endStop(view.stop)}>End the stop</button>`}
+      html`<button type="button" data-test="end-stop" onClick=${() => commands.endStop(view.stop)}>
+        End the stop
+      </button>`}
     </div>
   </div>`;
 }
@@ -162,7 +164,10 @@ function stopProgress(view, name, age) {
     case "confirmed":
       return view.sending_text && age < SHOWN_MS ? { kind: "wait", text: `${name} ${view.sending_text}` } : null;
     case "old":
-      return { kind: "wait", text: `${name} is stopped, but cannot be held: ${view.sending_text}. Zeros are sent to it.` };
+      return {
+        kind: "wait",
+        text: `${name} is stopped, but cannot be held: ${view.sending_text}. Zeros are sent to it.`,
+      };
     case "not confirmed":
       return { kind: "bad", text: `STOP NOT CONFIRMED by ${name}, and no longer sent.${more}` };
     default:
@@ -244,7 +249,8 @@ function Notice() {
   const { notice } = connection;
   const shown = notice && performance.now() - notice.at < NOTICE_MS;
   return html`<div role="status">
-    ${shown && html`<div class="banner note"><${Icon} name="info" /><div class="banner-text">${notice.text}</div></div>`}
+    ${shown &&
+    html`<div class="banner note"><${Icon} name="info" /><div class="banner-text">${notice.text}</div></div>`}
   </div>`;
 }
 

@@ -140,9 +140,10 @@ export function Speed() {
 export function DriveSettings() {
   const { driver } = usePage();
   const { turn, balance } = useModel(driver).sliders;
+  const part = `${Math.round(100 * turn)} %`;
   const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
   return html`<div class="sliders">
-    <${Slider} name="Turn" value=${turn} min=${5} text=${`${Math.round(100 * turn)} %`} onInput=${set(driver, "turn")} />
+    <${Slider} name="Turn" value=${turn} min=${5} text=${part} onInput=${set(driver, "turn")} />
     <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
     <div class="aux">
       <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>

@@ -39,13 +39,14 @@ export function Fleet() {
   const shownAway = away.filter(matches).sort();
   const total = online.length + away.length;
   const robots = refs.filter((ref) => typeOf(ref) === "robots" && (online.includes(ref) || away.includes(ref)));
+  const present = robots.filter((ref) => online.includes(ref));
   const others = total - robots.length;
   return html`<div class="fleet">
     <div class="fleet-head">
       <h1>
         ${total === 0
           ? "Robots"
-          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}, ${robots.filter((ref) => online.includes(ref)).length} online`}
+          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}, ${present.length} online`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
       </h1>
       ${total > 0 && html`<${FleetTools} filter=${filter} onFilter=${setFilter} />`}
@@ -155,8 +156,8 @@ function FleetCard({ at }) {
     ${settings.thumbnails && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
-      <${DriverFact} at=${at} offers=${offers} />
-      <${ScriptFact} at=${at} />
+      <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} />
+      <${ScriptFact} at=${at} online=${connection.isOpen} />
       ${typeOf(at) !== "robots" && html`<${StatusFact} at=${at} />`}
       ${estop?.latched &&
       html`<li class="fact bad">
@@ -191,18 +192,20 @@ function BatteryFact({ at, online }) {
   </li>`;
 }
 
-function DriverFact({ at, offers }) {
+function DriverFact({ at, offers, online }) {
   const view = useValue(at, "web/driver");
-  if (!offers.drives) return offers.known ? html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>` : null;
+  if (!online) return null;
+  if (!offers.known && !offers.drives) return null;
+  if (!offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>`;
   if (!view?.by) return html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
   return html`<li class="fact">
     <${Icon} name="wheel" />${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}
   </li>`;
 }
 
-function ScriptFact({ at }) {
+function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
-  if (!status?.running) return null;
+  if (!online || !status?.running) return null;
   return html`<li class="fact"><${Icon} name="script" />script: ${String(status.file ?? "?")}</li>`;
 }
 

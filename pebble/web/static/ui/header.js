@@ -115,7 +115,7 @@ export function Liveness({ at }) {
     return html`<span class="state bad"><i>✖</i> ${view.silent_s === null ? "offline" : `silent${silent}`}</span>`;
   }
   const latency = view.whole_seconds || view.latency_ms === null ? "? ms" : span(view.latency_ms);
-  const why = view.whole_seconds ? "Its clock counts whole seconds: how late its heartbeats are is not known" : undefined;
+  const why = view.whole_seconds ? "Its clock counts whole seconds: how late its heartbeats are is unknown" : undefined;
   return html`<span class="state ok" title=${why}
     ><i>●</i> <span class="sr">online, heartbeats late by </span>${latency}</span
   >`;
@@ -135,7 +135,9 @@ function Vital({ at }) {
         >${battery(level.value)}<//
       ></span
     >`}
-    ${connection.isOpen && view?.by && html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${whoDrives(view)}</span>`}
+    ${connection.isOpen &&
+    view?.by &&
+    html`<span class=${`chip ${view.you ? "mine" : ""}`}><${Icon} name="wheel" />${whoDrives(view)}</span>`}
   </div>`;
 }
 

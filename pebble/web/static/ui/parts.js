@@ -78,7 +78,8 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
 export const Why = ({ id, children }) => html`<span class="why" id=${id}>${children}</span>`;
 
 /**
- * A value and how old it is: paler after two periods, and no longer shown as a value after ten seconds or three periods.
+ * A value and how old it is: of another colour after two periods; after ten seconds, or three periods if these are
+ * longer, it is no longer shown as a value.
  * @param {{entry?: import("../core/store.js").Value, online?: boolean, children: any}} props
  */
 export function Live({ entry, online = true, children }) {

@@ -63,7 +63,10 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
   const [chosen, choose] = useState("");
   const cards = wanted(offers, view);
   const first = Boolean(video) || offers.drives;
-  const tabOf = (card) => (card.tab === "sensors" && first && !offers.drives ? "drive" : card.tab);
+  const tabOf = (card) => {
+    if (first && !offers.drives && card.tab === "sensors") return "drive";
+    return first || typeOf(at) === "robots" ? card.tab : "sensors"; // little is known of it: all of that in one place
+  };
   const has = (id) => (id === "drive" ? first : id === "more" || cards.some((card) => tabOf(card) === id));
   const tabs = TABS.filter(({ id }) => has(id));
   const tab = tabs.some(({ id }) => id === chosen) ? chosen : tabs[0].id;
@@ -96,7 +99,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
           ><${PictureSettings} at=${at} source=${source} offers=${offers}
         /><//>`}
         <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
-        <button type="button" class="wide" onClick=${onPanel}><${Icon} name="settings" />Settings and who I am</button>`}
+        <${MoreSettings} onPanel=${onPanel} />`}
     </div>
     <nav class="tabs" aria-label="Parts of this page">
       ${tabs.map(
@@ -131,16 +134,21 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
     <//>`}
     ${drawer &&
     html`<aside class="drawer" aria-label="Everything else">
-      ${offers.drives && html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${DriveSettings} /><//>`}
+      ${offers.drives &&
+      html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${DriveSettings} /><//>`}
       ${video &&
       html`<${Card} id="picture" title="Picture" icon="camera"
         ><${PictureSettings} at=${at} source=${source} offers=${offers} video=${video}
       /><//>`}
       ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
-      <button type="button" class="wide" onClick=${onPanel}><${Icon} name="settings" />Settings and who I am</button>
+      <${MoreSettings} onPanel=${onPanel} />
     </aside>`}
   </div>`;
 }
+
+const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
+  <${Icon} name="settings" />Settings and who I am
+</button>`;
 
 const wanted = (offers, view) => CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id));
 
@@ -152,13 +160,14 @@ function CardOf({ card, at, offers, view }) {
 
 /** What is not on this page, and why. */
 function Missing({ at, offers, view, hasVideo }) {
-  const lacks = typeOf(at) !== "robots" ? [] : [!hasVideo && "camera", !offers.drives && offers.known && "driving"].filter(Boolean);
+  const isRobot = typeOf(at) === "robots";
+  const lacks = [!hasVideo && "camera", !offers.drives && offers.known && "driving"].filter((one) => isRobot && one);
   const hidden = CARDS.filter((card) => view.hidden.has(card.id));
   if (!lacks.length && !hidden.length) return null;
   return html`<div class="missing">
     ${lacks.length > 0 && html`<span class="dim">Not on ${nameOf(at)}: ${lacks.join(", ")}.</span>`}
     ${hidden.map(
-      (card) => html`<button key=${card.id} type="button" onClick=${() => view.show(card.id)}>Show ${card.title}</button>`,
+      ({ id, title }) => html`<button key=${id} type="button" onClick=${() => view.show(id)}>Show ${title}</button>`,
     )}
   </div>`;
 }

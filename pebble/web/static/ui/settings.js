@@ -22,7 +22,9 @@ export function SettingsPanel({ onClose }) {
   return html`<dialog open class="panel" ref=${panel} tabindex="-1" aria-labelledby="settings-title" onKeyDown=${key}>
     <div class="card-head">
       <h2 id="settings-title">Settings</h2>
-      <button type="button" class="quiet" aria-label="Close settings" onClick=${onClose}><${Icon} name="close" /></button>
+      <button type="button" class="quiet" aria-label="Close settings" onClick=${onClose}>
+        <${Icon} name="close" />
+      </button>
     </div>
     <${WhoAmI} />
     <fieldset>

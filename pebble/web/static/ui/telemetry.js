@@ -37,7 +37,8 @@ function Heartbeat({ at }) {
   const view = entry?.value;
   if (!view) return null;
   const age = view.silent_s === null ? null : 1000 * view.silent_s + entry.age;
-  const seen = age === null ? "none since the server started" : age < 1500 ? "within the last second" : `${roughly(age)} ago`;
+  const ago = age < 1500 ? "within the last second" : `${roughly(age)} ago`;
+  const seen = age === null ? "none since the server started" : ago;
   const late = view.whole_seconds
     ? "unknown: its clock counts whole seconds"
     : view.latency_ms === null

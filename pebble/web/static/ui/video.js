@@ -105,7 +105,8 @@ export function PictureSettings({ at, source, offers, video }) {
   const listed = offers.section("video").encodings;
   const encodings = ENCODINGS.filter((one) => !Array.isArray(listed) || listed.includes(one) || one === view?.pinned);
   const cameras = useCameras(at);
-  const why = !connection.isOpen ? "No connection to the server" : connection.may("drive") ? "" : "Log in as driver to change";
+  const may = connection.may("drive") ? "" : "Log in as driver to change";
+  const why = connection.isOpen ? may : "No connection to the server";
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   return html`<div class="picture-settings">
     ${video &&
