@@ -505,7 +505,7 @@ def test_the_login_leads_back_to_the_page_that_was_asked_for(hall: Hall) -> None
 # -- slow and many
 
 
-def test_a_socket_that_says_nothing_is_closed(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "HELLO_S", 0.3)
     assert hall.closed_after("/ws/control", hall.cookie("admin"))
 
