@@ -79,7 +79,7 @@ def test_a_robot_is_stopped(broker: Broker, robot: LiveRobot) -> None:
     assert (done.returncode, done.stderr, robot.latched) == (0, "", True)
 
 
-def test_driving_by_keys_says_where_it_works() -> None:
+def test_driving_by_keys_is_refused_with_what_to_use() -> None:
     terminal, side = pty.openpty()
     done = subprocess.run(
         [*ELSEWHERE, "drive", "goob", "--url", "mqtt://127.0.0.1:1"],

@@ -67,7 +67,7 @@ class DriverLease:
         if driver is None:
             self._others.pop(address.identity.id, None)
         elif address.identity.id in self._others or len(self._others) < _MAX_SERVERS:
-            self._heard(OtherDriver(driver.by, driver.device, address.identity.id, driver.since, now))
+            self._update(OtherDriver(driver.by, driver.device, address.identity.id, driver.since, now))
 
     def other(self, now: float) -> OtherDriver | None:
         """Who drives the robot elsewhere; None: it is free, or the lease is held here."""
@@ -120,7 +120,7 @@ class DriverLease:
         """What was on its way is lost."""
         self._unanswered.clear()
 
-    def _heard(self, one: OtherDriver) -> None:
+    def _update(self, one: OtherDriver) -> None:
         self._others[one.server] = one
         if self.held and (one.since_ms, one.server) > (self._since_ms, self._server):
             self.release()

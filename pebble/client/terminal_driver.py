@@ -24,7 +24,7 @@ TWICE_S = 0.6  # between two presses of Escape
 RESET_S = 0.6  # a robot that was reset refuses its drivers until they have paused for 0.5 s
 
 _TOPICS = 64  # of one robot that are remembered
-_HEARD = (ESTOP_STATE, CAPABILITIES, ONLINE, CHARGING_LEVEL, AUTONOMY_STATUS)
+_RECEIVED = (ESTOP_STATE, CAPABILITIES, ONLINE, CHARGING_LEVEL, AUTONOMY_STATUS)
 
 
 class TerminalDriver:
@@ -61,7 +61,7 @@ class TerminalDriver:
     @property
     def filters(self) -> list[str]:
         """What to subscribe to."""
-        return [*(channel.filter(self.base) for channel in _HEARD), FILTER]
+        return [*(channel.filter(self.base) for channel in _RECEIVED), FILTER]
 
     # -- what arrives
 

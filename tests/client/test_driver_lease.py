@@ -79,7 +79,7 @@ def test_what_is_no_announcement_of_another_driver_of_this_robot(message: Messag
     assert mine.other(0.1) is None
 
 
-def test_a_take_over_is_newer_than_what_it_ends_whatever_the_clocks_say() -> None:
+def test_a_take_over_is_newer_than_what_it_ends_despite_wrong_clocks() -> None:
     mine = lease()
     mine.receive(announcement("fair-1", EPOCH + 999_999), 0.0)
     mine.take(0.1, EPOCH)

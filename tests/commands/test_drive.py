@@ -84,7 +84,7 @@ class Lamp:
             self.capabilities.set()
 
 
-class Seat:
+class Console:
     """A process in a terminal of its own, whose keys can be held as a terminal repeats them."""
 
     def __init__(self, *command: str) -> None:
@@ -157,7 +157,7 @@ class Seat:
 
 
 SHELL = {"PS1": "$ ", "TERM": "xterm", "COLUMNS": "200", "HISTFILE": "/dev/null"}
-Drive = Callable[..., Seat]
+Drive = Callable[..., Console]
 
 
 @pytest.fixture
@@ -176,167 +176,167 @@ def lamp(tmp_path: Path, broker: Broker) -> Iterator[Lamp]:
 
 @pytest.fixture
 def drive(broker: Broker, lamp: Lamp) -> Iterator[Drive]:
-    seats: list[Seat] = []
+    consoles: list[Console] = []
 
-    def start(*options: str, shell: bool = False) -> Seat:
+    def start(*options: str, shell: bool = False) -> Console:
         url = f"mqtt://127.0.0.1:{broker.port}"
         command = [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", url, *options]
         if shell:
-            seats.append(Seat("bash", "--norc", "-i"))
-            seats[-1].type(" ".join(command).encode() + b"\n")
+            consoles.append(Console("bash", "--norc", "-i"))
+            consoles[-1].type(" ".join(command).encode() + b"\n")
         else:
-            seats.append(Seat(*command))
-        assert seats[-1].sees("ready"), seats[-1].shown
-        return seats[-1]
+            consoles.append(Console(*command))
+        assert consoles[-1].sees("ready"), consoles[-1].shown
+        return consoles[-1]
 
     yield start
-    for seat in seats:
-        seat.close()
+    for console in consoles:
+        console.close()
 
 
-def driving(seat: Seat, lamp: Lamp, key: bytes = b"w") -> None:
+def driving(console: Console, lamp: Lamp, key: bytes = b"w") -> None:
     """Press ``key``, and again where a stall of a busy machine has ended the gesture."""
     end = time.monotonic() + 20
-    while not (lamp.moving and "driving x" in seat.shown):
-        assert time.monotonic() < end, seat.shown
-        seat.hold(b"")
+    while not (lamp.moving and "driving x" in console.shown):
+        assert time.monotonic() < end, console.shown
+        console.hold(b"")
         time.sleep(0.5)
-        seat.forget()
-        seat.hold(key)
-        until(lambda: lamp.moving and "driving x" in seat.shown, 2)
+        console.forget()
+        console.hold(key)
+        until(lambda: lamp.moving and "driving x" in console.shown, 2)
 
 
 def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: Lamp) -> None:
-    seat = drive("--speed", "0.5")
+    console = drive("--speed", "0.5")
     before = time.monotonic()
-    driving(seat, lamp)
+    driving(console, lamp)
     time.sleep(1.0)
-    seat.hold(b"")
+    console.hold(b"")
     assert lamp.halted_after(time.monotonic()) < 0.4 + BUSY_S
-    assert seat.sees("ready")
+    assert console.sees("ready")
     sent = [command for at, command in lamp.commands if at > before]
     assert sent[0] == {"x": 0, "z": 0.5, "y": 0, "valid_ms": 400}
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [ZERO] * 3)
     assert 15 <= len([command for command in sent if command["z"]]) <= 45
     assert lamp.announced[0][BASE]["device"].startswith("terminal on ")
-    seat.type(b"\x03")
-    assert seat.process.wait(5) == 0
-    assert seat.restored
+    console.type(b"\x03")
+    assert console.process.wait(5) == 0
+    assert console.restored
     assert until(lambda: lamp.announced[-1] == {})
 
 
 def test_an_arrow_and_ctrl_d(drive: Drive, lamp: Lamp) -> None:
-    seat = drive()
-    driving(seat, lamp, b"\x1b[D")
+    console = drive()
+    driving(console, lamp, b"\x1b[D")
     assert lamp.motors[-1][1][0] < lamp.motors[-1][1][1]
-    seat.hold(b"")
+    console.hold(b"")
     pressed = time.monotonic()
-    seat.type(b"\x04")
+    console.type(b"\x04")
     assert lamp.halted_after(pressed) < BUSY_S
-    assert (seat.process.wait(5), seat.restored) == (0, True)
+    assert (console.process.wait(5), console.restored) == (0, True)
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT, signal.SIGQUIT])
 def test_a_signal_stops_the_robot_at_once(drive: Drive, lamp: Lamp, number: signal.Signals) -> None:
-    seat = drive()
-    driving(seat, lamp)
-    seat.process.send_signal(number)
+    console = drive()
+    driving(console, lamp)
+    console.process.send_signal(number)
     assert lamp.halted_after(time.monotonic()) < BUSY_S
-    assert seat.process.wait(5) == (0 if number == signal.SIGINT else 1)
-    assert seat.restored
+    assert console.process.wait(5) == (0 if number == signal.SIGINT else 1)
+    assert console.restored
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3)
 
 
 def test_a_terminal_that_is_closed_stops_the_robot_at_once(drive: Drive, lamp: Lamp) -> None:
-    seat = drive()
-    driving(seat, lamp)
-    seat.hang_up()
+    console = drive()
+    driving(console, lamp)
+    console.hang_up()
     assert lamp.halted_after(time.monotonic()) < BUSY_S
-    assert seat.process.wait(5) == 1
+    assert console.process.wait(5) == 1
 
 
 def test_a_killed_process_leaves_a_robot_that_stops_by_itself(drive: Drive, lamp: Lamp) -> None:
-    seat = drive()
-    driving(seat, lamp)
-    seat.process.kill()
+    console = drive()
+    driving(console, lamp)
+    console.process.kill()
     assert lamp.halted_after(time.monotonic()) < VALID_S + BUSY_S
 
 
 @pytest.mark.parametrize("stall", [0.6, 2.0])
 def test_after_a_stall_a_key_that_is_still_held_moves_nothing(drive: Drive, lamp: Lamp, stall: float) -> None:
-    seat = drive()
-    driving(seat, lamp)
-    seat.process.send_signal(signal.SIGSTOP)
+    console = drive()
+    driving(console, lamp)
+    console.process.send_signal(signal.SIGSTOP)
     stopped = time.monotonic()
     assert lamp.halted_after(stopped) < VALID_S + BUSY_S
     time.sleep(max(0.0, stopped + stall - time.monotonic()))
-    seat.forget()
+    console.forget()
     resumed = time.monotonic()
-    seat.process.send_signal(signal.SIGCONT)
-    assert seat.sees("let go first")
+    console.process.send_signal(signal.SIGCONT)
+    assert console.sees("let go first")
     time.sleep(1.0)
     assert not lamp.moved_since(resumed)
-    seat.hold(b"")
-    assert seat.sees("ready")
-    driving(seat, lamp)
+    console.hold(b"")
+    assert console.sees("ready")
+    driving(console, lamp)
 
 
 def test_ctrl_z_stops_the_robot_and_what_follows_needs_a_new_key(drive: Drive, lamp: Lamp) -> None:
-    seat = drive(shell=True)
-    driving(seat, lamp)
-    seat.hold(b"")
-    seat.type(b"w\x1a")
+    console = drive(shell=True)
+    driving(console, lamp)
+    console.hold(b"")
+    console.type(b"w\x1a")
     pressed = time.monotonic()
     assert lamp.halted_after(pressed) < BUSY_S
-    assert seat.sees("Stopped")
+    assert console.sees("Stopped")
     assert [command for _, command in lamp.commands[-3:]] == [FINAL] * 3
-    seat.forget()
+    console.forget()
     resumed = time.monotonic()
-    seat.type(b"fg\n")
-    assert seat.sees("ready"), seat.shown
+    console.type(b"fg\n")
+    assert console.sees("ready"), console.shown
     assert not lamp.moved_since(resumed)
-    driving(seat, lamp)
-    seat.hold(b"")
-    seat.forget()
-    seat.type(b"\x03")
-    assert seat.sees("$ ")
-    seat.type(b"stty -a\n")
-    assert seat.sees(" icanon"), "the shell has its own mode again"
+    driving(console, lamp)
+    console.hold(b"")
+    console.forget()
+    console.type(b"\x03")
+    assert console.sees("$ ")
+    console.type(b"stty -a\n")
+    assert console.sees(" icanon"), "the shell has its own mode again"
 
 
 def test_space_stops_at_once(drive: Drive, lamp: Lamp) -> None:
-    seat = drive()
-    driving(seat, lamp)
-    seat.hold(b"")
-    seat.type(b" ")
+    console = drive()
+    driving(console, lamp)
+    console.hold(b"")
+    console.type(b" ")
     assert lamp.halted_after(time.monotonic()) < BUSY_S
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3)
 
 
 @pytest.mark.parametrize("keys", [b"!", b"\x1b\x1b"])
 def test_an_emergency_stop_latches(drive: Drive, lamp: Lamp, run: Run, broker: Broker, keys: bytes) -> None:
-    seat = drive()
-    driving(seat, lamp)
-    seat.type(keys)
+    console = drive()
+    driving(console, lamp)
+    console.type(keys)
     pressed = time.monotonic()
     assert lamp.halted_after(pressed) < BUSY_S
-    assert seat.sees("stopped by ")
+    assert console.sees("stopped by ")
     time.sleep(1.0)
-    assert (lamp.moved_since(pressed + BUSY_S), seat.process.poll()) == (False, None)
-    seat.hold(b"")
+    assert (lamp.moved_since(pressed + BUSY_S), console.process.poll()) == (False, None)
+    console.hold(b"")
     url = f"--url=mqtt://127.0.0.1:{broker.port}"
     assert run("estop", "reset", "minilamp", url) == 0
-    seat.forget()
-    assert seat.sees("ready"), seat.shown
-    driving(seat, lamp)
+    console.forget()
+    assert console.sees("ready"), console.shown
+    driving(console, lamp)
 
 
 def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(drive: Drive, lamp: Lamp) -> None:
-    seat = drive()
-    seat.type(b"!\x04")
-    assert seat.process.wait(10) == 0
+    console = drive()
+    console.type(b"!\x04")
+    assert console.process.wait(10) == 0
     assert lamp.stops >= 1
-    assert "NOT CONFIRMED" not in seat.shown.rpartition("\n")[2]
+    assert "NOT CONFIRMED" not in console.shown.rpartition("\n")[2]
 
 
 def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, lamp: Lamp) -> None:
@@ -353,14 +353,14 @@ def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, la
     thread.start()
     try:
         url_options = ("--take-over",)
-        seat = drive(*url_options)
-        driving(seat, lamp)
-        seat.hold(b"")
+        console = drive(*url_options)
+        driving(console, lamp)
+        console.hold(b"")
         began = time.time() + 60  # bob takes it back
-        assert seat.sees("bob (phone) at fair-1 is driving")
+        assert console.sees("bob (phone) at fair-1 is driving")
         resumed = time.monotonic()
         time.sleep(0.6)
-        seat.hold(b"w")
+        console.hold(b"w")
         time.sleep(0.6)
         assert not lamp.moved_since(resumed + VALID_S)
     finally:
@@ -369,17 +369,17 @@ def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, la
 
 
 def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, broker: Broker) -> None:
-    seat = drive()
-    driving(seat, lamp)
-    seat.forget()
+    console = drive()
+    driving(console, lamp)
+    console.forget()
     broker.stop()
-    assert seat.sees("no connection: ")
+    assert console.sees("no connection: ")
     assert lamp.halted_after(time.monotonic()) < VALID_S + 1.0
-    seat.hold(b"")
+    console.hold(b"")
     broker.start()
-    seat.forget()
-    assert seat.sees("ready", 30)
-    driving(seat, lamp)
+    console.forget()
+    assert console.sees("ready", 30)
+    driving(console, lamp)
 
 
 @pytest.mark.parametrize("stream", ["stdin", "stdout"])
@@ -394,11 +394,11 @@ def test_without_a_terminal_there_is_one_line(stream: str) -> None:
 
 
 def test_an_unreachable_broker_is_reported_before_the_terminal_is_changed() -> None:
-    seat = Seat(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1:1")
+    console = Console(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1:1")
     try:
-        assert seat.process.wait(20) == 1
-        assert seat.sees("cannot connect to mqtt://127.0.0.1:1")
-        assert seat.restored
+        assert console.process.wait(20) == 1
+        assert console.sees("cannot connect to mqtt://127.0.0.1:1")
+        assert console.restored
     finally:
-        seat.close()
-    assert gone(seat.process.pid)
+        console.close()
+    assert gone(console.process.pid)

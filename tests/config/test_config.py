@@ -602,7 +602,7 @@ class TestPasswords:
 
 
 class TestWebInterface:
-    def test_it_is_for_this_machine_unless_the_config_says_otherwise(self) -> None:
+    def test_it_is_for_this_machine_by_default(self) -> None:
         web = read({"robot": {"id": "goob"}}).web_interface
         assert (web.host, web.port, web.local, web.mqtt.host) == ("127.0.0.1", 8080, True, "")
         assert (web.plain_http, web.plain_http_drive) == (False, False)
