@@ -35,15 +35,15 @@ def missing() -> str | None:
 
 
 @contextmanager
-def chromium(*flags: str) -> Iterator[Browser]:
-    """Run one with further ``flags``. Raises PebbleError with what to install."""
+def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
+    """Run one with further ``flags``; ``program`` starts it in another way. Raises PebbleError with what to install."""
     problem = missing()
     if problem is not None:
         raise PebbleError(problem)
     from playwright.sync_api import sync_playwright  # optional
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=[*FLAGS, *flags])
+        browser = playwright.chromium.launch(executable_path=program or shutil.which("chromium"), args=[*FLAGS, *flags])
         try:
             yield browser
         finally:

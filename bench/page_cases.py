@@ -1,0 +1,364 @@
+"""What is measured of the operator page: each case takes a rig and returns samples, by the key of their row."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import signal
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from pebble.bench.estop_driver import Driver
+from pebble.bench.page_rig import Rig, monotonic
+from pebble.bench.percentiles import percentile
+from pebble.bench.usage import children, cpu_s
+from pebble.bench.worker import Worker, end_workers
+from pebble.contract.encodings import ALL_VIDEO
+from pebble.demo.programs import Program, end_all
+from pebble.demo.testbed import ROBOTS
+from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+Samples = dict[str, list[float]]
+
+KEY, ROBOT = "KeyW", "goob"
+VIEWERS, ROBOTS_SHOWN = 30, 100
+_HELD_S = 0.4
+_END_S = 3.0
+_COUNT_S = 40.0  # for processes of viewers to answer, beyond their time
+_REST_S = 8.0  # after the last viewer: the server lets go after 5, the camera rests then
+_HIDE = """hidden => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
+  const at = bench.now();
+  document.dispatchEvent(new Event("visibilitychange"));
+  return at;
+}"""
+_BLUR = "() => { const at = bench.now(); dispatchEvent(new Event('blur')); return at; }"
+
+
+def keys(rig: Rig, scale: float) -> Samples:
+    """A key is pressed and released again and again."""
+    page = rig.drivable(ROBOT)
+    found: Samples = {"key to MQTT": [], "key to motors": [], "release to stop": []}
+    for number in range(round(40 * scale)):
+        page.keyboard.down(KEY)
+        pressed = rig.stamp(page, "down")
+        moved = rig.moved_after(page, ROBOT, pressed)
+        found["key to MQTT"].append(1000 * (rig.command_after(page, ROBOT, pressed) - pressed))
+        found["key to motors"].append(1000 * (moved - pressed))
+        rig.pause(page, 0.15 + 0.007 * (number % 10))  # not in step with the page's own period
+        page.keyboard.up(KEY)
+        released = rig.stamp(page, "up")
+        found["release to stop"].append(1000 * (rig.stopped(page, ROBOT) - released))
+    return found
+
+
+def interruptions(rig: Rig, scale: float) -> Samples:
+    """A key is held, and something happens to the page, the connection or the server."""
+
+    def frozen(page: Page) -> Callable[[], float]:
+        """Chromium takes a while to freeze a page: its own event counts, which can be read when it is thawed."""
+        session = page.context.new_cdp_session(page)
+        session.send("Page.setWebLifecycleState", {"state": "frozen"})
+
+        def at() -> float:
+            session.send("Page.setWebLifecycleState", {"state": "active"})
+            return rig.stamp(page, "freeze")
+
+        return at
+
+    def closed(page: Page) -> float:
+        at = time.monotonic()
+        page.close()
+        return at
+
+    def stalled(_page: Page) -> float:
+        """The browser's process for the network stands still."""
+        return _signal(_network_process(), signal.SIGSTOP)
+
+    actions: dict[str, Callable[[Page], float | Callable[[], float]]] = {
+        "blur to stop": lambda page: monotonic(page.evaluate(_BLUR)),
+        "hidden to stop": lambda page: monotonic(page.evaluate(_HIDE, True)),
+        "frozen to stop": frozen,
+        "closed to stop": closed,
+        "stalled to stop": stalled,
+        "server frozen to stop": lambda _: _signal(rig.stage.server.program.pid, signal.SIGSTOP),
+        "server killed to stop": lambda _: _signal(rig.stage.server.program.pid, signal.SIGKILL),
+    }
+    found: Samples = {name: [] for name in actions}
+    for name, act in actions.items():
+        for _ in range(max(1, round(8 * scale))):
+            page = rig.drivable(ROBOT)
+            while not rig.stage.wheels_turning(ROBOT):  # a busy machine interrupts gestures, too
+                page.keyboard.up(KEY)
+                rig.hold(page, ROBOT, KEY)
+                rig.pause(page, _HELD_S)
+            at = act(page)
+            stopped = rig.stopped(None, ROBOT)
+            found[name].append(1000 * (stopped - (at() if callable(at) else at)))
+            _recover(rig, page)
+    return found
+
+
+def _signal(pid: int, number: signal.Signals) -> float:
+    at = time.monotonic()
+    os.kill(pid, number)
+    return at
+
+
+def _recover(rig: Rig, page: Page) -> None:
+    _signal(_network_process(), signal.SIGCONT)
+    if rig.stage.server.program.ended or _is_stopped(rig.stage.server.program.pid):
+        rig.stage.thaw_server()
+        rig.stage.restart_server()
+    if not page.is_closed():
+        page.context.close()
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether SIGSTOP holds it."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
+
+def _network_process() -> int:
+    """The process of our browser that has its connections."""
+    waiting = [os.getpid()]
+    while waiting:
+        pid = waiting.pop()
+        if b"network.mojom.NetworkService" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            return pid
+        waiting += children(pid)
+    raise PebbleError("the browser has no process for its network")
+
+
+def stops(rig: Rig, scale: float) -> Samples:
+    """STOP is clicked while other operators drive."""
+    found: Samples = {}
+    driver = Driver(rig.stage.broker_port)
+    threading.Thread(target=driver.run, daemon=True).start()
+    for what, names, button in (("STOP", (ROBOT,), "stop-one"), ("STOP ALL", ROBOTS, "stop-all")):
+        page = rig.page(ROBOT) if what == "STOP" else rig.fleet()
+        stop, shown = found.setdefault(f"{what} to motors", []), found.setdefault(f"{what} to confirmed", [])
+        refs = [rig.ref(name) for name in names]
+        page.locator(f"[data-test={button}]").wait_for()
+        for _ in range(max(1, round(10 * scale))):
+            driver.choose(tuple(refs))
+            rig.until(page, lambda: all(map(rig.stage.wheels_turning, names)), "the robots do not move")  # noqa: B023
+            rig.pause(page, _HELD_S)
+            page.evaluate("refs => bench.confirmed(refs)", refs)
+            page.locator(f"[data-test={button}]").click()
+            pressed = rig.stamp(page, "pointer")
+            rig.until(page, lambda: page.evaluate("bench.mark"), "the stop was not confirmed")  # noqa: B023
+            stop += [1000 * (rig.stopped(page, name) - pressed) for name in names]
+            shown.append(1000 * (monotonic(page.evaluate("bench.mark")) - pressed))
+            driver.choose(())
+            reset(rig, page, refs)
+        page.context.close()
+    driver.close()
+    return found
+
+
+def reset(rig: Rig, page: Page, refs: list[str]) -> None:
+    """End the stops that the page shows."""
+    value = "pebble.store.get(ref, 'web/estop')?.value"
+    rig.pause(page, 0.6)  # robots refuse a reset of those who still drive
+    page.evaluate(f"refs => refs.forEach((ref) => pebble.commands.reset(ref, {value}.owners))", refs)
+    free = f"refs => refs.every((ref) => !{value}.latched)"
+    rig.until(page, lambda: page.evaluate(free, refs), "the stops were not reset")
+    rig.pause(page, 0.7)
+
+
+def pictures(rig: Rig, scale: float) -> Samples:
+    """Capture to drawn in each encoding, and the share of pictures that were not drawn."""
+    page = rig.page(ROBOT)
+    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture")
+    page.evaluate("bench.film()")
+    found: Samples = {}
+    for encoding in ALL_VIDEO:
+        page.evaluate("([ref, one]) => pebble.commands.setEncoding(ref, one)", [rig.ref(ROBOT), encoding])
+        rig.until(page, lambda: page.evaluate("bench.drawn.at(-1)?.[0]") == encoding, f"no {encoding}")  # noqa: B023
+        rig.pause(page, 1.5)
+        page.evaluate("bench.drawn.length = 0")
+        rig.pause(page, 20 * scale)
+        drawn = [one for one in page.evaluate("bench.drawn") if one[0] == encoding]
+        found[f"{encoding} to drawn"] = [at - captured for _, _, captured, at, _ in drawn]
+        found[f"{encoding} lost"] = [lost_percent([one[1] for one in drawn])]
+    return found
+
+
+def lost_percent(numbers: list[int]) -> float:
+    """Per cent of the pictures between the first and the last that are missing, by their numbers."""
+    if len(numbers) < 2:
+        return 100.0
+    return 100.0 * (1 - len(set(numbers)) / (max(numbers) - min(numbers) + 1))
+
+
+def loading(rig: Rig, scale: float) -> Samples:
+    """A visitor opens the fleet's page, then a robot's, whose camera rests."""
+    found: Samples = {"first robot": [], "first picture": []}
+    for _ in range(max(1, round(4 * scale))):
+        for key, page, stamp in (("first robot", rig.fleet(), "robot"), ("first picture", rig.page(ROBOT), "picture")):
+            rig.until(page, lambda: page.evaluate(f"bench.{stamp}"), f"no {stamp}")  # noqa: B023
+            found[key].append(page.evaluate(f"bench.{stamp}"))
+            page.context.close()
+        time.sleep(_REST_S)
+    return found
+
+
+def files(rig: Rig, _scale: float) -> Samples:
+    """Everything that a robot's page requests until it shows a picture."""
+    page = rig.page(ROBOT)
+    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture")
+    urls = page.evaluate("[location.href, ...performance.getEntriesByType('resource').map((one) => one.name)]")
+    unique = sorted({url for url in urls if url.startswith("http")})
+    own = [url for url in unique if urlsplit(url).netloc == urlsplit(rig.stage.url).netloc]
+    bodies = [urllib.request.urlopen(url, timeout=5).read() for url in own]  # noqa: S310 - of our own server
+    return {
+        "page, kB": [sum(map(len, bodies)) / 1000],
+        "page, kB gz": [sum(len(gzip.compress(body)) for body in bodies) / 1000],
+        "requests": [float(len(own))],
+        "foreign hosts": [float(len(unique) - len(own))],
+    }
+
+
+def driving(rig: Rig, scale: float) -> Samples:
+    """The server while one page shows pictures and drives."""
+    page = rig.drivable(ROBOT)
+    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture")
+    rig.hold(page, ROBOT, "KeyA")
+    with _cost(rig, "1 viewer, driving") as found:
+        rig.pause(page, 20 * scale)
+    page.keyboard.up("KeyA")
+    return found
+
+
+def viewers(rig: Rig, scale: float) -> Samples:
+    """Many viewers of one robot, of which none may lose pictures or cost the robot anything."""
+    one, _ = _watched(rig, 1, 10 * scale)
+    with _cost(rig, f"{VIEWERS} viewers") as found:
+        many, shares = _watched(rig, VIEWERS, 20 * scale)
+    return {**found, "frames of each viewer": shares, "robot's uplink, of that with 1 viewer": [100 * many / one]}
+
+
+def _watched(rig: Rig, count: int, seconds: float) -> tuple[float, list[float]]:
+    """Bytes a second of the robot, and per cent of its frames that each viewer received."""
+    module = [sys.executable, "-m", "pebble.bench.page_viewers"]
+    command = [*module, rig.stage.url, rig.ref(ROBOT), str(count), str(seconds)]
+    worker = Worker("viewers", command, Path(rig.stage.folder_of_logs) / "viewers.log")
+    try:
+        answer = worker.answer(seconds + _COUNT_S)
+    finally:
+        end_workers([worker])
+    began, ended = answer["began"], answer["ended"]
+    published = [size for at, ref, size in rig.frames if ref == rig.ref(ROBOT) and began <= at < ended]
+    if not published:
+        raise PebbleError("the robot published no pictures")
+    return sum(published) / (ended - began), [100 * frames / len(published) for frames in answer["frames"]]
+
+
+def crowd(rig: Rig, scale: float) -> Samples:
+    """A hundred robots on the fleet's screen."""
+    command = [sys.executable, "-m", "pebble.cli", "sim", "fleet", "-n", str(ROBOTS_SHOWN)]
+    command += ["--broker", f"mqtt://127.0.0.1:{rig.stage.broker_port}"]
+    robots = Program("the fleet", command, Path(rig.stage.folder_of_logs) / "fleet.log")
+    try:
+        page = rig.fleet()
+        count = "document.querySelectorAll('[data-test^=\"card-\"]').length"
+        rig.until(page, lambda: page.evaluate(count) > ROBOTS_SHOWN, lambda: f"{page.evaluate(count)} robots", 60.0)
+        rig.pause(page, 5.0)
+        page.evaluate("new MutationObserver(() => bench.updates++).observe(document.body, "
+                      "{ subtree: true, childList: true, characterData: true, attributes: true })")  # fmt: skip
+        session = page.context.new_cdp_session(page)
+        session.send("Performance.enable")
+        before = _busy(session.send("Performance.getMetrics"))
+        with _cost(rig, f"{ROBOTS_SHOWN} robots") as found:
+            rig.pause(page, 20 * scale)
+        busy = _busy(session.send("Performance.getMetrics")) - before
+        return {**found, f"{ROBOTS_SHOWN} robots: ms an update": [1000 * busy / max(1, page.evaluate("bench.updates"))]}
+    finally:
+        end_all([robots], _END_S)
+
+
+def _busy(answer: dict[str, Any]) -> float:
+    """Seconds of script, style and layout so far."""
+    values = {one["name"]: one["value"] for one in answer["metrics"]}
+    return float(sum(values[name] for name in ("ScriptDuration", "LayoutDuration", "RecalcStyleDuration")))
+
+
+@contextmanager
+def _cost(rig: Rig, what: str) -> Iterator[Samples]:
+    """CPU and memory of the server during the block."""
+    found: Samples = {}
+    pid = rig.stage.server.program.pid
+    before, began = cpu_s([pid]), time.monotonic()
+    yield found
+    found[f"{what}: CPU"] = [100 * (cpu_s([pid]) - before) / (time.monotonic() - began)]
+    status = Path(f"/proc/{pid}/status").read_text()
+    found[f"{what}: RSS"] = [int(status.partition("VmRSS:")[2].split()[0]) / 1000]
+
+
+def link_pictures(rig: Rig, scale: float) -> Samples:
+    """The age of pictures that offer more than the link carries."""
+    page = rig.page("wide")
+    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture", 30.0)
+    page.evaluate("bench.film()")
+    rig.pause(page, 3.0)
+    page.evaluate("bench.drawn.length = 0")
+    began = time.monotonic()
+    rig.pause(page, 20 * scale)
+    offered = sum(size for at, ref, size in rig.frames if ref == rig.ref("wide") and at >= began)
+    drawn = page.evaluate("bench.drawn")
+    return {
+        "2 Mbit/s: picture age": [at - captured for _, _, captured, at, _ in drawn if captured],
+        "2 Mbit/s: offered": [8 * offered / 1e6 / (time.monotonic() - began)],
+        "2 Mbit/s: drawn a second": [len(drawn) / (time.monotonic() - began)],
+    }
+
+
+def link_driving(rig: Rig, scale: float) -> Samples:
+    """Driving, and the emergency stop, over a link that is slow, far and lossy."""
+    page = rig.drivable(ROBOT)
+    ref = rig.ref(ROBOT)
+    page.evaluate("bench.number = 1")
+    interrupted, end = -1.0, time.monotonic() + 20 * scale
+    while time.monotonic() < end:
+        if not page.evaluate("pebble.driver.gestureActive"):
+            page.keyboard.up(KEY)
+            rig.ready(page)
+            rig.hold(page, ROBOT, KEY)
+            interrupted += 1
+        rig.pause(page, 0.1)
+    page.keyboard.up(KEY)
+    rig.pause(page, 1.0)
+    sent = page.evaluate("bench.sent")
+    arrived = {round(axes.get("y", 0.0), 3): at for at, base, axes in rig.drives if base == ref}
+    late = [1000 * (arrived[round(y, 3)] - monotonic(at)) for y, at in sent if round(y, 3) in arrived]
+    stop: list[float] = []
+    driver = Driver(rig.stage.broker_port)
+    threading.Thread(target=driver.run, daemon=True).start()
+    for _ in range(max(1, round(8 * scale))):
+        driver.choose((ref,))
+        rig.until(page, lambda: rig.stage.wheels_turning(ROBOT), "the robot does not move")
+        page.locator("[data-test=stop-one]").click()
+        pressed = rig.stamp(page, "pointer")
+        stop.append(1000 * (rig.stopped(page, ROBOT) - pressed))
+        driver.choose(())
+        rig.until(page, lambda: page.evaluate(f"pebble.store.get('{ref}', 'web/estop')?.value.latched"), "not shown")
+        reset(rig, page, [ref])
+    driver.close()
+    return {
+        "256 kbit/s: drive": late,
+        "256 kbit/s: drive, arrived": [100 * len(late) / max(1, len(sent))],
+        "256 kbit/s: gestures interrupted": [interrupted],
+        "256 kbit/s: STOP to motors": stop,
+        "256 kbit/s: round trip shown": [percentile([page.evaluate("pebble.connection.socket.roundTripMs")], 50)],
+    }
