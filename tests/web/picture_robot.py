@@ -139,7 +139,7 @@ class Page:
         seq, kind = struct.unpack_from(">IB", data)
         self.frames.append((seq, kind, data[5:]))
         if self.answer is not None:
-            self.say(seq, self.answer)
+            self.acknowledge(seq, self.answer)
 
     async def receive(self) -> dict[str, Any]:
         return await self._answers.get()
@@ -148,7 +148,7 @@ class Page:
         self.closed = self.closed or code
         self._answers.put_nowait({"type": "websocket.disconnect"})
 
-    def say(self, seq: int, what: int) -> None:
+    def acknowledge(self, seq: int, what: int) -> None:
         self._answers.put_nowait({"type": "websocket.receive", "bytes": struct.pack(">IB", seq, what)})
 
     def send_raw(self, data: bytes) -> None:

@@ -1,4 +1,4 @@
-// Reads payloads, and decides which pictures may be shown: the rules of pebble/media/decode.py. Pure: no browser needed.
+// Reads payloads, and decides which pictures may be shown: the rules of pebble/media/decode.py. Pure: it needs no page.
 
 import { PayloadError } from "./errors.js";
 import { MAX_BYTES, joined } from "./jpeg.js";
