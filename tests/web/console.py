@@ -97,7 +97,10 @@ class Console:
         if self.reason == "free":
             self.test("take").click()
         if self.reason == "lease":
-            self.hold_button("take-over")
+            self.test("take-over").hover()
+            self.page.mouse.down()
+            self.because("", within=6)
+            self.page.mouse.up()
         assert self.because(""), self.reason
 
     def hold_button(self, name: str, seconds: float = 1.15) -> None:
@@ -181,10 +184,17 @@ def pad(x: float = 0.0, z: float = 0.0, *buttons: int, stamp: float = 0.0, name:
 
 @contextmanager
 def console(
-    browser: Browser, stage: Stage, name: str, size: Size = "desktop", theme: Theme = "light", url: str = ""
+    browser: Browser,
+    stage: Stage,
+    name: str,
+    size: Size = "desktop",
+    theme: Theme = "light",
+    *,
+    url: str = "",
+    script: str = "",
 ) -> Iterator[Console]:
     """Open the page of a robot. ``url`` with a slash at the end: by another way than the server's own address."""
-    with tab(browser, f"{url or stage.url}r/{stage.ref(name)}", size, theme, script=_PADS) as opened:
+    with tab(browser, f"{url or stage.url}r/{stage.ref(name)}", size, theme, script=_PADS + script) as opened:
         yield Console(opened, stage, name)
 
 

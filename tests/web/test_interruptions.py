@@ -138,7 +138,7 @@ STALLS: dict[str, Callable[[TcpProxy], object]] = {
 def test_a_connection_that_fails_stops(
     browser: Browser, lamp: Stage, proxy: TcpProxy, how: str, seconds: float
 ) -> None:
-    with console(browser, lamp, "minilamp", "phone", "dark", f"http://127.0.0.1:{proxy.port}/") as robot:
+    with console(browser, lamp, "minilamp", "phone", "dark", url=f"http://127.0.0.1:{proxy.port}/") as robot:
         robot.take()
         assert robot.drive()
         began = time.monotonic()
