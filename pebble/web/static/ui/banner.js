@@ -98,6 +98,7 @@ function StopBanners({ at }) {
 function StopBanner({ at }) {
   const { commands, connection } = usePage();
   useModel(connection);
+  useTick(500);
   const entry = useMetric(at, "web/estop");
   const view = entry?.value;
   const [asked, ask] = useState(false);
@@ -160,7 +161,8 @@ function stopProgress(view, name, age) {
   const more = view.sending_text ? ` ${view.sending_text}` : "";
   switch (view.sending) {
     case "sent":
-      return { kind: age > NO_ANSWER_MS ? "bad" : "wait", text: `STOP is being sent to ${name}…${more}` };
+      if (age > NO_ANSWER_MS) return { kind: "bad", text: `STOP NOT CONFIRMED by ${name}, and sent again…${more}` };
+      return { kind: "wait", text: `STOP is being sent to ${name}…${more}` };
     case "confirmed":
       return view.sending_text && age < SHOWN_MS ? { kind: "wait", text: `${name} ${view.sending_text}` } : null;
     case "old":
