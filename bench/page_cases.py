@@ -64,16 +64,15 @@ def keys(rig: Rig, scale: float) -> Samples:
 
 def interruptions(rig: Rig, scale: float) -> Samples:
     """A key is held, and something happens to the page, the connection or the server."""
+    thaw: list[Callable[[], object]] = []
 
-    def frozen(page: Page) -> Callable[[], float]:
-        """Chromium takes a while to freeze a page: its own event counts, which can be read when it is thawed."""
+    def frozen(page: Page) -> float:
+        """Its script stands still; Page.setWebLifecycleState has no effect on visible pages, as all here are."""
         session = page.context.new_cdp_session(page)
-        session.send("Page.setWebLifecycleState", {"state": "frozen"})
-
-        def at() -> float:
-            session.send("Page.setWebLifecycleState", {"state": "active"})
-            return rig.stamp(page, "freeze")
-
+        session.send("Debugger.enable")
+        at = time.monotonic()
+        session.send("Debugger.pause")
+        thaw.append(session.detach)
         return at
 
     def closed(page: Page) -> float:
@@ -85,7 +84,7 @@ def interruptions(rig: Rig, scale: float) -> Samples:
         """The browser's process for the network stands still."""
         return _signal(_network_process(), signal.SIGSTOP)
 
-    actions: dict[str, Callable[[Page], float | Callable[[], float]]] = {
+    actions: dict[str, Callable[[Page], float]] = {
         "blur to stop": lambda page: monotonic(page.evaluate(_BLUR)),
         "hidden to stop": lambda page: monotonic(page.evaluate(_HIDE, True)),
         "frozen to stop": frozen,
@@ -103,8 +102,9 @@ def interruptions(rig: Rig, scale: float) -> Samples:
                 rig.hold(page, ROBOT, KEY)
                 rig.pause(page, _HELD_S)
             at = act(page)
-            stopped = rig.stopped(None, ROBOT)
-            found[name].append(1000 * (stopped - (at() if callable(at) else at)))
+            found[name].append(1000 * (rig.stopped(None, ROBOT) - at))
+            while thaw:
+                thaw.pop()()
             _recover(rig, page)
     return found
 

@@ -30,11 +30,10 @@ _STEP_MS = 10
 #: Stamps inputs, first contents, drawn pictures and sent commands; runs before the page's own scripts.
 _HOOKS = """
 const now = () => performance.timeOrigin + performance.now();
-window.bench = { now, down: [], up: [], pointer: [], freeze: [], drawn: [], sent: [], mark: 0, updates: 0, robot: 0, picture: 0 };
+window.bench = { now, down: [], up: [], pointer: [], drawn: [], sent: [], mark: 0, updates: 0, robot: 0, picture: 0 };
 addEventListener("keydown", (event) => event.repeat || bench.down.push(now()), true);
 addEventListener("keyup", () => bench.up.push(now()), true);
 addEventListener("pointerdown", () => bench.pointer.push(now()), true);
-document.addEventListener("freeze", () => bench.freeze.push(now()));
 const look = () => {
   if (!bench.robot && document.querySelector('[data-test^="card-"]')) bench.robot = performance.now();
   if (!bench.picture && window.pebble?.video?.info) bench.picture = performance.now();
