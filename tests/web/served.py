@@ -79,7 +79,7 @@ class Page:
         self.welcome: dict[str, Any] = {}
         self.bye: dict[str, Any] = {}
         self.closed = False
-        self.echoes = True  # False: as a page that stands still
+        self.answers = True  # False: as a page that stands still
         self.echo_offset_ms = 0.0
         self._socket: ClientConnection = connect(
             f"ws://127.0.0.1:{served.port}/ws/control", origin=served.origin, additional_headers=headers, max_size=None
@@ -139,7 +139,7 @@ class Page:
         match message["op"]:
             case "ping":
                 self.state["", "round trip"] = message["round_trip_ms"]
-                if self.echoes:
+                if self.answers:
                     self.send("echo", n=message["n"], t=now_ms() + self.echo_offset_ms)
             case "state":
                 self.state |= {(ref, metric): value for ref, metric, value, _ in message["set"]}
@@ -179,7 +179,7 @@ class RecordingRobot:
             payload = msgspec.json.encode({"schema": "pebble-capabilities/v1", "t": 1, "value": value})
             self._transport.publish(CAPABILITIES.topic(base), payload, qos=QoS.DELIVERED, retain=True)
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._beat, daemon=True)
+        self._thread = threading.Thread(target=self._heartbeats, daemon=True)
         self._thread.start()
 
     def drives(self, since: float = 0.0) -> list[dict[str, Any]]:
@@ -209,7 +209,7 @@ class RecordingRobot:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
 
-    def _beat(self) -> None:
+    def _heartbeats(self) -> None:
         while True:
             payload = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()), online=True))
             self._transport.publish(ONLINE.topic(self.base), payload, qos=QoS.DELIVERED, retain=True)

@@ -90,9 +90,9 @@ def test_a_clock_that_jumps_ends_the_connection(page, robot):
     assert until(lambda: not robot.drives() or last(robot) == FINAL)
 
 
-def test_a_page_without_echoes_does_not_drive(page, robot):
+def test_a_page_that_does_not_answer_does_not_drive(page, robot):
     assert page.take(robot.base)
-    page.echoes = False
+    page.answers = False
     time.sleep(1.3)
     page.drive(robot.base, 1, z=0.5)
     assert until(lambda: page.refused)
@@ -177,7 +177,7 @@ def test_all_are_stopped(broker, page, robot):
         assert until(lambda: page.value(second.base, "web/estop", "sending") == "confirmed")
 
 
-def test_an_old_robot_is_sent_zeros_and_said_to_be_old(broker, served):
+def test_an_old_robot_is_sent_zeros_and_shown_as_old(broker, served):
     base = f"pebble/robots/old{next(NAMES)}"
     drive = {"available": True, "controls": True}
     with RecordingRobot(broker.port, base, capabilities={"drive": drive}) as old, served.page() as page:
@@ -220,7 +220,7 @@ def test_capabilities_cannot_name_topics_of_another_robot(broker, served, robot)
         assert robot.received == []
 
 
-def test_a_silent_robot_is_said_to_be_silent_and_not_driven(page, robot):
+def test_a_silent_robot_is_shown_as_silent_and_not_driven(page, robot):
     assert page.take(robot.base)
     robot.silent()
     assert until(lambda: page.value(robot.base, "web/liveness", "online") is False, 4)
