@@ -121,7 +121,7 @@ class Human:
         """Why the page may not send this command now; empty if it may."""
         if not (op.x or op.z or op.y):
             ended, self.gesture = self.gesture is not None, None
-            if op.final and ended:
+            if op.final and ended and self.unblocked != now:  # else it is about something that happened before
                 self.interrupt(now, "the page has ended the gesture")
             return ""
         begins = self.gesture != (socket, op.g)

@@ -116,7 +116,7 @@ const commands = {
       reason: reason?.code ?? "",
       ref: driver.ref,
       open: socket.state === "open",
-      active: driver.gesture.active,
+      dragged: page.pointer !== null && holds(page, page.pointer),
       ended: !socket.again, // the server has ended the session
       token: page.storage.get("pebble-token") ?? "",
     });

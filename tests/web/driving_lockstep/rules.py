@@ -73,9 +73,11 @@ class Rules:
         self._newest: dict[Any, int] = {}  # by tab: the newest gesture
         self._over: dict[Any, int] = {}  # this one and all before it have ended
         self._heard: dict[Any, float] = {}  # the newest command of that gesture
+        self._newest_command: Command | None = None
         self._gap_s = 0.0  # between the newest two
         self.published = 0  # commands that move
         self.reachable: Callable[[], bool] = lambda: True  # the broker, by the server
+        self.stopping: Callable[[], bool] = lambda: False  # an emergency stop is being sent, with zeros
         self.owner_up: Callable[[], bool] = lambda: True  # it receives commands
         self.moves = 0  # for statistics: how often the wheels began to turn
         self._turning: Command | None = None
@@ -87,6 +89,7 @@ class Rules:
         tab = control._tab
         if not before:
             self._handling = None
+            self._over[tab] = max(self._over.get(tab, -1), tab.over)  # it may end more than it must
             if op is None:
                 self._ends(tab, "a wheel turns though the connection of its page has ended")
             return
@@ -97,6 +100,8 @@ class Rules:
                 now = self._scheduler.now
                 self._gap_s = now - self._heard.get((tab, op.g), now)
                 self._heard[tab, op.g] = now
+                if self._gap_s > SILENCE_S + _EPS:
+                    self._over[tab] = max(self._over.get(tab, -1), op.g)
             else:
                 self._over[tab] = max(self._over.get(tab, -1), op.g)
                 self._stops_soon(
@@ -116,7 +121,10 @@ class Rules:
 
     def rewrite(self, topic: str, drive: Drive) -> Drive:
         """The server publishes a drive command: give it speeds by which it is known again."""
-        if not topic.startswith(self._base) or not drive.moves:
+        if not topic.startswith(self._base):
+            return drive
+        if not drive.moves:
+            self._zero()
             return drive
         control, op = self._handling or (None, None)
         now = self._scheduler.now
@@ -126,15 +134,26 @@ class Rules:
         lease = self.driving().leases.get(self._base)
         self._check(lease is not None and lease.tab is tab, "a page moves wheels without the lease")
         self._check(op.g > self._over.get(tab, -1), "a gesture goes on that has ended")
-        self._check(self._gap_s <= SILENCE_S + _EPS, "a gesture goes on after a silence")
         sent, sent_number = self.sent[control.page, op.t]
         self._check(now - sent <= AGE_S + _DRIFT_S, "a command that is too old moves wheels")
         valid_s = drive.valid_ms / 1000 if isinstance(drive.valid_ms, int) else 9.0
         self.published += 1
         command = Command(control.page, tab, op.g, sent, sent_number, now, valid_s, self.published)
         self._watch_silence(command)
+        self._newest_command = command
         x, z = self.commands.add(command)  # type: ignore[arg-type]
         return msgspec.structs.replace(drive, x=x, z=z, y=0.0)
+
+    def _zero(self) -> None:
+        """The server publishes a zero; by itself only if the gesture has ended."""
+        command = self._newest_command
+        if self._handling is not None or command is None or self.stopping():
+            return
+        tab, g = command.tab, command.g
+        silent = self._scheduler.now - self._heard[tab, g] > SILENCE_S
+        lease = self.driving().leases.get(self._base)
+        ended = g <= self._over.get(tab, -1) or lease is None or lease.tab is not tab
+        self._check(silent or ended, "the server interrupts a gesture by a zero")
 
     def lease_moved(self, tab: Any) -> None:
         """It belongs to another page, or another server."""

@@ -140,6 +140,7 @@ class WebServer(Process):
         super().__init__("web", network.scheduler)
         self.lives = 0
         self.roles: dict[int, Role] = {}
+        self.lease_moved: Callable[[Any], None] = lambda tab: None  # to another server
         self._network, self._rewrite, self._handling = network, rewrite, handling
         self._restart = 0
         self.loop: VirtualLoop | None = None
@@ -155,8 +156,21 @@ class WebServer(Process):
         connection.rewrite = self._rewrite
         with patch.object(broker, "create", lambda *_: connection):
             self.server = server.Server(WebSettings(broker=None, server="fair"), _Nothing(), _Nothing())  # type: ignore[arg-type]
+        self.server.driving.announced = self._announced(self.server.driving)
         self.loop.create_task(self.server.open())
         self.wake()
+
+    def _announced(self, driving: Any) -> Any:
+        take = driving.announced
+
+        def announced(server: str, robots: dict[str, Any], now: float) -> Any:
+            for ref, (_, _, since_ms) in robots.items():
+                lease = driving.leases.get(ref)
+                if lease is not None and (lease.since_ms, driving._server) < (since_ms, server):
+                    self.lease_moved(lease.tab)
+            return take(server, robots, now)
+
+        return announced
 
     def kill(self, restart_s: float | None) -> None:
         """End at once: nothing is published any more."""
@@ -178,10 +192,10 @@ class WebServer(Process):
     def accept(self, page: int, socket: ServerSocket) -> None:
         """Serve a connection of a page."""
         assert self.loop is not None
-        session = Session(f"session-{page}", f"human-{page}", self.roles.get(page, Role.DRIVER))
+        session = Session(f"session-{page}", f"human-{page}", self.roles.get(page % 8, Role.DRIVER))
 
         def check() -> Session | None:
-            return Session(session.id, session.user, self.roles.get(page, Role.DRIVER))
+            return Session(session.id, session.user, self.roles.get(page % 8, Role.DRIVER))
 
         one = RecordedControl(self.server, socket, session, check)  # type: ignore[arg-type]
         one.page, one.handling = page, self._handling

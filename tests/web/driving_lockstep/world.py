@@ -92,6 +92,8 @@ class World:
         self.robot = Process("robot", scheduler)
         self.silent_until = 0.0
         self.server = WebServer(self.network, self.rules.rewrite, self._handling)
+        self.rules.stopping = lambda: any(not one.finished for one, _ in self.server.server.stops._senders.values())
+        self.server.lease_moved = self.rules.lease_moved
         self.rules.driving = lambda: self.server.server.driving
         self.rules.reachable = self._reachable
         self.rules.owner_up = self._owner_up
@@ -157,7 +159,7 @@ class World:
         self.states.pop(page, None)
         self.pages.do(page, "ask")
         self.scheduler.flush()
-        return self.states.get(page, {"reason": "gone", "open": False, "active": False, "token": ""})
+        return self.states.get(page, {"reason": "gone", "open": False, "ended": False, "dragged": False, "token": ""})
 
     def _output(self, output: Output) -> None:
         slot = self.slot(output.page)
@@ -280,7 +282,8 @@ class World:
             human.change(name, axes, self.now)
             self.pages.do(human.page, "stickMove", finger, x, z)
         elif f"stick{1 - finger}" in human.held:
-            self._void(slot, "a second finger has touched the stick")
+            if self.ask(slot)["dragged"]:
+                self._void(slot, "a second finger has touched the stick")
             human.press(name, axes, self.now)  # it is the first one for a page that has refused the other
             self.pages.do(human.page, "stickStart", finger, x, z)
         else:
@@ -291,7 +294,7 @@ class World:
         """The browser takes the pointer away; the finger stays where it is."""
         slot, human = self._human(a)
         for finger in range(2):
-            if f"stick{finger}" in human.held:
+            if f"stick{finger}" in human.held and self.ask(slot)["dragged"]:
                 self._void(slot, "the browser has taken the pointer")
                 self.pages.do(human.page, "stickCancel", finger)
 
@@ -458,7 +461,8 @@ class World:
     def do_clock(self, a: int, b: int) -> None:
         """The wall clock of the computer is set."""
         slot, human = self._human(a)
-        self.pages.do(human.page, "wall", (5000, -5000, 400, -400)[b % 4])
+        if not human.asleep:
+            self.pages.do(human.page, "wall", (5000, -5000, 400, -400)[b % 4])
 
     def do_reload(self, a: int, b: int) -> None:
         """The page is loaded again: by the same tab, by a copy of it, or by another one; the old one may hang on."""

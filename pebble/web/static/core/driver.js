@@ -217,9 +217,10 @@ export class Driver {
 
   /** Where the page's clock stands still while the machine is suspended, only the other one shows it. */
   checkClock(now) {
-    const drift = Date.now() - now - this.clockBase;
-    if (Math.abs(drift) <= SUSPENDED_MS) return;
-    this.clockBase += drift;
+    const base = Date.now() - now;
+    const jump = Math.abs(base - this.clockBase);
+    this.clockBase = base;
+    if (jump <= SUSPENDED_MS) return;
     this.leave();
     this.socket.restart();
   }
