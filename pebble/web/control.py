@@ -171,7 +171,7 @@ class Control:
             case m.EstopOp():
                 self._server.stop(op.ref, op.stop, self._session, self._tab.device, op.why)
             case m.EstopEndOp():
-                self._end_stop(op.stop)
+                self._end_stop(op)
             case m.EstopResetOp():
                 self._reset(op)
             case m.Watch():
@@ -179,29 +179,29 @@ class Control:
             case m.Lease():
                 self._lease(op)
             case m.EncodingOp():
-                if self._may("drive", "encoding", op.ref):
+                if self._may("drive", op):
                     self._server.media.pin(op.ref, op.encoding)
             case m.PictureFromOp():
-                if self._may("drive", "picture-from", op.ref):
+                if self._may("drive", op):
                     self._server.picture_from(op.ref, op.source)
             case _:
                 raise Leave("hello comes only once", again=True)
         self._wake.set()
 
     def _drive(self, op: m.DriveOp) -> None:
-        if not self._may("drive", "drive", op.ref, g=op.g):
+        if not self._may("drive", op):
             return
         server, now = self._server, clock()
         if op.ref not in server.robots.components:
-            self._refuse("drive", op.ref, "unknown component", g=op.g)
+            self._refuse(op, "unknown component")
             return
         outcome = server.driving.drive(self._tab, op, now, self._why_not or server.blocked(op.ref))
         accepted = server.publish(outcome.commands)
         if outcome.refused:
-            self._refuse("drive", op.ref, outcome.refused, g=op.g)
+            self._refuse(op, outcome.refused)
         elif not accepted:
             server.publish(server.driving.stop(op.ref, now))
-            self._refuse("drive", op.ref, "The server cannot reach the broker", g=op.g)
+            self._refuse(op, "The server cannot reach the broker")
         elif outcome.commands and outcome.commands[0].drive.moves and op.ref not in self._moved:
             self._moved.add(op.ref)
             self._audit("drive", op.ref)
@@ -211,15 +211,15 @@ class Control:
         if component is not None and (component.drives() or not component.capabilities):
             self._server.publish(self._server.driving.stop(op.ref, clock()))
 
-    def _end_stop(self, name: str) -> None:
+    def _end_stop(self, op: m.EstopEndOp) -> None:
         """One's own, or with the right to reset: a viewer must not end the stop of another person."""
-        user = self._server.stops.user(name)
-        if user is not None and (user == self._session.user or self._may("reset", "estop-end", "")):
-            self._server.stops.end(name)
+        user = self._server.stops.user(op.stop)
+        if user is not None and (user == self._session.user or self._may("reset", op)):
+            self._server.stops.end(op.stop)
 
     def _reset(self, op: m.EstopResetOp) -> None:
         component = self._server.robots.components.get(op.ref)
-        if not self._may("reset", "estop-reset", op.ref) or component is None:
+        if not self._may("reset", op) or component is None:
             return
         reset = Reset(component.estop, self._session.user)
         shown = {one.owner: (one.boot, one.count) for one in op.owners}
@@ -248,26 +248,27 @@ class Control:
         if not op.take:
             server.publish(server.driving.release(self._tab, op.ref, clock()))
             self._audit("release", op.ref)
-        elif self._may("drive", "lease", op.ref):
+        elif self._may("drive", op):
             why = self._why_not or ("" if op.ref in server.robots.components else "unknown component")
             if not why:
                 now = int(1000 * time.time())
                 commands, why = server.driving.take(self._tab, op.ref, clock(), now, over=op.over)
                 server.publish(commands)
             if why:
-                self._refuse("lease", op.ref, why)
+                self._refuse(op, why)
                 return
             self._audit("take over" if op.over else "take", op.ref)
         self._moved.discard(op.ref)
 
-    def _may(self, right: str, cmd: str, ref: str, *, g: int = -1) -> bool:
+    def _may(self, right: str, op: m.FromPage) -> bool:
         if right in rights(self._session.role):
             return True
-        self._refuse(cmd, ref, f"The role {self._session.role} may not do this", g=g)
+        self._refuse(op, f"The role {self._session.role} may not do this")
         return False
 
-    def _refuse(self, cmd: str, ref: str, why: str, *, g: int = -1) -> None:
-        self._post(m.Refused(cmd=cmd, ref=ref, why=why, g=g))
+    def _refuse(self, op: m.FromPage, why: str) -> None:
+        command = str(op.__struct_config__.tag)
+        self._post(m.Refused(cmd=command, ref=getattr(op, "ref", ""), why=why, g=getattr(op, "g", -1)))
 
     def _audit(self, what: str, ref: str) -> None:
         client = self._websocket.client

@@ -11,6 +11,7 @@ from typing import Final
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from pebble.contract import CAMERA
 from pebble.contract.identity import Direction
 from pebble.web.broker import Broker
 from pebble.web.encoding_choice import BEST_FIRST
@@ -40,7 +41,7 @@ class MediaHub:
 
     async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
         """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
-        if self._closed or not own_topic(ref, f"{ref}/{Direction.OUTGOING}/front-camera", Direction.OUTGOING):
+        if self._closed or not own_topic(ref, CAMERA.topic(ref), Direction.OUTGOING):
             await websocket.close(_BAD_REQUEST, "no such component")
             return
         viewer = PageViewer(can)
