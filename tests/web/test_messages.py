@@ -38,5 +38,7 @@ def test_what_is_not_a_message_is_refused(wrong):
 
 
 def test_what_a_page_sends_is_understood():
-    op = decoder.decode(b'{"op":"drive","ref":"pebble/robots/goob","g":3,"t":1234.5,"x":0.25,"z":-1,"y":0,"final":false}')
+    op = decoder.decode(
+        b'{"op":"drive","ref":"pebble/robots/goob","g":3,"t":1234.5,"x":0.25,"z":-1,"y":0,"final":false}'
+    )
     assert op == messages.DriveOp(ref="pebble/robots/goob", g=3, t=1234.5, x=0.25, z=-1.0)
