@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Locator
 
 from pebble.contract.payloads import Heartbeat
 from tests.web.browser import tab
-from tests.web.console import BACK, FORWARD, KEYS, LEFT, REST, RIGHT, Console, Wheels, Wire, console, pad, used
+from tests.web.console import BACK, FORWARD, KEYS, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
 from tests.web.stage import Stage
 
 pytestmark = pytest.mark.alone  # deadlines are checked
@@ -135,70 +135,6 @@ def test_the_stick_follows_the_mouse(at_benjr: Console, x: int, y: int, wheels: 
     assert at_benjr.wheels == wheels
     at_benjr.page.mouse.up()
     assert at_benjr.rests()
-
-
-# -- gamepads
-
-
-def test_a_gamepad_drives_once_it_was_seen_in_neutral(at_lamp: Console) -> None:
-    at_lamp.pads(pad(z=1))
-    assert at_lamp.stays_at_rest()
-    at_lamp.pads(pad())
-    at_lamp.page.wait_for_timeout(120)
-    at_lamp.pads(pad(z=1))
-    assert at_lamp.turns(FORWARD)
-    at_lamp.pads(pad(x=-1))
-    assert at_lamp.turns(LEFT)
-    at_lamp.pads(pad(0.05, -0.05))
-    assert at_lamp.rests()
-
-
-def _pad_drives(at_lamp: Console, *more: dict[str, object]) -> None:
-    at_lamp.pads(pad(), *more)
-    at_lamp.page.wait_for_timeout(120)
-    at_lamp.pads(pad(z=1), *more)
-    assert at_lamp.turns(FORWARD)
-
-
-def test_a_gamepad_that_is_disconnected_while_it_is_deflected_stops(at_lamp: Console) -> None:
-    _pad_drives(at_lamp)
-    at_lamp.pads(None)
-    assert at_lamp.rests()
-    at_lamp.pads(None, pad(z=1))
-    assert at_lamp.stays_at_rest()
-    _pad_drives(at_lamp)
-
-
-def test_a_deflected_gamepad_whose_time_stands_still_is_given_up(at_lamp: Console) -> None:
-    _pad_drives(at_lamp)
-    began = time.monotonic()
-    assert at_lamp.rests(6)
-    assert time.monotonic() - began > 2.5
-    assert at_lamp.reason in ("pad", "release")
-    at_lamp.pads(pad(z=1))
-    assert at_lamp.stays_at_rest()
-    _pad_drives(at_lamp)
-
-
-def test_of_two_gamepads_the_attack_3_drives(at_lamp: Console) -> None:
-    _pad_drives(at_lamp, pad(z=-1, name="another"))
-    second = pad(name="Logitech Attack 3")
-    at_lamp.pads(pad(z=1), second)
-    assert at_lamp.rests()
-    at_lamp.pads(pad(z=1), {**second, "axes": [0, 1]})
-    assert at_lamp.turns(BACK)
-
-
-def test_the_buttons_of_a_gamepad_stop(at_lamp: Console, wire: Wire) -> None:
-    _pad_drives(at_lamp)
-    at_lamp.pads(pad(0, 1, 0))
-    assert at_lamp.rests()
-    assert at_lamp.stays_at_rest()
-    assert not wire.latched("minilamp")
-    _pad_drives(at_lamp)
-    at_lamp.pads(pad(0, 1, 8, 9))
-    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
-    assert at_lamp.rests()
 
 
 # -- stops

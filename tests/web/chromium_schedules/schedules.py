@@ -7,28 +7,29 @@ from dataclasses import dataclass
 
 ROBOTS = ("minilamp", "fred")
 KEYS = {"KeyW": (0, 1), "KeyS": (0, -1), "KeyA": (-1, 0), "KeyD": (1, 0), "ArrowUp": (0, 1)}  # x and z
-ACTIVE_S = 3.0
-_STEPS = {
-    "press": 9,
-    "release": 5,
-    "stick": 4,
-    "drop stick": 2,
-    "blur": 1,
-    "hide": 1,
-    "show": 2,
-    "menu": 1,
-    "space": 1,
-    "reload": 1,
-    "take": 2,
-    "give back": 1,
-    "other takes": 2,
-    "other drives": 2,
-    "other's space": 2,
-    "stop": 1,
-    "other stops": 1,
-    "reset": 3,
-}
-_FAULTS = {"stall": 4, "cut": 2, "busy": 3, "freeze": 2, "suspend server": 3, "kill server": 1}
+ROUNDS, ROUND_S = 3, 1.2
+ACTIVE_S = ROUNDS * ROUND_S
+_INPUTS = ("press", "press", "stick")
+#: What ends a gesture, and how often.
+_BY_PERSONS = {"release": 2, "drop stick": 1, "blur": 3, "hide": 3, "menu": 2, "space": 2, "reload": 1, "give back": 1}
+_BY_OTHERS = {"other takes": 3, "other's space": 2, "stop": 1, "other stops": 2}
+_BY_FAULTS = {"stall": 5, "cut": 3, "busy": 4, "freeze": 3, "suspend server": 4, "kill server": 1}
+_INTERRUPTIONS = _BY_PERSONS | _BY_OTHERS | _BY_FAULTS
+#: What makes driving possible again while the input is still held.
+_REMEDIES = {"hide": "show", "stop": "reset", "other stops": "reset", "other takes": "take", "give back": "take"}
+_FURTHER = (
+    "press",
+    "press",
+    "release",
+    "stick",
+    "drop stick",
+    "blur",
+    "space",
+    "take",
+    "other drives",
+    "other's space",
+)
+_FAULTS = ("stall", "busy", "freeze", "suspend server")
 _LASTS_S = (0.15, 0.4, 0.9, 1.6)
 
 
@@ -51,20 +52,26 @@ class Schedule:
 
 
 def make(seed: int) -> Schedule:
-    """The schedule of a seed; it begins with a key, so that something moves."""
+    """The schedule of a seed: each round has an input, an interruption, what makes driving possible, and a release."""
     chance = random.Random(f"page {seed}")
-    steps = [_input(chance, 0.0, "press")]
-    for _ in range(chance.randrange(6, 13)):
-        what = chance.choices(list(_STEPS), list(_STEPS.values()))[0]
-        steps.append(_input(chance, chance.uniform(0.05, ACTIVE_S), what))
-    for _ in range(chance.choice((0, 1, 1, 2))):
-        what = chance.choices(list(_FAULTS), list(_FAULTS.values()))[0]
-        at, seconds = chance.uniform(0.2, ACTIVE_S - 1.0), chance.choice(_LASTS_S)
-        steps.append(Step(round(at, 3), what, seconds=seconds))
+    steps: list[Step] = []
+    for number in range(ROUNDS):
+        began = number * ROUND_S + chance.uniform(0.0, 0.1)
+        what = chance.choices(list(_INTERRUPTIONS), list(_INTERRUPTIONS.values()))[0]
+        steps.append(_step(chance, began, chance.choice(_INPUTS)))
+        steps.append(_step(chance, began + chance.uniform(0.15, 0.4), what))
+        if what in _REMEDIES:
+            steps.append(_step(chance, began + chance.uniform(0.5, 0.7), _REMEDIES[what]))
+        steps += [
+            _step(chance, began + chance.uniform(0.0, ROUND_S), one)
+            for one in chance.sample(_FURTHER, chance.choice((0, 0, 1, 2)))
+        ]
+        steps += [_step(chance, began + ROUND_S - 0.15, one) for one in chance.sample(("release", "drop stick"), 2)]
     return Schedule(seed, ROBOTS[seed % 2], tuple(sorted(steps, key=lambda step: step.at)))
 
 
-def _input(chance: random.Random, at: float, what: str) -> Step:
+def _step(chance: random.Random, at: float, what: str) -> Step:
     key = chance.choice(list(KEYS))
     axes = chance.choice(((0, 1), (0, -1), (1, 0), (-1, 0))) if what == "stick" else KEYS[key]
-    return Step(round(at, 3), what, key, axes)
+    seconds = chance.choice(_LASTS_S) if what in _FAULTS else 0.0
+    return Step(round(at, 3), what, key, axes, seconds)

@@ -162,9 +162,7 @@ class World:
         self._end(1, PAGE_S, "a menu was opened")
 
     def _space(self, _: Step) -> None:
-        self.tabs[1].page.keyboard.press("Space")
-        self._end(1, PAGE_S, "the space bar")
-        self._end(2, PAGE_S, "the space bar of the other tab", by=1)
+        self._space_by(1, 2)
 
     def _reload(self, _: Step) -> None:
         if self._server_away or self._obstructed:
@@ -200,9 +198,7 @@ class World:
             self._end(2, PAGE_S, "it was released")
 
     def _others_space(self, _: Step) -> None:
-        self.tabs[2].page.keyboard.press("Space")
-        self._end(2, PAGE_S, "the space bar")
-        self._end(1, PAGE_S, "the space bar of the other tab", by=2)
+        self._space_by(2, 1)
 
     def _other_stops(self, _: Step) -> None:
         self._stopped_by(2)
@@ -305,6 +301,16 @@ class World:
         self._holder = tab if taken else None
         if taken:
             self._end(other, PAGE_S, "the other tab has taken control")
+
+    def _space_by(self, tab: int, other: int) -> None:
+        connected = self._connected(tab)
+        self.tabs[tab].page.keyboard.press("Space")
+        self._end(tab, PAGE_S, "the space bar")
+        if connected and self._connected(tab):
+            self._end(other, PAGE_S, "the space bar of the other tab", by=tab)
+
+    def _connected(self, tab: int) -> bool:
+        return self.tabs[tab].page.evaluate("window.pebble?.connection.state") == "open"
 
     def _has(self, tab: int) -> bool:
         """Whether this tab has the lease, by what it was sent."""
