@@ -310,7 +310,7 @@ class World:
             self._end(other, PAGE_S, "the space bar of the other tab", by=tab)
 
     def _connected(self, tab: int) -> bool:
-        return self.tabs[tab].page.evaluate("window.pebble?.connection.state") == "open"
+        return bool(self.tabs[tab].page.evaluate("window.pebble?.connection.isOpen"))
 
     def _has(self, tab: int) -> bool:
         """Whether this tab has the lease, by what it was sent."""
