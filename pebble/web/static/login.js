@@ -1,9 +1,9 @@
 /** The login page: sends user and password as JSON, and shows why they were refused. */
 
 const form = document.getElementById("login");
-const user = document.getElementById("user");
-const password = document.getElementById("password");
-const submit = document.getElementById("submit");
+const user = /** @type {HTMLInputElement} */ (document.getElementById("user"));
+const password = /** @type {HTMLInputElement} */ (document.getElementById("password"));
+const submit = /** @type {HTMLButtonElement} */ (document.getElementById("submit"));
 const why = document.getElementById("why");
 
 /**

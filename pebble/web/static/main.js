@@ -11,7 +11,7 @@ import { Connection, Route, Settings } from "./ui/models.js";
 import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
 
-const version = document.querySelector("meta[name=pebble-version]")?.content ?? "";
+const version = document.querySelector("meta[name=pebble-version]")?.getAttribute("content") ?? "";
 const store = new Store();
 const connection = new Connection(version);
 const route = new Route();
@@ -76,4 +76,4 @@ page.driver.start();
 follow();
 render(h(Page.Provider, { value: page }, h(App)), document.getElementById("app"));
 page.connection.socket.connect();
-window.pebble = page; // for tests, and for people who look into it
+Object.assign(window, { pebble: page }); // for tests, and for people who look into it

@@ -4,9 +4,11 @@ const STEP_MS = 50; // subscribers are called at most this often, and at most on
 const SYNCS = 60; // half a minute of pings
 const INTERVALS = 5; // between updates, from which the period of a value is estimated
 
-/** One value. Ages are measured by a clock that nothing sets. */
+/** @typedef {import("../messages.js").Metrics} Metrics */
+
+/** One value. Ages are measured by a clock that nothing sets. @template [V=any] */
 export class Value {
-  /** @param {Store} store @param {unknown} value @param {number} receivedAt of performance.now() */
+  /** @param {Store} store @param {V} value @param {number} receivedAt of performance.now() */
   constructor(store, value, receivedAt) {
     this.store = store;
     this.value = value;
@@ -27,7 +29,7 @@ export class Value {
     return this.store.now() - this.age;
   }
 
-  /** @param {unknown} value @param {number} receivedAt */
+  /** @param {V} value @param {number} receivedAt */
   replace(value, receivedAt) {
     const interval = receivedAt - this.receivedAt;
     if (interval > 5) {
@@ -62,7 +64,10 @@ export class Store {
     this.pending = false;
   }
 
-  /** @param {string} ref @param {string} metric @returns {Value | undefined} */
+  /**
+   * @template {string} M @param {string} ref @param {M} metric
+   * @returns {Value<M extends keyof Metrics ? Metrics[M] : any> | undefined}
+   */
   get(ref, metric) {
     return this.components.get(ref)?.get(metric);
   }

@@ -106,7 +106,7 @@ function fromBase64(text) {
 /**
  * Unpacks the one complete zlib stream in `packed`; throws PayloadError for anything else.
  * The limit matters because a few kilobytes may unpack to gigabytes. zlib ends with a checksum of the content.
- * @param {Uint8Array} packed
+ * @param {any} packed bytes
  * @param {number} [limit]
  * @returns {Promise<Uint8Array>}
  */

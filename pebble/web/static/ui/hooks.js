@@ -15,7 +15,12 @@ export const usePage = () => useContext(Page);
 
 const useRedraw = () => useReducer((n) => n + 1, 0)[1];
 
-/** @param {string} ref @param {string} metric @returns {import("../core/store.js").Value | undefined} */
+/** @typedef {import("../messages.js").Metrics} Metrics */
+
+/**
+ * @template {string} M @param {string} ref @param {M} metric
+ * @returns {import("../core/store.js").Value<M extends keyof Metrics ? Metrics[M] : any> | undefined}
+ */
 export function useMetric(ref, metric) {
   const { store } = usePage();
   const redraw = useRedraw();
@@ -26,7 +31,11 @@ export function useMetric(ref, metric) {
   return store.get(ref, metric);
 }
 
-/** @param {string} ref @param {string} metric @returns {any} the payload; undefined until there is one */
+/**
+ * The payload; undefined until there is one.
+ * @template {string} M @param {string} ref @param {M} metric
+ * @returns {(M extends keyof Metrics ? Metrics[M] : any) | undefined}
+ */
 export const useValue = (ref, metric) => useMetric(ref, metric)?.value;
 
 /** @returns {string[]} all components */
@@ -51,7 +60,7 @@ export function useMetrics(ref) {
   return store.metrics(ref);
 }
 
-/** Draw again after each change of a model. @template T @param {T} model @returns {T} */
+/** Draw again after each change of a model. @template {{onChange: (fn: () => void) => () => void}} T @param {T} model @returns {T} */
 export function useModel(model) {
   const redraw = useRedraw();
   useEffect(() => {

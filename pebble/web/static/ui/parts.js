@@ -93,7 +93,7 @@ export function Live({ entry, online = true, children }) {
   return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 
-/** @param {{title: string, id: string, icon?: string, aside?: any, children: any}} props */
+/** @param {{title: string, id: string, icon?: string, aside?: any, view?: any, className?: string, children: any}} props */
 export function Card({ title, id, icon, aside, view, className = "", children }) {
   const closed = view?.isClosed(id) ?? false;
   return html`<section class=${`card ${className}`} aria-labelledby=${`${id}-title`} data-card=${id}>

@@ -13,7 +13,7 @@ export function SettingsPanel({ onClose }) {
   useModel(driver);
   const panel = useRef(null);
   useEffect(() => {
-    const before = document.activeElement;
+    const before = /** @type {HTMLElement | null} */ (document.activeElement);
     driver.interrupt();
     panel.current.focus();
     return () => before?.focus?.();

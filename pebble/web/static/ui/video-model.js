@@ -38,7 +38,7 @@ export class Video extends Model {
     this.changed();
   }
 
-  /** @param {CanvasImageSource & {width: number, height: number}} bitmap @param {any} info */
+  /** @param {any} bitmap a VideoFrame, or an ImageBitmap @param {any} info */
   draw(bitmap, info) {
     const { canvas } = this;
     const width = bitmap.displayWidth ?? bitmap.width;
