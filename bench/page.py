@@ -86,134 +86,76 @@ def _goob() -> AbstractContextManager[Rig]:
 
 
 _STOP, _GONE, _SERVER = Goal(15, 60), Goal(None, 300), Goal(None, 450)
-_DRAWN, _NONE = Goal(25, 50), Goal(0, 0)
+_PICTURES = {"json": "17 / 24", "pbvd": "14 / 18", "pbvz": "17 / 22", "h264": "13 / 20"}
 _V, _R = f"{cases.VIEWERS} viewers", f"{cases.ROBOTS_SHOWN} robots"
 
 CASES = (
-    Case(
-        "keys",
-        cases.keys,
-        (
-            Row("key to MQTT", "ms", Goal(2, 5), "0.93 / 1.35"),
-            Row("key to motors", "ms", Goal(10, 20), "6.2 / 9.4"),
-            Row("release to stop", "ms", _STOP, "7 / 18"),
-        ),
-        _goob,
-    ),
-    Case(
-        "interruptions",
-        cases.interruptions,
-        (
-            Row("blur to stop", "ms", _STOP, "12"),
-            Row("hidden to stop", "ms", _STOP, "48"),
-            Row("frozen to stop", "ms", _GONE, "250"),
-            Row("closed to stop", "ms", _GONE, "66"),
-            Row("stalled to stop", "ms", _GONE, "252"),
-            Row("server frozen to stop", "ms", _SERVER, "723"),
-            Row("server killed to stop", "ms", _SERVER, "739"),
-        ),
-        _goob,
-    ),
-    Case(
-        "stops",
-        cases.stops,
-        (
-            Row("STOP to motors", "ms", Goal(None, 50), "12-28"),
-            Row("STOP to confirmed", "ms", Goal(None, 300)),
-            Row("STOP ALL to motors", "ms", Goal(None, 150), "52-67"),
-            Row("STOP ALL to confirmed", "ms", Goal(None, 300)),
-        ),
-    ),
-    Case(
-        "pictures",
-        cases.pictures,
-        tuple(
-            row
-            for encoding, prototype in {
-                "json": "17 / 24",
-                "pbvd": "14 / 18",
-                "pbvz": "17 / 22",
-                "h264": "13 / 20",
-            }.items()
-            for row in (
-                Row(f"{encoding} to drawn", "ms", _DRAWN, prototype),
-                Row(f"{encoding} lost", "%", _NONE, "0"),
-            )
-        ),
-        _goob,
-    ),
-    Case(
-        "loading",
-        cases.loading,
-        (
-            Row("first robot", "ms", Goal(None, 1000), "400-700"),
-            Row("first picture", "ms", Goal(None, 3000), "1700-2500"),
-        ),
-    ),
-    Case(
-        "files",
-        cases.files,
-        (
-            Row("page, kB", "kB"),
-            Row("page, kB gz", "kB", Goal(60), "14"),
-            Row("requests", ""),
-            Row("foreign hosts", "", Goal(0), "0"),
-        ),
-        _goob,
-    ),
-    Case(
-        "driving",
-        cases.driving,
-        (
-            Row("1 viewer, driving: CPU", "%", Goal(8), "5.0"),
-            Row("1 viewer, driving: RSS", "MB", Goal(60), "36"),
-        ),
-        _goob,
-    ),
-    Case(
-        "viewers",
-        cases.viewers,
-        (
-            Row(f"{_V}: CPU", "%", Goal(25), "5.2"),
-            Row(f"{_V}: RSS", "MB", Goal(80), "37"),
-            Row("frames of each viewer", "%", Goal(at_least=95), "50"),
-            Row("robot's uplink, of that with 1 viewer", "%", Goal(110)),
-        ),
-        _goob,
-    ),
-    Case(
-        "crowd",
-        cases.crowd,
-        (
-            Row(f"{_R}: ms an update", "ms", Goal(8)),
-            Row(f"{_R}: CPU", "%", Goal(10)),
-            Row(f"{_R}: RSS", "MB", Goal(80)),
-        ),
-        _lamp,
-    ),
-    Case(
-        "thin link",
-        cases.link_pictures,
-        (
-            Row("2 Mbit/s: picture age", "ms", Goal(250), "183 / 209"),
-            Row("2 Mbit/s: offered", "Mbit/s", Goal(at_least=3.8), "4.2"),
-            Row("2 Mbit/s: drawn a second", ""),
-        ),
-        _thin,
-    ),
-    Case(
-        "far link",
-        cases.link_driving,
-        (
-            Row("256 kbit/s: drive", "ms", Goal(None, 110)),
-            Row("256 kbit/s: drive, arrived", "%"),
-            Row("256 kbit/s: gestures interrupted", ""),
-            Row("256 kbit/s: STOP to motors", "ms"),
-            Row("256 kbit/s: round trip shown", "ms"),
-        ),
-        _far,
-    ),
-)
+    Case("keys", cases.keys, (
+        Row("key to MQTT", "ms", Goal(2, 5), "0.93 / 1.35"),
+        Row("key to motors", "ms", Goal(10, 20), "6.2 / 9.4"),
+        Row("release to stop", "ms", _STOP, "7 / 18"),
+    ), _goob),
+    Case("interruptions", cases.interruptions, (
+        Row("blur to stop", "ms", _STOP, "12"),
+        Row("hidden to stop", "ms", _STOP, "48"),
+        Row("frozen to stop", "ms", _GONE, "250"),
+        Row("closed to stop", "ms", _GONE, "66"),
+        Row("stalled to stop", "ms", _GONE, "252"),
+        Row("server frozen to stop", "ms", _SERVER, "723"),
+        Row("server killed to stop", "ms", _SERVER, "739"),
+    ), _goob),
+    Case("stops", cases.stops, (
+        Row("STOP to motors", "ms", Goal(None, 50), "12-28"),
+        Row("STOP to confirmed", "ms", Goal(None, 300)),
+        Row("STOP ALL to motors", "ms", Goal(None, 150), "52-67"),
+        Row("STOP ALL to confirmed", "ms", Goal(None, 300)),
+    )),
+    Case("pictures", cases.pictures, tuple(
+        row
+        for encoding, prototype in _PICTURES.items()
+        for row in (
+            Row(f"{encoding} to drawn", "ms", Goal(25, 50), prototype),
+            Row(f"{encoding} lost", "%", Goal(0, 0), "0"),
+        )
+    ), _goob),
+    Case("loading", cases.loading, (
+        Row("first robot", "ms", Goal(None, 1000), "400-700"),
+        Row("first picture", "ms", Goal(None, 3000), "1700-2500"),
+    )),
+    Case("files", cases.files, (
+        Row("page, kB", "kB"),
+        Row("page, kB gz", "kB", Goal(60), "14"),
+        Row("requests", ""),
+        Row("foreign hosts", "", Goal(0), "0"),
+    ), _goob),
+    Case("driving", cases.driving, (
+        Row("1 viewer, driving: CPU", "%", Goal(8), "5.0"),
+        Row("1 viewer, driving: RSS", "MB", Goal(60), "36"),
+    ), _goob),
+    Case("viewers", cases.viewers, (
+        Row(f"{_V}: CPU", "%", Goal(25), "5.2"),
+        Row(f"{_V}: RSS", "MB", Goal(80), "37"),
+        Row("frames of each viewer", "%", Goal(at_least=95), "50"),
+        Row("robot's uplink, of that with 1 viewer", "%", Goal(110)),
+    ), _goob),
+    Case("crowd", cases.crowd, (
+        Row(f"{_R}: ms an update", "ms", Goal(8)),
+        Row(f"{_R}: CPU", "%", Goal(10)),
+        Row(f"{_R}: RSS", "MB", Goal(80)),
+    ), _lamp),
+    Case("thin link", cases.link_pictures, (
+        Row("2 Mbit/s: picture age", "ms", Goal(250), "183 / 209"),
+        Row("2 Mbit/s: offered", "Mbit/s", Goal(at_least=3.8), "4.2"),
+        Row("2 Mbit/s: drawn a second", ""),
+    ), _thin),
+    Case("far link", cases.link_driving, (
+        Row("256 kbit/s: drive", "ms", Goal(None, 110)),
+        Row("256 kbit/s: drive, arrived", "%"),
+        Row("256 kbit/s: gestures interrupted", ""),
+        Row("256 kbit/s: STOP to motors", "ms"),
+        Row("256 kbit/s: round trip shown", "ms"),
+    ), _far),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -179,7 +179,7 @@ sys.exit(main.run())
     lines = [line for line in demos[0].output.splitlines() if "starlette" in line]
     assert lines == ["Without the operator page, which needs packages that are not installed (starlette): "
                      "pip install 'pebble-robot[web]'"]  # fmt: skip
-    assert not any("pebble.web" in line for line in demos[0].leftovers())
+    assert not any("pebble.web.program" in line for line in demos[0].leftovers())
 
 
 def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Path) -> None:
