@@ -27,6 +27,7 @@ export class ControlSocket {
     /** @type {WebSocket|null} */
     this.socket = null;
     this.heardAt = 0;
+    this.outdated = false; // what the store has is of an earlier connection
     setInterval(() => this.check(), CHECK_MS);
   }
 
@@ -88,13 +89,15 @@ export class ControlSocket {
     this.you = message;
     this.attempts = 0;
     this.state = "open";
-    this.options.store.clear(); // the server sends all that there is
+    this.outdated = true;
     this.options.store.sync(message.now);
     this.options.onOpen?.();
     this.options.onChange?.();
   }
 
   take(message) {
+    if (this.outdated) this.options.store.clear(); // the first state of a connection has all that there is
+    this.outdated = false;
     for (const ref of message.gone ?? []) this.options.store.remove(ref);
     for (const [ref, metric, value, age] of message.set) this.options.store.set(ref, metric, value, age);
   }
