@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -33,7 +33,7 @@ KEYS: dict[str, Wheels] = {
 REST_S = 1.0  # to come to rest after a release, on a busy machine; 20 ms on an idle one
 QUIET_S = 0.4  # so long nothing may turn where nothing may turn: eight commands of a gesture
 _READY_S = 20.0  # for picture, echoes and lease, on a busy machine
-_PRESSES = 6  # a machine that is too busy ends gestures, as it should
+_PRESSES = 6
 _MOVES_S = 0.7
 _PADS = "window.__pads = []; navigator.getGamepads = () => window.__pads;"
 
@@ -123,12 +123,16 @@ class Console:
             self.page.keyboard.up(self.held.pop())
 
     def drive(self, *codes: str, wheels: Wheels = FORWARD) -> bool:
-        """Press and hold keys until the wheels turn so; again, if a busy machine has ended the gesture."""
+        """Press and hold keys until the wheels turn so."""
+        return self.persists(lambda: self.down(*(codes or ("KeyW",))), lambda: self.wheels == wheels, self.let_go)
+
+    def persists(self, begin: Callable[[], None], reached: Callable[[], bool], end: Callable[[], None]) -> bool:
+        """Begin a gesture until it has its effect; again, if a busy machine has ended it, as it should."""
         for _ in range(_PRESSES):
-            self.down(*(codes or ("KeyW",)))
-            if self.turns(wheels, _MOVES_S):
+            begin()
+            if self.tab.until(reached, _MOVES_S):
                 return True
-            self.let_go()
+            end()
             self.page.wait_for_timeout(60)
         return False
 
@@ -152,7 +156,7 @@ class Console:
     def speeds(self) -> tuple[float, float]:
         return self.stage.motors(self.name)[-1][1]
 
-    def turns(self, wheels: Wheels = FORWARD, within: float = 2.0) -> bool:
+    def turns(self, wheels: Wheels, within: float = 2.0) -> bool:
         return self.tab.until(lambda: self.wheels == wheels, within)
 
     def rests(self, within: float = REST_S) -> bool:

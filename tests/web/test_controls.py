@@ -79,14 +79,13 @@ def test_the_extra_axis_has_keys_and_buttons(at_lamp: Console, wire: Wire, key: 
     def newest() -> float:
         return float((wire.last("minilamp/incoming/drive-values") or {}).get("y", 0.0))
 
-    at_lamp.down(key)
-    assert at_lamp.tab.until(lambda: newest() == y, 2)
+    assert at_lamp.persists(lambda: at_lamp.down(key), lambda: newest() == y, at_lamp.let_go)
     at_lamp.let_go()
     assert at_lamp.tab.until(lambda: newest() == 0, 2)
     at_lamp.test(button).hover()
-    at_lamp.page.mouse.down()
-    assert at_lamp.tab.until(lambda: newest() == y, 2)
-    at_lamp.page.mouse.up()
+    mouse = at_lamp.page.mouse
+    assert at_lamp.persists(mouse.down, lambda: newest() == y, mouse.up)
+    mouse.up()
     assert at_lamp.tab.until(lambda: newest() == 0, 2)
 
 
@@ -125,16 +124,22 @@ def test_arrow_keys_on_a_slider_move_the_slider_only(at_benjr: Console) -> None:
 
 @pytest.mark.parametrize(("x", "y", "wheels"), [(0, -1, FORWARD), (0, 1, BACK), (-1, 0, LEFT), (1, 0, RIGHT)])
 def test_the_stick_follows_the_mouse(at_benjr: Console, x: int, y: int, wheels: Wheels) -> None:
-    at_benjr.test("stick").hover()
     left, top, size = at_benjr.place("stick")
-    at_benjr.page.mouse.down()
-    assert at_benjr.stays_at_rest(0.1)
-    at_benjr.page.mouse.move(left + 0.4 * x * size, top + 0.4 * y * size, steps=3)
-    assert at_benjr.turns(wheels)
-    at_benjr.page.mouse.move(left + 3 * x * size, top + 3 * y * size)
+    mouse = at_benjr.page.mouse
+
+    def drag() -> None:
+        mouse.move(left, top)
+        mouse.down()
+        mouse.move(left + 0.4 * x * size, top + 0.4 * y * size, steps=3)
+
+    assert at_benjr.persists(drag, lambda: at_benjr.wheels == wheels, mouse.up)
+    mouse.move(left + 3 * x * size, top + 3 * y * size)
     assert at_benjr.wheels == wheels
-    at_benjr.page.mouse.up()
+    mouse.up()
     assert at_benjr.rests()
+    mouse.move(left, top)
+    mouse.down()
+    assert at_benjr.stays_at_rest(0.1)
 
 
 # -- stops

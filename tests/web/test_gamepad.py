@@ -35,14 +35,14 @@ def at_lamp(_lamp_page: Console) -> Iterator[Console]:
 
 
 def _drives(at_lamp: Console, *pads: dict[str, Any], wheels: Wheels = FORWARD) -> bool:
-    """Show the first gamepad in neutral, then as it is; again, if a busy machine has ended the gesture."""
-    for _ in range(6):
+    """Show the first gamepad in neutral, then as it is."""
+
+    def neutral() -> None:
         at_lamp.pads({**pads[0], "axes": [0, 0]}, *pads[1:])
         at_lamp.page.wait_for_timeout(120)
-        at_lamp.pads(*pads)
-        if at_lamp.turns(wheels, 0.7):
-            return True
-    return False
+
+    neutral()
+    return at_lamp.persists(lambda: at_lamp.pads(*pads), lambda: at_lamp.wheels == wheels, neutral)
 
 
 def test_a_gamepad_drives_once_it_was_seen_in_neutral(at_lamp: Console) -> None:

@@ -61,14 +61,7 @@ class Phone(Console):
         self.fingers.move(finger, left + 0.4 * x * size, top + 0.4 * y * size)
 
     def drive_by_stick(self, x: float = 0.0, y: float = -1.0, wheels: Wheels = FORWARD) -> bool:
-        """Again, if a busy machine has ended the gesture."""
-        for _ in range(6):
-            self.stick(x, y)
-            if self.turns(wheels, 0.7):
-                return True
-            self.fingers.lift()
-            self.page.wait_for_timeout(60)
-        return False
+        return self.persists(lambda: self.stick(x, y), lambda: self.wheels == wheels, self.fingers.lift)
 
     def touch(self, name: str, finger: int = 2) -> None:
         left, top, _ = self.place(name)
@@ -229,12 +222,10 @@ def test_control_and_reset_by_finger(browser: Browser, lamp: Stage, wire: Wire) 
 def test_the_extra_axis_is_held_by_a_finger(at_lamp: Phone, wire: Wire) -> None:
     axis: Callable[[], float] = lambda: (wire.last("minilamp/incoming/drive-values") or {}).get("y", 0.0)  # noqa: E731
     assert at_lamp.test("aux+").is_visible()  # the robot has no picture, so there is room
-    at_lamp.touch("aux+")
-    assert at_lamp.tab.until(lambda: axis() > 0, 2)
+    assert at_lamp.persists(lambda: at_lamp.touch("aux+"), lambda: axis() > 0, at_lamp.fingers.lift)
     at_lamp.fingers.up(2)
     assert at_lamp.tab.until(lambda: axis() == 0, 2)
-    at_lamp.touch("aux-")
-    assert at_lamp.tab.until(lambda: axis() < 0, 2)
+    assert at_lamp.persists(lambda: at_lamp.touch("aux-"), lambda: axis() < 0, at_lamp.fingers.lift)
     at_lamp.fingers.cancel()
     assert at_lamp.tab.until(lambda: axis() == 0, 2)
     assert at_lamp.wheels == REST

@@ -123,7 +123,7 @@ class World:
     # -- what happens at tab 1
 
     def _press(self, step: Step) -> None:
-        if step.key not in self.tabs[1].held:
+        if step.key not in self.tabs[1].held and not self._opposed(step):
             self._begins(1, step.key, step.axes)
             self.tabs[1].down(step.key)
 
@@ -135,6 +135,8 @@ class World:
         left, top, size = self.tabs[1].place("stick")
         mouse = self.tabs[1].page.mouse
         self._drop_stick(step)
+        if self._opposed(step):
+            return
         mouse.move(left, top)
         self._begins(1, "stick", step.axes)
         mouse.down()
@@ -262,6 +264,11 @@ class World:
         """An input is pressed now. One of a page that may not drive stays dead."""
         dead = (tab == 1 and self._hidden) or self._latched or self._holder not in (tab, None)
         self._presses.append(Press(tab, name, axes, float("inf") if dead else time.monotonic()))
+
+    def _opposed(self, step: Step) -> bool:
+        """Whether the opposite is held: together they are no gesture that anything could end."""
+        x, z = step.axes
+        return any(one.axes == (-x, -z) for one in self._alive(1))
 
     def _alive(self, tab: int) -> list[Press]:
         return [one for one in self._presses if one.tab == tab and one.until == float("inf")]
