@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.bench import page_cases as cases
+from pebble.bench import page_links as links
 from pebble.bench.output import check_folder
 from pebble.bench.page_rig import Rig, rig
 from pebble.bench.percentiles import percentile
@@ -66,15 +67,11 @@ class Case:
 
 
 def _thin() -> AbstractContextManager[Rig]:
-    from pebble.bench.page_links import THIN, linked
-
-    return linked(THIN, "minilamp", wide=True)
+    return links.linked(links.THIN, "minilamp", wide=True)
 
 
 def _far() -> AbstractContextManager[Rig]:
-    from pebble.bench.page_links import FAR, linked
-
-    return linked(FAR, cases.ROBOT)
+    return links.linked(links.FAR, cases.ROBOT)
 
 
 def _lamp() -> AbstractContextManager[Rig]:
@@ -143,12 +140,12 @@ CASES = (
         Row(f"{_R}: CPU", "%", Goal(10)),
         Row(f"{_R}: RSS", "MB", Goal(80)),
     ), _lamp),
-    Case("thin link", cases.link_pictures, (
+    Case("thin link", links.pictures, (
         Row("2 Mbit/s: picture age", "ms", Goal(250), "183 / 209"),
         Row("2 Mbit/s: offered", "Mbit/s", Goal(at_least=3.8), "4.2"),
         Row("2 Mbit/s: drawn a second", ""),
     ), _thin),
-    Case("far link", cases.link_driving, (
+    Case("far link", links.driving, (
         Row("256 kbit/s: drive", "ms", Goal(None, 110)),
         Row("256 kbit/s: drive, arrived", "%"),
         Row("256 kbit/s: gestures interrupted", ""),

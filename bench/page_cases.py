@@ -17,7 +17,6 @@ from urllib.parse import urlsplit
 
 from pebble.bench.estop_driver import Driver
 from pebble.bench.page_rig import Rig, monotonic
-from pebble.bench.percentiles import percentile
 from pebble.bench.usage import children, cpu_s
 from pebble.bench.worker import Worker, end_workers
 from pebble.contract.encodings import ALL_VIDEO
@@ -143,8 +142,7 @@ def _network_process() -> int:
 def stops(rig: Rig, scale: float) -> Samples:
     """STOP is clicked while other operators drive."""
     found: Samples = {}
-    driver = Driver(rig.stage.broker_port)
-    threading.Thread(target=driver.run, daemon=True).start()
+    driver = driven_by_others(rig)
     for what, names, button in (("STOP", (ROBOT,), "stop-one"), ("STOP ALL", ROBOTS, "stop-all")):
         page = rig.page(ROBOT) if what == "STOP" else rig.fleet()
         stop, shown = found.setdefault(f"{what} to motors", []), found.setdefault(f"{what} to confirmed", [])
@@ -165,6 +163,13 @@ def stops(rig: Rig, scale: float) -> Samples:
         page.context.close()
     driver.close()
     return found
+
+
+def driven_by_others(rig: Rig) -> Driver:
+    """Another operator, who drives whichever robots are chosen."""
+    driver = Driver(rig.stage.broker_port)
+    threading.Thread(target=driver.run, name="another operator", daemon=True).start()
+    return driver
 
 
 def reset(rig: Rig, page: Page, refs: list[str]) -> None:
@@ -304,61 +309,3 @@ def _cost(rig: Rig, what: str) -> Iterator[Samples]:
     found[f"{what}: CPU"] = [100 * (cpu_s([pid]) - before) / (time.monotonic() - began)]
     status = Path(f"/proc/{pid}/status").read_text()
     found[f"{what}: RSS"] = [int(status.partition("VmRSS:")[2].split()[0]) / 1000]
-
-
-def link_pictures(rig: Rig, scale: float) -> Samples:
-    """The age of pictures that offer more than the link carries."""
-    page = rig.page("wide")
-    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture", 30.0)
-    page.evaluate("bench.film()")
-    rig.pause(page, 3.0)
-    page.evaluate("bench.drawn.length = 0")
-    began = time.monotonic()
-    rig.pause(page, 20 * scale)
-    offered = sum(size for at, ref, size in rig.frames if ref == rig.ref("wide") and at >= began)
-    drawn = page.evaluate("bench.drawn")
-    return {
-        "2 Mbit/s: picture age": [at - captured for _, _, captured, at, _ in drawn if captured],
-        "2 Mbit/s: offered": [8 * offered / 1e6 / (time.monotonic() - began)],
-        "2 Mbit/s: drawn a second": [len(drawn) / (time.monotonic() - began)],
-    }
-
-
-def link_driving(rig: Rig, scale: float) -> Samples:
-    """Driving, and the emergency stop, over a link that is slow, far and lossy."""
-    page = rig.drivable(ROBOT)
-    ref = rig.ref(ROBOT)
-    page.evaluate("bench.number = 1")
-    interrupted, end = -1.0, time.monotonic() + 20 * scale
-    while time.monotonic() < end:
-        if not page.evaluate("pebble.driver.gestureActive"):
-            page.keyboard.up(KEY)
-            rig.ready(page)
-            rig.hold(page, ROBOT, KEY)
-            interrupted += 1
-        rig.pause(page, 0.1)
-    page.keyboard.up(KEY)
-    rig.pause(page, 1.0)
-    sent = page.evaluate("bench.sent")
-    arrived = {round(axes.get("y", 0.0), 3): at for at, base, axes in rig.drives if base == ref}
-    late = [1000 * (arrived[round(y, 3)] - monotonic(at)) for y, at in sent if round(y, 3) in arrived]
-    stop: list[float] = []
-    driver = Driver(rig.stage.broker_port)
-    threading.Thread(target=driver.run, daemon=True).start()
-    for _ in range(max(1, round(8 * scale))):
-        driver.choose((ref,))
-        rig.until(page, lambda: rig.stage.wheels_turning(ROBOT), "the robot does not move")
-        page.locator("[data-test=stop-one]").click()
-        pressed = rig.stamp(page, "pointer")
-        stop.append(1000 * (rig.stopped(page, ROBOT) - pressed))
-        driver.choose(())
-        rig.until(page, lambda: page.evaluate(f"pebble.store.get('{ref}', 'web/estop')?.value.latched"), "not shown")
-        reset(rig, page, [ref])
-    driver.close()
-    return {
-        "256 kbit/s: drive": late,
-        "256 kbit/s: drive, arrived": [100 * len(late) / max(1, len(sent))],
-        "256 kbit/s: gestures interrupted": [interrupted],
-        "256 kbit/s: STOP to motors": stop,
-        "256 kbit/s: round trip shown": [percentile([page.evaluate("pebble.connection.socket.roundTripMs")], 50)],
-    }

@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,8 @@ import numpy as np
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.namespaces import ROBOT as SERVER
 from pebble.bench.impair.namespaces import NamespaceNetwork, obstacle
-from pebble.bench.page_rig import Rig, rig
+from pebble.bench.page_cases import KEY, ROBOT, Samples, driven_by_others, reset
+from pebble.bench.page_rig import Rig, monotonic, rig
 from pebble.contract import CAMERA, CAPABILITIES, MQTT_VIDEO, ONLINE, VIDEO_CONTROL, codec
 from pebble.contract.payloads import Capabilities, Heartbeat
 from pebble.errors import PebbleError
@@ -115,3 +116,64 @@ class WideRobot:
                 beat = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time())))
                 self._transport.publish(ONLINE.topic(self.base), beat)
             number += 1
+
+
+# -- what is measured there
+
+
+def pictures(rig: Rig, scale: float) -> Samples:
+    """The age of pictures that offer more than the link carries."""
+    page = rig.page("wide")
+    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture", 30.0)
+    page.evaluate("bench.film()")
+    rig.pause(page, 3.0)
+    page.evaluate("bench.drawn.length = 0")
+    began = time.monotonic()
+    rig.pause(page, 20 * scale)
+    offered = sum(size for at, ref, size in rig.frames if ref == rig.ref("wide") and at >= began)
+    drawn = page.evaluate("bench.drawn")
+    return {
+        "2 Mbit/s: picture age": [at - captured for _, _, captured, at, _ in drawn if captured],
+        "2 Mbit/s: offered": [8 * offered / 1e6 / (time.monotonic() - began)],
+        "2 Mbit/s: drawn a second": [len(drawn) / (time.monotonic() - began)],
+    }
+
+
+def driving(rig: Rig, scale: float) -> Samples:
+    """Driving, and the emergency stop, over a link that is slow, far and lossy."""
+    page = rig.drivable(ROBOT)
+    ref = rig.ref(ROBOT)
+    page.evaluate("bench.number = 1")
+    interrupted, end = -1.0, time.monotonic() + 20 * scale
+    while time.monotonic() < end:
+        if not page.evaluate("pebble.driver.gestureActive"):
+            interrupted += 1
+            page.keyboard.up(KEY)
+            with suppress(PebbleError):  # the page may refuse for a while, because commands are late
+                rig.ready(page)
+                rig.hold(page, ROBOT, KEY)
+        rig.pause(page, 0.1)
+    page.keyboard.up(KEY)
+    rig.pause(page, 1.0)
+    sent = page.evaluate("bench.sent")
+    arrived = {round(axes.get("y", 0.0), 3): at for at, base, axes in rig.drives if base == ref}
+    late = [1000 * (arrived[round(y, 3)] - monotonic(at)) for y, at in sent if round(y, 3) in arrived]
+    stop: list[float] = []
+    driver = driven_by_others(rig)
+    for _ in range(max(1, round(8 * scale))):
+        driver.choose((ref,))
+        rig.until(page, lambda: rig.stage.wheels_turning(ROBOT), "the robot does not move")
+        page.locator("[data-test=stop-one]").click()
+        pressed = rig.stamp(page, "pointer")
+        stop.append(1000 * (rig.stopped(page, ROBOT) - pressed))
+        driver.choose(())
+        rig.until(page, lambda: page.evaluate(f"pebble.store.get('{ref}', 'web/estop')?.value.latched"), "not shown")
+        reset(rig, page, [ref])
+    driver.close()
+    return {
+        "256 kbit/s: drive": late,
+        "256 kbit/s: drive, arrived": [100 * len(late) / max(1, len(sent))],
+        "256 kbit/s: gestures interrupted": [interrupted],
+        "256 kbit/s: STOP to motors": stop,
+        "256 kbit/s: round trip shown": [page.evaluate("pebble.connection.socket.roundTripMs")],
+    }
