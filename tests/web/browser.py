@@ -26,7 +26,7 @@ SIZES: dict[Size, tuple[int, int]] = {
     "landscape": (844, 390),
     "small": (320, 640),
 }
-_OPEN_S = 15.0
+_OPEN_S = 40.0
 _VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
   pebbleViolation(`${event.violatedDirective} ${event.blockedURI}`))"""
 _HIDE = """(hidden) => {
