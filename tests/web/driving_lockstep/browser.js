@@ -7,6 +7,7 @@
 const REPEAT_AFTER = 0.25; // s, of a key that is held
 const REPEAT_EVERY = 0.1;
 const THROTTLED = 1; // timers of hidden pages
+const SILENCE = 1.4; // s, a connection that has been silent for longer may be given up
 const WAITING_REPEATS = 4; // of a key, while the page is blocked
 
 export const world = { now: 0, epoch: 0, out: [], pages: new Map() };
@@ -56,6 +57,8 @@ export class Page {
     this.number = number;
     this.options = options;
     this.loaded = world.now;
+    this.heard = world.now; // from the network
+    this.touched = world.now; // by anything else
     this.paused = 0; // s, of performance.now()
     this.wall = 0; // ms, by which the wall clock was set
     this.random = options.seed;
@@ -124,10 +127,29 @@ export class Page {
     return this.timerNumber;
   }
 
+  /** When something may happen. What timers of an idle page do shows nowhere: it is made up for later. */
   get due() {
+    let due = this.repeating?.at ?? Infinity;
+    if (this.blocked) return due;
+    const idle = this.isIdle();
+    if (idle) due = Math.min(due, this.heard + SILENCE);
+    for (const timer of this.timers.values())
+      if (!idle || timer.period === null) due = Math.min(due, timer.due);
+    return due;
+  }
+
+  /** The first timer, whatever it does. */
+  get next() {
     let due = this.repeating?.at ?? Infinity;
     if (!this.blocked) for (const timer of this.timers.values()) due = Math.min(due, timer.due);
     return due;
+  }
+
+  isIdle() {
+    if (world.now < this.touched + 0.12 || world.now >= this.heard + SILENCE || this.pad) return false;
+    if (this.socket.state !== "open") return false;
+    const { gesture, inputs } = this.driver;
+    return !gesture.active && !gesture.repeats.length && inputs.neutral && inputs.pointer === null;
   }
 
   /** Run what is due. */

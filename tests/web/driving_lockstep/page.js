@@ -49,7 +49,12 @@ const commands = {
     page.run(() => load(page, ref));
   },
   gone: (page) => world.pages.delete(page.number),
-  network: (page, socket, what, value) => page.soon("network", () => page.sockets[socket].arrive(what, value)),
+  network(page, socket, what, value) {
+    page.soon("network", () => {
+      page.heard = world.now;
+      page.sockets[socket].arrive(what, value);
+    });
+  },
 
   // -- what the human does
   key: (page, code, down) => page.key(code, down),
@@ -160,12 +165,25 @@ function due() {
   return first;
 }
 
-function advance(to) {
-  for (let next = due(); next <= to && !world.out.length; next = due()) {
+/** Run the timers of idle pages that were not worth an answer. */
+function catchUp(to) {
+  for (;;) {
+    let next = Infinity;
+    for (const page of world.pages.values()) next = Math.min(next, page.next);
+    if (next >= to) break;
     world.now = Math.max(world.now, next);
     for (const page of [...world.pages.values()]) page.tick();
+    if (world.out.length) throw new Error("an idle page has done something");
   }
-  if (!world.out.length) world.now = Math.max(world.now, to);
+  world.now = Math.max(world.now, to);
+}
+
+function advance(to) {
+  for (let next = due(); next <= to && !world.out.length; next = due()) {
+    catchUp(next);
+    for (const page of [...world.pages.values()]) page.tick();
+  }
+  if (!world.out.length) catchUp(to);
 }
 
 function answer(line) {
@@ -175,10 +193,12 @@ function answer(line) {
     [world.now, world.epoch] = request.begin;
   }
   world.out = [];
-  if (request.at > world.now) world.now = request.at;
+  catchUp(request.at);
   for (const [number, command, ...rest] of request.do) {
     const page = command === "load" ? number : world.pages.get(number);
-    if (page !== undefined) commands[command](page, ...rest);
+    if (page === undefined) continue;
+    commands[command](page, ...rest);
+    if (command !== "network" && command !== "load" && command !== "ask") page.touched = world.now;
   }
   if (request.to !== undefined) advance(request.to);
   const next = due();

@@ -16,7 +16,7 @@ Schedule = tuple[int, list[Step]]
 
 _HANDS = {
     "wait": 40, "press": 16, "release": 12, "tap": 6, "stick": 8, "cancel": 2, "hold": 2, "slide": 3, "pad": 8,
-    "space": 3, "meta": 3, "blur": 6, "hide": 4, "event": 3, "dialog": 2, "block": 5, "take": 4, "give": 1, "select": 1,
+    "lose_pad": 1, "space": 3, "meta": 3, "blur": 6, "hide": 4, "event": 3, "dialog": 2, "block": 5, "take": 4, "give": 1, "select": 1,
 }  # fmt: skip
 _NET = {
     "wait": 40, "press": 16, "release": 10, "tap": 4, "stick": 4, "pad": 3, "slide": 1, "space": 2, "blur": 1,

@@ -38,6 +38,7 @@ BASE, OTHER_BASE = "pebble/robots/goob", "pebble/robots/fred"
 WAITS_S = (0.0, 0.004, 0.01, 0.03, 0.05, 0.08, 0.12, 0.16, 0.2, 0.26, 0.3, 0.35, 0.45, 0.6, 0.9, 1.6)
 _BLOCKS_S = (0.03, 0.1, 0.2, 0.24, 0.3, 0.4, 0.8, 1.6, 2.5)
 _DELAYS_S = (0.001, 0.003, 0.02, 0.05, 0.1, 0.16, 0.25, 0.31, 0.4, 0.7, 1.2)
+_FIRST_DELAYS_S = ((0.003, 0.003), (0.4, 0.01), (0.003, 0.003), (0.02, 0.02), (0.003, 0.003), (0.003, 0.003), (0.16, 0.16))
 _STALLS_S = (0.05, 0.15, 0.28, 0.4, 0.7, 1.2, 1.8, 3.0)
 _OUTAGES_S = (0.05, 0.3, 0.7, 1.5, 2.5)
 _ORDERS = (
@@ -50,7 +51,7 @@ _ORDERS = (
 )
 _NAMES = tuple(KEYS)
 _STICK = ((0.0, 0.9), (0.7, 0.3), (-0.8, 0.0), (0.05, 0.02), (0.3, -0.9))
-_HEARTBEAT_S = 0.5
+_HEARTBEAT_S = 1.0
 
 _decoder = msgspec.json.Decoder(m.FromPage)
 
@@ -60,6 +61,7 @@ class Rig:
 
     def __init__(self, folder: Path = CORE) -> None:
         self.folder = folder
+        self.drives = 0  # how often wheels began to turn
 
     def __enter__(self) -> Self:
         self._stack = ExitStack()
@@ -78,6 +80,7 @@ class World:
 
     def __init__(self, layout: int, rig: Rig) -> None:
         rig.robot.clear()
+        self.rig = rig
         self.layout, self.pages = layout, rig.pages
         self.scheduler = scheduler = PagesScheduler(100.0 + (layout % 7) * 0.0071, rig.pages)
         scheduler.on_output = self._output
@@ -113,9 +116,10 @@ class World:
         scheduler.run(0.3)
         for slot in range(1 + layout % 3):
             self.wires.append(Wire(scheduler))
+            self.wires[-1].delay(*_FIRST_DELAYS_S[layout // 12 % len(_FIRST_DELAYS_S)])
             self.humans.append(Human(-1, mac=layout % 4 == 1))
             self.load(slot, "")
-        scheduler.run(0.9)
+        scheduler.run(0.1 + 4 * (self.wires[0].up.delay + self.wires[0].down.delay))
 
     def perform(self, steps: list[Step]) -> None:
         for action, a, b in steps:
@@ -123,6 +127,7 @@ class World:
             self.scheduler.flush()
 
     def end(self) -> None:
+        self.rig.drives += self.rules.moves
         self.server.leave()
         self.server.end()
 
@@ -325,6 +330,19 @@ class World:
             self._pad(
                 slot, ((0.0, 0.8, 0.0), (0.9, 0.2, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0))[b % 5]
             )
+
+    def do_lose_pad(self, a: int, b: int) -> None:
+        """The radio of a gamepad is lost while its stick is moved, and the human lets go."""
+        slot, human = self._human(a)
+        if "pad" in human.held or human.pad_frozen:
+            return
+        self._pad(slot, (0.0, 0.0, 0.0))
+        self.scheduler.run(0.06)
+        self._pad(slot, (0.0, 0.8, 0.0))
+        self.scheduler.run(0.1)
+        human.pad_frozen = True
+        human.let_go("pad", self.now)
+        self.scheduler.run((0.3, 3.2)[b % 2])
 
     def _pad(self, slot: int, axes: tuple[float, float, float] | None) -> None:
         human = self.humans[slot]
@@ -594,7 +612,7 @@ class World:
 
     def do_silent(self, a: int, b: int) -> None:
         """The robot sends no heartbeats for a while."""
-        self.silent_until = self.now + (1.0, 2.0, 4.0)[b % 3]
+        self.silent_until = self.now + (1.5, 2.5, 4.0)[b % 3]
 
     def do_slow(self, a: int, b: int) -> None:
         self.rules.faults += 1

@@ -1,0 +1,55 @@
+"""Random schedules of humans, pages, networks and servers in virtual time; deliberate bugs show in them.
+
+``python -m tests.web.driving_lockstep`` runs thousands.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator
+
+import pytest
+
+from tests.web.driving_lockstep.mutations import MUTATIONS
+from tests.web.driving_lockstep.schedules import first_violation, generate, violation
+from tests.web.driving_lockstep.world import Rig
+
+SCHEDULES = 300
+PARTS = 4  # of them, for as many processes of pytest
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> Iterator[None]:
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_no_schedule_violates_a_rule(part: int) -> None:
+    with Rig() as rig:
+        found = [violation(generate(0, number), rig) for number in range(part, SCHEDULES, PARTS)]
+    assert not any(found), "python -m tests.web.driving_lockstep --seed 0 prints the shortest schedule"
+    assert rig.drives > SCHEDULES / PARTS
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_each_deliberate_bug_shows(name: str) -> None:
+    mutation = MUTATIONS[name]
+    with mutation.applied() as folder, Rig(folder) as rig:
+        found = first_violation(1, 200, rig, mutation.schedule)
+    assert found is not None
+    assert found[1].startswith("ViolatedError"), found[1]
+
+
+def test_a_schedule_is_always_the_same() -> None:
+    with MUTATIONS["the number of a gesture is not checked"].applied() as folder:
+        found = []
+        for _ in range(2):
+            with Rig(folder) as rig:
+                found.append([violation(generate(1, number), rig) for number in range(8, 16)])
+    assert found[0] == found[1]
+    assert any(found[0])
