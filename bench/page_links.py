@@ -113,8 +113,8 @@ class WideRobot:
             encoder.quality = min(95.0, max(5.0, encoder.quality * (_OFFERED_BYTES / len(payload)) ** 0.3))
             self._transport.publish(CAMERA.topic(self.base), payload)
             if number % _FPS == 0:
-                beat = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time())))
-                self._transport.publish(ONLINE.topic(self.base), beat)
+                heartbeat = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time())))
+                self._transport.publish(ONLINE.topic(self.base), heartbeat)
             number += 1
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client
     from playwright.sync_api import Page
 
-SETTLED_S = 0.2  # motors that are off for so long have stopped
+AT_REST_S = 0.2  # motors that are off for so long have stopped
 _WAIT_S, _MOVED_S = 20.0, 3.0
 _PRESSES = 3
 _STEP_MS = 10
@@ -156,10 +156,10 @@ class Rig:
     def stopped(self, page: Page | None, name: str) -> float:
         """When its motors stopped, once they have."""
 
-        def settled() -> bool:
-            return time.monotonic() - self.stage.last_motion_ns(name) / 1e9 > SETTLED_S
+        def at_rest() -> bool:
+            return time.monotonic() - self.stage.last_motion_ns(name) / 1e9 > AT_REST_S
 
-        self.until(page, settled, f"{name} did not stop", 5.0)
+        self.until(page, at_rest, f"{name} did not stop", 5.0)
         return self.stage.last_motion_ns(name) / 1e9
 
     def command_after(self, page: Page, name: str, since: float) -> float:

@@ -58,17 +58,17 @@ class Stage:
 
     def _wait_until_drivable(self) -> None:
         """Every robot is online, and its capabilities say that it drives."""
-        observer = Operator(self.broker_port, "stage")
-        observer.connect()
+        operator = Operator(self.broker_port, "stage")
+        operator.connect()
         end = time.monotonic() + _DRIVABLE_S
         try:
-            while not observer.ready(len(self._names)):
+            while not operator.ready(len(self._names)):
                 problems = self._testbed.unexpected_exits()
                 if problems or time.monotonic() > end:
                     raise PebbleError("; ".join(problems) or "the robots did not become ready to drive")
                 time.sleep(_POLL_S)
         finally:
-            observer.end()
+            operator.end()
 
     @property
     def server(self) -> PageServer:

@@ -34,7 +34,7 @@ class Robot:
         payload = codec.encode(CAPABILITIES, Capabilities(t=1, value=value))
         self.transport.publish(CAPABILITIES.topic(BASE), payload, retain=True, qos=QoS.DELIVERED)
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._beat, daemon=True)
+        self._thread = threading.Thread(target=self._send_heartbeats, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -57,7 +57,7 @@ class Robot:
         topic = ESTOP_STATE.topic(BASE, owner="m")
         self.transport.publish(topic, codec.encode(ESTOP_STATE, state), retain=True, qos=QoS.DELIVERED)
 
-    def _beat(self) -> None:
+    def _send_heartbeats(self) -> None:
         while not self._ended.wait(0.1):
             payload = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time())))
             self.transport.publish(ONLINE.topic(BASE), payload)

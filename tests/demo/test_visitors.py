@@ -15,7 +15,7 @@ def announcement(server: str, *robots: str, device: str = "phone") -> Message:
     return Message(DRIVING.topic(f"pebble/servers/{server}"), codec.encode(DRIVING, Driving(t=1, robots=driven)))
 
 
-def test_a_robot_is_driven_while_a_server_says_so() -> None:
+def test_a_robot_is_driven_while_a_server_announces_it() -> None:
     visitors = Visitors()
     assert visitors.driver(GOOB, 0.0) == ""
     visitors.receive(announcement("hall", GOOB), 10.0)
