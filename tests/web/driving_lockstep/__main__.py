@@ -31,7 +31,8 @@ def main(arguments: list[str]) -> int:
 
 def _schedules(options: argparse.Namespace, pool: ProcessPoolExecutor) -> int:
     broken, began, done, drives = Counter[str](), time.monotonic(), 0, 0
-    parts = [range(first, min(first + _TOGETHER, options.schedules)) for first in range(0, options.schedules, _TOGETHER)]
+    firsts = range(0, options.schedules, _TOGETHER)
+    parts = [range(first, min(first + _TOGETHER, options.schedules)) for first in firsts]
     for part, (found, moved) in zip(parts, pool.map(_part, [options.seed] * len(parts), parts), strict=True):
         for number, rule in found:
             broken[rule] += 1

@@ -93,7 +93,9 @@ MUTATIONS = {
         "        self._server.driving.closed(self._tab, clock())\n",
     ),
     "zeros are not forwarded": Mutation(
-        _DRIVING, "        return [Command(op.ref, FINAL_ZERO if op.final or not mine else ZERO)]\n", "        return []\n"
+        _DRIVING,
+        "        return [Command(op.ref, FINAL_ZERO if op.final or not mine else ZERO)]\n",
+        "        return []\n",
     ),
     "commands are valid for long": Mutation(
         _DRIVING, "Drive(x=op.x, z=op.z, y=op.y, valid_ms=VALID_MS)", "Drive(x=op.x, z=op.z, y=op.y, valid_ms=5000)"
@@ -133,7 +135,9 @@ MUTATIONS = {
         "gesture.js", "    this.command(ZERO, now, final);\n    this.repeats = ", "    this.repeats = "
     ),
     "a page that stood still goes on": Mutation(
-        "driver.js", "    if (now - this.updatedAt > STALL_MS) this.leave(); // the", "    this.gesture.updatedAt = now; // the"
+        "driver.js",
+        "    if (now - this.updatedAt > STALL_MS) this.leave(); // the",
+        "    this.gesture.updatedAt = now; // the",
     ),
     "a suspended computer goes on": Mutation("driver.js", "    this.checkClock(now);\n", ""),
     "old events count": Mutation("driver.js", "  return performance.now() - at > STALL_MS;\n", "  return false;\n"),
@@ -141,17 +145,23 @@ MUTATIONS = {
         "driver.js", '  return event.key === "Meta" || event.key === "OS";\n', "  return false;\n"
     ),
     "opposite keys are a release": Mutation(
-        "gesture.js", "    else if (neutral) this.mustRelease = false;\n", "    else if (!moving) this.mustRelease = false;\n"
+        "gesture.js",
+        "    else if (neutral) this.mustRelease = false;\n",
+        "    else if (!moving) this.mustRelease = false;\n",
     ),
     "a frozen gamepad drives on": Mutation("inputs.js", "const FROZEN_MS = 3000;", "const FROZEN_MS = 300000;"),
     "a gesture outlives its connection": Mutation(
-        "driver.js", "    this.inputs.clear();\n    this.gesture.reset();\n    this.changed();\n", "    this.changed();\n"
+        "driver.js",
+        "    this.inputs.clear();\n    this.gesture.reset();\n    this.changed();\n",
+        "    this.changed();\n",
     ),
     "a dialog ends nothing": Mutation(
-        "driver.js", 'if (this.gesture.active && document.querySelector("dialog[open]")) this.interrupt();', ""
+        "reasons.js", '  if (s.dialog) return reason("dialog", "Close the panel first");\n', ""
     ),
     "a lost release blocks for good": Mutation(
-        "inputs.js", "    if (!this.keys.size) this.waiting.clear(); // the release of the others may have been lost\n", ""
+        "inputs.js",
+        "    if (!this.keys.size) this.waiting.clear(); // the release of the others may have been lost\n",
+        "",
     ),
     "a press right after a reset is lost without a word": Mutation(
         "reasons.js", "const RESET_MS = 600;", "const RESET_MS = 0;"

@@ -60,9 +60,7 @@ class Rules:
 
     def __init__(self, scheduler: Scheduler, base: str) -> None:
         self._scheduler, self._base, self._check = scheduler, base, scheduler.check
-        self.sent: dict[
-            tuple[int, float], tuple[float, int]
-        ] = {}  # by page and its own time: the newest, and its number
+        self.sent: dict[tuple[int, float], tuple[float, int]] = {}  # by page and its own time
         self.commands = Commands()
         self.faults = 0
         self.path_s: Callable[[], float] = lambda: 0.0
@@ -129,7 +127,8 @@ class Rules:
         control, op = self._handling or (None, None)
         now = self._scheduler.now
         self._check(isinstance(op, m.DriveOp) and op.ref == self._base, "the server makes up a command")
-        assert control is not None and op is not None
+        assert control is not None
+        assert op is not None
         tab = control._tab
         lease = self.driving().leases.get(self._base)
         self._check(lease is not None and lease.tab is tab, "a page moves wheels without the lease")

@@ -82,7 +82,7 @@ class BrokerConnection(Connection):
 
     rewrite: Callable[[Any], Any]
 
-    def open(self, timeout: float = 0.0) -> Any:  # noqa: ARG002
+    def open(self, timeout: float = 0.0) -> Any:
         return super().open(0.0)
 
     def publish(

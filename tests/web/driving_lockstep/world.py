@@ -38,7 +38,8 @@ BASE, OTHER_BASE = "pebble/robots/goob", "pebble/robots/fred"
 WAITS_S = (0.0, 0.004, 0.01, 0.03, 0.05, 0.08, 0.12, 0.16, 0.2, 0.26, 0.3, 0.35, 0.45, 0.6, 0.9, 1.6)
 _BLOCKS_S = (0.03, 0.1, 0.2, 0.24, 0.3, 0.4, 0.8, 1.6, 2.5)
 _DELAYS_S = (0.001, 0.003, 0.02, 0.05, 0.1, 0.16, 0.25, 0.31, 0.4, 0.7, 1.2)
-_FIRST_DELAYS_S = ((0.003, 0.003), (0.4, 0.01), (0.003, 0.003), (0.02, 0.02), (0.003, 0.003), (0.003, 0.003), (0.16, 0.16))
+_FAST_S = (0.003, 0.003)
+_FIRST_DELAYS_S = (_FAST_S, (0.4, 0.01), _FAST_S, (0.02, 0.02), _FAST_S, _FAST_S, (0.16, 0.16))
 _STALLS_S = (0.05, 0.15, 0.28, 0.4, 0.7, 1.2, 1.8, 3.0)
 _OUTAGES_S = (0.05, 0.3, 0.7, 1.5, 2.5)
 _ORDERS = (
@@ -79,7 +80,6 @@ class World:
     """``layout`` chooses how many humans there are, their computers, and the phases of timers."""
 
     def __init__(self, layout: int, rig: Rig) -> None:
-        rig.robot.clear()
         self.rig = rig
         self.layout, self.pages = layout, rig.pages
         self.scheduler = scheduler = PagesScheduler(100.0 + (layout % 7) * 0.0071, rig.pages)

@@ -97,6 +97,7 @@ export class Driver {
       rights: this.socket.you?.rights ?? [],
       hidden: document.hidden,
       focus: document.hasFocus(),
+      dialog: document.querySelector("dialog[open]") !== null,
       fromKeys: this.inputs.fromKeys,
       liveness: value("web/liveness"),
       estop: value("web/estop"),
@@ -210,7 +211,6 @@ export class Driver {
   }
 
   tick() {
-    if (this.gesture.active && document.querySelector("dialog[open]")) this.interrupt();
     this.readPad();
     this.update();
   }

@@ -19,6 +19,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @property {readonly string[]} rights
  * @property {boolean} hidden
  * @property {boolean} focus
+ * @property {boolean} dialog whether one is open, or a panel
  * @property {boolean} fromKeys whether a key or the gamepad is used
  * @property {{online: boolean|null, silent_s: number|null}|undefined} liveness
  * @property {{latched: boolean, by: string}|undefined} estop
@@ -76,6 +77,7 @@ function leaseReason(s) {
 }
 
 function momentReason(s) {
+  if (s.dialog) return reason("dialog", "Close the panel first");
   if (s.script?.running && s.capabilities.drive?.arbitrates !== true)
     return reason("script", `${s.script.file || "A script"} is driving: stop it first`);
   if (s.pictureAgeMs !== null && s.pictureAgeMs > PICTURE_OLD_MS && !s.inSight) return reason("picture", oldPicture(s), SEE);

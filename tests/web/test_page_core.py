@@ -1,0 +1,323 @@
+"""The page's driving modules: gestures, inputs, and the reasons why a control is off; in Node.js."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from typing import Any
+
+import pytest
+
+from tests.support import ROOT
+
+CORE = ROOT / "pebble" / "web" / "static" / "core"
+
+
+@pytest.fixture(autouse=True)
+def _node() -> None:
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+
+
+def run(module: str, names: str, steps: str) -> Any:
+    """The value of ``result`` after ``steps``."""
+    program = f"import {{ {names} }} from {json.dumps((CORE / module).as_uri())};\nlet result;\n{steps}\n"
+    command = ["node", "--input-type=module", "-e", f"{program}\nconsole.log(JSON.stringify(result));"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+# -- gestures: what is sent is listed as [gesture, z, final]
+
+_GESTURE = """
+const sent = [];
+const gesture = new Gesture(({ g, z, final }) => sent.push([g, z, final]));
+let now = 1000;
+const at = (z) => ({ x: 0, z, y: 0 });
+const step = (z, { wait = 50, allowed = true, neutral, waits } = {}) =>
+  gesture.update(at(z), allowed, (now += wait), neutral ?? z === 0, waits);
+const quiet = (times) => { for (let i = 0; i < times; i += 1) step(0); };
+"""
+
+
+def gesture(steps: str) -> Any:
+    return run("gesture.js", "Gesture", _GESTURE + steps + "\nresult ??= sent;")
+
+
+def test_a_gesture_is_sent_every_50_ms_and_its_end_three_times() -> None:
+    assert gesture("step(0.5); step(0.5); step(0); quiet(5);") == [
+        [1, 0.5, False], [1, 0.5, False], [1, 0, False], [1, 0, False], [1, 0, False],
+    ]  # fmt: skip
+
+
+def test_a_change_is_sent_sooner_but_not_at_once_after_another() -> None:
+    assert gesture("step(0.5); step(0.6, { wait: 10 }); step(0.7, { wait: 15 });") == [[1, 0.5, False], [1, 0.7, False]]
+
+
+def test_without_a_gesture_nothing_is_sent() -> None:
+    assert gesture("quiet(20);") == []
+
+
+def test_an_interruption_is_final_and_holds_until_everything_is_released() -> None:
+    assert gesture("step(0.5); gesture.interrupt(now); step(0.5); step(0.5); step(0); sent.length = 0; step(0.5);") == [
+        [2, 0.5, False]
+    ]
+    assert gesture("step(0.5); gesture.interrupt(now); step(0.5); step(0.5);")[1:] == [[1, 0, True]] * 3
+
+
+def test_what_is_not_allowed_interrupts() -> None:
+    assert gesture("step(0.5); step(0.5, { allowed: false }); step(0.5, { wait: 500 }); result = sent.slice(0, 2);") == [
+        [1, 0.5, False], [1, 0, True],
+    ]  # fmt: skip
+
+
+def test_what_was_held_before_it_was_allowed_moves_nothing() -> None:
+    assert gesture("step(0.5, { allowed: false }); step(0.5); step(0.5); result = [sent, gesture.mustRelease];") == [
+        [], True,
+    ]  # fmt: skip
+
+
+def test_a_page_that_stood_still_ends_its_gesture() -> None:
+    assert gesture("step(0.5); step(0.5, { wait: 251 }); result = [sent, gesture.active];") == [
+        [[1, 0.5, False], [1, 0, True]], False,
+    ]  # fmt: skip
+
+
+def test_opposite_keys_are_no_release() -> None:
+    assert gesture("gesture.interrupt(now); step(0, { neutral: false }); step(0.5); result = sent;") == []
+
+
+def test_what_waits_to_be_released_begins_nothing() -> None:
+    assert gesture("step(0.5, { waits: true }); step(0.5); result = sent;") == []
+
+
+def test_a_refused_gesture_is_over_and_sends_nothing_more() -> None:
+    assert gesture("step(0.5); gesture.refused(1); step(0.5); step(0.5);") == [[1, 0.5, False]]
+
+
+def test_a_refusal_of_an_earlier_gesture_changes_nothing() -> None:
+    assert gesture("step(0.5); step(0); step(0.5); gesture.refused(1); result = gesture.active;") is True
+
+
+def test_the_next_gesture_ends_the_repetitions() -> None:
+    assert gesture("step(0.5); step(0); step(0.5); step(0.5);")[2:] == [[2, 0.5, False], [2, 0.5, False]]
+
+
+def test_a_new_connection_counts_from_the_beginning_and_needs_a_release() -> None:
+    assert gesture("step(0.5); gesture.reset(); step(0.5); step(0); step(0.5); result = sent.slice(1);") == [
+        [1, 0.5, False]
+    ]
+
+
+# -- inputs
+
+_INPUTS = """
+const inputs = new Inputs();
+const full = { speed: 1, turn: 1, balance: 0 };
+const vector = (sliders = full) => { const { x, z, y } = inputs.vector(sliders); return [x + 0, z + 0, y + 0]; };
+const pad = (x, z, timestamp = 1, buttons = []) =>
+  ({ id: "pad", axes: [x, -z], buttons: [0, 1].map((i) => ({ pressed: buttons.includes(i) })), timestamp });
+const seen = (...pads) => pads.forEach((one, i) => inputs.padSample(one, 1000 + 50 * i));
+"""
+
+
+def inputs(steps: str) -> Any:
+    return run("inputs.js", "Inputs, balanced", _INPUTS + steps)
+
+
+@pytest.mark.parametrize(
+    ("codes", "expected"),
+    [
+        (["KeyW"], [0, 1, 0]),
+        (["ArrowDown"], [0, -1, 0]),
+        (["KeyA"], [-1, 0, 0]),
+        (["ArrowRight"], [1, 0, 0]),
+        (["KeyW", "ArrowUp"], [0, 1, 0]),
+        (["KeyW", "KeyS"], [0, 0, 0]),
+        (["KeyW", "KeyD"], [0.5, 0.5, 0]),
+        (["KeyQ"], [0, 0, 1]),
+        (["KeyE"], [0, 0, -1]),
+        (["KeyX"], [0, 0, 0]),
+    ],
+)
+def test_keys(codes: list[str], expected: list[float]) -> None:
+    assert (
+        inputs(f"for (const code of {json.dumps(codes)}) inputs.keyDown(code, false); result = vector();") == expected
+    )
+
+
+def test_sliders_scale_and_balance() -> None:
+    assert inputs('inputs.keyDown("KeyW", false); result = vector({ speed: 0.5, turn: 1, balance: 0 });') == [0, 0.5, 0]
+    assert inputs('inputs.keyDown("KeyD", false); result = vector({ speed: 0, turn: 0.5, balance: 0 });') == [0.5, 0, 0]
+    assert inputs('inputs.keyDown("KeyW", false); result = vector({ speed: 1, turn: 1, balance: -1 });') == [
+        -0.5,
+        0.5,
+        0,
+    ]
+
+
+def test_no_wheel_is_asked_for_more_than_full_speed() -> None:
+    steps = """
+    result = 0;
+    for (let x = -1; x <= 1; x += 0.25) for (let z = -1; z <= 1; z += 0.25) for (let b = -1; b <= 1; b += 0.5) {
+      const one = balanced(x, z, b);
+      result = Math.max(result, Math.abs(one.x + one.z), Math.abs(one.z - one.x));
+    }"""
+    assert inputs(steps) <= 1 + 1e-9
+
+
+def test_a_repeated_key_moves_nothing_and_waits_to_be_released() -> None:
+    steps = 'inputs.keyDown("KeyW", true); result = [vector(), inputs.neutral]; inputs.keyUp("KeyW");'
+    assert inputs(steps + "result.push(inputs.neutral);") == [[0, 0, 0], False, True]
+
+
+def test_what_was_interrupted_counts_after_it_was_released() -> None:
+    steps = """
+    inputs.keyDown("KeyW", false); inputs.clear(); inputs.keyDown("KeyW", true);
+    result = [vector(), inputs.neutral];
+    inputs.keyUp("KeyW"); inputs.keyDown("KeyW", false);
+    result.push(vector());"""
+    assert inputs(steps) == [[0, 0, 0], False, [0, 1, 0]]
+
+
+def test_a_release_that_was_lost_does_not_wait_for_ever() -> None:
+    steps = """
+    inputs.keyDown("KeyW", false); inputs.clear();
+    inputs.keyDown("KeyD", false); inputs.keyUp("KeyD");
+    result = inputs.neutral;"""
+    assert inputs(steps) is True
+
+
+def test_when_the_window_has_lost_the_keyboard_nothing_waits() -> None:
+    assert inputs('inputs.keyDown("KeyW", false); inputs.leave(); result = [inputs.neutral, vector()];') == [
+        True, [0, 0, 0],
+    ]  # fmt: skip
+
+
+def test_the_stick_belongs_to_one_finger() -> None:
+    assert inputs("result = [inputs.stickStart(1), inputs.stickStart(2)];") == [True, False]
+
+
+def test_the_stick_stays_in_its_circle_and_rests_in_the_middle() -> None:
+    steps = """
+    inputs.stickStart(1); inputs.stickMove(3, 4); result = [Math.hypot(inputs.stick.x, inputs.stick.z) < 1];
+    inputs.stickMove(0.05, -0.09); result.push(vector());
+    inputs.stickMove(0, 1); result.push(vector()); inputs.stickEnd(); result.push(vector());"""
+    assert inputs(steps) == [True, [0, 0, 0], [0, 1, 0], [0, 0, 0]]
+
+
+def test_a_button_moves_the_auxiliary_axis_while_it_is_held() -> None:
+    assert inputs('inputs.hold("up", 1); result = [vector()]; inputs.hold("up", 0); result.push(vector());') == [
+        [0, 0, 1], [0, 0, 0],
+    ]  # fmt: skip
+
+
+def test_a_gamepad_counts_after_it_was_seen_in_neutral() -> None:
+    assert inputs("seen(pad(0, 1)); result = [vector()]; seen(pad(0, 0, 2), pad(0, 1, 3)); result.push(vector());") == [
+        [0, 0, 0], [0, 1, 0],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("interruption", ["inputs.clear()", "inputs.leave()", "inputs.padGone()", "seen(null)"])
+def test_after_an_interruption_a_gamepad_has_to_be_seen_in_neutral_again(interruption: str) -> None:
+    steps = f"seen(pad(0, 0), pad(0, 1, 2)); {interruption}; seen(pad(0, 1, 3)); result = vector();"
+    assert inputs(steps) == [0, 0, 0]
+
+
+def test_a_gamepad_whose_time_stands_still_is_not_believed_for_long() -> None:
+    steps = """
+    inputs.padSample(pad(0, 0), 0); inputs.padSample(pad(0, 1, 2), 50);
+    inputs.padSample(pad(0, 1, 2), 3000); result = [vector(), inputs.padFrozen];
+    inputs.padSample(pad(0, 1, 2), 3100); result.push(vector(), inputs.padFrozen);
+    inputs.padSample(pad(0, 1, 3), 3150); result.push(vector());
+    inputs.padSample(pad(0, 0, 4), 3200); inputs.padSample(pad(0, 1, 5), 3250); result.push(vector(), inputs.padFrozen);"""
+    assert inputs(steps) == [[0, 1, 0], False, [0, 0, 0], True, [0, 0, 0], [0, 1, 0], False]
+
+
+def test_the_second_button_of_a_gamepad_chooses_the_auxiliary_axis() -> None:
+    assert inputs("seen(pad(0, 0), pad(-1, 0, 2, [1])); result = vector();") == [0, 0, -1]
+
+
+def test_keys_and_gamepad_need_the_focus_and_the_stick_does_not() -> None:
+    steps = """
+    inputs.stickStart(1); inputs.stickMove(0, 1); result = [inputs.fromKeys];
+    inputs.keyDown("KeyW", false); result.push(inputs.fromKeys); inputs.keyUp("KeyW");
+    seen(pad(0, 0), pad(0, 1, 2)); result.push(inputs.fromKeys);"""
+    assert inputs(steps) == [False, True, True]
+
+
+# -- reasons, in their order
+
+#: Everything is wrong at once; each line mends what the reason before it was about.
+_SITUATION = """
+const situation = {
+  name: "goob", open: false, broker: "refused", reload: true, drives: false, rights: [], hidden: true, focus: false, dialog: true,
+  fromKeys: true, liveness: { online: false, silent_s: 12.3 }, estop: { latched: true, by: "eve" }, freeForMs: 100,
+  capabilities: {}, driver: { by: "bob", device: "phone", server: "fair-2", you: false },
+  script: { running: true, file: "april-follow" }, pictureAgeMs: 2400, inSight: false, roundTripMs: 640,
+  padFrozen: true, mustRelease: true,
+};
+const mends = [
+  {}, { open: true }, { broker: "" }, { reload: false }, { drives: true }, { rights: ["drive"] }, { hidden: false },
+  { liveness: { online: true, silent_s: 0 } }, { estop: { latched: false, by: "" } }, { freeForMs: Infinity },
+  { capabilities: { drive: { available: true } } }, { driver: undefined }, { driver: { you: true, by: "anna" } },
+  { dialog: false },
+  { script: undefined }, { inSight: true }, { roundTripMs: 4 }, { padFrozen: false }, { focus: true },
+  { mustRelease: false },
+];
+"""
+
+
+def reasons(steps: str) -> Any:
+    return run("reasons.js", "driveReason, offReason", _SITUATION + steps)
+
+
+def test_the_first_reason_counts() -> None:
+    found = reasons("result = mends.map((mend) => driveReason(Object.assign(situation, mend)));")
+    assert [None if one is None else one["code"] for one in found] == [
+        "server", "broker", "reload", "plain", "role", "hidden", "silent", "stopped", "reset", "no-drive", "lease",
+        "free", "dialog", "script", "picture", "late", "pad", "focus", "release", None,
+    ]  # fmt: skip
+    texts = {one["code"]: one["text"] for one in found if one is not None}
+    assert texts["server"] == "No connection to the server"
+    assert texts["silent"] == "goob is silent for 12 s"
+    assert texts["stopped"] == "Stopped by eve"
+    assert texts["lease"] == "bob (phone, fair-2) is driving"
+    assert texts["free"] == "Take control to drive"
+    assert texts["picture"] == "The picture is 2.4 s old"
+    assert texts["late"] == "Commands are late (640 ms)"
+    assert texts["release"] == "Let go first"
+    actions = {one["code"]: one["action"]["kind"] for one in found if one is not None and "action" in one}
+    expected = {"reload": "reload", "role": "login", "lease": "take-over", "free": "take", "picture": "see"}
+    assert actions == expected
+
+
+def test_without_server_or_broker_everything_is_off() -> None:
+    steps = "result = mends.map((mend) => offReason(Object.assign(situation, mend))?.code ?? null).slice(0, 4);"
+    assert reasons(steps) == ["server", "broker", None, None]
+
+
+_GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ("{ liveness: { online: null, silent_s: null } }", None),
+        ("{ liveness: undefined }", "silent"),
+        ("{ capabilities: { drive: { available: true, controls: false } } }", "no-drive"),
+        ("{ script: { running: true }, capabilities: { drive: { available: true, arbitrates: true } } }", None),
+        ("{ pictureAgeMs: 1900, inSight: false }", None),
+        ("{ pictureAgeMs: null, inSight: false }", None),
+        ("{ pictureAgeMs: Infinity, inSight: false }", "picture"),
+        ("{ roundTripMs: 599 }", None),
+        ("{ roundTripMs: 600 }", "late"),
+        ("{ focus: false, fromKeys: false }", None),
+        ("{ freeForMs: 599 }", "reset"),
+        ("{ freeForMs: 601 }", None),
+    ],
+)
+def test_limits_of_reasons(change: str, code: str | None) -> None:
+    assert reasons(f"{_GOOD} result = driveReason({{ ...situation, ...{change} }})?.code ?? null;") == code
