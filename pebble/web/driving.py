@@ -57,7 +57,7 @@ class Lease:
     idle_from: float
     moving: bool = False  # its last command was no zero
     sent_at: float = float("-inf")  # of the last command that was forwarded
-    heard_at: float = float("-inf")  # of the last command of the gesture, forwarded or not
+    received_at: float = float("-inf")  # of the last command of the gesture, forwarded or not
 
 
 class Announced(NamedTuple):
@@ -167,7 +167,7 @@ class Driving:
         lease = self.leases[op.ref]
         if tab.live != op.g:
             self._begin(tab, lease, op)
-        lease.heard_at = now
+        lease.received_at = now
         if now - lease.sent_at < MIN_STEP_S:
             return Outcome([])
         lease.sent_at, lease.moving = now, True
@@ -185,7 +185,7 @@ class Driving:
         commands: list[Command] = []
         for ref, lease in list(self.leases.items()):
             if lease.tab.live is not None and lease.tab.live_ref == ref:
-                if now - lease.heard_at > SILENCE_S:
+                if now - lease.received_at > SILENCE_S:
                     commands += self._end_gesture(lease.tab, lease.tab.live, now)
             elif now - lease.idle_from > IDLE_S:
                 commands += self._end_lease(ref, now)
@@ -215,7 +215,7 @@ class Driving:
             return f"{other} is driving" if other else "Take control to drive"
         if tab.live is not None and (tab.live != op.g or tab.live_ref != op.ref):
             return LET_GO  # the end of the one before was lost
-        if tab.live is not None and now - lease.heard_at > SILENCE_S:
+        if tab.live is not None and now - lease.received_at > SILENCE_S:
             return LET_GO  # the page stood still, or this process
         if problem := tab.clock.problem(now):
             return problem[0].upper() + problem[1:]

@@ -16,7 +16,7 @@ LATE_S = 0.6  # a round trip, or a command, as old as this
 _EXTRA_S = 0.3  # what a command may be older than the page's usual round trip
 _ECHO_S = 1.0  # without an echo for so long nothing is known any more
 _JUMP_S = 1.0
-_ECHOES = 20  # ten seconds of them: clocks drift apart by less than a millisecond
+_ANSWERS = 20  # ten seconds of them: clocks drift apart by less than a millisecond
 _UNANSWERED = 32
 
 
@@ -32,7 +32,7 @@ class PageClock:
         self._numbers = count(1)
         self._sent: dict[int, float] = {}
         self._echoed_at = float("-inf")
-        self._bounds: deque[tuple[float, float, float]] = deque(maxlen=_ECHOES)  # of the offset, and the round trip
+        self._bounds: deque[tuple[float, float, float]] = deque(maxlen=_ANSWERS)  # of the offset, and the round trip
 
     def ping(self, now: float) -> int:
         """The number of a ping that is sent now."""

@@ -71,6 +71,8 @@ class Component:
         self.name = ref.rpartition("/")[2]
         self.liveness = Liveness()
         self.estop = RobotEstop(ref)
+        self.was_latched = False
+        self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
         self.capabilities: dict[str, Any] = {}
         self.known: dict[str, Message] = {}  # what a stop needs to know of it, by topic
         self.values: dict[str, _Value] = {}

@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 TICK_S = 0.05
 _REFRESH_S = 0.25
 _ANNOUNCE_S = 1.0
+_RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
 _ANNOUNCED = 64  # robots in one announcement
 
 
@@ -96,8 +97,17 @@ class Server:
             return
         self.stops.receive(message, clock(), known=address.identity.base in self.robots.components)
         self._send(self.stops.tick(clock()))
+        self._note_latch(address.identity.base)
         if address.metric == CAPABILITIES.metric:
             self.open_components.update(address.identity.base)
+
+    def _note_latch(self, ref: str) -> None:
+        component = self.robots.components.get(ref)
+        if component is not None:
+            latched = bool(component.estop.latched)
+            if component.was_latched and not latched:
+                component.reset_at = clock()
+            component.was_latched = latched
 
     def _announced(self, message: Message, _now: float) -> None:
         """Another server drives robots."""
@@ -153,6 +163,8 @@ class Server:
             return (
                 f"Stopped by {component.estop.stopped_by.by or 'unknown'}" if component.estop.stopped_by else "Stopped"
             )
+        if clock() - component.reset_at < _RESET_S:
+            return "It was just reset: wait a moment"
         return "" if component.online(time.monotonic()) is not False else f"{component.name} is silent"
 
     def picture_from(self, ref: str, source: str) -> None:

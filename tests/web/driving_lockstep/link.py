@@ -95,15 +95,15 @@ class Link:
         if self.broken:
             return
         self.broken = True
-        self._tell_page()
+        self._notify_page()
         if server_knows:
-            self._tell_server()
+            self._notify_server()
 
     def vanish(self) -> None:
         """Neither end notices by itself."""
         if not self.broken:
             self.broken = True
-            self._server.scheduler.after(NOTICED_S, self._tell_server)
+            self._server.scheduler.after(NOTICED_S, self._notify_server)
 
     # -- inside
 
@@ -112,7 +112,7 @@ class Link:
             return
         if not self._server.alive:
             self.broken = True
-            self._tell_page()
+            self._notify_page()
             return
         self._server.do(self._accept)
 
@@ -133,7 +133,7 @@ class Link:
             self._socket.arrive(text)
             self._server.wake()
 
-    def _tell_server(self) -> None:
+    def _notify_server(self) -> None:
         life = self._server.lives
         self._server.do(lambda: life == self._server.lives and self._arrive(None))
 
@@ -143,7 +143,7 @@ class Link:
     def _close_down(self, code: int) -> None:
         self._wire.down.send(lambda: self._to_page("closed", code))
 
-    def _tell_page(self) -> None:
+    def _notify_page(self) -> None:
         self._wire.down.send(lambda: self._pages.do(self.page, "network", self.number, "closed", LOST))
 
     def _to_page(self, what: str, value: str | int = "") -> None:

@@ -59,13 +59,13 @@ MUTATIONS = {
     ),
     "a silent gesture goes on": Mutation(
         _DRIVING,
-        "                if now - lease.heard_at > SILENCE_S:\n",
-        "                if now - lease.heard_at > 1e9:\n",
+        "                if now - lease.received_at > SILENCE_S:\n",
+        "                if now - lease.received_at > 1e9:\n",
     ),
     "a server that stood still goes on": Mutation(
         _DRIVING,
-        "        if tab.live is not None and now - lease.heard_at > SILENCE_S:\n",
-        "        if tab.live is not None and now - lease.heard_at > 1e9:\n",
+        "        if tab.live is not None and now - lease.received_at > SILENCE_S:\n",
+        "        if tab.live is not None and now - lease.received_at > 1e9:\n",
     ),
     "repeated zeros interrupt the next gesture": Mutation(
         _DRIVING, "        self._repeats.pop(op.ref, None)  # they would interrupt it\n", ""
@@ -167,7 +167,10 @@ MUTATIONS = {
         "reasons.js", "const RESET_MS = 600;", "const RESET_MS = 0;"
     ),
     "a lost connection is not made again": Mutation(
-        "control-socket.js", "    setTimeout(() => this.connect(), delay);\n", ""
+        "control-socket.js", "    this.retry = setTimeout(() => this.connect(), delay);\n", ""
+    ),
+    "two attempts make two connections": Mutation(
+        "control-socket.js", "    clearTimeout(this.retry); // two attempts would be two connections\n", ""
     ),
     "a silent connection is not given up": Mutation(
         "control-socket.js", "    setInterval(() => this.check(), CHECK_MS);\n", ""

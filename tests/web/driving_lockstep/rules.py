@@ -70,7 +70,7 @@ class Rules:
         self._handling: tuple[Any, Any] | None = None
         self._newest: dict[Any, int] = {}  # by tab: the newest gesture
         self._over: dict[Any, int] = {}  # this one and all before it have ended
-        self._heard: dict[Any, float] = {}  # the newest command of that gesture
+        self._received: dict[Any, float] = {}  # the newest command of that gesture
         self._newest_command: Command | None = None
         self._gap_s = 0.0  # between the newest two
         self.published = 0  # commands that move
@@ -96,8 +96,8 @@ class Rules:
             if op.x or op.z or op.y:
                 self._newest[tab] = max(self._newest.get(tab, -1), op.g)
                 now = self._scheduler.now
-                self._gap_s = now - self._heard.get((tab, op.g), now)
-                self._heard[tab, op.g] = now
+                self._gap_s = now - self._received.get((tab, op.g), now)
+                self._received[tab, op.g] = now
                 if self._gap_s > SILENCE_S + _EPS:
                     self._over[tab] = max(self._over.get(tab, -1), op.g)
             else:
@@ -149,7 +149,7 @@ class Rules:
         if self._handling is not None or command is None or self.stopping():
             return
         tab, g = command.tab, command.g
-        silent = self._scheduler.now - self._heard[tab, g] > SILENCE_S
+        silent = self._scheduler.now - self._received[tab, g] > SILENCE_S
         lease = self.driving().leases.get(self._base)
         ended = g <= self._over.get(tab, -1) or lease is None or lease.tab is not tab
         self._check(silent or ended, "the server interrupts a gesture by a zero")
@@ -242,7 +242,7 @@ class Rules:
         faults = self.faults
 
         def look() -> None:
-            if faults == self.faults and self._heard[command.tab, command.g] == command.published:
+            if faults == self.faults and self._received[command.tab, command.g] == command.published:
                 turning = self.turning()
                 silent = turning is None or turning.tab is not command.tab or turning.g != command.g
                 self._check(silent, "a wheel turns though its gesture is silent")

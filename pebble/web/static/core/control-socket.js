@@ -27,6 +27,8 @@ export class ControlSocket {
     /** @type {WebSocket|null} */
     this.socket = null;
     this.heardAt = 0;
+    /** @type {ReturnType<typeof setTimeout>|undefined} */
+    this.retry = undefined;
     this.outdated = false; // what the store has is of an earlier connection
     setInterval(() => this.check(), CHECK_MS);
   }
@@ -118,7 +120,8 @@ export class ControlSocket {
     if (code === 4401 || code === 1006) askForLogin();
     const delay = Math.min(LONGEST_DELAY_MS, FIRST_DELAY_MS * 2 ** this.attempts) * (0.75 + Math.random() / 2);
     this.attempts += 1;
-    setTimeout(() => this.connect(), delay);
+    clearTimeout(this.retry); // two attempts would be two connections
+    this.retry = setTimeout(() => this.connect(), delay);
   }
 }
 

@@ -7,6 +7,7 @@
 export const PERIOD_MS = 50;
 export const STALL_MS = 250;
 const STEP_MS = 20; // at least, between two commands
+const EARLY_MS = 15; // a timer may be: without it every second command would be missing
 const REPEATS_MS = [50, 100]; // after a release, the zero is sent again
 
 /** @typedef {{x: number, z: number, y: number}} Vector */
@@ -81,7 +82,7 @@ export class Gesture {
 
   step(vector, now) {
     const changed = vector.x !== this.last.x || vector.z !== this.last.z || vector.y !== this.last.y;
-    if (now - this.sentAt >= (changed ? STEP_MS : PERIOD_MS)) this.command(vector, now, false);
+    if (now - this.sentAt >= (changed ? STEP_MS : PERIOD_MS - EARLY_MS)) this.command(vector, now, false);
   }
 
   end(now, final) {

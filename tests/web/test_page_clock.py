@@ -1,0 +1,131 @@
+"""How old a page's messages are, whatever its clock shows: delays that are always there, jumps, drift and silence."""
+
+from __future__ import annotations
+
+import pytest
+
+from pebble.web.page_clock import ClockJumpError, PageClock
+
+OFFSET_S = 5000.0  # of the page's clock
+
+
+class Page:
+    """A page whose messages take ``up`` and ``down`` seconds."""
+
+    def __init__(self, up: float, down: float, *, drift: float = 0.0) -> None:
+        self.clock = PageClock()
+        self.up, self.down, self.drift = up, down, drift
+        self.now = 100.0
+
+    def page_ms(self, at: float) -> float:
+        return 1000 * (OFFSET_S + at * (1 + self.drift))
+
+    def ping(self, times: int = 1) -> Page:
+        for _ in range(times):
+            number = self.clock.ping(self.now)
+            stamp = self.page_ms(self.now + self.down)
+            self.now += self.down + self.up
+            self.clock.echo(number, stamp, self.now)
+            self.now += max(0.0, 0.5 - self.down - self.up)
+        return self
+
+    def late(self, age: float) -> bool:
+        """Whether a command that was sent so long ago is too old."""
+        return self.clock.late(self.page_ms(self.now - age), self.now)
+
+
+def test_a_quick_page_may_drive() -> None:
+    page = Page(0.003, 0.003).ping()
+    assert not page.late(0.003)
+    assert page.clock.problem(page.now) == ""
+
+
+def test_before_the_first_echo_nothing_may_move() -> None:
+    clock = PageClock()
+    clock.ping(1.0)
+    assert clock.late(1.0, 1.0)
+    assert clock.problem(1.0) == "the connection to the page is stalled"
+
+
+@pytest.mark.parametrize(("up", "down"), [(0.7, 0.003), (0.003, 0.7), (0.35, 0.35), (1.5, 1.5)])
+def test_a_delay_that_is_always_there_is_refused(up: float, down: float) -> None:
+    page = Page(up, down).ping(40)
+    assert page.clock.problem(page.now)
+    assert page.late(up) or up < 0.6
+
+
+def test_a_delay_that_was_always_there_counts_as_age() -> None:
+    page = Page(0.4, 0.02).ping(40)
+    assert not page.late(0.45)
+    assert page.late(0.61)
+
+
+@pytest.mark.parametrize("age", [0.7, 1.6, 30.0])
+def test_what_was_held_back_is_too_old(age: float) -> None:
+    assert Page(0.003, 0.003).ping(5).late(age)
+
+
+def test_the_age_is_limited_to_the_usual_round_trip_and_a_little() -> None:
+    page = Page(0.02, 0.02).ping(5)
+    assert not page.late(0.28)
+    assert page.late(0.36)
+
+
+def test_a_page_without_answers_for_a_second_may_not_drive() -> None:
+    page = Page(0.003, 0.003).ping(5)
+    newest = page.now - 0.494
+    assert page.clock.problem(newest + 0.99) == ""
+    assert page.clock.problem(newest + 1.01) == "the connection to the page is stalled"
+
+
+def test_a_ping_that_is_not_answered_is_a_round_trip_that_lasts() -> None:
+    page = Page(0.003, 0.003).ping(5)
+    page.clock.ping(page.now)
+    assert page.clock.problem(page.now + 0.4) == ""
+    assert page.clock.problem(page.now + 0.6) != ""
+
+
+def test_a_round_trip_that_was_refused_counts_as_well() -> None:
+    page = Page(0.003, 0.003).ping(5)
+    page.up = 0.7
+    page.ping()
+    assert "late" in page.clock.problem(page.now)
+    page.up = 0.003
+    page.ping()
+    assert page.clock.problem(page.now) == ""
+
+
+def test_messages_that_wait_do_not_move_the_base() -> None:
+    page = Page(0.003, 0.003).ping(5)
+    page.up = 0.5
+    page.ping(10)
+    assert page.late(0.65)
+    assert page.late(0.5)
+
+
+@pytest.mark.parametrize("jump", [1.5, -1.5, 3600.0])
+def test_a_jump_of_the_pages_clock_ends_the_connection(jump: float) -> None:
+    page = Page(0.003, 0.003).ping(3)
+    number = page.clock.ping(page.now)
+    with pytest.raises(ClockJumpError):
+        page.clock.echo(number, page.page_ms(page.now) + 1000 * jump, page.now + 0.006)
+
+
+def test_a_command_from_the_future_ends_the_connection() -> None:
+    page = Page(0.003, 0.003).ping(3)
+    with pytest.raises(ClockJumpError):
+        page.late(-1.5)
+
+
+@pytest.mark.parametrize("drift", [0.001, -0.001])
+def test_clocks_may_drift_apart_for_long(drift: float) -> None:
+    page = Page(0.02, 0.02, drift=drift).ping(7200)
+    assert not page.late(0.02)
+    assert page.late(0.62)
+
+
+def test_an_echo_of_no_ping_is_ignored() -> None:
+    page = Page(0.003, 0.003).ping(3)
+    page.clock.echo(999, 0.0, page.now)
+    page.clock.echo(1, 0.0, page.now)
+    assert not page.late(0.003)
