@@ -61,7 +61,7 @@ class Serving:
                 **options,
             )
         )
-        self._server.capture_signals = _no_signals  # type: ignore[method-assign]
+        self._server.capture_signals = NoSignals  # type: ignore[method-assign]
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         assert until(lambda: self._server.started)
@@ -84,7 +84,7 @@ class Serving:
         self.listener.close()
 
 
-class _no_signals:  # noqa: N801 - stands for a context manager
+class NoSignals:
     def __enter__(self) -> None:
         return None
 

@@ -68,9 +68,8 @@ def test_an_interruption_is_final_and_holds_until_everything_is_released() -> No
 
 
 def test_what_is_not_allowed_interrupts() -> None:
-    assert gesture("step(0.5); step(0.5, { allowed: false }); step(0.5, { wait: 500 }); result = sent.slice(0, 2);") == [
-        [1, 0.5, False], [1, 0, True],
-    ]  # fmt: skip
+    steps = "step(0.5); step(0.5, { allowed: false }); step(0.5, { wait: 500 }); result = sent.slice(0, 2);"
+    assert gesture(steps) == [[1, 0.5, False], [1, 0, True]]
 
 
 def test_what_was_held_before_it_was_allowed_moves_nothing() -> None:
@@ -232,7 +231,8 @@ def test_a_gamepad_whose_time_stands_still_is_not_believed_for_long() -> None:
     inputs.padSample(pad(0, 1, 2), 3000); result = [vector(), inputs.padFrozen];
     inputs.padSample(pad(0, 1, 2), 3100); result.push(vector(), inputs.padFrozen);
     inputs.padSample(pad(0, 1, 3), 3150); result.push(vector());
-    inputs.padSample(pad(0, 0, 4), 3200); inputs.padSample(pad(0, 1, 5), 3250); result.push(vector(), inputs.padFrozen);"""
+    inputs.padSample(pad(0, 0, 4), 3200); inputs.padSample(pad(0, 1, 5), 3250);
+    result.push(vector(), inputs.padFrozen);"""
     assert inputs(steps) == [[0, 1, 0], False, [0, 0, 0], True, [0, 0, 0], [0, 1, 0], False]
 
 
@@ -253,7 +253,8 @@ def test_keys_and_gamepad_need_the_focus_and_the_stick_does_not() -> None:
 #: Everything is wrong at once; each line mends what the reason before it was about.
 _SITUATION = """
 const situation = {
-  name: "goob", open: false, broker: "refused", reload: true, drives: false, rights: [], hidden: true, focus: false, dialog: true,
+  name: "goob", open: false, broker: "refused", reload: true, drives: false, rights: [], hidden: true, focus: false,
+  dialog: true,
   fromKeys: true, liveness: { online: false, silent_s: 12.3 }, estop: { latched: true, by: "eve" }, freeForMs: 100,
   capabilities: {}, driver: { by: "bob", device: "phone", server: "fair-2", you: false },
   script: { running: true, file: "april-follow" }, pictureAgeMs: 2400, inSight: false, roundTripMs: 640,

@@ -220,7 +220,7 @@ def test_control_and_reset_by_finger(browser: Browser, lamp: Stage, wire: Wire) 
 
 
 def test_the_extra_axis_is_held_by_a_finger(at_lamp: Phone, wire: Wire) -> None:
-    axis: Callable[[], float] = lambda: (wire.last("minilamp/incoming/drive-values") or {}).get("y", 0.0)  # noqa: E731
+    axis: Callable[[], float] = lambda: (wire.last("minilamp/incoming/drive-values") or {}).get("y", 0.0)
     assert at_lamp.test("aux+").is_visible()  # the robot has no picture, so there is room
     assert at_lamp.persists(lambda: at_lamp.touch("aux+"), lambda: axis() > 0, at_lamp.fingers.lift)
     at_lamp.fingers.up(2)

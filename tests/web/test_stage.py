@@ -72,6 +72,6 @@ def test_a_browser_opens_the_page_and_keeps_its_complaints(lamp: Stage, browser:
 def test_nothing_outlives_a_stage() -> None:
     with Stage("minilamp") as stage:
         pids = [stage.server.program.pid, *(program.pid for program in stage.robots["minilamp"].programs)]
-        alive: Callable[[], list[int]] = lambda: [pid for pid in pids if not gone(pid)]  # noqa: E731
+        alive: Callable[[], list[int]] = lambda: [pid for pid in pids if not gone(pid)]
         assert alive() == pids
     assert alive() == []

@@ -25,6 +25,12 @@ from tests.web.stage import Stage
 _BACK_S = 25.0  # until everything works again
 _ANSWER_S = 0.4
 _NO_PICTURE = "localStorage.setItem('pebble video {ref}', 'false')"  # its age is another test's
+_REFUSALS = """() => {
+  const { driver } = window.pebble;
+  const before = driver.refused.bind(driver);
+  window.refusals = new Set();
+  driver.refused = (message) => { window.refusals.add(message.why); before(message); };
+}"""
 _BUSY = "(ms) => { setTimeout(() => { const end = Date.now() + ms; while (Date.now() < end); }) }"
 
 
@@ -109,7 +115,9 @@ class World:
             return [f"it cannot be driven any more: {one.reason}"]
         began = time.monotonic()
         self._log("a new press")
+        one.page.evaluate(_REFUSALS)
         drives = one.drive()
+        refusals = one.page.evaluate("[...window.refusals].join('; ')")
         one.let_go()
         ended = time.monotonic()
         rests = one.rests()
@@ -117,7 +125,9 @@ class World:
         last.end(ended, 1.0, "it was released")
         self._presses.append(last)
         return [
-            text for text, good in (("a new press does not drive", drives), ("it does not rest", rests)) if not good
+            text
+            for text, good in ((f"a new press does not drive: {refusals}", drives), ("it does not rest", rests))
+            if not good
         ]
 
     # -- what happens at tab 1

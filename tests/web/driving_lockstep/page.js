@@ -119,6 +119,7 @@ const commands = {
     const reason = page.run(() => driver.reason());
     page.emit("state", {
       reason: reason?.code ?? "",
+      action: reason?.action?.kind ?? "",
       ref: driver.ref,
       open: socket.state === "open",
       dragged: page.pointer !== null && holds(page, page.pointer),

@@ -87,7 +87,7 @@ def _drives(world: World, slot: int) -> None:
     human = world.humans[slot]
     end = world.now + DRIVES_WITHIN_S
     pressed = False
-    state = {"reason": ""}
+    state = {"reason": "", "action": ""}
     while world.now < end:
         world.scheduler.run(_LOOK_S)
         if pressed and _driven_by(world, human.page) is not None:
@@ -105,8 +105,8 @@ def _drives(world: World, slot: int) -> None:
         elif reason == "release":  # a release was lost
             world.press_key(slot, "KeyW")
             world.release(slot, "KeyW")
-        if reason in ("free", "lease"):
-            world.pages.do(human.page, "take", reason == "lease")
+        if state["action"] in ("take", "take-over"):
+            world.pages.do(human.page, "take", state["action"] == "take-over")
         elif reason == "stopped":
             world.pages.do(human.page, "reset")
         elif reason == "pad":

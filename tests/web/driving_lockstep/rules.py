@@ -56,7 +56,7 @@ class RecordedWheels(Wheels):
 
 
 class Rules:
-    """Call its methods when the thing happens. ``faults`` counts what disturbs the way from the server to the wheels."""
+    """Call its methods when the thing happens. ``faults`` counts what disturbs the way from server to wheels."""
 
     def __init__(self, scheduler: Scheduler, base: str) -> None:
         self._scheduler, self._base, self._check = scheduler, base, scheduler.check
@@ -177,7 +177,7 @@ class Rules:
         )
 
     def let_go(self, page: int, wait_s: float, why: str, disturbed: Callable[[], object]) -> None:
-        """Motion ends at a page that can act, which reaches the server after ``wait_s`` unless ``disturbed`` changes."""
+        """Motion ends at a page that can act; the server knows after ``wait_s``, unless ``disturbed`` changes."""
         number = len(self.sent)
         what = f"a wheel turns though {why}"
         self._stops_soon(lambda one: one.page == page and one.sent_number <= number, what, wait_s, disturbed)

@@ -16,7 +16,8 @@ Schedule = tuple[int, list[Step]]
 
 _HANDS = {
     "wait": 40, "press": 16, "release": 12, "tap": 6, "stick": 8, "cancel": 2, "hold": 2, "slide": 3, "pad": 8,
-    "lose_pad": 1, "space": 3, "meta": 3, "blur": 6, "hide": 4, "event": 3, "dialog": 2, "block": 5, "take": 4, "give": 1, "select": 1,
+    "lose_pad": 1, "space": 3, "meta": 3, "blur": 6, "hide": 4, "event": 3, "dialog": 2, "block": 5, "take": 4,
+    "give": 1, "select": 1,
 }  # fmt: skip
 _NET = {
     "wait": 40, "press": 16, "release": 10, "tap": 4, "stick": 4, "pad": 3, "slide": 1, "space": 2, "blur": 1,
@@ -24,7 +25,8 @@ _NET = {
 }  # fmt: skip
 _SERVERS = {
     "wait": 40, "press": 16, "release": 10, "stick": 4, "pad": 3, "space": 2, "take": 8, "freeze": 8, "kill": 4,
-    "outage": 4, "lose": 4, "owner": 2, "slow": 2, "stall": 3, "block": 3, "silent": 2, "role": 1, "estop": 1, "reset": 2,
+    "outage": 4, "lose": 4, "owner": 2, "slow": 2, "stall": 3, "block": 3, "silent": 2, "role": 1, "estop": 1,
+    "reset": 2,
 }  # fmt: skip
 _LEASES = {
     "wait": 40, "press": 18, "release": 10, "tap": 4, "stick": 4, "space": 5, "take": 16, "give": 5, "other": 5,

@@ -54,6 +54,8 @@ _NAMES = tuple(KEYS)
 _STICK = ((0.0, 0.9), (0.7, 0.3), (-0.8, 0.0), (0.05, 0.02), (0.3, -0.9))
 _HEARTBEAT_S = 1.0
 
+_GONE = {"reason": "gone", "action": "", "open": False, "ended": False, "dragged": False, "token": ""}
+
 _decoder = msgspec.json.Decoder(m.FromPage)
 
 
@@ -164,7 +166,7 @@ class World:
         self.states.pop(page, None)
         self.pages.do(page, "ask")
         self.scheduler.flush()
-        return self.states.get(page, {"reason": "gone", "open": False, "ended": False, "dragged": False, "token": ""})
+        return self.states.get(page, _GONE)
 
     def _output(self, output: Output) -> None:
         slot = self.slot(output.page)
@@ -173,7 +175,7 @@ class World:
         elif slot is None:
             return
         elif output.what == "connect":
-            deliver = lambda text: self._delivered(output.page, output.value, text)  # noqa: E731
+            deliver = lambda text: self._delivered(output.page, output.value, text)
             link = Link(output.page, output.value, self.wires[slot], self.server, self.pages, deliver)
             self.links[output.page, output.value] = link
         elif output.what == "close":
@@ -231,7 +233,7 @@ class World:
     # -- inputs
 
     def do_press(self, a: int, b: int) -> None:
-        slot, human = self._human(a)
+        slot, _human = self._human(a)
         self.press_key(slot, _NAMES[b % len(_NAMES)])
 
     def press_key(self, slot: int, code: str) -> None:
@@ -269,7 +271,7 @@ class World:
             self._at_rest(slot, "everything is released", late=0.06 if name == "pad" else 0.0)
 
     def do_tap(self, a: int, b: int) -> None:
-        slot, human = self._human(a)
+        slot, _human = self._human(a)
         name = _NAMES[b % len(_NAMES)]
         self.press_key(slot, name)
         self.scheduler.run((0.0, 0.01, 0.04, 0.1)[b // 8 % 4])
@@ -304,13 +306,13 @@ class World:
                 self.pages.do(human.page, "stickCancel", finger)
 
     def do_hold(self, a: int, b: int) -> None:
-        slot, human = self._human(a)
+        _slot, human = self._human(a)
         if human.visible and "hold" not in human.held:
             human.press("hold", (0.0, 0.0, 1.0), self.now)
             self.pages.do(human.page, "hold", "up", 1)
 
     def do_slide(self, a: int, b: int) -> None:
-        slot, human = self._human(a)
+        _slot, human = self._human(a)
         human.acted = self.now
         positions = sliders(b)
         human.balance = positions["balance"] or (human.balance and 0.001)  # what was sent with it is on the way
@@ -478,13 +480,13 @@ class World:
 
     def do_clock(self, a: int, b: int) -> None:
         """The wall clock of the computer is set."""
-        slot, human = self._human(a)
+        _slot, human = self._human(a)
         if not human.asleep:
             self.pages.do(human.page, "wall", (5000, -5000, 400, -400)[b % 4])
 
     def do_reload(self, a: int, b: int) -> None:
         """The page is loaded again: by the same tab, by a copy of it, or by another one; the old one may hang on."""
-        slot, human = self._human(a)
+        slot, _human = self._human(a)
         token = "" if b % 4 == 3 else self.ask(slot)["token"]
         self._leave(slot, vanish=b % 4 == 2)
         self.load(slot, token)
@@ -522,7 +524,7 @@ class World:
         self.pages.do(human.page, "estop")
 
     def do_reset(self, a: int, b: int) -> None:
-        slot, human = self._human(a)
+        _slot, human = self._human(a)
         self.pages.do(human.page, "reset")
 
     def do_other(self, a: int, b: int) -> None:
@@ -533,7 +535,7 @@ class World:
 
     def do_role(self, a: int, b: int) -> None:
         """The human may no longer drive, or may again."""
-        slot, human = self._human(a)
+        slot, _human = self._human(a)
         self.server.roles[slot] = Role.VIEWER if b % 2 == 0 else Role.DRIVER
 
     # -- faults
@@ -630,7 +632,7 @@ class World:
         links = [link for link in self.links.values() if link.page == human.page and link.open]
         if human.blocked_from is None and not wire.up.stalled and links and self._reachable():
             link = links[-1]
-            changed = lambda: (wire.changed, human.blocked_from, human.page, link.open, human.sent)  # noqa: E731
+            changed = lambda: (wire.changed, human.blocked_from, human.page, link.open, human.sent)
             self.rules.let_go(human.page, wire.up.wait + late, why, changed)
 
     def _announce(self) -> None:
