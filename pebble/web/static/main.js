@@ -40,6 +40,7 @@ function join(can) {
   const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
   connection.socket = socket;
   estop.onChange = () => connection.changed();
+  driver.onControlLost = (by) => connection.show(by ? `${by} took over` : "Your control has ended: take it again");
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
   video.pictures = new Pictures(
     (bitmap, info) => video.draw(bitmap, info),

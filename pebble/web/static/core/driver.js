@@ -24,6 +24,9 @@ export class Driver {
     this.inSight = false; // the driver sees the robot itself
     /** @type {() => number|null} the age of the picture in ms; null: none is wanted on this page */
     this.pictureAge = () => null;
+    /** @type {(by: string) => void} called when this page loses the lease: to ``by``, or "" */
+    this.onControlLost = () => {};
+    this.mine = false;
     this.padName = "";
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
@@ -55,6 +58,7 @@ export class Driver {
     this.interrupt();
     this.gesture.repeats = []; // they would be sent to the other one
     this.ref = ref;
+    this.mine = false;
     this.inSight = false;
     this.latchedAt = -Infinity;
     this.socket.send({ op: "watch", ref });
@@ -104,6 +108,7 @@ export class Driver {
       freeForMs: performance.now() - this.latchedAt,
       capabilities: value("capabilities")?.value ?? {},
       driver: value("web/driver"),
+      driverIdleMs: this.idleMs(),
       script: value("autonomy-status"),
       pictureAgeMs: this.pictureAge(),
       inSight: this.inSight,
@@ -113,6 +118,13 @@ export class Driver {
     };
   }
 
+  /** How long whoever has the lease has not driven. */
+  idleMs() {
+    const entry = this.store.get(this.ref, "web/driver");
+    const idle = entry?.value.idle_s;
+    return typeof idle === "number" ? 1000 * idle + entry.age : -1;
+  }
+
   take(over = false) {
     this.interrupt();
     this.socket.send({ op: "lease", ref: this.ref, take: true, over });
@@ -120,6 +132,7 @@ export class Driver {
 
   release() {
     this.interrupt();
+    this.mine = false;
     this.socket.send({ op: "lease", ref: this.ref, take: false });
   }
 
@@ -213,6 +226,14 @@ export class Driver {
   tick() {
     this.readPad();
     this.update();
+    this.watchLease();
+  }
+
+  watchLease() {
+    const view = this.store.get(this.ref, "web/driver")?.value;
+    if (this.socket.state !== "open" || !view) return;
+    if (this.mine && !view.you) this.onControlLost(view.by);
+    this.mine = view.you;
   }
 
   /** Where the page's clock stands still while the machine is suspended, only the other one shows it. */

@@ -2,6 +2,7 @@
 
 export const PING_TIMEOUT_MS = 1500;
 const PICTURE_OLD_MS = 2000;
+const IDLE_MS = 5500; // the server lets a driver be replaced after 5 s without a gesture
 export const SLOW_MS = 300; // from this round trip on, the speed is limited
 const LATE_MS = 600;
 export const SLOW_SPEED = 0.4;
@@ -26,6 +27,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @property {number} freeForMs since it was seen stopped
  * @property {Record<string, any>} capabilities
  * @property {{by: string, device: string, server: string, you: boolean}|undefined} driver
+ * @property {number} driverIdleMs since the driver's last gesture; -1: it lasts, or is not known
  * @property {{running?: boolean, file?: string}|undefined} script
  * @property {number|null} pictureAgeMs null: no picture is wanted here
  * @property {boolean} inSight the driver sees the robot itself
@@ -72,7 +74,11 @@ function leaseReason(s) {
   if (s.driver?.you) return null;
   if (!s.driver?.by) return reason("free", "Take control to drive", { label: "Take control", kind: "take" });
   const where = [s.driver.device, s.driver.server].filter(Boolean).join(", ");
-  const text = `${s.driver.by}${where ? ` (${where})` : ""} is driving`;
+  const who = `${s.driver.by}${where ? ` (${where})` : ""}`;
+  if (s.driverIdleMs >= IDLE_MS) {
+    return reason("idle", `${who} has control, but does not drive`, { label: "Take control", kind: "take" });
+  }
+  const text = `${who} is driving`;
   return reason("lease", text, { label: `Take over from ${s.driver.by}`, kind: "take-over" });
 }
 

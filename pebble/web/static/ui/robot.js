@@ -5,7 +5,7 @@ import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, html, useEffect, useMetric, useModel, usePage, useState, useValue } from "./hooks.js";
 import { CardView, Offers } from "./models.js";
 import { Card, Icon } from "./parts.js";
-import { PictureSettings, Stage, useVideo } from "./video.js";
+import { NoCamera, PictureSettings, Stage, useVideo } from "./video.js";
 import { nameOf, typeOf } from "./words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
@@ -48,6 +48,7 @@ function Desktop({ at, offers, view, video, source }) {
         html`<${Boundary} what="The picture"
           ><${Stage} at=${at} video=${video} source=${source} offers=${offers} wide
         /><//>`}
+        ${!video && offers.drives && html`<${NoCamera} at=${at} offers=${offers} />`}
         <div class="cards">
           ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
         </div>
@@ -76,6 +77,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
     html`<div class="phone-drive">
       ${video &&
       html`<${Boundary} what="The picture"><${Stage} at=${at} video=${video} source=${source} offers=${offers} /><//>`}
+      ${!video && offers.drives && html`<${NoCamera} at=${at} offers=${offers} />`}
       ${offers.drives &&
       html`<${Boundary} what="Driving">
         <section class="phone-pad" aria-label="Drive">

@@ -33,9 +33,17 @@ export class Video extends Model {
     if (ref === this.ref) return;
     this.ref = ref;
     this.forget();
+    this.shape();
     if (ref) this.pictures?.show(ref);
     else this.pictures?.stop();
     this.changed();
+  }
+
+  /** Give the canvas the shape that the pictures will have, so that nothing moves when the first one comes. */
+  shape() {
+    const { width, height } = this.store.get(this.ref, "capabilities")?.value?.value?.video ?? {};
+    const plausible = (size) => Number.isInteger(size) && size >= 16 && size <= 4096;
+    if (plausible(width) && plausible(height)) Object.assign(this.canvas, { width, height });
   }
 
   /** @param {any} bitmap a VideoFrame, or an ImageBitmap @param {any} info */

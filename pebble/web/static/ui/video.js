@@ -32,8 +32,11 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   useTick(200);
   const place = useRef(null);
   useEffect(() => {
-    place.current.append(video.canvas);
-    return () => video.canvas.remove();
+    const { current } = place;
+    current.append(video.canvas);
+    return () => {
+      if (video.canvas.parentNode === current) video.canvas.remove(); // another layout may have it already
+    };
   }, []);
   const cover = useCover(control, source);
   const stale = cover !== "";
@@ -104,7 +107,6 @@ export function PictureSettings({ at, source, offers, video }) {
   const view = useValue(source, "web/picture");
   const listed = offers.section("video").encodings;
   const encodings = ENCODINGS.filter((one) => !Array.isArray(listed) || listed.includes(one) || one === view?.pinned);
-  const cameras = useCameras(at);
   const may = connection.may("drive") ? "" : "Log in as driver to change";
   const why = connection.isOpen ? may : "No connection to the server";
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
@@ -125,21 +127,42 @@ export function PictureSettings({ at, source, offers, video }) {
         ${encodings.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
       </select></label
     >
-    ${cameras.length > 0 &&
-    html`<label class="field"
-      ><span>Picture from</span>
-      <select
-        data-test="picture-from"
-        value=${source === at ? "" : source}
-        ...${more}
-        onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
-      >
-        <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
-        ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
-      </select></label
-    >`}
+    <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
     ${why && html`<${Why} id="why-picture">${why}<//>`}
   </div>`;
+}
+
+/** For a component without a camera: another one may look at it. */
+export function NoCamera({ at, offers }) {
+  const { connection } = usePage();
+  useModel(connection);
+  if (useCameras(at).length === 0) return null;
+  const may = connection.may("drive") ? "" : "Log in as driver to choose one";
+  const why = connection.isOpen ? may : "No connection to the server";
+  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
+  return html`<section class="no-camera picture-settings" aria-label="Picture">
+    <p>${nameOf(at)} has no camera.</p>
+    <${PictureFrom} at=${at} source=${at} offers=${offers} more=${more} />
+    ${why && html`<${Why} id="why-picture">${why}<//>`}
+  </section>`;
+}
+
+function PictureFrom({ at, source, offers, more }) {
+  const { commands } = usePage();
+  const cameras = useCameras(at);
+  if (!cameras.length) return null;
+  return html`<label class="field"
+    ><span>Picture from</span>
+    <select
+      data-test="picture-from"
+      value=${source === at ? "" : source}
+      ...${more}
+      onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
+    >
+      <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
+      ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
+    </select></label
+  >`;
 }
 
 function useCameras(at) {
