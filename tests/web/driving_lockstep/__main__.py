@@ -42,7 +42,7 @@ def _schedules(options: argparse.Namespace, pool: ProcessPoolExecutor) -> int:
         if broken and not options.all:
             pool.shutdown(cancel_futures=True)
             return 1
-        if done % 1000 == 0 or done == options.schedules:
+        if done % 500 == 0 or done == options.schedules:
             took = time.monotonic() - began
             print(f"{done} schedules, {drives} drives, {took:.0f} s, {broken.total()} with a violation", flush=True)
     for rule, times in broken.most_common():

@@ -70,6 +70,7 @@ class Link:
         self.page, self.number = page, number
         self._wire, self._server, self._pages, self._delivered = wire, server, pages, delivered
         self._socket: ServerSocket | None = None
+        self.first = 0  # how many commands pages had sent before
         self.broken = False  # nothing arrives any more
         self.closed = False  # as the page sees it
         wire.up.send(self._connect)

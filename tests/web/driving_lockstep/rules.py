@@ -176,11 +176,11 @@ class Rules:
             needs_server=False,
         )
 
-    def let_go(self, page: int, wait_s: float, why: str, disturbed: Callable[[], object]) -> None:
+    def let_go(self, page: int, first: int, wait_s: float, why: str, disturbed: Callable[[], object]) -> None:
         """Motion ends at a page that can act; the server knows after ``wait_s``, unless ``disturbed`` changes."""
         number = len(self.sent)
         what = f"a wheel turns though {why}"
-        self._stops_soon(lambda one: one.page == page and one.sent_number <= number, what, wait_s, disturbed)
+        self._stops_soon(lambda one: one.page == page and first < one.sent_number <= number, what, wait_s, disturbed)
 
     # -- wheels
 

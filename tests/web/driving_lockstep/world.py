@@ -177,6 +177,7 @@ class World:
         elif output.what == "connect":
             deliver = lambda text: self._delivered(output.page, output.value, text)
             link = Link(output.page, output.value, self.wires[slot], self.server, self.pages, deliver)
+            link.first = len(self.rules.sent)
             self.links[output.page, output.value] = link
         elif output.what == "close":
             self.links[output.page, output.value].close()
@@ -633,7 +634,7 @@ class World:
         if human.blocked_from is None and not wire.up.stalled and links and self._reachable():
             link = links[-1]
             changed = lambda: (wire.changed, human.blocked_from, human.page, link.open, human.sent)
-            self.rules.let_go(human.page, wire.up.wait + late, why, changed)
+            self.rules.let_go(human.page, link.first, wire.up.wait + late, why, changed)
 
     def _announce(self) -> None:
         for base in (BASE, OTHER_BASE):
