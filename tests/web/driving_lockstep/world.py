@@ -201,6 +201,7 @@ class World:
         human, message = self.humans[slot], json.loads(text)
         if message["cmd"] == "drive" and message["ref"] == BASE and human.gesture == (socket, message["g"]):
             self._void(slot, f"the server has refused it: {message['why']}")
+            human.gesture = None
 
     def _void(self, slot: int, why: str) -> None:
         self.humans[slot].interrupt(self.now, why)
@@ -631,6 +632,8 @@ class World:
         """Motion ends at this page now, if it can say so."""
         human, wire = self.humans[slot], self.wires[slot]
         links = [link for link in self.links.values() if link.page == human.page and link.open]
+        if human.gesture is None:
+            return
         if human.blocked_from is None and not wire.up.stalled and links and self._reachable():
             link = links[-1]
             changed = lambda: (wire.changed, human.blocked_from, human.page, link.open, human.sent)

@@ -127,7 +127,7 @@ export class Inputs {
   get neutral() {
     const { stick, pad } = this;
     const still = !stick.x && !stick.z && !pad.x && !pad.z && !pad.y;
-    return still && !this.keys.size && !this.waiting.size && !this.held.size;
+    return still && this.pointer === null && !this.keys.size && !this.waiting.size && !this.held.size;
   }
 
   /** Whether a key, or the gamepad, asks for motion: these need the focus of the window. */
