@@ -114,7 +114,7 @@ class Control:
             )
         )
         if "drive" in rights(self._session.role):
-            server.driving.restore(hello.token, self._tab, clock())
+            server.publish(server.driving.restore(hello.token, self._tab, clock()))
         server.robots.join(self._interest)
         self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
         self._post(self._ping())

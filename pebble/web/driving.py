@@ -124,12 +124,19 @@ class Driving:
         self._reserved.pop(tab.token, None)
         return commands
 
-    def restore(self, token: str, tab: Tab, now: float) -> None:
-        """Give a page that has connected again its lease back, unless another page has taken it, but no gesture."""
+    def restore(self, token: str, tab: Tab, now: float) -> list[Command]:
+        """Give a page that has connected again its lease back, unless another page has taken it, but no gesture.
+
+        Its old connection may still be open, if nothing comes from it any more.
+        """
+        old = (one.tab for one in self.leases.values() if one.tab.token == token)
+        stalled = next((one for one in old if one.clock.problem(now)), None)
+        commands = [] if stalled is None else self.closed(stalled, now)
         ref, lease, until = self._reserved.pop(token, ("", None, 0.0))
         if lease is not None and now <= until and ref not in self.leases and not self._active(ref, now):
             self.leases[ref] = Lease(tab, lease.since_ms, now)
             self.changed.add(ref)
+        return commands
 
     def announced(self, server: str, robots: dict[str, tuple[str, str, int]], now: float) -> list[Command]:
         """Take over what another server announces: by robot, who drives it, from which device and since when."""

@@ -134,6 +134,20 @@ def test_a_page_that_connects_again_has_its_lease_but_no_gesture(served, robot):
             assert copy.value(robot.base, "web/driver", "you") is False
 
 
+def test_a_page_that_connects_again_need_not_wait_for_the_end_of_its_stalled_connection(served, robot):
+    with served.page() as first:
+        assert first.knows(robot.base)
+        assert first.ready()
+        assert first.take(robot.base)
+        first.answers = False
+        time.sleep(1.6)  # so long a page waits before it connects anew
+        with served.page(token=first.welcome["token"]) as again:
+            assert until(lambda: again.value(robot.base, "web/driver", "you") is True)
+            first.close()
+            time.sleep(0.2)
+            assert again.value(robot.base, "web/driver", "you") is True
+
+
 def test_space_stops_for_everybody_and_ends_the_gesture(served, page, robot):
     assert page.take(robot.base)
     page.drive(robot.base, 1, z=0.5)
