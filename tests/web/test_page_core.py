@@ -207,6 +207,11 @@ def test_the_stick_stays_in_its_circle_and_rests_in_the_middle() -> None:
     assert inputs(steps) == [True, [0, 0, 0], [0, 1, 0], [0, 0, 0]]
 
 
+def test_a_finger_that_rests_on_the_stick_is_no_release() -> None:
+    steps = "inputs.stickStart(1); inputs.stickMove(0, 0); result = [inputs.neutral]; inputs.stickEnd();"
+    assert inputs(steps + "result.push(inputs.neutral);") == [False, True]
+
+
 def test_a_button_moves_the_auxiliary_axis_while_it_is_held() -> None:
     assert inputs('inputs.hold("up", 1); result = [vector()]; inputs.hold("up", 0); result.push(vector());') == [
         [0, 0, 1], [0, 0, 0],
