@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser
 
-from tests.web.browser import SIZES, Size, Tab, Theme
+from tests.web.browser import Size, Tab, Theme
 from tests.web.console import BACK, FORWARD, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
 from tests.web.stage import Stage
 
@@ -98,7 +98,7 @@ def test_the_stick_follows_a_finger_until_it_is_lifted(browser: Browser, lamp: S
             robot.fingers.up(1)
             assert robot.rests()
         assert robot.drive_by_stick()
-        robot.fingers.move(1, SIZES[size][0] / 2, 1)  # far off the stick
+        robot.fingers.move(1, robot.place("stick")[0], 1)  # far above the stick
         assert robot.turns(FORWARD)
         robot.fingers.up(1)
         assert robot.rests()
