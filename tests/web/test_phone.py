@@ -114,7 +114,7 @@ def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Wire) -> None:
     assert at_lamp.rests()
     at_lamp.fingers.up(2)
     at_lamp.reset()
-    assert at_lamp.because("", "release")
+    assert at_lamp.tab.until(lambda: not wire.latched("minilamp"), 3)
     left, top, size = at_lamp.place("stick")
     at_lamp.fingers.move(1, left, top - 0.3 * size)
     assert at_lamp.stays_at_rest()
