@@ -21,9 +21,9 @@ _HELP = """Certificates of one's own, for the operator page by https.
     pebble cert renew
 """
 _TRUST = """\
-Each browser trusts the authority once. Compare the fingerprint before you do:
+Each browser trusts the authority once, from the port of `pebble web`. Compare the fingerprint before you do:
     {sha256}
-    iPhone, iPad   open https://{name}:8080/ca.pem, install the profile in Settings, then switch it on in
+    iPhone, iPad   open https://{name}:PORT/ca.pem, install the profile in Settings, then switch it on in
                    General > About > Certificate Trust Settings
     Android        download it there, then Settings > Security > Encryption & credentials > Install a certificate > CA
     Firefox        Settings > Privacy & Security > View Certificates > Authorities > Import

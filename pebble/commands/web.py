@@ -210,6 +210,7 @@ def _run(settings: WebSettings) -> int:
 def _print_ready(settings: WebSettings, url: str) -> None:
     typer.echo(f"The operator page is at {url} (Ctrl-C ends it)")
     if settings.authority is not None and settings.authority.is_file():
-        typer.echo(f"Browsers must trust {url}ca.pem once; `pebble cert show` explains how")
+        show = f"pebble cert show --folder {settings.authority.parent}"
+        typer.echo(f"Browsers must trust {url}ca.pem once; `{show}` explains how")
     elif settings.login and settings.certificate is None:
         typer.echo("pebble: it is not encrypted: everybody on the network can read passwords and pictures", err=True)

@@ -54,11 +54,12 @@ def audit(
     \b
         pebble web audit --limit 200
     """
-    log = Audit(_file(config, people))
+    file = _file(config, people)
+    log = Audit(file)
     entries = log.read(limit)
     log.close()
     if not entries:
-        typer.echo("nothing was logged yet")
+        typer.echo(f"{file} has no entries yet")
         return 0
     from rich.console import Console
     from rich.table import Table

@@ -6,11 +6,12 @@ uvicorn has no time limit for the head of a request, and waits without end for a
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from collections import Counter
 from ipaddress import ip_address
-from typing import Any
+from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -126,7 +127,7 @@ class HttpProtocol(H11Protocol):
         if seconds != self._seconds:
             self._unlimit()
             self._seconds = seconds
-            self._deadline = self.loop.call_later(seconds, self.transport.abort)
+            self._deadline = self.loop.call_later(seconds, _abort, self.transport)
 
     def _unlimit(self) -> None:
         self._seconds = 0.0
@@ -141,11 +142,11 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
     def handle_ping(self) -> None:
         super().handle_ping()
         if self.transport.get_write_buffer_size() > _MAX_UNREAD:
-            self.transport.abort()
+            _abort(self.transport)
 
     def keepalive_timeout(self) -> None:
         super().keepalive_timeout()
-        self.transport.abort()
+        _abort(self.transport)
 
     def on_task_complete(self, task: asyncio.Task[None]) -> None:
         super().on_task_complete(task)
@@ -154,7 +155,13 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
 
 def _abort_later(transport: asyncio.Transport) -> None:
     """A transport that is closed sends the rest first, for as long as the client likes."""
-    asyncio.get_running_loop().call_later(FLUSH_S, transport.abort)
+    asyncio.get_running_loop().call_later(FLUSH_S, _abort, transport)
+
+
+def _abort(transport: asyncio.BaseTransport) -> None:
+    """Close it without waiting. Python 3.11's TLS transport raises if its connection has ended already."""
+    with contextlib.suppress(AttributeError):
+        cast(asyncio.Transport, transport).abort()
 
 
 def _is_loopback(address: str) -> bool:

@@ -9,12 +9,14 @@ from collections.abc import Callable
 import uvicorn
 
 from pebble.errors import PebbleError
+from pebble.fleet import certificates
 from pebble.web.app import create_app
 from pebble.web.connections import MAX_CONNECTIONS, HttpProtocol, Listener, Loop, WebSocketProtocol
 from pebble.web.settings import WebSettings
 
 _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1
+_ALL_ADDRESSES = ("0.0.0.0", "::")  # noqa: S104 - compared, not listened on
 
 
 def run(settings: WebSettings, *, on_ready: Callable[[str], None] | None = None) -> int:
@@ -83,6 +85,9 @@ def _listen(settings: WebSettings) -> socket.socket:
 def url_of(settings: WebSettings, listener: socket.socket) -> str:
     """The address that a browser on this machine opens, or the name by which others reach it."""
     host = settings.names[0] if settings.names else settings.host
+    if host in _ALL_ADDRESSES:  # no browser can open these
+        names = certificates.show(settings.certificate).names if settings.certificate else ()
+        host = next((name for name in names if name not in _ALL_ADDRESSES), socket.gethostname())
     shown = f"[{host}]" if host.count(":") > 1 else host
     port = "" if ":" in host and shown == host else f":{listener.getsockname()[1]}"  # a name may have its own port
     return f"{'https' if settings.certificate else 'http'}://{shown}{port}/"

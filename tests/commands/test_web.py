@@ -231,7 +231,7 @@ def test_a_terminal_is_asked_twice_without_echo(run: Run, monkeypatch: pytest.Mo
 
 def test_audit(run: Run, state: Path) -> None:
     assert run("web", "audit") == 0
-    assert run.out == "nothing was logged yet\n"
+    assert run.out == f"{state / 'people.sqlite'} has no entries yet\n"
     log = Audit(state / "people.sqlite")
     for number in range(60):
         log.write(f"drive-{number}", ref="pebble/robots/goob", user="alice", device="phone", address="10.0.0.2")
