@@ -4,7 +4,7 @@
 VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test stops schedules script-schedules page-schedules check firmware report clean
+.PHONY: help demo test stops schedules script-schedules page-schedules page-tests check firmware report clean
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -13,6 +13,7 @@ help:
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
+	@echo "make page-tests       every state, interruption and finger at the operator page in Chromium, five minutes"
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
@@ -26,9 +27,14 @@ demo: .venv/.ready-demo
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
-	@$(VENV) tools/run_tests.py --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone"
+	@$(VENV) tools/run_tests.py --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone and not page"
 	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines"
 	@$(VENV) tools/run_tests.py --numprocesses 2 --dist loadscope -m alone tests/robot tests/services tests/web tests/test_demo.py
+
+# Every state of the operator page on every size, every interruption, and fingers.
+page-tests: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
+	@$(VENV) tools/run_tests.py -m page tests/web
 
 # What violates a rule is described in build/stops; the seed in its name repeats it.
 stops: .venv/.ready-dev

@@ -22,7 +22,7 @@ def test_init_prints_what_to_type_next_and_how_phones_trust_it(run: Run, state: 
     lines = run.out.splitlines()
     assert lines[0] == f"{state} has a certificate for lab-pc.local, 192.168.1.20."
     assert lines[2] == f"    pebble web CONFIG --host 0.0.0.0 --tls {state}"
-    assert "https://lab-pc.local:8080/ca.pem" in run.out
+    assert "https://lab-pc.local:PORT/ca.pem" in run.out
     assert sorted(path.name for path in state.iterdir()) == ["ca.key", "ca.pem", "server.key", "server.pem"]
     assert stat.S_IMODE((state / "ca.key").stat().st_mode) == 0o600
 

@@ -8,7 +8,7 @@ from tests.web.chromium_schedules.__main__ import perform
 from tests.web.chromium_schedules.rules import BUSY_S, Motors, Press, problems
 from tests.web.chromium_schedules.schedules import make
 
-pytestmark = pytest.mark.alone  # deadlines are checked
+pytestmark = pytest.mark.page  # deadlines are checked
 
 FORWARD, TURN, REST = (0.6, 0.6), (0.558, -0.6), (0.0, 0.0)
 

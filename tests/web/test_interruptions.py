@@ -14,7 +14,7 @@ from tests.tcp_proxy import TcpProxy
 from tests.web.console import QUIET_S, Console, console, used
 from tests.web.stage import Stage
 
-pytestmark = pytest.mark.alone  # deadlines are checked
+pytestmark = pytest.mark.page  # deadlines are checked
 
 
 def nothing(_: Console) -> None:

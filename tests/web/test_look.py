@@ -26,7 +26,7 @@ WIDTHS: dict[Size, tuple[int, ...]] = {
     "small": (320,),
 }
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
 
 def _nothing(_page: Page) -> None:

@@ -12,7 +12,7 @@ from tests.web.browser import Size, Tab, Theme
 from tests.web.console import BACK, FORWARD, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
 from tests.web.stage import Stage
 
-pytestmark = pytest.mark.alone  # deadlines are checked
+pytestmark = pytest.mark.page  # deadlines are checked
 
 
 class Fingers:
