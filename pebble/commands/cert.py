@@ -46,7 +46,7 @@ def init(names: _Names, folder: _Folder = None) -> int:
     """Make a certificate authority and a certificate for this machine's names.
 
     The authority signs for these names and for local ones only: a phone that trusts it trusts it for nothing else.
-    Keep ca.key secret; whoever has it can imitate the operator page.
+    Keep ca.key secret: with it one can imitate the operator page.
 
     \b
         pebble cert init lab-pc.local 192.168.1.20

@@ -228,7 +228,7 @@ class EstopView(Struct, frozen=True, kw_only=True):
 
 
 class DriverView(Struct, frozen=True, kw_only=True):
-    """``web/driver``: who holds the lease; ``by`` "" is nobody."""
+    """``web/driver``: who holds the lease; ``by`` is "" while it is free."""
 
     by: str
     device: str

@@ -118,7 +118,7 @@ export class Driver {
     };
   }
 
-  /** How long whoever has the lease has not driven. */
+  /** How long the holder of the lease has not driven. */
   idleMs() {
     const entry = this.store.get(this.ref, "web/driver");
     const idle = entry?.value.idle_s;
@@ -136,7 +136,7 @@ export class Driver {
     this.socket.send({ op: "lease", ref: this.ref, take: false });
   }
 
-  /** The space bar: stops the robot, whoever drives it. */
+  /** The space bar: stops the robot, with or without the lease. */
   space() {
     this.interrupt();
     this.socket.send({ op: "stop", ref: this.ref });
