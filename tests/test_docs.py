@@ -16,9 +16,10 @@ DOCUMENTS = [
     *(path for path in sorted((ROOT / "docs").rglob("*.md")) if path.name not in GENERATED),
 ]
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
-#: `folder/`, `folder/file.py` or `file.py`; what begins like a topic below a robot's identity is none
+#: `folder/`, `folder/file.py` or `file.py`; what begins like a topic below a robot's identity is none, and what is
+#: below build/ is written by a run
 CODE = re.compile(
-    r"`((?!(?:incoming|outgoing|flags|sensors|mcu|by)/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`"
+    r"`((?!(?:incoming|outgoing|flags|sensors|mcu|by|build)/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`"
 )
 OURS = ("pebble", "transports", "services", "simulation", "bench", "firmware")
 
