@@ -4,12 +4,14 @@
 VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test stops schedules script-schedules page-schedules page-tests check firmware report clean
+unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
+.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make test             all checks and tests"
+	@echo "make thorough         the same, with all cases of the tests with random inputs, about 25 minutes"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
@@ -24,12 +26,19 @@ help:
 demo: .venv/.ready-demo
 	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS))
 
+# Folders whose tests take longest come first: else the last of them run while the other processors have nothing to do.
+TESTS := $(VENV) tools/run_tests.py --dist loadscope --no-loadscope-reorder
+LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
+
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
-	@$(VENV) tools/run_tests.py --numprocesses 4 --dist loadscope --no-loadscope-reorder -m "not alone and not page"
-	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines"
-	@$(VENV) tools/run_tests.py --numprocesses 2 --dist loadscope -m alone tests/robot tests/services tests/web tests/test_demo.py
+	@$(TESTS) --numprocesses 4 -m "not alone and not page$(LESS)" tests/web tests/services tests/commands tests
+	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
+	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" tests/test_demo.py tests/services tests/robot/test_faults.py tests/robot tests/web
+
+thorough:
+	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
 # Every state of the operator page on every size, every interruption, and fingers.
 page-tests: .venv/.ready-dev

@@ -20,6 +20,15 @@ from pebble.runtime.parent import tied_to_parent
 ROOT = Path(__file__).resolve().parent.parent
 
 
+#: `make thorough` sets it: tests with many cases then try all of them.
+THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
+
+
+def cases(some: int, all_: int) -> int:
+    """How many cases a test with random inputs tries."""
+    return all_ if THOROUGH else some
+
+
 def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.005) -> bool:
     """Wait until ``condition()`` is true; False when ``timeout`` seconds went by without it."""
     end = time.monotonic() + timeout
@@ -117,8 +126,11 @@ class Broker:
         assert until(self._answers, 10), f"mosquitto did not start with {self._config.read_text()}"
 
     def stop(self) -> None:
-        """SIGTERM: persistence is written."""
-        self._end(lambda process: process.terminate())
+        """SIGTERM: persistence is written. With its security plugin it has been seen to hang then, once."""
+        try:
+            self._end(lambda process: process.terminate())
+        except subprocess.TimeoutExpired:
+            self.kill()
 
     def kill(self) -> None:
         """SIGKILL: what was not saved is lost."""

@@ -61,13 +61,14 @@ class Message(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """The bytes that a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
+    """What a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
 
     Zero from a backend that cannot measure it (T20).
     """
 
     waiting: int = 0  # bytes that the other machine has not confirmed, including some overhead of the protocols
     round_trip_s: float = 0.0  # the shortest of this connection: what has waited for less is merely travelling
+    unanswered_s: float = 0.0  # how long the oldest DELIVERED message has waited for its acknowledgement
 
 
 Handler = Callable[[Message], None]

@@ -154,8 +154,9 @@ class _Loop:
     def _tick(self, now: float) -> None:
         while self._arrived:
             self._driver.receive(*self._arrived.popleft())
-        self._in_flight.acknowledge(self._transport.outgoing.waiting)
-        late_s = self._in_flight.age_s(now)
+        outgoing = self._transport.outgoing
+        self._in_flight.acknowledge(outgoing.waiting)
+        late_s = max(self._in_flight.age_s(now), outgoing.unanswered_s - outgoing.round_trip_s)
         if problem := self._problem():
             self._in_flight.clear()
         self._publish(self._driver.tick(now, time.time(), problem=problem, late_s=late_s), now)

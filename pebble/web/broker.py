@@ -11,6 +11,8 @@ from pebble.transports import Message, MqttSettings, QoS, State, Subscription, T
 
 Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
 
+ANSWER_S = 0.25  # a broker that takes longer would deliver commands late, all at once
+
 
 class Broker:
     """Handlers and watchers run on the event loop; subscribing waits for the broker, so it does not happen there."""
@@ -31,8 +33,16 @@ class Broker:
 
     @property
     def problem(self) -> str:
-        """Why there is no connection, in one line; empty while there is one."""
-        return "" if self.connected else self.transport.problem or "not connected yet"
+        """Why nothing should be sent to it now, in one line; empty if all is well."""
+        if not self.connected:
+            return self.transport.problem or "not connected yet"
+        return "it does not answer" if self._late else ""
+
+    @property
+    def _late(self) -> bool:
+        """Whether it has not acknowledged what was published a while ago; it may be suspended."""
+        outgoing = self.transport.outgoing
+        return outgoing.unanswered_s > ANSWER_S + outgoing.round_trip_s
 
     async def open(self) -> None:
         """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""

@@ -17,6 +17,8 @@ WINDOW: Final = 2  # frames sent and not acknowledged
 SLOW_ACK_S, FAST_ACK_S = 0.15, 0.12
 #: More frames may be under way if they are small: they delay nothing, and a distant page would get too few of them.
 SMALL_WINDOW, SMALL_BYTES = 8, 4096
+#: A connection is thin if two frames in a row take longer: while one is under way, commands and echoes wait behind it.
+THIN_ACK_S, THIN_FRAMES = 0.4, 2
 MAX_FRAMES: Final = 4
 SLOW_FRAMES: Final = 1  # JPEG encodings on a slow connection: the next key frame is near, and shows what is newer
 MAX_QUEUED_BYTES: Final = 4 << 20
@@ -48,6 +50,7 @@ class MediaQueue:
         self.skipped = 0
         self.window = WINDOW
         self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
+        self.late_acks = 0  # in a row
         self._queue: deque[Frame] = deque()
         self._under_way: dict[int, tuple[float, Frame]] = {}
 
@@ -79,6 +82,7 @@ class MediaQueue:
         sent_at, frame = self._under_way.pop(seq, (0.0, None))
         if frame is not None:
             self.ack_s = now - sent_at
+            self.late_acks = self.late_acks + 1 if self.ack_s > THIN_ACK_S else 0
             if self.ack_s > SLOW_ACK_S:
                 self.window = 1
             elif self.ack_s < FAST_ACK_S:
@@ -130,6 +134,7 @@ class ViewerQueue(MediaQueue):
         super().__init__()
         self.can = can
         self.rescued = False
+        self.thin = False  # in the rescue stream it gets small pictures
         self.new = True  # it has received no picture, and no key frame was requested for it
         self._undecodable: set[str] = set()
         self._waiting_since = self._direct_since = now
@@ -175,15 +180,22 @@ class ViewerQueue(MediaQueue):
             self._note_waiting(now)
             self.not_drawn()
 
+    @property
+    def is_thin(self) -> bool:
+        """Whether its connection carries no large frames."""
+        return self.late_acks >= THIN_FRAMES
+
     def rescue(self, now: float) -> None:
         """Change to the rescue stream: because the page is slow, for a while; else until the next key frame."""
-        if self.overflowed:
+        self.thin = self.is_thin
+        if self.overflowed or self.thin:
             self._retry_s = _FIRST_RETRY_S if now - self._direct_since > _RECOVERED_S else self._retry_s
             self._retry_at = now + self._retry_s
             self._retry_s = min(_LAST_RETRY_S, 2 * self._retry_s)
         self.rescued = True
         self.wait_for_keyframe()
         self.overflowed = False
+        self.late_acks = 0
 
     def waiting_s(self, now: float) -> float:
         """How long it has waited for a key frame of the robot's own pictures."""
@@ -198,10 +210,11 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
     """Move viewers between the two streams; return whether to request a key frame (at most once a second).
 
     A key frame costs all viewers and the robot's uplink. One is requested if most wait, or once for a viewer that is
-    new; a slow viewer among fast ones gets the rescue stream instead.
+    new; a slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
     """
-    for viewer in viewers:
-        if can_rescue and not viewer.rescued and not viewer.decodes(encoding):
+    for viewer in viewers if can_rescue else ():
+        viewer.thin = viewer.thin or viewer.is_thin  # also in the rescue stream
+        if not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):
             viewer.rescue(now)
     direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
     patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S

@@ -19,7 +19,7 @@ from pebble.web.media_queue import NO_FRAME, Frame, ViewerQueue, assess
 from pebble.web.messages import PictureView
 from pebble.web.picture_header import PictureHeader, follows, read_header
 from pebble.web.picture_source import MAX_PAYLOAD, PictureSource, offered, refusal
-from pebble.web.rescue import RescuedPicture, RescueStream
+from pebble.web.rescue import FULL, THIN, Form, RescuedPicture, RescueStream
 from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
@@ -173,13 +173,14 @@ class PictureStream:
             viewer.queue.lost(now)
         self._wakeup.set()
 
-    def _on_rescued(self, picture: RescuedPicture) -> None:
+    def _on_rescued(self, form: Form, picture: RescuedPicture) -> None:
         seq = self._next_seq()
         data = _RESCUE_HEAD.pack(seq, 1, picture.captured_ms) + picture.jpeg
         frame = Frame(seq, data, "jpeg", keyframe=True)
         for viewer in self.viewers:
-            viewer.queue.offer_rescue(frame)
-            viewer.wakeup.set()
+            if viewer.queue.thin is (form is THIN):
+                viewer.queue.offer_rescue(frame)
+                viewer.wakeup.set()
 
     def _next_seq(self) -> int:
         self._seq = (self._seq + 1) % NO_FRAME  # NO_FRAME itself is no number
@@ -243,7 +244,9 @@ class PictureStream:
         can_rescue = not changing and not rescue.unavailable(self._encoding)
         queues = [viewer.queue for viewer in self.viewers]
         wanted = assess(queues, self._encoding, now, can_rescue=can_rescue)
-        if can_rescue and any(queue.rescued for queue in queues):
+        thin = {queue.thin for queue in queues if queue.rescued}
+        if can_rescue and thin:
+            self._rescue.forms = [THIN if one else FULL for one in thin]
             self._rescue.start(self._chain)
         else:
             self._rescue.stop()

@@ -1,14 +1,15 @@
-"""Pictures as plain JPEGs, for pages that cannot decode a robot's encoding or cannot keep up with it.
+"""Pictures as plain JPEGs, for pages that cannot decode a robot's encoding, or whose connection cannot carry it.
 
 One stream per robot for all who need it: the server decodes, and sends at most five pictures a second, always the
-newest. cv2 and PyAV are imported with the first picture, for they take memory that most servers never need.
+newest; over a thin connection smaller ones, because a large one would delay everything else. cv2 and PyAV are
+imported with the first picture, for they take memory that most servers never need.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from pebble.media import pyav
 
@@ -16,8 +17,18 @@ if TYPE_CHECKING:
     from pebble.media.decode import Decoded, VideoDecoder
 
 PERIOD_S: Final = 0.2
-QUALITY: Final = 60
 _MAX_WAITING_BYTES: Final = 16 << 20
+
+
+class Form(NamedTuple):
+    """What the pictures are like."""
+
+    quality: int
+    width: int  # pixels, at most
+
+
+FULL: Final = Form(60, 1920)
+THIN: Final = Form(40, 320)
 
 
 class RescuedPicture(NamedTuple):
@@ -32,13 +43,15 @@ def unavailable(encoding: str) -> str:
 
 def newest_jpeg(payloads: Sequence[bytes]) -> RescuedPicture | None:
     """The last picture of a key frame and the differences after it. Takes milliseconds: call it on a thread."""
-    return _newest(_make_decoder(), payloads)
+    decoded = _newest(_make_decoder(), payloads)
+    return None if decoded is None else _encode(decoded, FULL)
 
 
 class RescueStream:
-    """Converts the pictures of one robot while it is started. All methods run on the event loop."""
+    """Converts the pictures of one robot while it is started, to all ``forms``. All methods run on the event loop."""
 
-    def __init__(self, ready: Callable[[RescuedPicture], None]) -> None:
+    def __init__(self, ready: Callable[[Form, RescuedPicture], None]) -> None:
+        self.forms: Sequence[Form] = ()
         self._ready = ready
         self._pending: list[bytes] = []
         self._fed = asyncio.Event()
@@ -76,9 +89,8 @@ class RescueStream:
             await self._fed.wait()
             self._fed.clear()
             batch, self._pending = self._pending, []
-            made = await asyncio.to_thread(_newest, decoder, batch)
-            if made is not None:
-                self._ready(made)
+            for form, picture in await asyncio.to_thread(_convert, decoder, batch, self.forms):
+                self._ready(form, picture)
             await asyncio.sleep(PERIOD_S)
 
 
@@ -88,15 +100,27 @@ def _make_decoder() -> VideoDecoder:
     return VideoDecoder()
 
 
-def _newest(decoder: VideoDecoder, payloads: Sequence[bytes]) -> RescuedPicture | None:
+def _convert(
+    decoder: VideoDecoder, payloads: Sequence[bytes], forms: Sequence[Form]
+) -> list[tuple[Form, RescuedPicture]]:
+    newest = _newest(decoder, payloads)
+    return [] if newest is None else [(form, _encode(newest, form)) for form in forms]
+
+
+def _newest(decoder: VideoDecoder, payloads: Sequence[bytes]) -> Decoded | None:
     newest: Decoded | None = None
     for payload in payloads:
         newest = decoder.feed(payload) or newest
-    return None if newest is None else _encode(newest)
+    return newest
 
 
-def _encode(decoded: Decoded) -> RescuedPicture:
+def _encode(decoded: Decoded, form: Form) -> RescuedPicture:
     import cv2
 
-    jpeg = cv2.imencode(".jpg", decoded.picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    picture: Any = decoded.picture
+    height, width = picture.shape[:2]
+    if width > form.width:
+        size = (form.width, max(1, height * form.width // width))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, form.quality])[1]
     return RescuedPicture(jpeg.tobytes(), decoded.captured_ms or 0)

@@ -37,6 +37,8 @@ async def _serve(settings: WebSettings, listener: socket.socket, on_ready: Calla
         await server.serve(sockets=[listener])
     finally:
         watching.cancel()
+    if not server.started:
+        raise PebbleError("the operator page did not start: the lines above say why")
 
 
 async def _report(server: uvicorn.Server, url: str, on_ready: Callable[[str], None] | None) -> None:

@@ -122,9 +122,8 @@ class Server:
         self.publish(self.driving.announced(address.identity.id, robots, clock()))
 
     def _show_broker(self) -> None:
-        view = m.BrokerView(
-            connected=self.broker.connected, problem=self.broker.problem, robots_omitted=self.robots.omitted
-        )
+        problem = self.broker.problem
+        view = m.BrokerView(connected=not problem, problem=problem, robots_omitted=self.robots.omitted)
         self.robots.set_server_metric("", "web/broker", view)
 
     # -- to the broker
@@ -155,8 +154,8 @@ class Server:
     def blocked(self, ref: str) -> str:
         """Why this component may not be moved by any page; empty if it may."""
         component = self.robots.components.get(ref)
-        if not self.broker.connected:
-            return f"The server cannot reach the broker: {self.broker.problem}"
+        if problem := self.broker.problem:
+            return f"The server cannot reach the broker: {problem}"
         if component is None or not component.drives():
             return "This component does not drive"
         if component.estop.latched:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import posixpath
 import re
 from collections.abc import Iterator
 from importlib.resources.abc import Traversable
@@ -23,6 +24,8 @@ _TYPES = {
     "webmanifest": "application/manifest+json",
 }
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
+_MODULES = b"{modules}"  # replaced by links to all that main.js imports: browsers need not discover them one by one
+_IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
 
 
@@ -37,8 +40,20 @@ class StaticFiles:
         self.version = digest.hexdigest()[:12]
         for name in self.files:
             if name.endswith(".html"):
-                self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
+                page = self.files[name].replace(_MODULES, b"\n    ".join(map(_link, self._imported("main.js"))))
+                self.files[name] = page.replace(_VERSION, self.version.encode())
         self._packed = {name: gzip.compress(content, 9, mtime=0) for name, content in self.files.items()}
+
+    def _imported(self, *names: str) -> list[str]:
+        """What these modules import, and what that imports."""
+        found = dict.fromkeys(names)
+        for name in (waiting := list(names)):
+            for path in _IMPORT.findall(self.files.get(name, b"")):
+                other = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
+                if other not in found:
+                    found[other] = None
+                    waiting.append(other)
+        return [name for name in found if name not in names]
 
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
         """The file ``name``, compressed if the browser takes that; 404 if there is none."""
@@ -50,6 +65,10 @@ class StaticFiles:
         if packed:
             headers["content-encoding"] = "gzip"
         return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
+
+
+def _link(module: str) -> bytes:
+    return b'<link rel="modulepreload" href="/static/{version}/%s">' % module.encode()
 
 
 def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:

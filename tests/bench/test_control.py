@@ -45,6 +45,7 @@ def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output, "find_spec", lambda _name: None)
 
 
+@pytest.mark.thorough
 def test_all_variants_alone_and_beside_a_busy_process(temporary: Path, tmp_path: Path) -> None:
     options = ("--sizes", "40", "--rates", "200", "--loads", "none,hog", "--seconds", "0.1", "--rounds", "1")
     ended = subprocess.run(

@@ -30,6 +30,7 @@ def segments(pid: int) -> set[Path]:
     return {Path(line.split()[5]) for line in lines if line.endswith(".zenoh")}
 
 
+@pytest.mark.thorough
 def test_a_short_run_leaves_results_and_nothing_else(temporary: Path, tmp_path: Path) -> None:
     folder = tmp_path / "results"
     options = ("--seconds", "0.3", "--rounds", "2", "--size", "64x48", "--readers", "1", "--output", str(folder))

@@ -209,6 +209,7 @@ def test_a_comparison_that_fails_does_not_stop_the_others(tmp_path: Path, monkey
     assert "sound ended with code 2: see" in document
 
 
+@pytest.mark.thorough
 def test_what_this_user_may_not_run_is_not_taken_from_an_earlier_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

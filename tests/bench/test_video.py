@@ -34,6 +34,7 @@ def test_the_film_is_always_the_same(scene: str) -> None:
     assert squared_error(first, second) > 1
 
 
+@pytest.mark.thorough
 def test_the_aims_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, quick=True) == 0
     results = load(tmp_path / "video.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,8 @@ from tests.commands.command_line import Run
 
 def pytest_in(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}  # users have none; ours take seconds to import
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
 
 
 @pytest.fixture
@@ -36,6 +38,7 @@ def test_its_test_passes_and_fails_for_a_robot_that_turns_away(folder: Path) -> 
     assert "1 failed" in pytest_in(folder).stdout
 
 
+@pytest.mark.thorough
 def test_it_passes_below_a_folder_with_other_settings_for_pytest(folder: Path) -> None:
     (folder.parent / "pyproject.toml").write_text(
         '[tool.pytest.ini_options]\naddopts = "-qq --strict-config"\nunknown = 1\n'
@@ -43,6 +46,7 @@ def test_it_passes_below_a_folder_with_other_settings_for_pytest(folder: Path) -
     assert "1 passed" in pytest_in(folder.parent, folder.name).stdout
 
 
+@pytest.mark.thorough
 def test_the_tests_of_two_scripts_pass_in_one_run(folder: Path) -> None:
     second = shutil.copytree(folder, folder.with_name("second"))
     (second / "test_follow_me.py").rename(second / "test_second.py")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import subprocess
@@ -18,6 +19,8 @@ from pebble.contract.payloads import ChargingLevel, Drive, Heartbeat, TouchSenso
 from pebble.contract.schemas import schemas
 from tests.support import ROOT
 
+topics_document = functools.cache(topic_docs.topics_document)  # takes half a second
+
 
 @pytest.mark.parametrize("name", sorted(topic_docs.documents()))
 def test_the_file_in_docs_is_generated_from_the_contract(name: str) -> None:
@@ -31,7 +34,7 @@ def test_running_the_module_writes_the_files(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.suffix)
 def test_every_channel_has_its_lines(channel: Channel) -> None:
-    lines = [line for line in topic_docs.topics_document().splitlines() if line.startswith(f"| `{channel.suffix}` |")]
+    lines = [line for line in topics_document().splitlines() if line.startswith(f"| `{channel.suffix}` |")]
     meaning, route = lines
     assert channel.kind.name in meaning
     assert channel.doc in meaning
@@ -40,7 +43,7 @@ def test_every_channel_has_its_lines(channel: Channel) -> None:
 
 
 def test_every_link_leads_to_a_payload() -> None:
-    text = topic_docs.topics_document()
+    text = topics_document()
     headings = {heading.lower() for heading in re.findall(r"^### (\w+)$", text, re.MULTILINE)}
     links = set(re.findall(r"\]\(#(\w+)\)", text))
     assert links <= headings
@@ -57,7 +60,7 @@ def test_who_decides_and_where_it_goes() -> None:
 
 
 def test_units_and_synonyms_are_documented() -> None:
-    text = topic_docs.topics_document()
+    text = topics_document()
     assert "| `t` | integer | required | epoch milliseconds |" in text
     assert "Understood like `online`." in text
 

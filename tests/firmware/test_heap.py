@@ -1,4 +1,4 @@
-"""Each robot runs for a minute in the real MicroPython within the memory of its board."""
+"""Robots run for a minute in the real MicroPython within the memory of their boards; with ``make thorough`` each."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import pytest
 
 from tests.firmware.heap import CASES, LIMITS, Case, measure
 from tests.firmware.sizes import documented
+from tests.support import THOROUGH
 
 _PEAK = 7  # column of the table
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize("case", CASES if THOROUGH else CASES[::3], ids=str)
 def test_heap(case: Case, tmp_path: Path) -> None:
     cost = measure(case, tmp_path)
     limit = LIMITS[case]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pebble.media.scene import COUNTER_LIMIT, TAG_ID, Scene, read_counter
+from tests.support import cases
 
 NUMBERS = (0, 1, 2, 255, 256, 65_535, 0xABCDEF, COUNTER_LIMIT - 1)
 
@@ -30,7 +31,7 @@ def test_the_same_number_gives_the_same_pixels_whatever_was_drawn_before() -> No
 
 def test_it_never_stands_still() -> None:
     scene, before, after = Scene(640, 480), *np.empty((2, 480, 640, 3), np.uint8)
-    for number in range(0, 900, 7):
+    for number in range(0, 900, cases(37, 7)):
         scene.render(number, before)
         scene.render(number + 1, after)
         assert np.mean(before[:400] != after[:400]) > 0.2, number
@@ -59,7 +60,7 @@ def test_the_counter_survives_being_sent_as_differences() -> None:
     scene, now = Scene(320, 240), np.empty((240, 320, 3), np.uint8)
     scene.render(1000, now)
     shown = jpeg(now)
-    for number in range(1001, 1060):
+    for number in range(1001, cases(1020, 1060)):
         scene.render(number, now)
         difference = jpeg(np.clip(now.astype(np.int16) - shown + 128, 0, 255).astype(np.uint8))
         shown = np.clip(shown.astype(np.int16) + difference.astype(np.int16) - 128, 0, 255).astype(np.uint8)
@@ -69,7 +70,7 @@ def test_the_counter_survives_being_sent_as_differences() -> None:
 def test_a_torn_counter_is_read_as_none() -> None:
     """The upper half of one picture above the lower half of another, as a lost slice leaves them."""
     scene, mixed, other = Scene(640, 480), *np.empty((2, 480, 640, 3), np.uint8)
-    for number in range(100, 400):
+    for number in range(100, cases(160, 400)):
         scene.render(number, mixed)
         scene.render(1000 * number, other)
         mixed[456:] = other[456:]
@@ -96,7 +97,7 @@ def test_tiny_pictures_are_drawn_too(size: tuple[int, int]) -> None:
 def test_the_tag_is_found_where_it_is() -> None:
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
     scene, out = Scene(640, 480), np.empty((480, 640, 3), np.uint8)
-    for number in range(0, 450, 15):
+    for number in range(0, 450, cases(45, 15)):
         scene.render(number, out)
         corners, ids, _ = detector.detectMarkers(out)
         found = {int(tag): corner for tag, corner in zip(np.ravel(ids), corners, strict=True)}

@@ -13,8 +13,10 @@ from tests.motion.histories import STEPS, generate, shortest, violation
 from tests.motion.mutations import MUTATIONS, Mutation
 from tests.motion.rules import PERSON, UNKNOWN_RUN
 from tests.motion.world import CORES
+from tests.support import cases
 
-HISTORIES = 300_000 // STEPS
+HISTORIES = cases(80_000, 300_000) // STEPS
+WITH_BUG = 3_000_000 // STEPS  # at most, until it shows
 
 
 def test_no_history_breaks_a_rule() -> None:
@@ -27,7 +29,7 @@ def test_each_deliberate_bug_shows_in_a_short_history(tmp_path: Path, name: str)
     with_bug, cores = MUTATIONS[name].load(tmp_path)
     found = (
         (history, rule)
-        for history in (generate(0, number) for number in range(10 * HISTORIES))
+        for history in (generate(0, number) for number in range(WITH_BUG))
         if (rule := violation(history, with_bug, cores))
     )
     history, rule = next(found)

@@ -184,6 +184,7 @@ def test_a_robot_arrives_at_the_tag(seed: int, camera: str) -> None:
     assert abs(result.bearing_deg) < 5
 
 
+@pytest.mark.thorough
 def test_the_same_run_twice_is_identical() -> None:
     first, second = (FollowRig(3, **CAMERAS["all of it"]).run(5.0) for _ in range(2))
     assert first == second

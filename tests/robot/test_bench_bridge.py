@@ -20,7 +20,7 @@ from pebble.errors import PebbleError
 from tests.robot.rig import Rig, descendants
 from tests.support import until
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.thorough]
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,7 @@ from pebble.bench.usage import children
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, Child, until
 
-pytestmark = pytest.mark.alone  # whole robots
+pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # whole robots
 
 
 @pytest.fixture(autouse=True)
@@ -39,9 +39,11 @@ def test_startup_of_both_kinds(tmp_path: Path) -> None:
         (measure.name, kind) for measure in startup.MEASURES for kind in KINDS
     }
     for kind in KINDS:
-        heartbeat, ready, obeyed, operator, paho, service = (
+        heartbeat, ready, obeyed, operator, paho, service, *pictures = (
             cell for measure in startup.MEASURES if (cell := results.find(kind, measure.name)) is not None
         )
+        assert all(0 < cell.samples[0] < 60_000 for cell in pictures)
+        assert len(pictures) == len(startup.PICTURES)
         assert all(0 < cell.samples[0] < 60 for cell in (heartbeat, ready, obeyed))
         assert all(len(cell.samples) == startup.QUICK_JOINS for cell in (operator, paho, service))
         assert all(cell.figures["topics"] for cell in (operator, paho, service))

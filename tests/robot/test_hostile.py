@@ -1,4 +1,7 @@
-"""100,000 malformed messages and as many garbage lines: nothing dies, nothing moves, every refusal is counted."""
+"""Malformed messages and as many garbage lines: nothing dies, nothing moves, every refusal is counted.
+
+100,000 of each with ``make thorough``.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +26,9 @@ from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, Lights
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.robot.rig import Rig
-from tests.support import until
+from tests.support import cases, until
 
-MESSAGES = 100_000
+MESSAGES = cases(6_400, 100_000)
 CHUNK = 800  # messages before waiting for a sign that the robot has read them: less than any queue on the way holds
 LINES = 400  # the same for lines: together fewer bytes than may wait unread
 

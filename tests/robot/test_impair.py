@@ -36,7 +36,10 @@ def permitted(kind: str) -> None:
 
 
 @pytest.mark.usefixtures("permitted")
-@pytest.mark.parametrize(("kind", "subject"), [("namespaces", "mqtt original"), ("proxy", "zenoh h264 opus")])
+@pytest.mark.parametrize(
+    ("kind", "subject"),
+    [("namespaces", "zenoh h264 opus"), pytest.param("proxy", "mqtt original", marks=pytest.mark.thorough)],
+)
 def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     kind: str, subject: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

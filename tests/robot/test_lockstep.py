@@ -13,8 +13,9 @@ import pytest
 from tests.robot.lockstep.mutations import MUTATIONS
 from tests.robot.lockstep.schedules import first_violation, generate, violation
 from tests.robot.lockstep.world import Folder
+from tests.support import cases
 
-SCHEDULES = 150
+SCHEDULES = cases(80, 150)
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from tests.robot.stop_schedules.history import History
 pytestmark = pytest.mark.alone  # deadlines are checked
 
 
-@pytest.mark.parametrize(("transport", "seed"), [("zenoh", 2), ("mqtt", 4)])
+@pytest.mark.parametrize(("transport", "seed"), [("zenoh", 2), pytest.param("mqtt", 4, marks=pytest.mark.thorough)])
 def test_a_persons_stop_and_the_end_of_a_script_are_seen_at_the_wheels(transport: str, seed: int) -> None:
     ((_, found, log),) = perform(transport, [seed])
     assert not found, log

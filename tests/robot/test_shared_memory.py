@@ -27,7 +27,9 @@ def test_a_robot_that_has_stopped_leaves_no_shared_memory(kind: str) -> None:
     with Rig(kind, av_daemon=DEVICES) as rig:
         rig.operator.send("incoming/front-camera", {"enabled": True})
         rig.operator.send("incoming/flags/mqtt-video", {"value": True}, retain=True)
-        assert until(lambda: "camera_publisher" in rig.processes() and len(segments_of(rig)) >= 2, 20)
+        assert until(lambda: "camera_publisher" in rig.processes() and len(segments_of(rig)) >= 2, 20), (
+            f"{rig.processes()}, {segments_of(rig)}:\n{rig.log.read_text()[-4000:]}"
+        )
         time.sleep(2 * YOUNG_S)  # younger ones may still be in the making and are left alone
         used = segments_of(rig)
         assert rig.stop() == 0

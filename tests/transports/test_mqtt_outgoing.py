@@ -55,9 +55,9 @@ def retained(topic: str, payload: bytes = b"1", qos: QoS = QoS.DELIVERED) -> Mes
     return Message(topic, payload, qos, retain=True)
 
 
-def send(in_flight: InFlightTable, message: Message, mid: int) -> Message:
+def send(in_flight: InFlightTable, message: Message, mid: int, now: float = 0.0) -> Message:
     in_flight.accept(message)
-    in_flight.sent(message, mid)
+    in_flight.sent(message, mid, now)
     return message
 
 
@@ -73,6 +73,20 @@ def test_an_acknowledgement_proves_the_message_it_names() -> None:
     assert in_flight.unconfirmed_retained() == []
     assert not in_flight.acknowledge(3)
     assert in_flight.unacked == 1
+
+
+def test_the_oldest_message_without_an_acknowledgement_counts() -> None:
+    in_flight = InFlightTable()
+    assert in_flight.unanswered_since is None
+    send(in_flight, Message("stream", b"", QoS.LATEST), 1, 1.0)
+    assert in_flight.unanswered_since is None
+    send(in_flight, Message("event", b"", QoS.DELIVERED), 2, 2.0)
+    send(in_flight, Message("event", b"", QoS.DELIVERED), 3, 3.0)
+    assert in_flight.unanswered_since == 2.0
+    in_flight.acknowledge(2)
+    assert in_flight.unanswered_since == 3.0
+    in_flight.acknowledge(3)
+    assert in_flight.unanswered_since is None
 
 
 def test_an_answered_ping_proves_what_was_sent_before_it() -> None:

@@ -100,6 +100,30 @@ def test_a_page_that_does_not_answer_does_not_drive(page, robot):
     assert robot.drives() == []
 
 
+def test_a_broker_that_does_not_answer_ends_the_gesture(broker, page, robot):
+    assert page.take(robot.base)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: robot.drives())
+    broker.freeze()
+
+    def refused() -> bool:
+        page.drive(robot.base, 1, z=0.5)
+        time.sleep(0.05)
+        return bool(page.refused)
+
+    assert until(refused, 3)
+    assert page.refused[0]["why"] == "The server cannot reach the broker: it does not answer"
+    page.drive(robot.base, 2, z=0.7)
+    assert until(lambda: any(one["g"] == 2 for one in page.refused))
+    broker.thaw()
+    assert until(lambda: last(robot) == FINAL)
+    assert until(lambda: page.value("", "web/broker", "connected") is True)
+    assert all(one["z"] != 0.7 for one in robot.drives())
+    assert last(robot) == FINAL
+    page.drive(robot.base, 3, z=0.5)
+    assert until(lambda: last(robot)["z"] == 0.5)
+
+
 def test_one_robot_has_one_driver(served, page, robot):
     with served.page(device="phone") as other:
         assert other.knows(robot.base)

@@ -66,6 +66,9 @@ INTERRUPTIONS = {
     "the broker is killed": Interruption(
         lambda robot: robot.stage.kill_broker(), CONNECTION_S, lambda robot: robot.stage.restart_broker(), 1.0
     ),
+    "the broker is suspended": Interruption(
+        lambda robot: robot.stage.freeze_broker(), VALID_S, lambda robot: robot.stage.thaw_broker(), 1.5
+    ),
 }
 
 

@@ -7,7 +7,16 @@ import random
 import pytest
 
 from pebble.web.encoding_choice import EncodingChoice, best
-from pebble.web.media_queue import MAX_FRAMES, MAX_QUEUED_BYTES, NO_FRAME, Frame, MediaQueue, ViewerQueue, assess
+from pebble.web.media_queue import (
+    MAX_FRAMES,
+    MAX_QUEUED_BYTES,
+    NO_FRAME,
+    THIN_ACK_S,
+    Frame,
+    MediaQueue,
+    ViewerQueue,
+    assess,
+)
 
 ALL = frozenset({"h264", "pbvz", "pbvd", "json", "jpeg"})
 
@@ -237,6 +246,46 @@ def test_what_cannot_be_decoded_is_rescued_until_it_can() -> None:
     viewer.cannot_decode("json")
     assess([viewer], "json", 0.4, can_rescue=True)
     assert viewer.rescued
+
+
+@pytest.mark.parametrize("encoding", ["h264", "pbvz"])
+def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream(encoding: str) -> None:
+    viewer, now = ViewerQueue(ALL, 0.0), 0.0
+    for seq in range(2):
+        viewer.offer_direct(frame(seq, keyframe=True, encoding=encoding), now)
+        assert not assess([viewer], encoding, now, can_rescue=True)
+        assert not viewer.rescued
+        assert viewer.take(now)
+        now += THIN_ACK_S + 0.1
+        viewer.acknowledge(seq, now)
+    assert not assess([viewer], encoding, now, can_rescue=True)
+    assert (viewer.rescued, viewer.thin) == (True, True)
+    viewer.offer_direct(frame(2, keyframe=True, encoding=encoding), now + 9)
+    assert viewer.rescued
+    viewer.offer_direct(frame(3, keyframe=True, encoding=encoding), now + 11)
+    assert not viewer.rescued
+
+
+def test_one_late_acknowledgement_is_no_thin_connection() -> None:
+    viewer = ViewerQueue(ALL, 0.0)
+    for seq, late_s in enumerate((2.0, 0.1, 2.0, 0.1)):
+        viewer.offer_direct(frame(seq, keyframe=True), 0.0)
+        viewer.take(0.0)
+        viewer.acknowledge(seq, late_s)
+        assert not assess([viewer], "pbvz", late_s, can_rescue=True)
+    assert not viewer.rescued
+
+
+def test_a_page_that_cannot_decode_gets_small_pictures_only_if_it_has_to() -> None:
+    viewer = ViewerQueue(frozenset({"jpeg"}), 0.0)
+    assess([viewer], "h264", 0.0, can_rescue=True)
+    assert (viewer.rescued, viewer.thin) == (True, False)
+    for seq in range(2):
+        viewer.offer_rescue(frame(seq, keyframe=True, encoding="jpeg"))
+        viewer.take(0.0)
+        viewer.acknowledge(seq, 1.0)
+    assess([viewer], "h264", 1.0, can_rescue=True)
+    assert (viewer.rescued, viewer.thin) == (True, True)
 
 
 # -- the encoding

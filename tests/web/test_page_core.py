@@ -271,7 +271,7 @@ const mends = [
   { capabilities: { drive: { available: true } } }, { driver: undefined }, { driver: { you: true, by: "anna" } },
   { dialog: false },
   { script: undefined }, { inSight: true }, { roundTripMs: 4 }, { padFrozen: false }, { focus: true },
-  { mustRelease: false },
+  { refusal: "Commands are late" }, { mustRelease: false },
 ];
 """
 
@@ -284,9 +284,9 @@ def test_the_first_reason_counts() -> None:
     found = reasons("result = mends.map((mend) => driveReason(Object.assign(situation, mend)));")
     assert [None if one is None else one["code"] for one in found] == [
         "server", "broker", "reload", "plain", "role", "hidden", "silent", "stopped", "reset", "no-drive", "lease",
-        "free", "dialog", "script", "picture", "late", "pad", "focus", "release", None,
+        "free", "dialog", "script", "picture", "late", "pad", "focus", "release", "release", None,
     ]  # fmt: skip
-    texts = {one["code"]: one["text"] for one in found if one is not None}
+    texts = {one["code"]: one["text"] for one in reversed(found) if one is not None}
     assert texts["server"] == "No connection to the server"
     assert texts["silent"] == "goob is silent for 12 s"
     assert texts["stopped"] == "Stopped by eve"
@@ -295,6 +295,7 @@ def test_the_first_reason_counts() -> None:
     assert texts["picture"] == "The picture is 2.4 s old"
     assert texts["late"] == "Commands are late (640 ms)"
     assert texts["release"] == "Let go first"
+    assert found[-2]["text"] == "Commands are late: let go first"
     actions = {one["code"]: one["action"]["kind"] for one in found if one is not None and "action" in one}
     expected = {"reload": "reload", "role": "login", "lease": "take-over", "free": "take", "picture": "see"}
     assert actions == expected

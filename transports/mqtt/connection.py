@@ -335,7 +335,7 @@ class Connection:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
             properties.MessageExpiryInterval = expires_s
         sent = self._client.publish(message.topic, message.payload, int(message.qos), message.retain, properties)
-        self._in_flight.sent(message, sent.mid)
+        self._in_flight.sent(message, sent.mid, time.monotonic())
         self._client.loop_write()
 
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
@@ -395,7 +395,9 @@ class Connection:
             if sock is None:
                 return Outgoing()
             waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
-            return Outgoing(waiting, shortest_round_trip_s(sock))
+            since = self._in_flight.unanswered_since
+            unanswered_s = 0.0 if since is None else time.monotonic() - since
+            return Outgoing(waiting, shortest_round_trip_s(sock), unanswered_s)
 
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages that the broker may not have received, oldest first."""

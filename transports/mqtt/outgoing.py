@@ -127,7 +127,7 @@ class InFlightTable:
 
     def __init__(self) -> None:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
-        self._unacked: dict[int, str | None] = {}  # by message id: the topic, if retained
+        self._unacked: dict[int, tuple[str | None, float]] = {}  # by message id: the topic, if retained; when sent
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, PendingAck] = {}
         self._answered: list[PendingAck] = []  # not completed yet
@@ -141,6 +141,11 @@ class InFlightTable:
         """How many DELIVERED messages the broker has not acknowledged."""
         return len(self._unacked)
 
+    @property
+    def unanswered_since(self) -> float | None:
+        """When the oldest DELIVERED message that the broker has not acknowledged was sent."""
+        return next(iter(self._unacked.values()))[1] if self._unacked else None
+
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages the broker may not have, oldest first."""
         return [entry.message for entry in self._unconfirmed.values()]
@@ -151,10 +156,10 @@ class InFlightTable:
             self._unconfirmed.pop(message.topic, None)
             self._unconfirmed[message.topic] = _Unconfirmed(message)
 
-    def sent(self, message: Message, mid: int) -> None:
+    def sent(self, message: Message, mid: int, now: float) -> None:
         """Note that ``message`` went out under the id ``mid``."""
         if message.qos is QoS.DELIVERED:
-            self._unacked[mid] = message.topic if message.retain else None
+            self._unacked[mid] = (message.topic if message.retain else None, now)
         if message.retain:
             entry = self._unconfirmed[message.topic]
             if message.qos is QoS.DELIVERED:
@@ -166,7 +171,7 @@ class InFlightTable:
         """Process a PUBACK; False if it belongs to no known message."""
         if mid not in self._unacked:
             return False
-        topic = self._unacked.pop(mid)
+        topic, _ = self._unacked.pop(mid)
         if topic is not None and topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
         return True

@@ -18,11 +18,10 @@ const route = new Route();
 const settings = new Settings();
 const video = new Video(store);
 
-function join(can) {
+function join() {
   const socket = new ControlSocket({
     store,
     version,
-    can,
     onOpen: () => driver.opened(),
     onLost: () => driver.lost(),
     onChange: () => connection.changed(),
@@ -70,7 +69,7 @@ function commands(socket, driver, estop) {
   };
 }
 
-const page = join(await Pictures.canDecode());
+const page = join();
 const follow = () => page.driver.select(route.ref);
 route.onChange(follow);
 page.driver.start();

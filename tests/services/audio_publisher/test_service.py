@@ -109,6 +109,7 @@ def test_the_remote_broker_goes_and_comes_back(local: Broker, remote: Broker, ea
         assert robot.reported(last_error=None)
 
 
+@pytest.mark.thorough
 def test_a_slow_link_makes_opus_thrifty_and_nothing_waits(local: Broker, remote: Broker, ear: Ear) -> None:
     with (
         SlowTcpProxy(remote.port, kbits=100) as link,

@@ -110,6 +110,7 @@ def worst_age_ms(pictures: list[Seen]) -> int:
     return max(picture.arrived_ms - picture.captured_ms for picture in pictures)
 
 
+@pytest.mark.thorough
 def test_a_slow_connection_gets_recent_pictures_and_delays_nothing_else(
     local: Broker, remote: Broker, viewer: Viewer
 ) -> None:

@@ -144,7 +144,7 @@ def test_others_are_not_concerned(topics: PrivateTopics) -> None:
 
 
 def test_memory_is_bounded(topics: PrivateTopics) -> None:
-    for number in range(1000):
+    for number in range(300):
         topics.admit(Message(f"{OUT}/mcu/u{number}/x", b"{}", retain_requested=True))
         topics.admit(described(SPY, f"d{number}"))
     assert len(topics._waiting) <= 256

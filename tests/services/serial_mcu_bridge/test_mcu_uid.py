@@ -21,6 +21,7 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.uid_claim import AGAIN_S
 from pebble.transports import Message
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, STATION, F, I, M
+from tests.support import cases
 
 # -- uids
 
@@ -224,7 +225,7 @@ _ODD_INTERFACE = st.fixed_dictionaries({}, optional={
 })  # fmt: skip
 
 
-@settings(max_examples=1000)
+@settings(max_examples=cases(200, 1000))
 @given(st.lists(_ODD_INTERFACE, max_size=4))
 @example([{"channel": "sensors/imu", "profile": "imu.summary.v1", "encoding": {"fields": 5}}])
 def test_no_manifest_of_another_device_raises_anything(interfaces: list[dict[str, object]]) -> None:

@@ -10,8 +10,9 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import Described, Gone, Reading, RefusedInput, Session
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, STATION, M
+from tests.support import cases
 
-FRAMES = 200_000
+FRAMES = cases(40_000, 200_000)
 GROUP = 500
 
 _BODIES = [

@@ -18,7 +18,7 @@ import zenoh.shm
 from pebble.errors import TransportError
 from pebble.runtime.parent import tied_to_parent
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, views
-from tests.support import ROOT, Child, until
+from tests.support import ROOT, Child, cases, until
 
 LARGE = 500_000  # bytes: the allocator's margin holds no such frame
 
@@ -243,7 +243,7 @@ def soak(folder: Path, frames: int, *options: str) -> tuple[int, int, int]:
     return wrong, lost, growth
 
 
-@pytest.mark.parametrize(("frames", "options"), [(100_000, ()), (5_000, ("-X", "dev"))])
+@pytest.mark.parametrize(("frames", "options"), [(cases(20_000, 100_000), ()), (5_000, ("-X", "dev"))])
 def test_a_soak(tmp_path: Path, frames: int, options: tuple[str, ...]) -> None:
     wrong, lost, growth = soak(tmp_path, frames, *options)
     assert wrong == 0

@@ -128,8 +128,8 @@ MUTATIONS = {
     ),
     "a refused gesture begins again": Mutation(
         "gesture.js",
-        "      this.active = false;\n      this.mustRelease = true;\n      this.last = ZERO;\n",
-        "      this.active = false;\n      this.last = ZERO;\n",
+        "    this.active = false;\n    this.mustRelease = true;\n    this.last = ZERO;\n    return true;\n",
+        "    this.active = false;\n    this.last = ZERO;\n    return true;\n",
     ),
     "the end of a gesture is not sent": Mutation(
         "gesture.js", "    this.command(ZERO, now, final);\n    this.repeats = ", "    this.repeats = "

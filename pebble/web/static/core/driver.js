@@ -33,6 +33,7 @@ export class Driver {
     this.padStopped = false;
     this.updatedAt = -Infinity;
     this.latchedAt = -Infinity; // when the component was last seen stopped
+    this.refusal = ""; // why the server has ended the last gesture
     this.clockBase = Date.now() - performance.now();
     /** @type {Set<() => void>} */
     this.watchers = new Set();
@@ -48,6 +49,7 @@ export class Driver {
     document.addEventListener("visibilitychange", () => document.hidden && this.leave());
     document.addEventListener("contextmenu", () => this.interrupt());
     screen.orientation?.addEventListener?.("change", () => this.interrupt());
+    for (const name of ["focusin", "focusout"]) document.addEventListener(name, () => this.changed());
     addEventListener("gamepaddisconnected", () => this.inputs.padGone());
     setInterval(() => this.tick(), PERIOD_MS);
   }
@@ -78,9 +80,9 @@ export class Driver {
     this.changed();
   }
 
-  /** @param {{cmd: string, ref: string, g: number}} message */
+  /** @param {{cmd: string, ref: string, g: number, why: string}} message */
   refused(message) {
-    if (message.cmd === "drive" && message.ref === this.ref) this.gesture.refused(message.g);
+    if (message.cmd === "drive" && message.ref === this.ref && this.gesture.refused(message.g)) this.refusal = message.why;
     this.changed();
   }
 
@@ -115,6 +117,7 @@ export class Driver {
       roundTripMs: this.socket.roundTripMs,
       padFrozen: this.inputs.padFrozen,
       mustRelease: this.gesture.mustRelease,
+      refusal: this.refusal,
     };
   }
 
@@ -176,6 +179,11 @@ export class Driver {
   hold(name, value, at = performance.now()) {
     if (!value || !isOld(at)) this.inputs.hold(name, value);
     this.update();
+  }
+
+  /** Whether keys go to a field or a list, and not to the robot. */
+  get typing() {
+    return document.activeElement?.matches(TYPING) ?? false;
   }
 
   get gestureActive() {
@@ -274,6 +282,7 @@ export class Driver {
     const { neutral, waiting } = this.inputs;
     this.gesture.update(vector, situation !== null && why === null, now, neutral, waiting.size > 0);
     if (this.gesture.mustRelease) this.inputs.clearKeys();
+    else this.refusal = "";
     this.output = this.gesture.active ? vector : { x: 0, z: 0, y: 0 };
     this.changed();
   }
@@ -281,7 +290,8 @@ export class Driver {
   /** Notify watchers, if what they show is another than before. */
   changed() {
     const { x, z, y } = this.output;
-    const shown = JSON.stringify([this.ref, this.reason(), x, z, y, this.padName, this.sliders, this.inSight]);
+    const { ref, padName, sliders, inSight, typing } = this;
+    const shown = JSON.stringify([ref, this.reason(), x, z, y, padName, sliders, inSight, typing]);
     if (shown === this.shown) return;
     this.shown = shown;
     for (const watcher of this.watchers) watcher();

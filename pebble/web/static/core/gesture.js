@@ -55,13 +55,13 @@ export class Gesture {
     this.mustRelease = true;
   }
 
-  /** The server has ended gesture ``g``, and has stopped what it moved. */
+  /** The server has ended gesture ``g``, and has stopped what it moved. @returns {boolean} whether it lasted until now */
   refused(g) {
-    if (this.active && g === this.number) {
-      this.active = false;
-      this.mustRelease = true;
-      this.last = ZERO;
-    }
+    if (!this.active || g !== this.number) return false;
+    this.active = false;
+    this.mustRelease = true;
+    this.last = ZERO;
+    return true;
   }
 
   /** A new connection counts from the beginning; what was under way is over. */

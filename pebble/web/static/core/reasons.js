@@ -6,6 +6,7 @@ const IDLE_MS = 5500; // the server lets a driver be replaced after 5 s without 
 export const SLOW_MS = 300; // from this round trip on, the speed is limited
 const LATE_MS = 600;
 export const SLOW_SPEED = 0.4;
+const LET_GO = "Let go first"; // the server says the same
 const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 0.5 s
 
 /** @typedef {{code: string, text: string, action?: {label: string, kind: "take"|"take-over"|"see"|"login"|"reload"}}} Reason */
@@ -34,6 +35,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @property {number} roundTripMs
  * @property {boolean} padFrozen
  * @property {boolean} mustRelease
+ * @property {string} refusal why the server has ended the last gesture; "" it has not
  */
 
 /** Why nothing may be commanded at all. @param {Situation} s @returns {Reason|null} */
@@ -90,7 +92,7 @@ function momentReason(s) {
   if (s.roundTripMs >= LATE_MS) return reason("late", `Commands are late (${Math.round(s.roundTripMs)} ms)`);
   if (s.padFrozen) return reason("pad", "The gamepad stands still: move its stick to neutral and back");
   if (s.fromKeys && !s.focus) return reason("focus", "Click this page first: keys go to another window");
-  if (s.mustRelease) return reason("release", "Let go first");
+  if (s.mustRelease) return reason("release", s.refusal && s.refusal !== LET_GO ? `${s.refusal}: let go first` : LET_GO);
   return null;
 }
 

@@ -19,7 +19,7 @@ export function useLayout() {
   }, []);
   const lying = useMedia("(orientation: landscape) and (max-height: 500px) and (pointer: coarse)");
   const narrow = useMedia("(max-width: 760px)");
-  if (route.ref && (full || lying)) return "immersive";
+  if (route.ref && (lying || (full && !narrow))) return "immersive";
   return narrow ? "portrait" : "desktop";
 }
 

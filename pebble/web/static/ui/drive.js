@@ -24,7 +24,8 @@ export function WhyLine({ at }) {
   const reason = driver.reason();
   // the banner says why
   const why = reason?.code === "broker" ? "The server cannot reach the broker" : reason?.text;
-  const text = why ?? (mine ? `You are driving ${nameOf(at)}.` : "");
+  const keys = driver.typing ? " Keys go to the field you have chosen: click beside it." : "";
+  const text = why ?? (mine ? `You are driving ${nameOf(at)}.${keys}` : "");
   useWakeLock(mine);
   return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
     <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>

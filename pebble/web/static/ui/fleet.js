@@ -1,7 +1,7 @@
 // All components at a glance: who is there, who drives, what is stopped.
 
 import { RouteLink, Liveness } from "./header.js";
-import { html, useEffect, useMetric, useModel, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
+import { html, useEffect, useMetric, useModel, useNodes, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
 import { Offers } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import {
@@ -24,11 +24,12 @@ const SORTS = { name: "name", type: "type", battery: "battery" };
 
 export function Fleet() {
   const { connection, settings, store } = usePage();
-  useModel(connection);
+  useModel(connection, (one) => one.state);
   useModel(settings);
   useTick(1000); // robots come and go
   const refs = useRefs();
   const [filter, setFilter] = useState("");
+  const cards = useNodes((ref) => html`<li key=${ref}><${FleetCard} at=${ref} /></li>`);
   const online = refs.filter((ref) => isPresent(store, ref));
   const away = refs.filter((ref) => !isPresent(store, ref) && !settings.forgotten.has(ref));
   useEffect(() => {
@@ -54,7 +55,7 @@ export function Fleet() {
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
     <ul class="fleet-cards">
-      ${shown.map((ref) => html`<li key=${ref}><${FleetCard} at=${ref} /></li>`)}
+      ${cards(shown)}
     </ul>
     ${shownAway.length > 0 &&
     html`<section class="away" aria-labelledby="away-title">
@@ -135,6 +136,8 @@ const TRANSPORTS = { mqtt: "MQTT", zenoh: "Zenoh", mcu: "MCU" };
 
 function FleetCard({ at }) {
   const { commands, settings, connection } = usePage();
+  useModel(settings);
+  useModel(connection, (one) => one.state);
   const offers = new Offers(at, useValue(at, "capabilities"));
   const estop = useValue(at, "web/estop");
   const picture = useValue(at, "web/picture");

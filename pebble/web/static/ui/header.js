@@ -104,10 +104,10 @@ function Volts({ at }) {
 /** Whether a component is there, and how late its heartbeats are. @param {{at: string}} props */
 export function Liveness({ at }) {
   const { connection } = usePage();
-  useModel(connection);
-  useTick(1000);
+  useModel(connection, (one) => one.isOpen);
   const entry = useMetric(at, "web/liveness");
   const view = entry?.value;
+  useTick(view?.online === false ? 1000 : 0);
   if (!connection.isOpen) return html`<span class="state unknown"><i>○</i> unknown</span>`;
   if (!view || view.online === null) return html`<span class="state unknown"><i>○</i> waiting</span>`;
   if (view.online === false) {

@@ -60,23 +60,42 @@ export function useMetrics(ref) {
   return store.metrics(ref);
 }
 
-/** Draw again after each change of a model. @template {{onChange: (fn: () => void) => () => void}} T @param {T} model @returns {T} */
-export function useModel(model) {
+/**
+ * Draw again after each change of a model, or only after changes of what ``pick`` returns.
+ * @template {{onChange: (fn: () => void) => () => void}} T @param {T} model @param {(model: T) => unknown} [pick] @returns {T}
+ */
+export function useModel(model, pick) {
   const redraw = useRedraw();
+  const drawn = useRef(/** @type {unknown} */ (undefined));
+  drawn.current = pick?.(model);
   useEffect(() => {
     redraw();
-    return model.onChange(redraw);
+    return model.onChange(() => (!pick || pick(model) !== drawn.current) && redraw());
   }, [model]);
   return model;
 }
 
-/** Draw again every ``ms``, for ages. @param {number} ms */
+/** Draw again every ``ms``, for ages; 0: never. @param {number} ms */
 export function useTick(ms) {
   const redraw = useRedraw();
   useEffect(() => {
+    if (!ms) return undefined;
     const timer = setInterval(redraw, ms);
     return () => clearInterval(timer);
   }, [ms]);
+}
+
+/**
+ * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before.
+ * @param {(ref: string) => any} draw @returns {(refs: string[]) => any[]}
+ */
+export function useNodes(draw) {
+  const nodes = useRef(new Map());
+  return (refs) => {
+    const old = nodes.current;
+    nodes.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? draw(ref)]));
+    return [...nodes.current.values()];
+  };
 }
 
 /** @param {string} query @returns {boolean} whether the media query matches */

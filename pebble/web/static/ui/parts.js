@@ -32,10 +32,12 @@ export function StopButton({ onStop, label, children, className = "", describedB
 }
 
 const HOLD_MS = 1000;
+const HINT_MS = 2500;
 
 /** A button that has to be held for a second, by pointer or key. */
 export function HoldButton({ onHeld, disabled = false, children, className = "", describedBy, test }) {
   const [held, hold] = useState(false);
+  const [tapped, setTapped] = useState(false);
   const done = useRef(onHeld);
   done.current = onHeld;
   useEffect(() => {
@@ -46,7 +48,15 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
     }, HOLD_MS);
     return () => clearTimeout(timer);
   }, [held]);
-  const end = () => hold(false);
+  useEffect(() => {
+    if (!tapped) return undefined;
+    const timer = setTimeout(() => setTapped(false), HINT_MS);
+    return () => clearTimeout(timer);
+  }, [tapped]);
+  const end = () => {
+    if (held) setTapped(true); // too early
+    hold(false);
+  };
   const key = (event) => event.code === "Space" || event.code === "Enter";
   return html`<button
     type="button"
@@ -57,6 +67,7 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
     onPointerDown=${(event) => {
       if (event.button) return;
       event.currentTarget.setPointerCapture(event.pointerId);
+      setTapped(false);
       hold(true);
     }}
     onPointerUp=${end}
@@ -70,7 +81,9 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
       end();
     }}
   >
-    <span class="hold-fill" aria-hidden="true"></span><span class="hold-text">${children}</span>
+    <span class="hold-fill" aria-hidden="true"></span><span class="hold-text"
+      >${tapped ? "Keep it pressed for 1 s" : children}</span
+    >
   </button>`;
 }
 

@@ -25,7 +25,8 @@ export function Stick({ driver }) {
     event.preventDefault();
     element.current.focus({ preventScroll: true });
     if (dragged) return driver.interrupt(); // a second finger
-    if (event.button || driver.reason() || !driver.stickStart(event.pointerId, event.timeStamp)) return undefined;
+    if (driver.reason()) return pointAt("why-drive");
+    if (event.button || !driver.stickStart(event.pointerId, event.timeStamp)) return undefined;
     element.current.setPointerCapture(event.pointerId);
     setPointer(event.pointerId);
     return move(event);
@@ -61,6 +62,13 @@ export function Stick({ driver }) {
     <span class="stick-arrow s"></span><span class="stick-arrow w"></span>
     <span class="knob" style=${{ transform: `translate(${120 * x}%, ${-120 * z}%)` }}></span>
   </div>`;
+}
+
+/** Move an element a little, to show where the answer is. @param {string} id */
+function pointAt(id) {
+  if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+  const there = [0, 6, -6, 0].map((x) => ({ transform: `translateX(${x}px)` }));
+  document.getElementById(id)?.animate(there, 300);
 }
 
 /** What keys and gamepad ask for, as a place of the knob. */

@@ -3,6 +3,7 @@
 import { Model } from "./models.js";
 
 const STALE_MS = 500; // without a new picture, what is shown is no longer live
+const LATE_MS = 2000; // nobody drives by a picture that is older
 const WRONG_MS = 1000; // a clock that is so far off is not believed
 
 /** Owner of the canvas and of the connection for pictures. */
@@ -73,8 +74,12 @@ export class Video extends Model {
     return performance.now() - this.drawnAt;
   }
 
-  get isStale() {
+  get hasStopped() {
     return this.sinceDrawn > Math.max(STALE_MS, 2.5 * this.interval);
+  }
+
+  get isStale() {
+    return this.hasStopped || this.age().ms > LATE_MS;
   }
 
   /** How old the picture is in ms: since it was taken, or, if the component's clock is wrong, since it arrived. */
@@ -82,7 +87,7 @@ export class Video extends Model {
     const captured = this.info?.capturedMs;
     if (typeof captured === "number" && captured > 0 && this.clockIsRight) {
       const ms = this.store.now() - captured;
-      if (ms > -WRONG_MS && ms < 3_600_000) return { ms: Math.max(0, ms), since: "taken" };
+      if (ms > -WRONG_MS && ms < 3_600_000) return { ms: Math.max(ms, this.sinceDrawn), since: "taken" };
     }
     return { ms: this.sinceDrawn, since: "arrived" };
   }

@@ -59,16 +59,19 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
         type="button"
         data-test="full-screen"
         hidden=${!document.documentElement.requestFullscreen}
-        onClick=${goFull}
+        onClick=${toggleFull}
       >
-        <${Icon} name="full" />Full screen
+        <${Icon} name=${document.fullscreenElement ? "small" : "full"} />${document.fullscreenElement
+          ? "Leave full screen"
+          : "Full screen"}
       </button>
       ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
     </div>`}
   </section>`;
 }
 
-const goFull = () => document.documentElement.requestFullscreen().catch(() => {});
+const toggleFull = () =>
+  (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()).catch(() => {});
 
 /** Why there is no live picture; "" there is. */
 function useCover(control, source) {
@@ -80,6 +83,7 @@ function useCover(control, source) {
   const old = video.info ? ` · this picture is ${span(video.age().ms)} old` : "";
   if (!connection.isOpen) return `No connection to the server${old}`;
   if (video.info && !video.isStale) return "";
+  if (video.info && !video.hasStopped) return `The pictures come late${old}`;
   if (online === false) return `${nameOf(source)} is silent${old}`;
   if (view?.state === "refused") return `No picture: ${view.why || "the robot refuses"}`;
   if (video.info) return `The picture has stopped${old}`;
