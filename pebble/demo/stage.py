@@ -145,6 +145,12 @@ class Stage:
             return bool(changes) and _runs(changes, -1)
         return any(_runs(changes, index) and _until(changes, index) > since_ns for index in range(len(changes)))
 
+    def turned_s(self, name: str, since_ns: int) -> float:
+        """How long its motors have run since then, in seconds."""
+        changes = self.motors(name)
+        runs = [(max(since_ns, changes[index][0]), _until(changes, index)) for index in _running(changes)]
+        return sum(max(0, end - begin) for begin, end in runs) / 1e9
+
     def last_motion_ns(self, name: str) -> int:
         """When its motors were last switched off; now if they run, 0 if they have never run."""
         changes = self.motors(name)
@@ -160,6 +166,10 @@ def _kill(program: Program) -> None:
     os.kill(program.pid, signal.SIGKILL)
     while not program.ended:
         time.sleep(_POLL_S)
+
+
+def _running(changes: Changes) -> list[int]:
+    return [index for index in range(len(changes)) if _runs(changes, index)]
 
 
 def _runs(changes: Changes, index: int) -> bool:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
-from playwright.sync_api import Browser, Locator
+from playwright.sync_api import Browser, Error, Locator
 
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.web.browser import Size, Tab, Theme, tab
@@ -90,18 +90,24 @@ class Console:
     def take(self) -> None:
         """Take control; there may be a stop to be reset, or a picture to wait for. Ends with nothing held."""
         self.let_go()
-        assert self.because("", "free", "stopped", "lease"), self.reason
-        if self.reason == "stopped":
-            self.reset()
-            assert self.because("", "free", "lease"), self.reason
-        if self.reason == "free":
-            self.test("take").click()
-        if self.reason == "lease":
-            self.test("take-over").hover()
-            self.page.mouse.down()
-            self.because("", within=6)
-            self.page.mouse.up()
-        assert self.because(""), self.reason
+        end = time.monotonic() + 2 * _READY_S
+        while not self.because("", within=0.2):
+            assert time.monotonic() < end, self.reason
+            with suppress(Error):  # the reason has changed meanwhile, and with it the button
+                self._improve(self.reason)
+
+    def _improve(self, reason: str) -> None:
+        """Do what the page offers against this reason."""
+        match reason:
+            case "stopped":
+                self.reset()
+            case "free" | "idle":
+                self.test("take").click(timeout=500)
+            case "lease":
+                self.test("take-over").hover(timeout=500)
+                self.page.mouse.down()
+                self.because("", "free", "idle", within=1.5)
+                self.page.mouse.up()
 
     def hold_button(self, name: str, seconds: float = 1.15) -> None:
         """Press it with the mouse for so long."""

@@ -113,6 +113,7 @@ def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Wire) -> None:
     assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
     assert at_lamp.rests()
     at_lamp.fingers.up(2)
+    assert at_lamp.because("stopped", within=3)
     at_lamp.reset()
     assert at_lamp.tab.until(lambda: not wire.latched("minilamp"), 3)
     left, top, size = at_lamp.place("stick")
@@ -151,6 +152,7 @@ def test_a_part_of_the_page_that_is_opened_takes_the_stick_away(at_lamp: Phone) 
     assert at_lamp.rests()
     assert at_lamp.test("stop-one").is_visible()
     at_lamp.fingers.lift()
+    at_lamp.page.wait_for_timeout(300)  # nobody taps anew at once
     at_lamp.test("tab-drive").tap()
     assert at_lamp.drive_by_stick()
 
