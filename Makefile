@@ -35,7 +35,7 @@ test: check
 	@echo "pebble: tests"
 	@$(TESTS) --numprocesses 4 -m "not alone and not page$(LESS)" tests/web tests/services tests/commands tests
 	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
-	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" tests/test_demo.py tests/services tests/robot/test_faults.py tests/robot tests/web
+	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" tests/test_demo.py tests/services tests/robot/test_faults.py tests
 
 thorough:
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test

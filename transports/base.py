@@ -68,7 +68,7 @@ class Outgoing:
 
     waiting: int = 0  # bytes that the other machine has not confirmed, including some overhead of the protocols
     round_trip_s: float = 0.0  # the shortest of this connection: what has waited for less is merely travelling
-    unanswered_s: float = 0.0  # how long the oldest DELIVERED message has waited for its acknowledgement
+    stalled_s: float = 0.0  # how long DELIVERED messages wait and none was acknowledged, beyond two usual round trips
 
 
 Handler = Callable[[Message], None]

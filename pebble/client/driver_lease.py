@@ -17,6 +17,7 @@ EVERY_S = 1.0
 VALID_S = 3.0  # so long an announcement counts
 LISTEN_S = 1.5  # before it is known that there is no other driver
 IDLE_S = 60.0  # without a gesture a lease ends
+ANSWER_S = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
 FILTER = DRIVING.filter(f"+/{SERVERS}/+")
 
 _MAX_SERVERS = 100  # whose announcements are remembered

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pebble.client.connection import Target, connected, target_of
-from pebble.client.driver_lease import DriverLease
+from pebble.client.driver_lease import ANSWER_S, DriverLease
 from pebble.client.key_decoder import END, KeyDecoder
 from pebble.client.key_gesture import PERIOD_S, KeyGesture
 from pebble.client.terminal_driver import TerminalDriver
@@ -156,9 +156,11 @@ class _Loop:
             self._driver.receive(*self._arrived.popleft())
         outgoing = self._transport.outgoing
         self._in_flight.acknowledge(outgoing.waiting)
-        late_s = max(self._in_flight.age_s(now), outgoing.unanswered_s - outgoing.round_trip_s)
+        late_s = self._in_flight.age_s(now)
         if problem := self._problem():
             self._in_flight.clear()
+        elif outgoing.stalled_s > ANSWER_S:
+            problem = "it does not answer"
         self._publish(self._driver.tick(now, time.time(), problem=problem, late_s=late_s), now)
 
     def _publish(self, messages: list[Message], now: float) -> None:

@@ -7,11 +7,10 @@ import secrets
 import time
 from collections.abc import Callable
 
+from pebble.client.driver_lease import ANSWER_S
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 
 Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
-
-ANSWER_S = 0.25  # a broker that takes longer would deliver commands late, all at once
 
 
 class Broker:
@@ -36,13 +35,7 @@ class Broker:
         """Why nothing should be sent to it now, in one line; empty if all is well."""
         if not self.connected:
             return self.transport.problem or "not connected yet"
-        return "it does not answer" if self._late else ""
-
-    @property
-    def _late(self) -> bool:
-        """Whether it has not acknowledged what was published a while ago; it may be suspended."""
-        outgoing = self.transport.outgoing
-        return outgoing.unanswered_s > ANSWER_S + outgoing.round_trip_s
+        return "it does not answer" if self.transport.outgoing.stalled_s > ANSWER_S else ""
 
     async def open(self) -> None:
         """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""

@@ -17,7 +17,7 @@ WINDOW: Final = 2  # frames sent and not acknowledged
 SLOW_ACK_S, FAST_ACK_S = 0.15, 0.12
 #: More frames may be under way if they are small: they delay nothing, and a distant page would get too few of them.
 SMALL_WINDOW, SMALL_BYTES = 8, 4096
-#: A connection is thin if two frames in a row take longer: while one is under way, commands and echoes wait behind it.
+#: A connection is thin, or far away, if two frames one after the other take longer: commands and echoes wait meanwhile.
 THIN_ACK_S, THIN_FRAMES = 0.4, 2
 MAX_FRAMES: Final = 4
 SLOW_FRAMES: Final = 1  # JPEG encodings on a slow connection: the next key frame is near, and shows what is newer
@@ -50,7 +50,8 @@ class MediaQueue:
         self.skipped = 0
         self.window = WINDOW
         self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
-        self.late_acks = 0  # in a row
+        self.late_acks = 0  # in a row; of frames that were under way together one counts
+        self._late_at = float("-inf")  # the newest of them
         self._queue: deque[Frame] = deque()
         self._under_way: dict[int, tuple[float, Frame]] = {}
 
@@ -82,12 +83,23 @@ class MediaQueue:
         sent_at, frame = self._under_way.pop(seq, (0.0, None))
         if frame is not None:
             self.ack_s = now - sent_at
-            self.late_acks = self.late_acks + 1 if self.ack_s > THIN_ACK_S else 0
+            self._note_lateness(sent_at, now)
             if self.ack_s > SLOW_ACK_S:
                 self.window = 1
             elif self.ack_s < FAST_ACK_S:
                 self.window = WINDOW
         return frame
+
+    def _note_lateness(self, sent_at: float, now: float) -> None:
+        if self.ack_s <= THIN_ACK_S:
+            self.late_acks = 0
+        elif sent_at >= self._late_at:
+            self.late_acks += 1
+            self._late_at = now
+
+    def forget_lateness(self, now: float) -> None:
+        """Frames that are under way say nothing of those that follow."""
+        self.late_acks, self._late_at = 0, now
 
     def wait_for_keyframe(self, skipped: int = 0) -> None:
         """Skip everything before the next key frame."""
@@ -134,7 +146,7 @@ class ViewerQueue(MediaQueue):
         super().__init__()
         self.can = can
         self.rescued = False
-        self.thin = False  # in the rescue stream it gets small pictures
+        self.small = False  # in the rescue stream it gets small pictures
         self.new = True  # it has received no picture, and no key frame was requested for it
         self._undecodable: set[str] = set()
         self._waiting_since = self._direct_since = now
@@ -150,9 +162,8 @@ class ViewerQueue(MediaQueue):
 
     def offer_direct(self, frame: Frame, now: float) -> None:
         """Offer one of the robot's own pictures; a page in the rescue stream returns at a key frame."""
-        if self.rescued and frame.keyframe and now >= self._retry_at and self.decodes(frame.encoding):
-            self.rescued = False
-            self._direct_since = now
+        if self.rescued and frame.keyframe and now >= self._retry_at:
+            self._retry(frame, now)
         if self.rescued:
             return
         was_waiting = self.waiting
@@ -161,6 +172,13 @@ class ViewerQueue(MediaQueue):
             self.new = False
         elif not was_waiting:
             self._waiting_since = now
+
+    def _retry(self, frame: Frame, now: float) -> None:
+        if self.decodes(frame.encoding):
+            self.rescued = False
+            self._direct_since = now
+            self.forget_lateness(now)
+        self.small = False
 
     def offer_rescue(self, frame: Frame) -> None:
         """Offer a picture of the rescue stream: only the newest counts."""
@@ -187,15 +205,15 @@ class ViewerQueue(MediaQueue):
 
     def rescue(self, now: float) -> None:
         """Change to the rescue stream: because the page is slow, for a while; else until the next key frame."""
-        self.thin = self.is_thin
-        if self.overflowed or self.thin:
+        self.small = self.is_thin
+        if self.overflowed or self.small:
             self._retry_s = _FIRST_RETRY_S if now - self._direct_since > _RECOVERED_S else self._retry_s
             self._retry_at = now + self._retry_s
             self._retry_s = min(_LAST_RETRY_S, 2 * self._retry_s)
         self.rescued = True
         self.wait_for_keyframe()
         self.overflowed = False
-        self.late_acks = 0
+        self.forget_lateness(now)
 
     def waiting_s(self, now: float) -> float:
         """How long it has waited for a key frame of the robot's own pictures."""
@@ -213,8 +231,7 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
     new; a slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
     """
     for viewer in viewers if can_rescue else ():
-        viewer.thin = viewer.thin or viewer.is_thin  # also in the rescue stream
-        if not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):
+        if viewer.is_thin or not (viewer.rescued or viewer.decodes(encoding)):
             viewer.rescue(now)
     direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
     patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S

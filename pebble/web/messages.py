@@ -30,7 +30,6 @@ class Hello(_FromPage, frozen=True, kw_only=True, tag="hello"):
     version: Short  # of the page; another one than the server's may not drive
     device: Short = ""  # what others see beside the user's name: "phone"
     token: Short = ""
-    can: Annotated[tuple[Short, ...], Meta(max_length=16)] = ()  # encodings of pictures it decodes
 
 
 class Echo(_FromPage, frozen=True, kw_only=True, tag="echo"):

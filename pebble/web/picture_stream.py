@@ -19,7 +19,7 @@ from pebble.web.media_queue import NO_FRAME, Frame, ViewerQueue, assess
 from pebble.web.messages import PictureView
 from pebble.web.picture_header import PictureHeader, follows, read_header
 from pebble.web.picture_source import MAX_PAYLOAD, PictureSource, offered, refusal
-from pebble.web.rescue import FULL, THIN, Form, RescuedPicture, RescueStream
+from pebble.web.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
 from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
@@ -178,7 +178,7 @@ class PictureStream:
         data = _RESCUE_HEAD.pack(seq, 1, picture.captured_ms) + picture.jpeg
         frame = Frame(seq, data, "jpeg", keyframe=True)
         for viewer in self.viewers:
-            if viewer.queue.thin is (form is THIN):
+            if viewer.queue.small is (form is SMALL):
                 viewer.queue.offer_rescue(frame)
                 viewer.wakeup.set()
 
@@ -244,10 +244,11 @@ class PictureStream:
         can_rescue = not changing and not rescue.unavailable(self._encoding)
         queues = [viewer.queue for viewer in self.viewers]
         wanted = assess(queues, self._encoding, now, can_rescue=can_rescue)
-        thin = {queue.thin for queue in queues if queue.rescued}
-        if can_rescue and thin:
-            self._rescue.forms = [THIN if one else FULL for one in thin]
+        small = {queue.small for queue in queues if queue.rescued}
+        if can_rescue and small:
+            self._rescue.forms = [SMALL if one else FULL for one in small]
             self._rescue.start(self._chain)
+            wanted = wanted or not self._chain  # it begins at a key frame, too
         else:
             self._rescue.stop()
         if wanted and not changing:

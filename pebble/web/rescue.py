@@ -24,11 +24,11 @@ class Form(NamedTuple):
     """What the pictures are like."""
 
     quality: int
-    width: int  # pixels, at most
+    width: int | None = None  # pixels, at most; None: as they come
 
 
-FULL: Final = Form(60, 1920)
-THIN: Final = Form(40, 320)
+FULL: Final = Form(60)
+SMALL: Final = Form(40, 320)
 
 
 class RescuedPicture(NamedTuple):
@@ -119,7 +119,7 @@ def _encode(decoded: Decoded, form: Form) -> RescuedPicture:
 
     picture: Any = decoded.picture
     height, width = picture.shape[:2]
-    if width > form.width:
+    if form.width is not None and width > form.width:
         size = (form.width, max(1, height * form.width // width))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, form.quality])[1]

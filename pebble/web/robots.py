@@ -234,17 +234,21 @@ class Robots:
 
         What is merely older than before is sent of a third of the components: no page has to draw all of them at once.
         """
-        turns = 1 + len(self.components) // 3
+        older: list[Component] = []
         for component in self.components.values():
-            online = component.online(now)
-            due = now - component.refreshed_at >= _REFRESH_S and (component.live or component.sent_online is not None)
-            new = online is not component.sent_online or component.refreshed_at == float("-inf")
-            turns -= due and not new
-            if new or (due and turns >= 0):
-                component.sent_online, component.refreshed_at = online, now
-                self.set_server_metric(component.ref, "web/liveness", component.view(now))
-                if ONLINE.metric in component.values:
-                    self._mark(component.ref, ONLINE.metric)
+            if component.online(now) is not component.sent_online or component.refreshed_at == float("-inf"):
+                self._refresh(component, now)
+            elif now - component.refreshed_at >= _REFRESH_S and (component.live or component.sent_online is not None):
+                older.append(component)
+        older.sort(key=lambda one: one.refreshed_at)
+        for component in older[: 1 + len(self.components) // 3]:
+            self._refresh(component, now)
+
+    def _refresh(self, component: Component, now: float) -> None:
+        component.sent_online, component.refreshed_at = component.online(now), now
+        self.set_server_metric(component.ref, "web/liveness", component.view(now))
+        if ONLINE.metric in component.values:
+            self._mark(component.ref, ONLINE.metric)
 
     def _add(self, ref: str, *, retained: bool) -> Component | None:
         if len(self.components) >= MAX_COMPONENTS and (retained or not self._make_room()):

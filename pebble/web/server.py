@@ -122,8 +122,9 @@ class Server:
         self.publish(self.driving.announced(address.identity.id, robots, clock()))
 
     def _show_broker(self) -> None:
-        problem = self.broker.problem
-        view = m.BrokerView(connected=not problem, problem=problem, robots_omitted=self.robots.omitted)
+        view = m.BrokerView(
+            connected=self.broker.connected, problem=self.broker.problem, robots_omitted=self.robots.omitted
+        )
         self.robots.set_server_metric("", "web/broker", view)
 
     # -- to the broker

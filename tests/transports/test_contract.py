@@ -853,7 +853,7 @@ def test_T20_nothing_is_on_its_way_once_everything_has_arrived(net: Net, base: s
         assert client.outgoing.waiting >= 0
     assert until(lambda: len(received.messages) == 50)
     assert until(lambda: client.outgoing.waiting == 0)
-    assert until(lambda: client.outgoing.unanswered_s == 0)
+    assert until(lambda: client.outgoing.stalled_s == 0)
     assert 0 <= client.outgoing.round_trip_s < 5
     client.close()
     assert client.outgoing.waiting == 0

@@ -67,26 +67,29 @@ def test_an_acknowledgement_proves_the_message_it_names() -> None:
     send(in_flight, retained("a"), 2)
     newer = send(in_flight, retained("a", b"2"), 3)
     assert in_flight.unacked == 3
-    assert in_flight.acknowledge(2)
+    assert in_flight.acknowledge(2, 0.0)
     assert in_flight.unconfirmed_retained() == [newer]
-    assert in_flight.acknowledge(3)
+    assert in_flight.acknowledge(3, 0.0)
     assert in_flight.unconfirmed_retained() == []
-    assert not in_flight.acknowledge(3)
+    assert not in_flight.acknowledge(3, 0.0)
     assert in_flight.unacked == 1
 
 
-def test_the_oldest_message_without_an_acknowledgement_counts() -> None:
+def test_messages_wait_since_the_newest_acknowledgement() -> None:
     in_flight = InFlightTable()
-    assert in_flight.unanswered_since is None
+    assert in_flight.waiting_since is None
     send(in_flight, Message("stream", b"", QoS.LATEST), 1, 1.0)
-    assert in_flight.unanswered_since is None
-    send(in_flight, Message("event", b"", QoS.DELIVERED), 2, 2.0)
-    send(in_flight, Message("event", b"", QoS.DELIVERED), 3, 3.0)
-    assert in_flight.unanswered_since == 2.0
-    in_flight.acknowledge(2)
-    assert in_flight.unanswered_since == 3.0
-    in_flight.acknowledge(3)
-    assert in_flight.unanswered_since is None
+    assert in_flight.waiting_since is None
+    for mid, at in ((2, 2.0), (3, 2.1), (4, 2.2)):
+        send(in_flight, Message("event", b"", QoS.DELIVERED), mid, at)
+    assert in_flight.waiting_since == 2.0
+    in_flight.acknowledge(3, 2.5)
+    assert in_flight.waiting_since == 2.5, "the other one is lost; nothing stands still"
+    in_flight.acknowledge(2, 2.6)
+    in_flight.acknowledge(4, 2.7)
+    assert in_flight.waiting_since is None
+    send(in_flight, Message("event", b"", QoS.DELIVERED), 5, 9.0)
+    assert in_flight.waiting_since == 9.0
 
 
 def test_an_answered_ping_proves_what_was_sent_before_it() -> None:

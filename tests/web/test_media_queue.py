@@ -259,7 +259,7 @@ def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream(encod
         now += THIN_ACK_S + 0.1
         viewer.acknowledge(seq, now)
     assert not assess([viewer], encoding, now, can_rescue=True)
-    assert (viewer.rescued, viewer.thin) == (True, True)
+    assert (viewer.rescued, viewer.small) == (True, True)
     viewer.offer_direct(frame(2, keyframe=True, encoding=encoding), now + 9)
     assert viewer.rescued
     viewer.offer_direct(frame(3, keyframe=True, encoding=encoding), now + 11)
@@ -276,16 +276,31 @@ def test_one_late_acknowledgement_is_no_thin_connection() -> None:
     assert not viewer.rescued
 
 
+def test_frames_that_were_under_way_together_are_late_once() -> None:
+    viewer = ViewerQueue(ALL, 0.0)
+    for seq in range(2):
+        viewer.offer_direct(frame(seq, keyframe=seq == 0), 0.0)
+        assert viewer.take(0.0)
+    for seq in range(2):
+        viewer.acknowledge(seq, 2.0 + seq / 10)
+    assert not assess([viewer], "pbvz", 2.2, can_rescue=True)
+    assert not viewer.rescued
+
+
 def test_a_page_that_cannot_decode_gets_small_pictures_only_if_it_has_to() -> None:
     viewer = ViewerQueue(frozenset({"jpeg"}), 0.0)
     assess([viewer], "h264", 0.0, can_rescue=True)
-    assert (viewer.rescued, viewer.thin) == (True, False)
+    assert (viewer.rescued, viewer.small) == (True, False)
     for seq in range(2):
         viewer.offer_rescue(frame(seq, keyframe=True, encoding="jpeg"))
-        viewer.take(0.0)
-        viewer.acknowledge(seq, 1.0)
-    assess([viewer], "h264", 1.0, can_rescue=True)
-    assert (viewer.rescued, viewer.thin) == (True, True)
+        viewer.take(float(seq))
+        viewer.acknowledge(seq, seq + 1.0)
+    assess([viewer], "h264", 2.0, can_rescue=True)
+    assert (viewer.rescued, viewer.small) == (True, True)
+    viewer.offer_direct(frame(9, keyframe=True, encoding="h264"), 11.0)
+    assert (viewer.rescued, viewer.small) == (True, True)
+    viewer.offer_direct(frame(9, keyframe=True, encoding="h264"), 13.0)
+    assert (viewer.rescued, viewer.small) == (True, False)
 
 
 # -- the encoding

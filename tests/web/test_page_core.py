@@ -295,7 +295,7 @@ def test_the_first_reason_counts() -> None:
     assert texts["picture"] == "The picture is 2.4 s old"
     assert texts["late"] == "Commands are late (640 ms)"
     assert texts["release"] == "Let go first"
-    assert found[-2]["text"] == "Commands are late: let go first"
+    assert found[-2]["text"] == "Let go first. It was: Commands are late"
     actions = {one["code"]: one["action"]["kind"] for one in found if one is not None and "action" in one}
     expected = {"reload": "reload", "role": "login", "lease": "take-over", "free": "take", "picture": "see"}
     assert actions == expected

@@ -395,9 +395,11 @@ class Connection:
             if sock is None:
                 return Outgoing()
             waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
-            since = self._in_flight.unanswered_since
-            unanswered_s = 0.0 if since is None else time.monotonic() - since
-            return Outgoing(waiting, shortest_round_trip_s(sock), unanswered_s)
+            round_trip_s, since = shortest_round_trip_s(sock), self._in_flight.waiting_since
+            # TCP may end before the broker; and brokers without TCP_NODELAY send an answer after that to the one before
+            usual_s = 2 * max(round_trip_s, self._in_flight.round_trip_s)
+            stalled_s = 0.0 if since is None else max(0.0, time.monotonic() - since - usual_s)
+            return Outgoing(waiting, round_trip_s, stalled_s)
 
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages that the broker may not have received, oldest first."""
@@ -476,7 +478,9 @@ class Connection:
         self._in_flight.answer(mid)
 
     def _on_publish(self, _client: Any, _data: Any, mid: int, _reason: Any, _properties: Any) -> None:
-        if self._in_flight.acknowledge(mid):  # paho also reports QoS 0 messages, which are only written
+        if self._in_flight.acknowledge(
+            mid, time.monotonic()
+        ):  # paho also reports QoS 0 messages, which are only written
             self._note_answer()
 
     def _on_message(self, _client: Any, _data: Any, raw: paho.MQTTMessage) -> None:

@@ -128,6 +128,7 @@ class InFlightTable:
     def __init__(self) -> None:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
         self._unacked: dict[int, tuple[str | None, float]] = {}  # by message id: the topic, if retained; when sent
+        self._acked_at = float("-inf")  # the newest acknowledgement
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, PendingAck] = {}
         self._answered: list[PendingAck] = []  # not completed yet
@@ -142,9 +143,9 @@ class InFlightTable:
         return len(self._unacked)
 
     @property
-    def unanswered_since(self) -> float | None:
-        """When the oldest DELIVERED message that the broker has not acknowledged was sent."""
-        return next(iter(self._unacked.values()))[1] if self._unacked else None
+    def waiting_since(self) -> float | None:
+        """Since when DELIVERED messages wait and none was acknowledged; None if none waits."""
+        return max(next(iter(self._unacked.values()))[1], self._acked_at) if self._unacked else None
 
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages the broker may not have, oldest first."""
@@ -167,10 +168,11 @@ class InFlightTable:
             else:
                 entry.ping = self._ping_number + 1
 
-    def acknowledge(self, mid: int) -> bool:
+    def acknowledge(self, mid: int, now: float) -> bool:
         """Process a PUBACK; False if it belongs to no known message."""
         if mid not in self._unacked:
             return False
+        self._acked_at = now
         topic, _ = self._unacked.pop(mid)
         if topic is not None and topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]

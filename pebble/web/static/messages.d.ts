@@ -5,7 +5,6 @@ export interface Hello {
   version: string;
   device?: string;
   token?: string;
-  can?: string[];
 }
 
 export interface Echo {

@@ -76,8 +76,10 @@ class Human:
         """The same input in another position."""
         self.acted = now
         press = self.held[name]
-        if name == "pad":  # the page reads it a little later
-            self.ended.append(Press(name, press.axes, press.at, min(press.until, now + PAD_S), press.why))
+        if name == "pad" or self.blocked_from is not None:  # the page learns it a little later
+            before = Press(name, press.axes, press.at, press.until, press.why)
+            self._end(before, now + (PAD_S if name == "pad" else 0.0), "it was moved")
+            self.ended.append(before)
         press.axes = axes
 
     def let_go(self, name: str, now: float) -> None:

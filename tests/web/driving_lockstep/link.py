@@ -18,6 +18,7 @@ class Pipe:
         self._scheduler = scheduler
         self.delay = delay
         self.stalled = False
+        self.stalled_until = 0.0
         self._waiting: list[Callable[[], None]] = []
         self._last = 0.0
 
@@ -31,7 +32,13 @@ class Pipe:
     @property
     def wait(self) -> float:
         """How long a message that is sent now travels."""
-        return max(self._last - self._scheduler.now, self.delay)  # type: ignore[attr-defined]
+        now = self._scheduler.now  # type: ignore[attr-defined]
+        stalled_s = self.stalled_until - now if self.stalled else 0.0
+        return max(self._last - now, stalled_s + self.delay)
+
+    def stall(self, until: float) -> None:
+        self.stalled_until = min(self.stalled_until, until) if self.stalled else until
+        self.stalled = True
 
     def release(self) -> None:
         self.stalled = False
@@ -47,10 +54,11 @@ class Wire:
         self.up, self.down = Pipe(scheduler, 0.003), Pipe(scheduler, 0.003)
         self.changed = 0  # counts faults
 
-    def stall(self, *, up: bool = True, down: bool = True) -> None:
+    def stall(self, until: float, *, up: bool = True, down: bool = True) -> None:
+        """Whoever calls it releases it then."""
         self.changed += 1
-        self.up.stalled |= up
-        self.down.stalled |= down
+        for pipe in [self.up] * up + [self.down] * down:
+            pipe.stall(until)
 
     def release(self) -> None:
         self.up.release()

@@ -467,8 +467,9 @@ class World:
         self._block(slot)
         human.asleep = True
         wire, page, began, stands = self.wires[slot], human.page, self.now, b // 4 % 2 == 0
+        sleeps_s = (0.6, 1.1, 2.0, 5.0)[b % 4]
         self.pages.do(page, "asleep")
-        wire.stall()
+        wire.stall(self.now + sleeps_s)
 
         def wake() -> None:
             if human.page == page and human.asleep:
@@ -478,7 +479,7 @@ class World:
                 self._unblock(slot, page, _ORDERS[b // 8 % len(_ORDERS)])
 
         self.wake[slot] = wake
-        self.scheduler.after((0.6, 1.1, 2.0, 5.0)[b % 4], wake)
+        self.scheduler.after(sleeps_s, wake)
 
     def do_clock(self, a: int, b: int) -> None:
         """The wall clock of the computer is set."""
@@ -550,11 +551,11 @@ class World:
     def do_stall(self, a: int, b: int) -> None:
         slot = a % len(self.humans)
         wire = self.wires[slot]
-        wait = wire.up.wait
-        wire.stall(up=b % 3 != 1, down=b % 3 != 2)
+        wait, stalls_s = wire.up.wait, _STALLS_S[b // 3 % len(_STALLS_S)]
+        wire.stall(self.now + stalls_s, up=b % 3 != 1, down=b % 3 != 2)
         if wire.up.stalled:
             self.rules.page_stands_still(self.humans[slot].page, wait)
-        self.scheduler.after(_STALLS_S[b // 3 % len(_STALLS_S)], wire.release)
+        self.scheduler.after(stalls_s, wire.release)
 
     def do_break(self, a: int, b: int) -> None:
         """The connection breaks; both ends notice, or neither."""
@@ -565,8 +566,9 @@ class World:
         for link in [link for link in self.links.values() if link.page == page]:
             link.vanish() if b % 2 else link.reset(server_knows=b % 4 == 0)
         if b % 2:
-            wire.stall()
-            self.scheduler.after(_STALLS_S[b // 2 % len(_STALLS_S)], wire.release)
+            stalls_s = _STALLS_S[b // 2 % len(_STALLS_S)]
+            wire.stall(self.now + stalls_s)
+            self.scheduler.after(stalls_s, wire.release)
 
     def do_freeze(self, a: int, b: int) -> None:
         """SIGSTOP of the server."""

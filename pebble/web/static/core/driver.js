@@ -63,6 +63,7 @@ export class Driver {
     this.mine = false;
     this.inSight = false;
     this.latchedAt = -Infinity;
+    this.refusal = "";
     this.socket.send({ op: "watch", ref });
     this.changed();
   }
@@ -97,7 +98,7 @@ export class Driver {
     return {
       name: this.ref.split("/").pop() ?? "",
       open: this.socket.state === "open",
-      broker: broker && !broker.connected ? broker.problem : "",
+      broker: broker?.problem ?? "",
       reload: this.reload(),
       drives: this.socket.you?.drives !== false,
       rights: this.socket.you?.rights ?? [],

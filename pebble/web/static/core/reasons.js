@@ -1,7 +1,7 @@
 /** Why a control is off, in one line for people; the first reason counts. Pure. */
 
 export const PING_TIMEOUT_MS = 1500;
-const PICTURE_OLD_MS = 2000;
+export const PICTURE_OLD_MS = 2000;
 const IDLE_MS = 5500; // the server lets a driver be replaced after 5 s without a gesture
 export const SLOW_MS = 300; // from this round trip on, the speed is limited
 const LATE_MS = 600;
@@ -92,7 +92,7 @@ function momentReason(s) {
   if (s.roundTripMs >= LATE_MS) return reason("late", `Commands are late (${Math.round(s.roundTripMs)} ms)`);
   if (s.padFrozen) return reason("pad", "The gamepad stands still: move its stick to neutral and back");
   if (s.fromKeys && !s.focus) return reason("focus", "Click this page first: keys go to another window");
-  if (s.mustRelease) return reason("release", s.refusal && s.refusal !== LET_GO ? `${s.refusal}: let go first` : LET_GO);
+  if (s.mustRelease) return reason("release", s.refusal && s.refusal !== LET_GO ? `${LET_GO}. It was: ${s.refusal}` : LET_GO);
   return null;
 }
 

@@ -61,7 +61,7 @@ export function useMetrics(ref) {
 }
 
 /**
- * Draw again after each change of a model, or only after changes of what ``pick`` returns.
+ * Draw again after each change of a model, or only after changes of what ``pick``, which never changes, returns.
  * @template {{onChange: (fn: () => void) => () => void}} T @param {T} model @param {(model: T) => unknown} [pick] @returns {T}
  */
 export function useModel(model, pick) {
@@ -86,7 +86,8 @@ export function useTick(ms) {
 }
 
 /**
- * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before.
+ * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before. ``draw`` may
+ * use nothing but its argument.
  * @param {(ref: string) => any} draw @returns {(refs: string[]) => any[]}
  */
 export function useNodes(draw) {

@@ -82,7 +82,7 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
     }}
   >
     <span class="hold-fill" aria-hidden="true"></span><span class="hold-text"
-      >${tapped ? "Keep it pressed for 1 s" : children}</span
+      >${tapped && !held ? "Keep it pressed for 1 s" : children}</span
     >
   </button>`;
 }

@@ -149,8 +149,12 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
 }
 
 const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
-  <${Icon} name="settings" />Settings and who I am
-</button>`;
+    <${Icon} name="settings" />Settings and who I am
+  </button>
+  ${document.fullscreenElement &&
+  html`<button type="button" class="wide" onClick=${() => document.exitFullscreen()}>
+    <${Icon} name="small" />Leave full screen
+  </button>`}`;
 
 const wanted = (offers, view) => CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id));
 

@@ -1,9 +1,9 @@
 // The picture of one component: what was drawn last, and how old that is. The canvas outlives every layout.
 
+import { PICTURE_OLD_MS } from "../core/reasons.js";
 import { Model } from "./models.js";
 
 const STALE_MS = 500; // without a new picture, what is shown is no longer live
-const LATE_MS = 2000; // nobody drives by a picture that is older
 const WRONG_MS = 1000; // a clock that is so far off is not believed
 
 /** Owner of the canvas and of the connection for pictures. */
@@ -79,7 +79,7 @@ export class Video extends Model {
   }
 
   get isStale() {
-    return this.hasStopped || this.age().ms > LATE_MS;
+    return this.hasStopped || this.age().ms > PICTURE_OLD_MS;
   }
 
   /** How old the picture is in ms: since it was taken, or, if the component's clock is wrong, since it arrived. */
