@@ -84,6 +84,10 @@ def test_a_page_that_stood_still_ends_its_gesture() -> None:
     ]  # fmt: skip
 
 
+def test_a_zero_that_is_repeated_late_would_stop_another_driver() -> None:
+    assert gesture("step(0.5); step(0); sent.length = 0; step(0, { wait: 1000 });") == []
+
+
 def test_opposite_keys_are_no_release() -> None:
     assert gesture("gesture.interrupt(now); step(0, { neutral: false }); step(0.5); result = sent;") == []
 

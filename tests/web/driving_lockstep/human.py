@@ -91,10 +91,11 @@ class Human:
         self._end(press, now + late, "it was released")
         self.ended = [*(one for one in self.ended if one.until >= now - 5), press]
 
-    def interrupt(self, now: float, why: str) -> None:
-        """What is held moves nothing any more, until it was released."""
+    def interrupt(self, now: float, why: str, before: float = float("inf")) -> None:
+        """What is held, and was pressed before then, moves nothing any more, until it was released."""
         for press in (*self.held.values(), *self.ended):
-            self._end(press, now, why)
+            if press.at < before:
+                self._end(press, now, why)
 
     def _end(self, press: Press, at: float, why: str) -> None:
         """A page that stands still learns it when it goes on, if that is soon."""

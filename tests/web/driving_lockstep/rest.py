@@ -39,7 +39,7 @@ def _mend(world: World) -> None:
         if human.asleep:
             world.wake[slot]()
         wire.release()
-        travels_s = max(travels_s, wire.up.wait)
+        travels_s = max(travels_s, wire.up.wait, wire.down.wait)
         wire.delay(0.003, 0.003)
         if human.blocked_from is not None:
             world._unblock(slot, human.page, ("input", "network", "timers"))

@@ -200,7 +200,9 @@ class World:
             return
         human, message = self.humans[slot], json.loads(text)
         if message["cmd"] == "drive" and message["ref"] == BASE and human.gesture == (socket, message["g"]):
-            self._void(slot, f"the server has refused it: {message['why']}")
+            # what is pressed while the page stands still begins another gesture
+            before = float("inf") if human.blocked_from is None else human.blocked_from
+            human.interrupt(self.now, f"the server has refused it: {message['why']}", before)
             human.gesture = None
 
     def _void(self, slot: int, why: str) -> None:

@@ -94,8 +94,9 @@ export class Gesture {
 
   repeat(now) {
     if (this.active || !this.repeats.length || this.repeats[0] > now) return;
+    const late = now - this.repeats[0] > STALL_MS; // in the background: meanwhile another page may drive, and be stopped
     this.repeats = this.repeats.filter((at) => at > now);
-    this.command(ZERO, now, this.final);
+    if (!late) this.command(ZERO, now, this.final);
   }
 
   command(vector, now, final) {
