@@ -142,6 +142,24 @@ def test_the_stick_follows_the_mouse(at_benjr: Console, x: int, y: int, wheels: 
     assert at_benjr.stays_at_rest(0.1)
 
 
+def test_what_appears_above_the_stick_does_not_turn_the_robot(at_benjr: Console) -> None:
+    left, top, size = at_benjr.place("stick")
+    mouse = at_benjr.page.mouse
+
+    def drag() -> None:
+        mouse.move(left, top)
+        mouse.down()
+        mouse.move(left + 0.4 * size, top, steps=3)
+
+    assert at_benjr.persists(drag, lambda: at_benjr.wheels == RIGHT, mouse.up)
+    at_benjr.page.evaluate("document.querySelector('main').style.paddingTop = '150px'")
+    mouse.move(left + 0.4 * size + 1, top)
+    assert not at_benjr.tab.until(lambda: at_benjr.wheels != RIGHT, 0.3)
+    mouse.up()
+    assert at_benjr.rests()
+    at_benjr.page.evaluate("document.querySelector('main').style.paddingTop = ''")
+
+
 # -- stops
 
 

@@ -31,6 +31,15 @@ _REFUSALS = """() => {
   window.refusals = new Set();
   driver.refused = (message) => { window.refusals.add(message.why); before(message); };
 }"""
+_PAGE = """() => {
+  const { driver } = window.pebble;
+  const { gesture, inputs } = driver;
+  const [focus, element] = [document.hasFocus(), document.activeElement?.outerHTML.slice(0, 80)];
+  const { number, active, mustRelease } = gesture;
+  const held = [...inputs.keys.keys(), ...inputs.waiting.keys(), inputs.pointer];
+  const refusals = [...window.refusals];
+  return JSON.stringify({ reason: driver.reason(), number, active, mustRelease, held, focus, element, refusals });
+}"""
 _BUSY = "(ms) => { setTimeout(() => { const end = Date.now() + ms; while (Date.now() < end); }) }"
 
 
@@ -117,18 +126,16 @@ class World:
         self._log("a new press")
         one.page.evaluate(_REFUSALS)
         drives = one.drive()
-        refusals = one.page.evaluate("[...window.refusals].join('; ')")
+        page = "" if drives else one.page.evaluate(_PAGE)
+        lines = len([entry for entry in self.stage.lines(self.robot) if entry.ns > 1e9 * began])
         one.let_go()
         ended = time.monotonic()
         rests = one.rests()
         last = Press(1, "KeyW", (0, 1), began)
         last.end(ended, 1.0, "it was released")
         self._presses.append(last)
-        return [
-            text
-            for text, good in ((f"a new press does not drive: {refusals}", drives), ("it does not rest", rests))
-            if not good
-        ]
+        failed = f"a new press does not drive, the MCU received {lines} lines: {page}"
+        return [text for text, good in ((failed, drives), ("it does not rest", rests)) if not good]
 
     # -- what happens at tab 1
 

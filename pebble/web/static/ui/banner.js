@@ -43,7 +43,7 @@ function ServerBanner() {
       <button type="button" onClick=${() => location.reload()}>Reload</button>
     <//>`;
   }
-  if (broker?.problem) {
+  if (broker && !broker.connected) {
     return html`<${Banner} kind="bad" icon="✖">
       <p><b>The server cannot reach the broker:</b> ${broker.problem || "no reason is known"}</p>
     <//>`;

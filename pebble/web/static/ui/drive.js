@@ -22,8 +22,8 @@ export function WhyLine({ at }) {
   const view = useValue(at, "web/driver");
   const mine = useModel(connection).isOpen && view?.you === true;
   const reason = driver.reason();
-  // the banner says why
-  const why = reason?.code === "broker" ? "The server cannot reach the broker" : reason?.text;
+  const connected = useValue("", "web/broker")?.connected !== false; // else the banner says why
+  const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
   const keys = driver.typing ? " Keys go to the field you have chosen: click beside it." : "";
   const text = why ?? (mine ? `You are driving ${nameOf(at)}.${keys}` : "");
   useWakeLock(mine);

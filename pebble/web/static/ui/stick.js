@@ -6,6 +6,7 @@ const REACH = 0.36; // of the width: how far the knob travels
 
 export function Stick({ driver }) {
   const element = useRef(null);
+  const place = useRef(new DOMRect()); // where it was touched: what appears above it later must not turn the robot
   const [knob, setKnob] = useState({ x: 0, z: 0 });
   const [pointer, setPointer] = useState(null);
   const reason = driver.reason();
@@ -13,7 +14,7 @@ export function Stick({ driver }) {
   useEffect(() => () => driver.stickEnd(), []);
 
   const move = (event) => {
-    const box = element.current.getBoundingClientRect();
+    const box = place.current;
     let x = (event.clientX - box.left - box.width / 2) / (box.width * REACH);
     let z = -(event.clientY - box.top - box.height / 2) / (box.height * REACH);
     const length = Math.hypot(x, z);
@@ -28,6 +29,7 @@ export function Stick({ driver }) {
     if (driver.reason()) return pointAt("why-drive");
     if (event.button || !driver.stickStart(event.pointerId, event.timeStamp)) return undefined;
     element.current.setPointerCapture(event.pointerId);
+    place.current = element.current.getBoundingClientRect();
     setPointer(event.pointerId);
     return move(event);
   };
