@@ -33,7 +33,7 @@ LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
-	@$(TESTS) --numprocesses 4 -m "not alone and not page$(LESS)" tests/web tests/services tests/commands tests
+	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" tests/web tests/services tests/commands tests
 	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
 	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" tests/test_demo.py tests/services tests/robot/test_faults.py tests
 
