@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean
+.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -35,7 +35,9 @@ test: check
 	@echo "pebble: tests"
 	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" tests/web tests/services tests/commands tests
 	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
-	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" tests/test_demo.py tests/services tests/robot/test_faults.py tests
+	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" --ignore=tests/test_demo.py tests/services tests/robot/test_faults.py tests
+	@echo "pebble: the demo, whose robots need all processors"
+	@$(VENV) tools/run_tests.py tests/test_demo.py
 
 thorough:
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
@@ -80,16 +82,22 @@ report: .venv/.ready-bench
 	@$(VENV) -m pebble.cli bench report $(if $(QUICK),--quick build/report-quick,docs/results)
 
 check: .venv/.ready-dev
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync check-types check-names
+
+check-types:
+	@echo "pebble: types"
+	@$(VENV) -m mypy
+
+check-names:
 	@echo "pebble: lint"
 	@$(VENV) -m ruff check
 	@$(VENV) -m ruff format --check
-	@echo "pebble: types"
-	@$(VENV) -m mypy
-	@$(VENV) -m tests.firmware.types
 	@echo "pebble: imports"
 	@.venv/bin/lint-imports --no-logo
 	@echo "pebble: retired identifiers"
 	@$(VENV) tools/retired_names.py
+	@echo "pebble: types of the firmware"
+	@$(VENV) -m tests.firmware.types
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
