@@ -95,9 +95,7 @@ def _drives(world: World, slot: int) -> None:
         world.show(slot, visible=True)  # the human has to be at the page
         world.focus(slot, focused=True)
         state = world.ask(slot)
-        if state["ended"]:  # the logout was still under way
-            world._leave(slot, vanish=False)
-            world.load(slot, "")
+        if state["ended"] or state["reason"] == "role":  # the logout was still under way
             _connected(world, slot)
             _let_go_of_all(world, slot)
             end, pressed = world.now + DRIVES_WITHIN_S, False
