@@ -11,6 +11,7 @@ DRIVES_WITHIN_S = 3.0
 CONNECTS_WITHIN_S = 14.5  # an attempt may take 8 s, and the next one comes after 5 s
 _SLEEP_S = 0.6  # no computer sleeps for a shorter time
 _LOOK_S = 0.05
+_HEARTBEAT_S = 1.0
 _HELD_S = 0.3
 _STILL_S = 0.6
 
@@ -58,6 +59,7 @@ def _mend(world: World) -> None:
         world.scheduler.run(0.1)
         if world._reachable() and world._other is None and not world.rules.stopping():
             break
+    world.scheduler.run(_HEARTBEAT_S)  # one that was lost is no silence any more
     world.rules.faults += 1
 
 
