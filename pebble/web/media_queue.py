@@ -231,7 +231,7 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
     new; a slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
     """
     for viewer in viewers if can_rescue else ():
-        if viewer.is_thin or not (viewer.rescued or viewer.decodes(encoding)):
+        if (viewer.is_thin and not viewer.small) or not (viewer.rescued or viewer.decodes(encoding)):
             viewer.rescue(now)
     direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
     patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S

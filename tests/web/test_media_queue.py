@@ -276,6 +276,26 @@ def test_one_late_acknowledgement_is_no_thin_connection() -> None:
     assert not viewer.rescued
 
 
+def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> None:
+    viewer, now = ViewerQueue(ALL, 0.0), 0.0
+    for seq in range(2):
+        viewer.offer_direct(frame(seq, keyframe=True), now)
+        viewer.take(now)
+        now += 0.5
+        viewer.acknowledge(seq, now)
+    assess([viewer], "pbvz", now, can_rescue=True)
+    assert viewer.small
+    rescued_at = now
+    for seq in range(2, 18):
+        viewer.offer_rescue(frame(seq, keyframe=True, encoding="jpeg"))
+        viewer.take(now)
+        now += 0.5
+        viewer.acknowledge(seq, now)
+        assess([viewer], "pbvz", now, can_rescue=True)
+    viewer.offer_direct(frame(18, keyframe=True), rescued_at + 10)
+    assert (viewer.rescued, viewer.small) == (False, False)
+
+
 def test_frames_that_were_under_way_together_are_late_once() -> None:
     viewer = ViewerQueue(ALL, 0.0)
     for seq in range(2):
