@@ -11,7 +11,7 @@ help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make test             all checks and tests, a quarter of an hour"
-	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest; half an hour"
+	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
