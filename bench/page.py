@@ -82,6 +82,11 @@ def _goob() -> AbstractContextManager[Rig]:
     return rig(cases.ROBOT)
 
 
+def _goob_alone() -> AbstractContextManager[Rig]:
+    """Its pictures are as old as they look: those of the demo's room are up to 20 ms old when they are drawn."""
+    return rig(cases.ROBOT, room=False)
+
+
 _STOP, _GONE, _SERVER = Goal(15, 60), Goal(None, 300), Goal(None, 450)
 _PICTURES = {"json": "17 / 24", "pbvd": "14 / 18", "pbvz": "17 / 22", "h264": "13 / 20"}
 _V, _R = f"{cases.VIEWERS} viewers", f"{cases.ROBOTS_SHOWN} robots"
@@ -114,7 +119,7 @@ CASES = (
             Row(f"{encoding} to drawn", "ms", Goal(25, 50), prototype),
             Row(f"{encoding} lost", "%", Goal(0, 0), "0"),
         )
-    ), _goob),
+    ), _goob_alone),
     Case("loading", cases.loading, (
         Row("first robot", "ms", Goal(None, 1000), "400-700"),
         Row("first picture", "ms", Goal(None, 3000), "1700-2500"),

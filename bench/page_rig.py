@@ -1,25 +1,28 @@
-"""A stage, a browser and a subscriber at the broker: what all measurements of the operator page need.
+"""A stage, a browser and subscribers at the broker: what all measurements of the operator page need.
 
-Times are seconds of time.monotonic(), also those that the page stamps.
+Times are seconds of time.monotonic(), also those that the page stamps. The subscribers are mosquitto's own: one in this
+process would wait for its other threads at the very moment that counts.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from pebble.bench.chromium import chromium
-from pebble.bench.tcp import send_at_once
 from pebble.contract import CAMERA, DRIVE
+from pebble.contract.channels import Channel
 from pebble.demo.stage import Stage
 from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
-    from paho.mqtt.client import Client
     from playwright.sync_api import Page
 
 AT_REST_S = 0.2  # motors that are off for so long have stopped
@@ -176,14 +179,21 @@ class Rig:
         page.goto(url, wait_until="domcontentloaded")
         return page
 
-    # -- a thread of paho
+    # -- threads that read what was received
 
-    def receive(self, topic: str, payload: bytes | bytearray) -> None:
-        now = time.monotonic()
-        if topic.endswith(f"/{DRIVE.suffix}"):
-            self.drives.append((now, topic.removesuffix(f"/{DRIVE.suffix}"), json.loads(payload)))
-        else:
-            self.frames.append((now, topic.removesuffix(f"/{CAMERA.suffix}"), len(payload)))
+    def receive_drives(self, lines: IO[bytes]) -> None:
+        for at, topic, payload in _received(lines):
+            self.drives.append((at, topic.removesuffix(f"/{DRIVE.suffix}"), json.loads(payload)))
+
+    def receive_frames(self, lines: IO[bytes]) -> None:
+        for at, topic, size in _received(lines):
+            self.frames.append((at, topic.removesuffix(f"/{CAMERA.suffix}"), int(size)))
+
+
+def _received(lines: IO[bytes]) -> Iterator[tuple[float, str, bytes]]:
+    for line in lines:
+        at, topic, rest = line.split(b" ", 2)
+        yield monotonic(1000 * float(at)), topic.decode(), rest
 
 
 def _moves(axes: dict[str, Any]) -> bool:
@@ -208,18 +218,22 @@ def rig(*names: str, program: str | None = None, flags: tuple[str, ...] = (), **
             return context.new_page()
 
         made = Rig(stage, open_page)
-        stack.callback(_subscribe(stage.broker_port, made).disconnect)
+        stack.enter_context(_subscribed(stage.broker_port, DRIVE, "%U %t %p", made.receive_drives))
+        stack.enter_context(_subscribed(stage.broker_port, CAMERA, "%U %t %l", made.receive_frames))
         yield made
 
 
-def _subscribe(port: int, made: Rig) -> Client:
-    from paho.mqtt.client import Client
-    from paho.mqtt.enums import CallbackAPIVersion
-
-    client = Client(CallbackAPIVersion.VERSION2)
-    client.on_socket_open = send_at_once
-    client.on_message = lambda _client, _data, message: made.receive(message.topic, message.payload)
-    client.connect("127.0.0.1", port)
-    client.subscribe([(DRIVE.filter("+/+/+"), 0), (CAMERA.filter("+/+/+"), 0)])
-    client.loop_start()
-    return client
+@contextmanager
+def _subscribed(port: int, channel: Channel, line: str, receive: Callable[[IO[bytes]], None]) -> Iterator[None]:
+    """``receive`` reads a line for each message, on a thread; ``line`` is mosquitto_sub's format."""
+    program = shutil.which("mosquitto_sub")
+    if program is None:
+        raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
+    command = [program, "-h", "127.0.0.1", "-p", str(port), "-t", channel.filter("+/+/+"), "-F", line]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as subscriber:
+        assert subscriber.stdout is not None  # noqa: S101
+        threading.Thread(target=receive, args=(subscriber.stdout,), name="subscriber", daemon=True).start()
+        try:
+            yield
+        finally:
+            subscriber.kill()

@@ -147,7 +147,8 @@ def page(
     """The operator page in a browser: what a driver feels, and what its server costs.
 
     From a key to the motors of a simulated robot, from whatever interrupts a driver to their stop, from the camera to
-    the screen; many viewers, many robots, slow links. Needs mosquitto, chromium, the extra dev, and root for the links.
+    the screen; many viewers, many robots, slow links. Needs mosquitto and its clients, chromium, the extra dev, and
+    root for the links.
 
     \b
         pebble bench page

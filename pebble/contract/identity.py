@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from enum import StrEnum
+from functools import lru_cache
 
 from msgspec import Struct
 
@@ -17,6 +18,8 @@ LEVEL_RULE = "a topic level: 1 to 64 characters, without / + # $ and control cha
 
 #: The type of operators' servers, which publish below their own identity but are no robots.
 SERVERS = "servers"
+
+_REMEMBERED, _REMEMBERED_LENGTH = 1024, 256  # topics, and characters of each: a megabyte at most
 
 _valid_level = re.compile(LEVEL).search
 
@@ -83,9 +86,16 @@ class ParsedTopic(Struct, frozen=True):
 
 def parse_topic(topic: str) -> ParsedTopic | None:
     """Parse ``topic``; None for topics that are not of the form ``{system}/{type}/{id}/{direction}/{metric}``."""
+    return _remembered(topic) if len(topic) <= _REMEMBERED_LENGTH else _parse(topic)
+
+
+def _parse(topic: str) -> ParsedTopic | None:
     levels = topic.split("/", 4)
     if len(levels) < 5 or levels[3] not in tuple(Direction) or not levels[4]:
         return None
     if not all(_valid_level(level) for level in levels[:3]):
         return None
     return ParsedTopic(Identity(*levels[:3]), Direction(levels[3]), levels[4])
+
+
+_remembered = lru_cache(_REMEMBERED)(_parse)

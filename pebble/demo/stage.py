@@ -28,14 +28,15 @@ class Stage:
     """The demo's brokers and the named robots (none: all four), and the page's server as a process of its own.
 
     ``robots``, by name, are traced: ``entries()`` is what each MCU received and did, with time.monotonic_ns().
+    ``room``: Goob sees the demo's room, in pictures as old as the room's state; else a scene that is drawn when due.
     ``settings`` are fields of WebSettings. A context manager, for the main thread. Raises PebbleError.
     """
 
-    def __init__(self, *names: str, **settings: Any) -> None:
+    def __init__(self, *names: str, room: bool = True, **settings: Any) -> None:
         self.robots: dict[str, SimulatedRobot] = {}
         self._names, self._settings = names or ROBOTS, settings
         self._ending = threading.Event()
-        self._testbed = Testbed(self._ending, self._names)
+        self._testbed = Testbed(self._ending, self._names, room=room)
 
     def __enter__(self) -> Self:
         try:

@@ -11,6 +11,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from types import TracebackType
@@ -223,11 +224,12 @@ class McuRobot(SimulatedRobot):
 class Testbed:
     """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU; or only those of ``names``.
 
-    ``keep``: the folder with the logs stays after the demo.
+    ``keep``: the folder with the logs stays after the demo. ``room``: Goob is in a simulated room, and sees it.
     """
 
-    def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS) -> None:
+    def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS, *, room: bool = True) -> None:
         self.keep = True
+        self._room = room
         self._names = names
         self.folder = Path(tempfile.mkdtemp(prefix="pebble-demo-", dir=_temporary_folder()))
         self.robots: Sequence[SimulatedRobot] = ()
@@ -255,8 +257,9 @@ class Testbed:
         for broker in (remote, local):
             broker.wait(self._ending)
         self.remote_port = remote.port
+        goob = RoomRobot if self._room else partial(LinuxRobot, has_imu=True)
         makers: dict[str, Callable[[], SimulatedRobot]] = {
-            "goob": lambda: RoomRobot("goob", self.folder, local.port, remote.port),
+            "goob": lambda: goob("goob", self.folder, local.port, remote.port),
             "fred": lambda: LinuxRobot("fred", self.folder, local.port, remote.port),
             "minilamp": lambda: McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
             "benjr": lambda: McuRobot("benjr", self.folder, "ESP8266", remote.port),

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import time
+from collections import deque
 from collections.abc import Callable
+from typing import Final
 
 from pebble.client.driver_lease import ANSWER_S
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 
+log = logging.getLogger(__name__)
+
 Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
+
+MAX_ARRIVED: Final = 10_000  # messages that the event loop has not taken yet, and their bytes
+MAX_ARRIVED_BYTES: Final = 64 << 20
 
 
 class Broker:
@@ -20,6 +28,7 @@ class Broker:
         self.transport: Transport = create("mqtt", f"pebble-web-{secrets.token_hex(4)}", settings)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []
+        self._arrived = Arrived()
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
@@ -54,13 +63,34 @@ class Broker:
         """Publish now, ahead of streams; False if it was refused because there is no connection."""
         return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
 
-    async def subscribe(self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED) -> Subscription:
-        """Deliver what matches ``filter_`` until it is unsubscribed."""
+    async def subscribe(
+        self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, patient: bool = False
+    ) -> Subscription:
+        """Deliver what matches ``filter_`` until it is unsubscribed.
+
+        ``patient``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
+        for each heartbeat of a hundred robots costs more than the heartbeats.
+        """
 
         def take(message: Message) -> None:
-            self._call(handler, message, time.monotonic())
+            if self._arrived.put(handler, message, time.monotonic()) and not patient:
+                self._call(self.deliver)
 
         return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)
+
+    def deliver(self) -> None:
+        """Hand over what has arrived, in its order."""
+        while (one := self._arrived.get()) is not None:
+            handler, message, at = one
+            try:
+                handler(message, at)
+            except Exception:  # one message must not hold back the others
+                log.exception("a message on %s", message.topic)
+
+    @property
+    def dropped(self) -> int:
+        """Messages that were not taken because the event loop was far behind."""
+        return self._arrived.dropped
 
     async def unsubscribe(self, subscription: Subscription) -> None:
         """Stop delivery; a message that has arrived before may still be handled."""
@@ -74,3 +104,30 @@ class Broker:
         """On a thread of the transport. The loop may have ended meanwhile."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(function, *arguments)
+
+
+class Arrived:
+    """Messages on their way from the transport's thread, which alone puts, to the event loop, which alone gets."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._waiting: deque[tuple[Handler, Message, float]] = deque()
+        self._put_bytes = self._got_bytes = 0  # each written by one thread
+
+    def put(self, handler: Handler, message: Message, at: float) -> bool:
+        """False if there is no room for it."""
+        size = len(message.payload)
+        if len(self._waiting) >= MAX_ARRIVED or self._put_bytes - self._got_bytes + size > MAX_ARRIVED_BYTES:
+            self.dropped += 1
+            return False
+        self._put_bytes += size
+        self._waiting.append((handler, message, at))
+        return True
+
+    def get(self) -> tuple[Handler, Message, float] | None:
+        """The oldest; None if there is none."""
+        if not self._waiting:
+            return None
+        one = self._waiting.popleft()
+        self._got_bytes += len(one[1].payload)
+        return one

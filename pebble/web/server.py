@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from pebble.contract import CAPABILITIES, DRIVE, DRIVING, codec
+from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity, parse_topic
 from pebble.contract.payloads import Driver
 from pebble.contract.payloads import Driving as DrivingPayload
@@ -38,6 +38,7 @@ _REFRESH_S = 0.25
 _ANNOUNCE_S = 1.0
 _RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
 _ANNOUNCED = 64  # robots in one announcement
+_ESTOP_METRIC = "web/estop"
 
 
 def clock() -> float:
@@ -68,7 +69,8 @@ class Server:
         self.broker.on_state(self._show_broker)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
-            await self.broker.subscribe(channel.filter("+/+/+"), self._receive)
+            patient = channel is ONLINE or channel in SYNONYMS
+            await self.broker.subscribe(channel.filter("+/+/+"), self._receive, patient=patient)
         await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
         self.spawn(self._tick())
 
@@ -95,11 +97,14 @@ class Server:
         address = parse_topic(message.topic)
         if address is None:
             return
-        self.stops.receive(message, clock(), known=address.identity.base in self.robots.components)
+        ref = address.identity.base
+        self.stops.receive(message, clock(), known=ref in self.robots.components)
         self._send(self.stops.tick(clock()))
-        self._note_latch(address.identity.base)
+        if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
+            self.stops.changed.add(ref)
+            self._note_latch(ref)
         if address.metric == CAPABILITIES.metric:
-            self.open_components.update(address.identity.base)
+            self.open_components.update(ref)
 
     def _note_latch(self, ref: str) -> None:
         component = self.robots.components.get(ref)
@@ -123,7 +128,9 @@ class Server:
 
     def _show_broker(self) -> None:
         view = m.BrokerView(
-            connected=self.broker.connected, problem=self.broker.problem, robots_omitted=self.robots.omitted
+            connected=self.broker.connected,
+            problem=self.broker.problem,
+            robots_omitted=self.robots.omitted + self.broker.dropped,
         )
         self.robots.set_server_metric("", "web/broker", view)
 
@@ -198,6 +205,7 @@ class Server:
             await asyncio.sleep(TICK_S)
             now = clock()
             with _logged():
+                self.broker.deliver()
                 self.publish(self.driving.tick(now))
                 self._send(self.stops.tick(now))
                 self._show_stops()
@@ -229,7 +237,7 @@ class Server:
         for ref in changed:
             component = self.robots.components.get(ref)
             if component is not None:
-                self.robots.set_server_metric(ref, "web/estop", self.stops.view(component.estop))
+                self.robots.set_server_metric(ref, _ESTOP_METRIC, self.stops.view(component.estop))
 
     def _show_drivers(self) -> None:
         changed, self.driving.changed = self.driving.changed, set()

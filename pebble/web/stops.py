@@ -72,7 +72,6 @@ class Stops:
                 continue
             if not sender.finished or now - began < COLLECT_S:
                 sender.receive(message, now)
-        self.changed.add(address.identity.base)
 
     def tick(self, now: float) -> list[Message]:
         """What to publish now; to be called every 50 ms, and after a message."""
