@@ -80,7 +80,7 @@ async def _page(request: Request) -> Response:
     if login.session_of(request) is None:
         wanted = "" if request.url.path == "/" else f"?next={quote(request.url.path)}"
         return Response(status_code=303, headers={"location": f"/login{wanted}", **NO_STORE})
-    return _static_of(request).answer(request, "index.html", NO_STORE)
+    return _static_of(request).page(request, NO_STORE)
 
 
 async def _static(request: Request) -> Response:

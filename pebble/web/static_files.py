@@ -24,9 +24,12 @@ _TYPES = {
     "webmanifest": "application/manifest+json",
 }
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
-_MODULES = b"{modules}"  # replaced by links to all that main.js imports: browsers need not discover them one by one
+_MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
+_SCREENS = {"fleet.html": "ui/fleet.js", "robot.html": "ui/robot.js"}  # index.html, with what that screen needs
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
+_LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
+_INDENTATION = re.compile(r"^[ \t]+", re.MULTILINE)
 
 
 class StaticFiles:
@@ -38,14 +41,17 @@ class StaticFiles:
         for name, content in self.files.items():
             digest.update(f"{name}\0{len(content)}\0".encode() + content)
         self.version = digest.hexdigest()[:12]
+        index = self.files.pop("index.html")
+        for name, screen in _SCREENS.items():
+            links = map(_link, (screen, *self._imported("main.js", screen)))
+            self.files[name] = index.replace(_MODULES, b"\n    ".join(links))
         for name in self.files:
             if name.endswith(".html"):
-                page = self.files[name].replace(_MODULES, b"\n    ".join(map(_link, self._imported("main.js"))))
-                self.files[name] = page.replace(_VERSION, self.version.encode())
+                self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
         self._packed = {name: gzip.compress(content, 9, mtime=0) for name, content in self.files.items()}
 
     def _imported(self, *names: str) -> list[str]:
-        """What these modules import, and what that imports."""
+        """What these modules import before they run, and what that imports."""
         found = dict.fromkeys(names)
         for name in (waiting := list(names)):
             for path in _IMPORT.findall(self.files.get(name, b"")):
@@ -54,6 +60,10 @@ class StaticFiles:
                     found[other] = None
                     waiting.append(other)
         return [name for name in found if name not in names]
+
+    def page(self, request: Request, headers: dict[str, str]) -> Response:
+        """The operator page; which screen it shows is up to its address."""
+        return self.answer(request, "robot.html" if request.url.path.startswith("/r/") else "fleet.html", headers)
 
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
         """The file ``name``, compressed if the browser takes that; 404 if there is none."""
@@ -78,9 +88,12 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
             yield from _read(entry, f"{path}{entry.name}/")
         elif suffix in _TYPES:
             content = entry.read_bytes()
-            yield path + entry.name, without_comments(content) if suffix in ("css", "js", "mjs") else content
+            yield path + entry.name, stripped(content, suffix) if suffix in ("css", "js", "mjs") else content
 
 
-def without_comments(source: bytes) -> bytes:
-    """Blank the lines that are only comments: a tenth less to send, and every line keeps its number."""
-    return _COMMENTS.sub(lambda found: "\n" * found[0].count("\n"), source.decode()).encode()
+def stripped(source: bytes, suffix: str) -> bytes:
+    """Without indentation and comments: a sixth less to send, and every line keeps its number."""
+    text = _COMMENTS.sub(lambda found: "\n" * found[0].count("\n"), source.decode())
+    if suffix != "css":
+        text = _LINE_ENDS.sub("", text)
+    return _INDENTATION.sub("", text).encode()

@@ -108,7 +108,7 @@ class CannedServer:
     # -- http
 
     async def _page(self, request: Request) -> Response:
-        return self.static.answer(request, "index.html", _headers())
+        return self.static.page(request, _headers())
 
     async def _static(self, request: Request) -> Response:
         return self.static.answer(request, request.path_params["name"], _headers())

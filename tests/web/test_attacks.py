@@ -632,5 +632,5 @@ def test_no_secret_leaves_the_server(
 
 def static(hall: Hall) -> list[str]:
     names = list(hall.served.app.state.static.files)
-    assert {"index.html", "login.html", "main.js"} <= set(names)
+    assert {"fleet.html", "robot.html", "login.html", "main.js"} <= set(names)
     return names

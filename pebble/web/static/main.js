@@ -5,11 +5,13 @@ import { ControlSocket } from "./core/control-socket.js";
 import { Driver } from "./core/driver.js";
 import { Estop } from "./core/estop.js";
 import { Store } from "./core/store.js";
-import { App } from "./ui/app.js";
+import { App, PARTS } from "./ui/app.js";
 import { Page } from "./ui/hooks.js";
 import { Connection, Route, Settings } from "./ui/models.js";
 import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
+
+const REST_MS = 3000; // after the start what is not shown yet is fetched, so that it is here without a server, too
 
 const version = document.querySelector("meta[name=pebble-version]")?.getAttribute("content") ?? "";
 const store = new Store();
@@ -76,4 +78,5 @@ page.driver.start();
 follow();
 render(h(Page.Provider, { value: page }, h(App)), document.getElementById("app"));
 page.connection.socket.connect();
+setTimeout(() => Promise.allSettled(Object.values(PARTS).map((fetchPart) => fetchPart())), REST_MS);
 Object.assign(window, { pebble: page }); // for tests, and for people who look into it

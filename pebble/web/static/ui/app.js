@@ -1,12 +1,16 @@
 // The frame of every screen: header, banners, the fleet or one component, and the settings.
 
 import { Banners } from "./banner.js";
-import { Fleet } from "./fleet.js";
 import { Header } from "./header.js";
-import { Boundary, html, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
-import { Robot } from "./robot.js";
-import { SettingsPanel } from "./settings.js";
+import { Boundary, html, useEffect, useMedia, useModel, usePage, usePart, useState } from "./hooks.js";
 import { nameOf } from "./words.js";
+
+/** What is fetched when it is first shown, so that the first screen is there soon; main.js fetches the rest later. */
+export const PARTS = {
+  fleet: async () => (await import("./fleet.js")).Fleet,
+  robot: async () => (await import("./robot.js")).Robot,
+  settings: async () => (await import("./settings.js")).SettingsPanel,
+};
 
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */
 export function useLayout() {
@@ -48,13 +52,26 @@ export function App() {
       />
     <//>
     <${Boundary} what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
-    ${panel && html`<${Boundary} what="Settings"><${SettingsPanel} onClose=${toggle} /><//>`}
+    ${panel &&
+    html`<${Boundary} what="Settings"><${Part} fetchPart=${PARTS.settings} onClose=${toggle} /><//>`}
     <main id="main" tabindex="-1">
       <${Boundary} what="This screen">
         ${ref
-          ? html`<${Robot} key=${ref} at=${ref} layout=${layout} drawer=${drawer} onPanel=${toggle} />`
-          : html`<${Fleet} />`}
+          ? html`<${Part}
+              fetchPart=${PARTS.robot}
+              key=${ref}
+              at=${ref}
+              layout=${layout}
+              drawer=${drawer}
+              onPanel=${toggle}
+            />`
+          : html`<${Part} fetchPart=${PARTS.fleet} />`}
       <//>
     </main>
   </div>`;
+}
+
+function Part({ fetchPart, ...props }) {
+  const part = usePart(fetchPart);
+  return part ? html`<${part} ...${props} />` : html`<p class="loading" role="status">Loading…</p>`;
 }

@@ -110,6 +110,29 @@ export function useMedia(query) {
   return matchMedia(query).matches;
 }
 
+const RETRY_MS = 1000;
+const fetched = new Map(); // parts of the page that are here, by what fetches them
+
+/**
+ * A part of the page that is fetched when it is first shown; undefined until it is here.
+ * @template T @param {() => Promise<T>} fetchPart the same one each time @returns {T | undefined}
+ */
+export function usePart(fetchPart) {
+  const redraw = useRedraw();
+  useEffect(() => {
+    let timer = 0;
+    const take = (part) => {
+      fetched.set(fetchPart, part);
+      redraw();
+    };
+    const again = () => (timer = setTimeout(attempt, RETRY_MS));
+    const attempt = () => fetchPart().then(take, again);
+    if (!fetched.has(fetchPart)) attempt();
+    return () => clearTimeout(timer);
+  }, [fetchPart]);
+  return fetched.get(fetchPart);
+}
+
 /** A text that changes at most once a second, so that it can be read aloud. @param {string} text @returns {string} */
 export function useCalm(text) {
   const [shown, show] = useState(text);

@@ -1,0 +1,45 @@
+"""Parts of the page that are fetched when they are first shown, and where that fails."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser
+
+from tests.web.browser import tab
+from tests.web.canned import CannedServer, serving
+from tests.web.states import STATES
+
+SCREEN = "**/ui/robot.js"
+LATER = "performance.getEntriesByType('resource').filter((one) => /(fleet|robot|settings).js$/.test(one.name)).length"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[CannedServer]:
+    with serving() as canned:
+        canned.show(STATES["driving"])
+        yield canned
+
+
+def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(server: CannedServer, browser: Browser):
+    with tab(browser, "about:blank") as opened:
+        opened.context.route(SCREEN, lambda route: route.abort())
+        opened.page.goto(server.url + STATES["driving"].path)
+        opened.page.locator(".loading").wait_for()
+        opened.test("stop-one").click()
+        assert opened.until(lambda: server.sent("estop"))
+        opened.context.unroute(SCREEN)
+        opened.test("why").first.wait_for()
+        assert not opened.page.locator(".loading").count()
+
+
+def test_the_other_screens_are_here_without_a_server(server: CannedServer, browser: Browser):
+    with tab(browser, server.url) as opened:
+        assert opened.until(f"{LATER} >= 3")
+        opened.page.wait_for_timeout(200)  # for what these import
+        opened.context.set_offline(True)
+        opened.page.locator("[data-test^=card-]", has_text="goob").locator("a").first.click()
+        opened.test("why").first.wait_for()
+        opened.test("settings").click()
+        opened.test("theme-dark").wait_for()
