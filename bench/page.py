@@ -116,8 +116,8 @@ CASES = (
         row
         for encoding, prototype in _PICTURES.items()
         for row in (
-            Row(f"{encoding} to drawn", "ms", Goal(25, 50), prototype),
-            Row(f"{encoding} lost", "%", Goal(0, 0), "0"),
+            Row(f"scene, {encoding} to drawn", "ms", Goal(25, 50), prototype),
+            Row(f"scene, {encoding} lost", "%", Goal(0, 0), "0"),
         )
     ), _goob_alone),
     Case("loading", cases.loading, (
@@ -127,6 +127,7 @@ CASES = (
     Case("files", cases.files, (
         Row("page, kB", "kB"),
         Row("page, kB gz", "kB", Goal(60), "14"),
+        Row("with other screens, kB gz", "kB"),
         Row("requests", ""),
         Row("foreign hosts", "", Goal(0), "0"),
     ), _goob),

@@ -34,6 +34,7 @@ VIEWERS, ROBOTS_SHOWN = 30, 100
 _HELD_S = 0.4
 _END_S = 3.0
 _COUNT_S = 40.0  # for processes of viewers to answer, beyond their time
+_LATER_S = 5.0  # the page has fetched its other screens by then
 _REST_S = 8.0  # after the last viewer: the server lets go after 5, the camera rests then
 _HIDE = """hidden => {
   Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
@@ -195,8 +196,8 @@ def pictures(rig: Rig, scale: float) -> Samples:
         page.evaluate("bench.drawn.length = 0")
         rig.pause(page, 20 * scale)
         drawn = [one for one in page.evaluate("bench.drawn") if one[0] == encoding]
-        found[f"{encoding} to drawn"] = [at - captured for _, _, captured, at, _ in drawn]
-        found[f"{encoding} lost"] = [lost_percent([one[1] for one in drawn])]
+        found[f"scene, {encoding} to drawn"] = [at - captured for _, _, captured, at, _ in drawn]
+        found[f"scene, {encoding} lost"] = [lost_percent([one[1] for one in drawn])]
     return found
 
 
@@ -220,18 +221,23 @@ def loading(rig: Rig, scale: float) -> Samples:
 
 
 def files(rig: Rig, _scale: float) -> Samples:
-    """Everything that a robot's page requests until it shows a picture."""
+    """Everything that a robot's page requests until it shows a picture, and what it fetches later."""
     page = rig.page(ROBOT)
     rig.until(page, lambda: page.evaluate("bench.picture"), "no picture")
-    urls = page.evaluate("[location.href, ...performance.getEntriesByType('resource').map((one) => one.name)]")
-    unique = sorted({url for url in urls if url.startswith("http")})
-    own = [url for url in unique if urlsplit(url).netloc == urlsplit(rig.stage.url).netloc]
-    bodies = [urllib.request.urlopen(url, timeout=5).read() for url in own]  # noqa: S310 - of our own server
+    rig.pause(page, _LATER_S)
+    entries = page.evaluate("performance.getEntriesByType('resource').map((one) => [one.name, one.startTime])")
+    picture = page.evaluate("bench.picture")
+    urls = {page.url: 0.0} | {url: at for url, at in reversed(entries) if url.startswith("http")}
+    own = {url: at for url, at in urls.items() if urlsplit(url).netloc == urlsplit(rig.stage.url).netloc}
+    bodies = {url: urllib.request.urlopen(url, timeout=5).read() for url in own}  # noqa: S310 - of our own server
+    packed = {url: len(gzip.compress(body)) / 1000 for url, body in bodies.items()}
+    before = [url for url, at in own.items() if at < picture]
     return {
-        "page, kB": [sum(map(len, bodies)) / 1000],
-        "page, kB gz": [sum(len(gzip.compress(body)) for body in bodies) / 1000],
-        "requests": [float(len(own))],
-        "foreign hosts": [float(len(unique) - len(own))],
+        "page, kB": [sum(len(bodies[url]) for url in before) / 1000],
+        "page, kB gz": [sum(packed[url] for url in before)],
+        "with other screens, kB gz": [sum(packed.values())],
+        "requests": [float(len(before))],
+        "foreign hosts": [float(len(urls) - len(own))],
     }
 
 

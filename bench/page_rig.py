@@ -21,6 +21,7 @@ from pebble.contract.channels import Channel
 from pebble.demo.stage import Stage
 from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
+from pebble.runtime.parent import tied_to_parent
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -29,6 +30,7 @@ AT_REST_S = 0.2  # motors that are off for so long have stopped
 _WAIT_S, _MOVED_S = 20.0, 3.0
 _PRESSES = 3
 _STEP_MS = 10
+_AT_ONCE_S = 2e-5
 
 #: Stamps inputs, first contents, drawn pictures and sent commands; runs before the page's own scripts.
 _HOOKS = """
@@ -201,8 +203,11 @@ def _moves(axes: dict[str, Any]) -> bool:
 
 
 def monotonic(page_ms: float) -> float:
-    """A stamp of a page on this machine: epoch milliseconds, as time.monotonic()."""
-    return page_ms / 1000 - time.time() + time.monotonic()
+    """A stamp of another process on this machine: epoch milliseconds, as time.monotonic()."""
+    while True:
+        before, wall, after = time.monotonic(), time.time(), time.monotonic()
+        if after - before < _AT_ONCE_S:  # else this thread stood still in between
+            return page_ms / 1000 - wall + (before + after) / 2
 
 
 @contextmanager
@@ -230,10 +235,13 @@ def _subscribed(port: int, channel: Channel, line: str, receive: Callable[[IO[by
     if program is None:
         raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
     command = [program, "-h", "127.0.0.1", "-p", str(port), "-t", channel.filter("+/+/+"), "-F", line]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as subscriber:
+    with subprocess.Popen(tied_to_parent(command), stdout=subprocess.PIPE) as subscriber:
         assert subscriber.stdout is not None  # noqa: S101
-        threading.Thread(target=receive, args=(subscriber.stdout,), name="subscriber", daemon=True).start()
+        reader = threading.Thread(target=receive, args=(subscriber.stdout,), name="subscriber", daemon=True)
+        reader.start()
         try:
             yield
+            if subscriber.poll() is not None or not reader.is_alive():
+                raise PebbleError("mosquitto_sub has ended: what it should have received is missing")
         finally:
             subscriber.kill()

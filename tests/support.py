@@ -10,14 +10,16 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pebble.runtime.parent import tied_to_parent
 
 #: The checkout: tests that start programs of ours start them here.
 ROOT = Path(__file__).resolve().parent.parent
+
+T = TypeVar("T")
 
 
 #: `make thorough` sets it: tests with many cases then try all of them.
@@ -27,6 +29,11 @@ THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
 def cases(some: int, all_: int) -> int:
     """How many cases a test with random inputs tries."""
     return all_ if THOROUGH else some
+
+
+def some(all_: Iterable[T], step: int) -> list[T]:
+    """Each ``step``-th of many parameters of a test; all of them if asked to be thorough."""
+    return list(all_)[:: 1 if THOROUGH else step]
 
 
 def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.005) -> bool:

@@ -19,7 +19,7 @@ LEVEL_RULE = "a topic level: 1 to 64 characters, without / + # $ and control cha
 #: The type of operators' servers, which publish below their own identity but are no robots.
 SERVERS = "servers"
 
-_REMEMBERED, _REMEMBERED_LENGTH = 1024, 256  # topics, and characters of each: a megabyte at most
+_REMEMBERED, _REMEMBERED_LENGTH = 1024, 128  # topics, and characters of each: 1.5 MB at most
 
 _valid_level = re.compile(LEVEL).search
 

@@ -6,19 +6,16 @@ import asyncio
 import logging
 import secrets
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Final
 
 from pebble.client.driver_lease import ANSWER_S
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
+from pebble.web.arrived import Arrived, Handler
 
 log = logging.getLogger(__name__)
 
-Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
-
-MAX_ARRIVED: Final = 10_000  # messages that the event loop has not taken yet, and their bytes
-MAX_ARRIVED_BYTES: Final = 64 << 20
+_DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
 
 
 class Broker:
@@ -29,6 +26,7 @@ class Broker:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()
+        self._woken = False  # deliver is about to be called
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
@@ -64,28 +62,38 @@ class Broker:
         return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
 
     async def subscribe(
-        self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, patient: bool = False
+        self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, deferred: bool = False
     ) -> Subscription:
         """Deliver what matches ``filter_`` until it is unsubscribed.
 
-        ``patient``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
+        ``deferred``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
         for each heartbeat of a hundred robots costs more than the heartbeats.
         """
 
         def take(message: Message) -> None:
-            if self._arrived.put(handler, message, time.monotonic()) and not patient:
-                self._call(self.deliver)
+            if self._arrived.put(handler, message, time.monotonic(), deferred=deferred) and not deferred:
+                self._wake()
 
         return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)
 
     def deliver(self) -> None:
-        """Hand over what has arrived, in its order."""
+        """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""
+        self._woken = False
+        end = time.monotonic() + _DELIVER_S
         while (one := self._arrived.get()) is not None:
             handler, message, at = one
             try:
                 handler(message, at)
             except Exception:  # one message must not hold back the others
                 log.exception("a message on %s", message.topic)
+            if time.monotonic() > end:
+                self._wake()
+                return
+
+    def _wake(self) -> None:
+        if not self._woken:
+            self._woken = True
+            self._call(self.deliver)
 
     @property
     def dropped(self) -> int:
@@ -104,30 +112,3 @@ class Broker:
         """On a thread of the transport. The loop may have ended meanwhile."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(function, *arguments)
-
-
-class Arrived:
-    """Messages on their way from the transport's thread, which alone puts, to the event loop, which alone gets."""
-
-    def __init__(self) -> None:
-        self.dropped = 0
-        self._waiting: deque[tuple[Handler, Message, float]] = deque()
-        self._put_bytes = self._got_bytes = 0  # each written by one thread
-
-    def put(self, handler: Handler, message: Message, at: float) -> bool:
-        """False if there is no room for it."""
-        size = len(message.payload)
-        if len(self._waiting) >= MAX_ARRIVED or self._put_bytes - self._got_bytes + size > MAX_ARRIVED_BYTES:
-            self.dropped += 1
-            return False
-        self._put_bytes += size
-        self._waiting.append((handler, message, at))
-        return True
-
-    def get(self) -> tuple[Handler, Message, float] | None:
-        """The oldest; None if there is none."""
-        if not self._waiting:
-            return None
-        one = self._waiting.popleft()
-        self._got_bytes += len(one[1].payload)
-        return one

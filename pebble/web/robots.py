@@ -311,7 +311,8 @@ class Robots:
             payload = codec.decode(ONLINE, message.payload)
         except PayloadError:
             return
-        component.heartbeat(payload.t, now, time.time(), online=payload.online is not False)
+        arrived = time.time() - (time.monotonic() - now)
+        component.heartbeat(payload.t, now, arrived, online=payload.online is not False)
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)

@@ -69,8 +69,8 @@ class Server:
         self.broker.on_state(self._show_broker)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
-            patient = channel is ONLINE or channel in SYNONYMS
-            await self.broker.subscribe(channel.filter("+/+/+"), self._receive, patient=patient)
+            deferred = channel is ONLINE or channel in SYNONYMS
+            await self.broker.subscribe(channel.filter("+/+/+"), self._receive, deferred=deferred)
         await self.broker.subscribe(DRIVING.filter("+/+/+"), self._announced)
         self.spawn(self._tick())
 
@@ -130,7 +130,7 @@ class Server:
         view = m.BrokerView(
             connected=self.broker.connected,
             problem=self.broker.problem,
-            robots_omitted=self.robots.omitted + self.broker.dropped,
+            robots_omitted=self.robots.omitted,
         )
         self.robots.set_server_metric("", "web/broker", view)
 
@@ -203,9 +203,9 @@ class Server:
         refresh_at = 0.0
         while True:
             await asyncio.sleep(TICK_S)
-            now = clock()
             with _logged():
                 self.broker.deliver()
+                now = clock()
                 self.publish(self.driving.tick(now))
                 self._send(self.stops.tick(now))
                 self._show_stops()

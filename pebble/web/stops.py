@@ -81,7 +81,6 @@ class Stops:
             self.changed |= {ref for ref, stop in sender.robots.items() if self._shown.get(ref) != _progress(stop)}
             if sender.finished and now - began > _SHOWN_S:
                 self._remove(name)
-                self.changed |= set(sender.robots)
         return messages
 
     def view(self, estop: RobotEstop) -> m.EstopView:
@@ -111,7 +110,9 @@ class Stops:
             self._remove(next(iter(self._senders)))
 
     def _remove(self, name: str) -> None:
-        self._senders.pop(name)[0].end()
+        sender, _ = self._senders.pop(name)
+        sender.end()
+        self.changed |= set(sender.robots)
         del self._users[name]
 
     def _newest(self, ref: str) -> tuple[str, RobotStop | None]:

@@ -8,12 +8,12 @@ import pytest
 
 from tests.firmware.heap import CASES, LIMITS, Case, measure
 from tests.firmware.sizes import documented
-from tests.support import THOROUGH
+from tests.support import some
 
 _PEAK = 7  # column of the table
 
 
-@pytest.mark.parametrize("case", CASES if THOROUGH else CASES[::3], ids=str)
+@pytest.mark.parametrize("case", some(CASES, 5), ids=str)
 def test_heap(case: Case, tmp_path: Path) -> None:
     cost = measure(case, tmp_path)
     limit = LIMITS[case]

@@ -16,7 +16,7 @@ from tests.web.driving_lockstep.mutations import MUTATIONS
 from tests.web.driving_lockstep.schedules import first_violation, generate, violation
 from tests.web.driving_lockstep.world import Rig
 
-SCHEDULES = cases(60, 300)
+SCHEDULES = cases(40, 300)
 PARTS = 4  # of them, for as many processes of pytest
 #: Bugs that show within 20 schedules; ``python -m tests.web.driving_lockstep --mutations`` looks for all.
 QUICK = (

@@ -320,6 +320,7 @@ _GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
         ("{ liveness: undefined }", "silent"),
         ("{ capabilities: { drive: { available: true, controls: false } } }", "no-drive"),
         ("{ script: { running: true }, capabilities: { drive: { available: true, arbitrates: true } } }", None),
+        ("{ loading: true }", "loading"),
         ("{ pictureAgeMs: 1900, inSight: false }", None),
         ("{ pictureAgeMs: null, inSight: false }", None),
         ("{ pictureAgeMs: Infinity, inSight: false }", "picture"),

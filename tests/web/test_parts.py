@@ -12,7 +12,8 @@ from tests.web.canned import CannedServer, serving
 from tests.web.states import STATES
 
 SCREEN = "**/ui/robot.js"
-LATER = "performance.getEntriesByType('resource').filter((one) => /(fleet|robot|settings).js$/.test(one.name)).length"
+LATER = "fleet", "cards", "telemetry", "values", "drive", "stick", "video", "settings"
+HERE = r"performance.getEntriesByType('resource').map((one) => one.name.match(/(\w+).js$/)?.[1])"
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +28,10 @@ def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(server:
         opened.context.route(SCREEN, lambda route: route.abort())
         opened.page.goto(server.url + STATES["driving"].path)
         opened.page.locator(".loading").wait_for()
+        opened.page.keyboard.down("KeyW")
+        opened.page.wait_for_timeout(300)
+        opened.page.keyboard.up("KeyW")
+        assert not [one for one in server.sent("drive") if one["x"] or one["z"]]
         opened.test("stop-one").click()
         assert opened.until(lambda: server.sent("estop"))
         opened.context.unroute(SCREEN)
@@ -36,8 +41,7 @@ def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(server:
 
 def test_the_other_screens_are_here_without_a_server(server: CannedServer, browser: Browser):
     with tab(browser, server.url) as opened:
-        assert opened.until(f"{LATER} >= 3")
-        opened.page.wait_for_timeout(200)  # for what these import
+        assert opened.until(lambda: set(LATER) <= set(opened.page.evaluate(HERE)))
         opened.context.set_offline(True)
         opened.page.locator("[data-test^=card-]", has_text="goob").locator("a").first.click()
         opened.test("why").first.wait_for()

@@ -6,7 +6,7 @@ import { Driver } from "./core/driver.js";
 import { Estop } from "./core/estop.js";
 import { Store } from "./core/store.js";
 import { App, PARTS } from "./ui/app.js";
-import { Page } from "./ui/hooks.js";
+import { Page, fetchPart, isHere } from "./ui/hooks.js";
 import { Connection, Route, Settings } from "./ui/models.js";
 import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
@@ -42,6 +42,7 @@ function join() {
   connection.socket = socket;
   estop.onChange = () => connection.changed();
   driver.onControlLost = (by) => connection.show(by ? `${by} took over` : "Your control has ended: take it again");
+  driver.loading = () => !isHere(PARTS.robot);
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
   video.pictures = new Pictures(
     (bitmap, info) => video.draw(bitmap, info),
@@ -78,5 +79,5 @@ page.driver.start();
 follow();
 render(h(Page.Provider, { value: page }, h(App)), document.getElementById("app"));
 page.connection.socket.connect();
-setTimeout(() => Promise.allSettled(Object.values(PARTS).map((fetchPart) => fetchPart())), REST_MS);
+setTimeout(() => Promise.allSettled(Object.values(PARTS).map(fetchPart)), REST_MS);
 Object.assign(window, { pebble: page }); // for tests, and for people who look into it

@@ -24,6 +24,7 @@ export class Driver {
     this.inSight = false; // the driver sees the robot itself
     /** @type {() => number|null} the age of the picture in ms; null: none is wanted on this page */
     this.pictureAge = () => null;
+    this.loading = () => false;
     /** @type {(by: string) => void} called when this page loses the lease: to ``by``, or "" */
     this.onControlLost = () => {};
     this.mine = false;
@@ -113,6 +114,7 @@ export class Driver {
       driver: value("web/driver"),
       driverIdleMs: this.idleMs(),
       script: value("autonomy-status"),
+      loading: this.loading(),
       pictureAgeMs: this.pictureAge(),
       inSight: this.inSight,
       roundTripMs: this.socket.roundTripMs,

@@ -19,6 +19,7 @@ const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 
  * @property {boolean} reload the page is older than the server
  * @property {boolean} drives false: not over this connection
  * @property {readonly string[]} rights
+ * @property {boolean} loading what shows the picture and these reasons is not here yet
  * @property {boolean} hidden
  * @property {boolean} focus
  * @property {boolean} dialog whether one is open, or a panel
@@ -85,6 +86,7 @@ function leaseReason(s) {
 }
 
 function momentReason(s) {
+  if (s.loading) return reason("loading", "This screen is still loading");
   if (s.dialog) return reason("dialog", "Close the panel first");
   if (s.script?.running && s.capabilities.drive?.arbitrates !== true)
     return reason("script", `${s.script.file || "A script"} is driving: stop it first`);

@@ -53,25 +53,30 @@ export function App() {
     <//>
     <${Boundary} what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
     ${panel &&
-    html`<${Boundary} what="Settings"><${Part} fetchPart=${PARTS.settings} onClose=${toggle} /><//>`}
+    html`<${Boundary} what="Settings"><${Part} part=${PARTS.settings} onClose=${toggle} /><//>`}
     <main id="main" tabindex="-1">
       <${Boundary} what="This screen">
         ${ref
           ? html`<${Part}
-              fetchPart=${PARTS.robot}
+              part=${PARTS.robot}
               key=${ref}
               at=${ref}
               layout=${layout}
               drawer=${drawer}
               onPanel=${toggle}
             />`
-          : html`<${Part} fetchPart=${PARTS.fleet} />`}
+          : html`<${Part} part=${PARTS.fleet} />`}
       <//>
     </main>
   </div>`;
 }
 
-function Part({ fetchPart, ...props }) {
-  const part = usePart(fetchPart);
-  return part ? html`<${part} ...${props} />` : html`<p class="loading" role="status">Loading…</p>`;
+function Part({ part, ...props }) {
+  const { body, failed } = usePart(part);
+  if (body) return html`<${body} ...${props} />`;
+  if (!failed) return html`<p class="loading" role="status">Loading…</p>`;
+  return html`<p class="failed" role="alert">
+    A part of this page could not be fetched.
+    <button type="button" onClick=${() => location.reload()}>Reload</button>
+  </p>`;
 }

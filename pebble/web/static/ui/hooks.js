@@ -111,26 +111,45 @@ export function useMedia(query) {
 }
 
 const RETRY_MS = 1000;
+const TRIES = 3; // older browsers remember that a module could not be fetched: only a reload helps them
 const fetched = new Map(); // parts of the page that are here, by what fetches them
 
+/** @param {() => Promise<any>} part @returns {boolean} whether it can be shown at once */
+export const isHere = (part) => fetched.has(part);
+
+/** @param {() => Promise<any>} part fetched now, so that it is here when it is shown */
+export async function fetchPart(part) {
+  if (!isHere(part)) fetched.set(part, await part());
+}
+
 /**
- * A part of the page that is fetched when it is first shown; undefined until it is here.
- * @template T @param {() => Promise<T>} fetchPart the same one each time @returns {T | undefined}
+ * A part of the page, fetched when it is first shown. ``failed``: nobody should wait for it any more.
+ * @param {() => Promise<any>} part the same one each time @returns {{body: any, failed: boolean}}
  */
-export function usePart(fetchPart) {
+export function usePart(part) {
   const redraw = useRedraw();
+  const failures = useRef(0);
+  const body = fetched.get(part);
   useEffect(() => {
     let timer = 0;
-    const take = (part) => {
-      fetched.set(fetchPart, part);
-      redraw();
+    let over = Boolean(body);
+    async function attempt() {
+      try {
+        await fetchPart(part);
+      } catch (error) {
+        console.error(error);
+        failures.current++;
+        if (!over) timer = setTimeout(attempt, RETRY_MS);
+      }
+      if (!over) redraw();
+    }
+    if (!over) attempt();
+    return () => {
+      over = true;
+      clearTimeout(timer);
     };
-    const again = () => (timer = setTimeout(attempt, RETRY_MS));
-    const attempt = () => fetchPart().then(take, again);
-    if (!fetched.has(fetchPart)) attempt();
-    return () => clearTimeout(timer);
-  }, [fetchPart]);
-  return fetched.get(fetchPart);
+  }, [part]);
+  return { body, failed: failures.current >= TRIES };
 }
 
 /** A text that changes at most once a second, so that it can be read aloud. @param {string} text @returns {string} */

@@ -1,0 +1,38 @@
+"""What pages see of stops that are no longer sent, and of components that were forgotten."""
+
+from __future__ import annotations
+
+import time
+
+from pebble.contract import ONLINE, codec
+from pebble.contract.payloads import Heartbeat
+from pebble.fleet.audit import Audit
+from pebble.fleet.people import People
+from pebble.transports import Message, MqttSettings
+from pebble.web.server import Server
+from pebble.web.settings import WebSettings
+from pebble.web.stops import MAX_EACH, Stops
+
+A, B = "pebble/robots/a", "pebble/robots/b"
+FIRST = "f" * 16
+
+
+def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
+    stops = Stops()
+    stops.press(A, FIRST, by="ann", why="", now=0.0, known=[], user="ann")
+    stops.changed.clear()
+    for number in range(MAX_EACH):
+        stops.press(B, f"{number:016x}", by="ann", why="", now=1.0, known=[], user="ann")
+    assert stops.user(FIRST) is None
+    assert A in stops.changed
+
+
+def test_a_component_that_was_forgotten_is_shown_again_by_its_heartbeat() -> None:
+    server = Server(WebSettings(broker=MqttSettings(host="127.0.0.1")), People(None), Audit(None))
+    beat = Message(ONLINE.topic(A), codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()))))
+    for _ in range(2):
+        server._receive(beat, time.monotonic())
+        server._show_stops()
+        assert server.robots.value(A, "web/estop") is not None
+        server.robots.forget(A)
+        assert server.robots.value(A, "web/estop") is None
