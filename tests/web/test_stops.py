@@ -8,6 +8,7 @@ from pebble.contract import ONLINE, codec
 from pebble.contract.payloads import Heartbeat
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
+from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
@@ -20,11 +21,13 @@ FIRST = "f" * 16
 def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
     stops = Stops()
     stops.press(A, FIRST, by="ann", why="", now=0.0, known=[], user="ann")
+    assert stops.view(RobotEstop(A)).sending == "sent"
     stops.changed.clear()
     for number in range(MAX_EACH):
         stops.press(B, f"{number:016x}", by="ann", why="", now=1.0, known=[], user="ann")
     assert stops.user(FIRST) is None
     assert A in stops.changed
+    assert stops.view(RobotEstop(A)).sending == ""
 
 
 def test_a_component_that_was_forgotten_is_shown_again_by_its_heartbeat() -> None:
