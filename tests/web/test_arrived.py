@@ -22,7 +22,7 @@ def ignore(_message: Message, _at: float) -> None:
     pass
 
 
-def test_the_order_is_kept_whatever_is_deferred() -> None:
+def test_messages_stay_in_order_whatever_is_deferred() -> None:
     waiting = Arrived()
     for number in range(6):
         assert waiting.put(ignore, message(str(number)), float(number), deferred=number % 2 == 0)

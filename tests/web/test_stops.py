@@ -32,9 +32,9 @@ def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
 
 def test_a_component_that_was_forgotten_is_shown_again_by_its_heartbeat() -> None:
     server = Server(WebSettings(broker=MqttSettings(host="127.0.0.1")), People(None), Audit(None))
-    beat = Message(ONLINE.topic(A), codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()))))
+    heartbeat = Message(ONLINE.topic(A), codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()))))
     for _ in range(2):
-        server._receive(beat, time.monotonic())
+        server._receive(heartbeat, time.monotonic())
         server._show_stops()
         assert server.robots.value(A, "web/estop") is not None
         server.robots.forget(A)
