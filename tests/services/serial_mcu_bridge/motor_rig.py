@@ -79,6 +79,10 @@ def stopped(bench: Bench) -> bool:
     return until(lambda: state(bench).get("latched") and state(bench)["persisted"], 5)
 
 
-def reset(bench: Bench) -> bool:
+def send_reset(bench: Bench) -> None:
     bench.send("incoming/estop-reset", {"boot": state(bench)["boot"], "count": state(bench)["count"], "by": "eve"})
+
+
+def reset(bench: Bench) -> bool:
+    send_reset(bench)
     return until(lambda: not state(bench)["latched"], 5)

@@ -15,7 +15,7 @@ from pebble.contract import DRIVE, ESTOP, ESTOP_RESET
 from pebble.contract.payloads import Drive
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, Bench, reset, state, stopped
+from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, Bench, reset, send_reset, state, stopped
 from tests.support import until
 
 
@@ -153,8 +153,8 @@ def test_after_a_stop_nothing_moves_until_the_reset_also_after_a_restart(bench: 
 def test_after_a_reset_a_person_lets_go_first(bench: Bench) -> None:
     bench.send("incoming/estop", STOP)
     assert stopped(bench)
-    assert reset(bench)
-    bench.send("incoming/drive-values", {"z": 0.25})
+    send_reset(bench)
+    bench.send("incoming/drive-values", {"z": 0.25})  # at once: after 0.5 s without a command it would be obeyed
     assert until(lambda: bench.service.counters["overruled"] == 1)
     bench.send("incoming/drive-values", {"z": 0})
     bench.send("incoming/drive-values", {"z": 0.125})
