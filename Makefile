@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names
+.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -37,7 +37,7 @@ test: check
 	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
 	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" --ignore=tests/test_demo.py tests/services tests/robot/test_faults.py tests
 	@echo "pebble: the demo, whose robots need all processors"
-	@$(VENV) tools/run_tests.py tests/test_demo.py
+	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
 
 thorough:
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
@@ -82,7 +82,7 @@ report: .venv/.ready-bench
 	@$(VENV) -m pebble.cli bench report $(if $(QUICK),--quick build/report-quick,docs/results)
 
 check: .venv/.ready-dev
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync check-types check-names
+	@$(MAKE) --no-print-directory --jobs=3 --output-sync check-types check-names check-collection
 
 check-types:
 	@echo "pebble: types"
@@ -98,6 +98,11 @@ check-names:
 	@$(VENV) tools/retired_names.py
 	@echo "pebble: types of the firmware"
 	@$(VENV) -m tests.firmware.types
+
+# Once, before six processes each compile what pytest makes of all tests.
+check-collection:
+	@echo "pebble: collection of the tests"
+	@$(VENV) -m pytest --quiet --collect-only tests >.venv/collection.log || { cat .venv/collection.log; exit 1; }
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -110,7 +110,7 @@ def requested(url: str) -> str:
         return str(answer.read().decode())
 
 
-@pytest.mark.parametrize("broker", ["MOSQUITTO", "EMBEDDED"])
+@pytest.mark.parametrize("broker", ["EMBEDDED", pytest.param("MOSQUITTO", marks=pytest.mark.thorough)])
 def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Path, broker: str) -> None:
     demo = start(demos, temporary, f"{SHORTEST_S}, broker=BrokerKind.{broker}")
     page = page_of(demo)

@@ -139,7 +139,7 @@ def test_numbers_go_on_over_a_change_of_encoding() -> None:
 # -- Opus
 
 
-@pytest.mark.parametrize("rate", [8000, 12000, 16000, 24000, 48000])
+@pytest.mark.parametrize("rate", some([16000, 8000, 12000, 48000, 24000], 3))
 @pytest.mark.parametrize("channels", [1, 2])
 def test_opus_sounds_the_same(rate: int, channels: int) -> None:
     recorded = speech(rate, channels)

@@ -19,7 +19,7 @@ from pebble.errors import TransportError
 from pebble.transports import segments
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
 from pebble.transports.frames.frame import encode
-from tests.support import until
+from tests.support import some, until
 from tests.transports.frames.frames_net import FramesNet
 
 VGA = 640 * 480 * 3
@@ -36,8 +36,7 @@ def net(tmp_path: Path) -> Iterator[FramesNet]:
     net.close()
 
 
-@pytest.mark.parametrize("views", [False, True])
-@pytest.mark.parametrize("born", [False, True])
+@pytest.mark.parametrize(("born", "views"), some([(True, True), (False, True), (True, False), (False, False)], 3))
 def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet, born: bool, views: bool) -> None:
     readers = [net.reader(views=views) for _ in range(3)]
     writer = net.writer(size=VGA, rate=60, born=born)
