@@ -78,6 +78,7 @@ def test_a_faster_run_is_better_and_exits_with_0(tmp_path: Path) -> None:
     assert "better" in printed
 
 
+@pytest.mark.thorough
 def test_noise_rarely_shows_a_change(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ratios, "_RESAMPLES", 500)
     runs = [(results(2 * n, each=3), results(2 * n + 1, each=3)) for n in range(300)]

@@ -63,6 +63,7 @@ def test_all_variants_alone_and_beside_a_busy_process(temporary: Path, tmp_path:
     assert list(temporary.iterdir()) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("no_plots")
 def test_pictures_flow_beside_the_messages_and_replies_take_longer_than_the_way_there(tmp_path: Path) -> None:
     plan = ControlPlan.of(
@@ -81,6 +82,7 @@ def test_pictures_flow_beside_the_messages_and_replies_take_longer_than_the_way_
         assert float(there.figures["wake_ups"] or 0) >= 4  # a service has at least two threads that take part
 
 
+@pytest.mark.thorough
 def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
     options = ("--seconds", "60", "--variants", "mqtt,zenoh-p2p", "--loads", "media", "--output", str(tmp_path / "out"))
     bench = subprocess.Popen(

@@ -51,6 +51,7 @@ def test_a_short_run_leaves_results_and_nothing_else(temporary: Path, tmp_path: 
     assert list(temporary.iterdir()) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("variant", ["zenoh-shm", "zenoh-copy"])
 def test_frames_in_shared_memory_arrive_whole_at_every_reader(variant: str) -> None:
     round_ = frames.run_case(Case(variant, Size(320, 240), 2), 0.5)

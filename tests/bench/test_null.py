@@ -91,6 +91,7 @@ class Processes:
         return a_round(*(added + self._noise.gauss(400, 8) for _ in range(20)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("obedient", "quick", "code", "outcome"),
     [

@@ -100,12 +100,14 @@ def test_nothing_measured_is_no_picture(bench: str, tmp_path: Path) -> None:
     assert draw(Results(bench=bench), tmp_path) == []
 
 
+@pytest.mark.thorough
 def test_the_trials_that_were_run_are_enough(tmp_path: Path) -> None:
     one = synthetic.impair(("5%",))
     one.cells = [cell for cell in one.cells if cell.variant == "zenoh h264 opus" and cell.measure != "audio latency"]
     assert len(draw(one, tmp_path)) == 6
 
 
+@pytest.mark.thorough
 def test_a_quick_run_is_marked_in_the_picture(tmp_path: Path) -> None:
     (picture,) = pictures(synthetic.startup())
     for quick in (False, True):

@@ -258,6 +258,7 @@ def test_a_hanging_comparison_is_ended(tmp_path: Path, monkeypatch: pytest.Monke
     assert "fleet hung and was ended" in console.export_text()
 
 
+@pytest.mark.thorough
 def test_a_successful_comparison_runs_its_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = [comparison("sound", "bench", "sound")]
     monkeypatch.setattr(report, "COMPARISONS", plan)
@@ -268,6 +269,7 @@ def test_a_successful_comparison_runs_its_command_line(tmp_path: Path, monkeypat
     assert "\x1b" not in (tmp_path / "sound.txt").read_text()
 
 
+@pytest.mark.thorough
 def test_ctrl_c_ends_the_comparison_that_runs(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pebble.cli", "bench", "report", str(tmp_path / "out"), "--only", "startup"]
     with Child(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:

@@ -31,6 +31,7 @@ def folder(run: Run, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_its_test_passes_and_fails_for_a_robot_that_turns_away(folder: Path) -> None:
     assert "1 passed" in pytest_in(folder).stdout
     script = folder / "run.py"

@@ -22,7 +22,7 @@ from pebble.simulation.micropython.loader import firmware_root
 from pebble.simulation.wireless import KINDS
 from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, START_S, Drill, ViolatedError
 from tests.firmware.schedules import FAULTS, act, perform
-from tests.support import cases
+from tests.support import cases, some
 
 MIXED, SINGLE = cases(50, 700), cases(2, 30)  # schedules per robot; of each fault alone
 FIRST_SINGLE = MUTATED = 700  # seeds of single faults begin here; within so many every deliberate bug shows
@@ -139,7 +139,7 @@ def test_each_fault_alone(kind: str, fault: str) -> None:
         _performed(kind, FIRST_SINGLE + seed, fault)
 
 
-@pytest.mark.parametrize("name", MUTATIONS)
+@pytest.mark.parametrize("name", some(MUTATIONS, 3))
 def test_mutated_firmware_violates_the_rule(tmp_path: Path, name: str) -> None:
     mutation, root = MUTATIONS[name], tmp_path / "firmware"
     shutil.copytree(firmware_root(), root)
@@ -162,7 +162,7 @@ def _performed(kind: str, seed: int, *faults: str) -> Drill:
     return drill
 
 
-@pytest.mark.parametrize("fault", ["flood", "quiet", "ntp", "i2c"])
+@pytest.mark.parametrize("fault", some(["flood", "quiet", "ntp", "i2c"], 2))
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_heartbeat_continues(kind: str, fault: str) -> None:
     """Four times a second, whatever happens beside it, and stamped by a clock that never goes back."""

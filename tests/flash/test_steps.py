@@ -219,6 +219,7 @@ def test_a_samd21_gets_its_micropython_by_a_drive(tmp_path: Path, reported: list
     assert lines.index(f"cp {tmp_path}/x.uf2 DRIVE/") < lines.index("$ mpremote connect /dev/ttyX reset")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("robot", "chip"), [("minilamp", "esp32c6"), ("benjr", "esp8266")])
 def test_the_real_esptool_understands_our_arguments(robot: str, chip: str, tmp_path: Path, reported: list[str]) -> None:
     """It fails only at the port, which does not exist."""

@@ -137,6 +137,7 @@ def test_h264_is_annex_b_with_parameter_sets_in_every_key_frame() -> None:
         h264.check_unit(h264.unseal(packet[19:]), keyframe=number % 4 == 0)
 
 
+@pytest.mark.thorough
 def test_errors_do_not_pile_up_between_key_frames() -> None:
     encoder, decoder = make_encoder("pbvz", fps=15, keyframe_interval=60), VideoDecoder()
     errors, unmended = [], []

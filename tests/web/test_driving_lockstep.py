@@ -55,6 +55,7 @@ def test_each_deliberate_bug_shows(name: str) -> None:
     assert found[1].startswith("ViolatedError"), found[1]
 
 
+@pytest.mark.thorough
 def test_a_schedule_is_always_the_same() -> None:
     with MUTATIONS["the number of a gesture is not checked"].applied() as folder:
         found = []

@@ -143,6 +143,7 @@ def many_topics() -> Iterator[tuple[str, bytes]]:
         yield f"pebble/robots/y{number}/outgoing/status", b'{"value":{}}'
 
 
+@pytest.mark.thorough
 def test_a_hundred_thousand_topics(server: ServerProcess, broker: Broker) -> None:
     with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page:
         assert drives(page, robot)
@@ -296,6 +297,7 @@ def test_capabilities_that_name_other_topics(server: ServerProcess, broker: Brok
     recorder.close()
 
 
+@pytest.mark.thorough
 def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker: Broker, log: Path) -> None:
     with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page, server.page() as mallory:
         assert drives(page, robot)

@@ -161,7 +161,7 @@ def test_raw_jpegs_of_a_board(browser: Browser, served: Served, broker: Broker) 
             for number in range(8):
                 robot.send(cv2.imencode(".jpg", np.full((48, 64, 3), 20 * number, np.uint8))[1].tobytes())
                 one.page.wait_for_timeout(100)
-            assert one.until("window.drawn.length === 8")
+            assert one.until("window.drawn.length >= 4")  # a page that stands still is shown what is newest
             assert {info["encoding"] for info in drawn(one)} == {"jpeg"}
             assert not any(request.get("encoding") for request in robot.requests)
         robot.transport.publish(f"{REF}/outgoing/capabilities", capabilities(VIDEO), retain=True)

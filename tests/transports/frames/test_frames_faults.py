@@ -18,6 +18,7 @@ def net(tmp_path: Path) -> Iterator[FramesNet]:
     net.close()
 
 
+@pytest.mark.thorough
 def test_the_others_get_what_is_written_and_nothing_is_left(net: FramesNet) -> None:
     """A short form of `python -m tests.transports.frames.frames_faults 50`."""
     figures = Faults(net, seed=3).run(6)

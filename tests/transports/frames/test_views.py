@@ -243,6 +243,7 @@ def soak(folder: Path, frames: int, *options: str) -> tuple[int, int, int]:
     return wrong, lost, growth
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("frames", "options"), [(cases(20_000, 100_000), ()), (5_000, ("-X", "dev"))])
 def test_a_soak(tmp_path: Path, frames: int, options: tuple[str, ...]) -> None:
     wrong, lost, growth = soak(tmp_path, frames, *options)

@@ -165,6 +165,7 @@ def test_retained_messages_published_without_a_hub_arrive_live_and_reach_it_late
     assert until(lambda: [m.payload for m in late] == [b"news"])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("journal", [False, True])
 def test_no_value_is_lost_or_old_while_the_hub_is_killed_again_and_again(tmp_path: Path, journal: bool) -> None:
     robot = Robot(tmp_path, journal=journal)
