@@ -35,10 +35,11 @@ def permitted(kind: str) -> None:
         pytest.skip(f"no namespaces: {obstacle}")
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("permitted")
 @pytest.mark.parametrize(
     ("kind", "subject"),
-    [("namespaces", "zenoh h264 opus"), pytest.param("proxy", "mqtt original", marks=pytest.mark.thorough)],
+    [("namespaces", "zenoh h264 opus"), ("proxy", "mqtt original")],
 )
 def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     kind: str, subject: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -79,6 +80,7 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     assert children(os.getpid()) == []
 
 
+@pytest.mark.thorough
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pebble.cli", "impair", "--subjects", "mqtt original", "--output", str(tmp_path)]
     process = subprocess.Popen(

@@ -18,7 +18,7 @@ FAST, SLOW = "sensors/imu-fast", "sensors/imu"
 PLUGGED_IN_S = 2.0
 
 
-@pytest.fixture(params=["mqtt", "zenoh"])
+@pytest.fixture(params=[pytest.param("mqtt", marks=pytest.mark.thorough), "zenoh"])
 def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
     rig = Rig(request.param, tmp_path)
     yield rig
