@@ -271,7 +271,7 @@ class World:
             self.pages.do(human.page, "hold", "up", 0)
         else:
             self._pad(slot, (0.0, 0.0, 0.0))
-        if not human.held and not (name == "pad" and human.pad_frozen) and not (human.mac and human.meta):
+        if not human.held and not human.pad_frozen and not (human.mac and human.meta):
             self._at_rest(slot, "everything is released", late=0.06 if name == "pad" else 0.0)
 
     def do_tap(self, a: int, b: int) -> None:
