@@ -95,11 +95,6 @@ class Broker:
             self._woken = True
             self._call(self.deliver)
 
-    @property
-    def dropped(self) -> int:
-        """Messages that were not taken because the event loop was far behind."""
-        return self._arrived.dropped
-
     async def unsubscribe(self, subscription: Subscription) -> None:
         """Stop delivery; a message that has arrived before may still be handled."""
         await asyncio.to_thread(subscription.close)

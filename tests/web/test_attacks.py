@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from pebble.fleet.roles import Role
 from pebble.web import connections, control
 from pebble.web import messages as m
-from tests.support import Broker, some, until
+from tests.support import Broker, until
 from tests.web.attacker import PASSWORDS, Everything, Hall
 from tests.web.served import Page, RecordingRobot, Served, now_ms
 
@@ -376,7 +376,7 @@ def bad_messages() -> dict[str, str | bytes]:
     }
 
 
-@pytest.mark.parametrize("kind", some(sorted(bad_messages()), 3))
+@pytest.mark.parametrize("kind", sorted(bad_messages()))
 def test_what_is_not_understood_ends_the_connection_and_moves_nothing(
     hall: Hall, goob: RecordingRobot, driver: Page, kind: str
 ) -> None:
@@ -443,7 +443,7 @@ HOSTILE_REFS = [
 UNKNOWN_REFS = ["pebble/servers/hall", "pebble/robots/unknown"]  # a robot that is off is stopped when it comes
 
 
-@pytest.mark.parametrize("ref", some(HOSTILE_REFS + UNKNOWN_REFS, 2))
+@pytest.mark.parametrize("ref", HOSTILE_REFS + UNKNOWN_REFS)
 def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everything: Everything, ref: str) -> None:
     with hall.page("admin") as page:
         assert page.knows(GOOB)

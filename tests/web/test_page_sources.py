@@ -93,7 +93,6 @@ def test_comments_and_indentation_are_left_out():
     assert stripped(b"a {\n  b: url(//c); /* d */\n}\n", "css") == b"a {\nb: url(//c); /* d */\n}\n"
 
 
-@pytest.mark.thorough
 def test_what_is_sent_is_the_same_program(tmp_path: Path):
     """Each module, printed without comments by TypeScript, before and after; markup ignores indentation."""
     if shutil.which("node") is None or not COMPILER.exists():
