@@ -24,6 +24,7 @@ export class Driver {
     this.inSight = false; // the driver sees the robot itself
     /** @type {() => number|null} the age of the picture in ms; null: none is wanted on this page */
     this.pictureAge = () => null;
+    /** @type {() => boolean} whether what shows the picture and the reasons is not here yet */
     this.loading = () => false;
     /** @type {(by: string) => void} called when this page loses the lease: to ``by``, or "" */
     this.onControlLost = () => {};
