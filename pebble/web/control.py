@@ -17,6 +17,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from pebble.client.estop_states import Reset
 from pebble.fleet.roles import Session, rights
 from pebble.web import messages as m
+from pebble.web import robot_commands
 from pebble.web.driving import Tab
 from pebble.web.pace import Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
@@ -184,9 +185,26 @@ class Control:
             case m.PictureFromOp():
                 if self._may("drive", op):
                     self._server.picture_from(op.ref, op.source)
-            case _:
+            case m.Hello():
                 raise Leave("hello comes only once", again=True)
+            case _:
+                self._command(op)
         self._wake.set()
+
+    def _command(self, op: m.RobotOp) -> None:
+        """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""
+        if not self._may(robot_commands.right(op), op):
+            return
+        if why := self._server.refuses(op):
+            self._refuse(op, why)
+            return
+        message = robot_commands.publication(op, self._server.robots.topic)
+        if not self._server.broker.publish(message.topic, message.payload, retain=message.retain, qos=message.qos):
+            self._refuse(op, "The server cannot reach the broker")
+            return
+        self._post(m.Done(cmd=_tag(op), ref=op.ref))
+        if not isinstance(op, m.LightsOp | m.SoundboardOp):
+            self._audit(_tag(op), op.ref, detail=_detail(op))
 
     def _drive(self, op: m.DriveOp) -> None:
         if not self._may("drive", op):
@@ -267,13 +285,13 @@ class Control:
         return False
 
     def _refuse(self, op: m.FromPage, why: str) -> None:
-        command = str(op.__struct_config__.tag)
-        self._post(m.Refused(cmd=command, ref=getattr(op, "ref", ""), why=why, g=getattr(op, "g", -1)))
+        self._post(m.Refused(cmd=_tag(op), ref=getattr(op, "ref", ""), why=why, g=getattr(op, "g", -1)))
 
-    def _audit(self, what: str, ref: str) -> None:
+    def _audit(self, what: str, ref: str, detail: str = "") -> None:
         client = self._websocket.client
         address = "" if client is None else client.host
-        self._server.audit.write(what, ref=ref, user=self._session.user, device=self._tab.device, address=address)
+        session, device = self._session, self._tab.device
+        self._server.audit.write(what, ref=ref, user=session.user, device=device, address=address, detail=detail)
 
     # -- to the page
 
@@ -341,6 +359,15 @@ class Control:
         tab = lease.tab
         idle = None if tab.live is not None and tab.live_ref == ref else now - lease.idle_from
         return m.DriverView(by=tab.user, device=tab.device, server="", you=tab is self._tab, idle_s=idle)
+
+
+def _tag(op: m.FromPage) -> str:
+    return str(op.__struct_config__.tag)
+
+
+def _detail(op: m.RobotOp) -> str:
+    fields = msgspec.to_builtins(op)
+    return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in ("op", "ref"))[:200]
 
 
 def _printable(text: str) -> str:

@@ -7,7 +7,7 @@ page's ``messages.d.ts`` are generated from these structs.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from msgspec import Meta, Struct
 
@@ -18,6 +18,8 @@ Short = Annotated[str, Meta(max_length=64)]
 Axis = Annotated[float, Meta(ge=-1, le=1)]
 Stamp = Annotated[float, Meta(ge=0, le=1e13)]
 Number = Annotated[int, Meta(ge=0, le=1 << 31)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Level = Annotated[str, Meta(pattern=r"^[^/+#\x00]{1,64}$", max_length=64)]  # one level of a topic
 
 
 class _FromPage(Struct, frozen=True, kw_only=True, tag_field="op"):
@@ -117,9 +119,71 @@ class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
     source: Ref
 
 
+class LightsOp(_FromPage, frozen=True, kw_only=True, tag="lights"):
+    """A colour; with ``period`` (seconds) it fades in and out. Black is off."""
+
+    ref: Ref
+    r: Share = 0.0
+    g: Share = 0.0
+    b: Share = 0.0
+    period: Annotated[float, Meta(ge=0.05, le=600)] | None = None
+
+
+class SoundboardOp(_FromPage, frozen=True, kw_only=True, tag="soundboard"):
+    """Play one of the robot's clips, once or until it is stopped; "" stops."""
+
+    ref: Ref
+    file: Annotated[str, Meta(max_length=300)]
+    repeat: bool = False
+
+
+class AutonomyOp(_FromPage, frozen=True, kw_only=True, tag="autonomy"):
+    """Start one of the robot's scripts; "" stops."""
+
+    ref: Ref
+    file: Annotated[str, Meta(max_length=200)]
+    config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}  # noqa: RUF012 - a Struct
+
+
+class OutletOp(_FromPage, frozen=True, kw_only=True, tag="outlet"):
+    """Switch one of the component's outlets."""
+
+    ref: Ref
+    outlet: Level
+    on: bool
+
+
+class McuOp(_FromPage, frozen=True, kw_only=True, tag="mcu"):
+    """A command to a self-describing MCU, with the fields of its manifest."""
+
+    ref: Ref
+    uid: Level
+    name: Level
+    value: Annotated[dict[str, bool | int | float], Meta(max_length=64)]
+
+
+class ActionOp(_FromPage, frozen=True, kw_only=True, tag="action"):
+    """What the robot does once, and does not acknowledge."""
+
+    ref: Ref
+    name: Literal["reboot", "service-restart", "git-pull"]
+
+
+class FlagOp(_FromPage, frozen=True, kw_only=True, tag="flag"):
+    """A switch whose last position the broker remembers."""
+
+    ref: Ref
+    name: Literal["remote-mirror", "mqtt-audio", "mqtt-video"]
+    on: bool
+
+
+#: What is published as it is asked for; see robot_commands.py.
+RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp
+
 FromPage: TypeAlias = (
     Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp
-)
+    | RobotOp
+)  # fmt: skip
 
 
 class _ToPage(Struct, frozen=True, kw_only=True, tag_field="op"):
@@ -176,6 +240,21 @@ class Refused(_ToPage, frozen=True, kw_only=True, tag="refused"):
     g: int = -1
 
 
+class Done(_ToPage, frozen=True, kw_only=True, tag="done"):
+    """A command was handed to the broker. Whether the robot obeys is seen in its own states."""
+
+    cmd: str
+    ref: str
+
+
+class Series(_ToPage, frozen=True, kw_only=True, tag="series"):
+    """What the server has of a metric of the watched component from before: ``[age in ms, value]``, oldest first."""
+
+    ref: str
+    metric: str
+    points: tuple[tuple[float, Any], ...]
+
+
 class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
     """The last message of a connection that the server closes. ``again``: whether to connect again."""
 
@@ -183,7 +262,7 @@ class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
     again: bool
 
 
-ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Bye
+ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Series | Bye
 
 
 # -- values of the server's own metrics
@@ -262,11 +341,20 @@ class PictureFrom(Struct, frozen=True, kw_only=True):
     source: str
 
 
+class FlagsView(Struct, frozen=True, kw_only=True):
+    """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none."""
+
+    remote_mirror: bool | None = None
+    mqtt_audio: bool | None = None
+    mqtt_video: bool | None = None
+
+
 SERVER_METRICS: dict[str, type] = {
     "web/liveness": Liveness,
     "web/estop": EstopView,
     "web/driver": DriverView,
     "web/picture": PictureView,
     "web/picture-from": PictureFrom,
+    "web/flags": FlagsView,
     "web/broker": BrokerView,
 }

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
+import msgspec
 from msgspec import inspect as types
 
 from pebble.web import messages
@@ -79,7 +80,8 @@ def _section(struct: type) -> str:
 
 
 def _default(field: Any) -> str:
-    return f"`{json.dumps(field.default)}`"
+    value = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+    return f"`{json.dumps(value)}`"
 
 
 def _summary(thing: object) -> str:
@@ -106,6 +108,10 @@ def _script(kind: Any) -> str:
             return " | ".join(map(_script, kind.types))
         case types.StructType():
             return str(kind.cls.__name__)
+        case types.LiteralType():
+            return " | ".join(json.dumps(value) for value in kind.values)
+        case types.DictType():
+            return f"Record<{_script(kind.key_type)}, {_script(kind.value_type)}>"
         case types.VarTupleType():
             item = _script(kind.item_type)
             return f"({item})[]" if "|" in item else f"{item}[]"

@@ -142,8 +142,13 @@ class Robots:
         return {} if component is None else component.capabilities
 
     def topic(self, ref: str, section: str, key: str, channel: Channel) -> str:
-        """The topic that the capabilities name, if it is the component's own; else the channel's."""
-        listed = self.capabilities(ref).get(section)
+        """The topic that the capabilities name, if it is the component's own; else the channel's.
+
+        ``section`` may be one of a section: ``system.reboot``.
+        """
+        listed: Any = self.capabilities(ref)
+        for name in section.split("."):
+            listed = listed.get(name) if isinstance(listed, dict) else None
         topic = str(listed.get(key)) if isinstance(listed, dict) else ""
         return topic if own_topic(ref, topic, channel.direction) else channel.topic(ref)
 

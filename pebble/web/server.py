@@ -172,6 +172,17 @@ class Server:
             return "It was just reset: wait a moment"
         return "" if component.online(time.monotonic()) is not False else f"{component.name} is silent"
 
+    def refuses(self, op: m.RobotOp) -> str:
+        """Why this is not asked of a robot now; empty if it is."""
+        component = self.robots.components.get(op.ref)
+        if component is None:
+            return "unknown component"
+        if problem := self.broker.problem:
+            return f"The server cannot reach the broker: {problem}"
+        if isinstance(op, m.AutonomyOp) and op.file and component.estop.latched:
+            return "Stopped: reset it first"
+        return ""
+
     def picture_from(self, ref: str, source: str) -> None:
         """Show the picture of ``source`` on the page of ``ref``, for everybody; "" is its own."""
         if ref in self.robots.components and (not source or source in self.robots.components):

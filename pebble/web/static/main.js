@@ -64,6 +64,18 @@ function commands(socket, driver, estop) {
     release: () => driver.release(),
     setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
     setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
+    /** @param {string} ref @param {{r: number, g: number, b: number, period?: number}} colour each 0..1; seconds */
+    setLights: (ref, colour) => socket.send({ op: "lights", ref, ...colour }),
+    playSound: (ref, file, repeat = false) => socket.send({ op: "soundboard", ref, file, repeat }),
+    stopSound: (ref) => socket.send({ op: "soundboard", ref, file: "" }),
+    startScript: (ref, file, config) => socket.send({ op: "autonomy", ref, file, config }),
+    stopScript: (ref) => socket.send({ op: "autonomy", ref, file: "" }),
+    switchOutlet: (ref, outlet, on) => socket.send({ op: "outlet", ref, outlet, on }),
+    commandMcu: (ref, uid, name, value) => socket.send({ op: "mcu", ref, uid, name, value }),
+    /** @param {string} ref @param {"reboot" | "service-restart" | "git-pull"} name */
+    act: (ref, name) => socket.send({ op: "action", ref, name }),
+    /** @param {string} ref @param {"remote-mirror" | "mqtt-audio" | "mqtt-video"} name @param {boolean} on */
+    setFlag: (ref, name, on) => socket.send({ op: "flag", ref, name, on }),
     async logOut() {
       const headers = { "content-type": "application/json" };
       await fetch("/api/logout", { method: "POST", headers, body: "{}" }).catch(() => {});

@@ -71,6 +71,57 @@ export interface PictureFromOp {
   source: string;
 }
 
+export interface LightsOp {
+  op: "lights";
+  ref: string;
+  r?: number;
+  g?: number;
+  b?: number;
+  period?: number | null;
+}
+
+export interface SoundboardOp {
+  op: "soundboard";
+  ref: string;
+  file: string;
+  repeat?: boolean;
+}
+
+export interface AutonomyOp {
+  op: "autonomy";
+  ref: string;
+  file: string;
+  config?: Record<string, string | number | number | boolean | null>;
+}
+
+export interface OutletOp {
+  op: "outlet";
+  ref: string;
+  outlet: string;
+  on: boolean;
+}
+
+export interface McuOp {
+  op: "mcu";
+  ref: string;
+  uid: string;
+  name: string;
+  value: Record<string, boolean | number | number>;
+}
+
+export interface ActionOp {
+  op: "action";
+  ref: string;
+  name: "git-pull" | "reboot" | "service-restart";
+}
+
+export interface FlagOp {
+  op: "flag";
+  ref: string;
+  name: "mqtt-audio" | "mqtt-video" | "remote-mirror";
+  on: boolean;
+}
+
 export interface Welcome {
   op: "welcome";
   server: string;
@@ -111,6 +162,19 @@ export interface Refused {
   ref: string;
   why: string;
   g?: number;
+}
+
+export interface Done {
+  op: "done";
+  cmd: string;
+  ref: string;
+}
+
+export interface Series {
+  op: "series";
+  ref: string;
+  metric: string;
+  points: [number, any][];
 }
 
 export interface Bye {
@@ -178,6 +242,12 @@ export interface PictureFrom {
   source: string;
 }
 
+export interface FlagsView {
+  remote_mirror?: boolean | null;
+  mqtt_audio?: boolean | null;
+  mqtt_video?: boolean | null;
+}
+
 export interface BrokerView {
   connected: boolean;
   problem: string;
@@ -190,9 +260,10 @@ export interface Metrics {
   "web/driver": DriverView;
   "web/picture": PictureView;
   "web/picture-from": PictureFrom;
+  "web/flags": FlagsView;
   "web/broker": BrokerView;
 }
 
-export type FromPage = Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp;
+export type FromPage = Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
 
-export type ToPage = Welcome | Ping | State | Logs | Refused | Bye;
+export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Series | Bye;

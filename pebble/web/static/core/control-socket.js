@@ -9,7 +9,8 @@ const CONNECT_MS = 8000; // a phone far from its access point needs seconds for 
 const TOKEN = "pebble-token"; // restores the driver lease after a reload
 
 /** @typedef {{store: any, version: string, onOpen?: () => void, onLost?: () => void,
- *   onRefused?: (message: any) => void, onLogs?: (message: any) => void, onBye?: (message: any) => void,
+ *   onRefused?: (message: any) => void, onDone?: (message: any) => void, onLogs?: (message: any) => void,
+ *   onSeries?: (message: any) => void, onBye?: (message: any) => void,
  *   onChange?: () => void}} Options */
 
 export class ControlSocket {
@@ -78,6 +79,10 @@ export class ControlSocket {
         return this.welcome(message);
       case "refused":
         return this.options.onRefused?.(message);
+      case "done":
+        return this.options.onDone?.(message);
+      case "series":
+        return this.options.onSeries?.(message);
       case "logs":
         return this.options.onLogs?.(message);
       case "bye":

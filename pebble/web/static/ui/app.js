@@ -2,7 +2,8 @@
 
 import { Banners } from "./banner.js";
 import { Header } from "./header.js";
-import { Boundary, html, useEffect, useMedia, useModel, usePage, usePart, useState } from "./hooks.js";
+import { Boundary, html, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
+import { Part } from "./parts.js";
 import { nameOf } from "./words.js";
 
 /** What is fetched when it is first shown, so that the first screen is there soon; main.js fetches the rest later. */
@@ -69,14 +70,4 @@ export function App() {
       <//>
     </main>
   </div>`;
-}
-
-function Part({ part, ...props }) {
-  const { body, failed } = usePart(part);
-  if (body) return html`<${body} ...${props} />`;
-  if (!failed) return html`<p class="loading" role="status">Loading…</p>`;
-  return html`<p class="failed" role="alert">
-    A part of this page could not be fetched.
-    <button type="button" onClick=${() => location.reload()}>Reload</button>
-  </p>`;
 }

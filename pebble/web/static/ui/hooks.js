@@ -183,3 +183,28 @@ export class Boundary extends Component {
     </p>`;
   }
 }
+
+const sheets = new Map(); // promises, by name
+
+/**
+ * A style sheet of a part of the page, beside app.css; to be awaited before the part is drawn.
+ * @param {string} name "cards.css" @returns {Promise<void>}
+ */
+export function fetchStyle(name) {
+  if (!sheets.has(name)) {
+    const link = document.createElement("link");
+    link.rel = "stylesheet";
+    link.href = new URL(`../${name}`, import.meta.url).href;
+    const loaded = new Promise((resolve, reject) => {
+      link.onload = () => resolve(undefined);
+      link.onerror = () => {
+        sheets.delete(name);
+        link.remove();
+        reject(new Error(`${name} could not be fetched`));
+      };
+    });
+    sheets.set(name, loaded);
+    document.head.append(link);
+  }
+  return sheets.get(name);
+}

@@ -186,16 +186,34 @@ const list = (value) => (Array.isArray(value) ? value.filter((one) => typeof one
 
 /** What a component offers, by its capabilities; a robot without any is assumed to have a camera. */
 export class Offers {
-  /** @param {string} ref @param {any} capabilities payload */
-  constructor(ref, capabilities) {
+  /** @param {string} ref @param {any} capabilities payload @param {string[]} [metrics] that were received of it */
+  constructor(ref, capabilities, metrics = []) {
+    this.metrics = metrics;
+    this.isRobot = ref.split("/")[1] === "robots";
     const value = inner(capabilities);
     this.known = isObject(value);
     this.value = this.known ? value : {};
-    this.assumed = !this.known && ref.split("/")[1] === "robots";
+    this.assumed = !this.known && this.isRobot;
   }
 
   section(name) {
     return isObject(this.value[name]) ? this.value[name] : {};
+  }
+
+  /** Whether it has a section that people use; assumed of a robot without capabilities, as the original page does. */
+  has(name) {
+    const section = this.section(name);
+    return this.assumed || section.available === true || (name === "system" && Object.keys(section).length > 0);
+  }
+
+  /** @param {string} prefix @returns {boolean} whether any such metric was received */
+  received(prefix) {
+    return this.metrics.some((metric) => metric.startsWith(prefix));
+  }
+
+  get hasLights() {
+    const lights = this.section("lights");
+    return lights.solid === true || lights.flash === true || lights.available === true;
   }
 
   get drives() {

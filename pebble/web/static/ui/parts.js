@@ -1,6 +1,6 @@
 // Small parts of many widgets.
 
-import { html, useEffect, useRef, useState, useTick } from "./hooks.js";
+import { html, useEffect, usePart, useRef, useState, useTick } from "./hooks.js";
 import { roughly } from "./words.js";
 
 const ICONS = new URL("../icons.svg", import.meta.url).href;
@@ -130,4 +130,15 @@ export function Card({ title, id, icon, aside, view, className = "", children })
     </header>
     ${!closed && html`<div class="card-body">${children}</div>`}
   </section>`;
+}
+
+/** A part of the page that is fetched when it is first shown. */
+export function Part({ part, ...props }) {
+  const { body, failed } = usePart(part);
+  if (body) return html`<${body} ...${props} />`;
+  if (!failed) return html`<p class="loading" role="status">Loading…</p>`;
+  return html`<p class="failed" role="alert">
+    A part of this page could not be fetched.
+    <button type="button" onClick=${() => location.reload()}>Reload</button>
+  </p>`;
 }

@@ -2,14 +2,14 @@
 
 import { CARDS, TABS } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
-import { Boundary, html, useEffect, useMetric, useModel, usePage, useState, useValue } from "./hooks.js";
+import { Boundary, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
 import { CardView, Offers } from "./models.js";
-import { Card, Icon } from "./parts.js";
+import { Card, Icon, Part } from "./parts.js";
 import { NoCamera, PictureSettings, Stage, useVideo } from "./video.js";
 import { nameOf, typeOf } from "./words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
-  const offers = new Offers(at, useValue(at, "capabilities"));
+  const offers = new Offers(at, useValue(at, "capabilities"), useMetrics(at));
   const [view] = useState(() => new CardView(at));
   useModel(view);
   const source = useValue(at, "web/picture-from")?.source || at;
@@ -160,7 +160,7 @@ const wanted = (offers, view) => CARDS.filter((card) => card.wants(offers) && !v
 
 function CardOf({ card, at, offers, view }) {
   return html`<${Card} id=${card.id} title=${card.title} icon=${card.icon} view=${view}>
-    <${Boundary} what=${card.title}><${card.body} at=${at} offers=${offers} /><//>
+    <${Boundary} what=${card.title}><${Part} part=${card.part} at=${at} offers=${offers} /><//>
   <//>`;
 }
 

@@ -1,0 +1,82 @@
+"""What a page asks of a robot, besides driving: which right it needs, and what is then published. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import msgspec
+
+from pebble import contract as c
+from pebble.contract import Channel, codec
+from pebble.contract import payloads as p
+from pebble.transports import Message, QoS
+from pebble.web import messages as m
+
+#: The topic of a channel of one component: its section and key of the capabilities, and the channel's own.
+TopicOf = Callable[[str, str, str, Channel], str]
+
+
+class _Command(NamedTuple):
+    channel: Channel
+    value: Any
+    section: str = ""  # of the capabilities that may name another topic; with dots: a section of a section
+    key: str = ""
+    names: dict[str, str] = {}  # of the channel's topic  # noqa: RUF012 - never changed
+    right: str = "drive"
+
+
+_ACTIONS = {
+    "reboot": (c.REBOOT, "reboot"),
+    "service-restart": (c.SERVICE_RESTART, "service_restart"),
+    "git-pull": (c.GIT_PULL, "git_pull"),
+}
+_FLAGS = {
+    "remote-mirror": (c.REMOTE_MIRROR, ""),
+    "mqtt-audio": (c.MQTT_AUDIO, "audio"),
+    "mqtt-video": (c.MQTT_VIDEO, "video"),
+}
+
+
+def right(op: m.RobotOp) -> str:
+    """That a person needs to ask this."""
+    return _command(op).right
+
+
+def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:
+    """What to publish."""
+    command = _command(op)
+    channel = command.channel
+    if command.section:
+        topic = topic_of(op.ref, command.section, command.key, channel)
+    else:
+        topic = channel.topic(op.ref, **command.names)
+    qos = QoS(channel.default_qos)
+    return Message(topic, codec.encode(channel, command.value), qos=qos, retain=channel.default_retain)
+
+
+def _command(op: m.RobotOp) -> _Command:
+    match op:
+        case m.LightsOp(r=r, g=g, b=b, period=None):
+            return _Command(c.LIGHTS_SOLID, p.LightsSolid(r=r, g=g, b=b), "lights", "solid_topic")
+        case m.LightsOp(r=r, g=g, b=b, period=period):
+            return _Command(c.LIGHTS_FLASH, p.LightsFlash(r=r, g=g, b=b, period=period or 0), "lights", "flash_topic")
+        case m.SoundboardOp(file=file, repeat=repeat):
+            play = p.SoundboardCommand(action="play", enabled=True, file=file, repeat=repeat or msgspec.UNSET)
+            stop = p.SoundboardCommand(action="stop", enabled=False)
+            return _Command(c.SOUNDBOARD_COMMAND, play if file else stop, "soundboard", "command_topic")
+        case m.AutonomyOp(file=file, config=config):
+            start = p.AutonomyCommand(action="start", file=file, config=config)
+            return _Command(
+                c.AUTONOMY_COMMAND, start if file else p.AutonomyCommand(action="stop"), "autonomy", "command_topic"
+            )
+        case m.OutletOp(outlet=outlet, on=on):
+            return _Command(c.OUTLET_COMMAND, p.OutletCommand(on=on), names={"outlet": outlet})
+        case m.McuOp(uid=uid, name=name, value=value):
+            return _Command(c.MCU_COMMAND, value, names={"uid": uid, "name": name})
+        case m.ActionOp(name=name):
+            channel, key = _ACTIONS[name]
+            return _Command(channel, True, f"system.{key}", "flag_topic", right="system")
+        case m.FlagOp(name=name, on=on):
+            channel, section = _FLAGS[name]
+            return _Command(channel, on, section, "flag_topic")
