@@ -160,6 +160,13 @@ class Driving:
         announced = self._announced.get(ref)
         return announced if announced is not None and now - announced.at <= ANNOUNCED_S else None
 
+    def moved_by(self, ref: str, now: float) -> str:
+        """Who moves that robot now: while a gesture lasts, or a lease at another server. Empty: no page does."""
+        if (announced := self.elsewhere(ref, now)) is not None:
+            return announced.by
+        lease = self.leases.get(ref)
+        return lease.tab.user if lease is not None and lease.tab.live_ref == ref else ""
+
     # -- commands
 
     def drive(self, tab: Tab, op: DriveOp, now: float, blocked: str = "") -> Outcome:

@@ -133,7 +133,7 @@ class SoundboardOp(_FromPage, frozen=True, kw_only=True, tag="soundboard"):
     """Play one of the robot's clips, once or until it is stopped; "" stops."""
 
     ref: Ref
-    file: Annotated[str, Meta(max_length=300)]
+    file: Annotated[str, Meta(max_length=1000)]
     repeat: bool = False
 
 

@@ -12,6 +12,7 @@ from pebble.contract import Channel, codec
 from pebble.contract import payloads as p
 from pebble.transports import Message, QoS
 from pebble.web import messages as m
+from pebble.web.robots import section_of
 
 #: The topic of a channel of one component: its section and key of the capabilities, and the channel's own.
 TopicOf = Callable[[str, str, str, Channel], str]
@@ -41,6 +42,28 @@ _FLAGS = {
 def right(op: m.RobotOp) -> str:
     """That a person needs to ask this."""
     return _command(op).right
+
+
+def ends(op: m.RobotOp) -> bool:
+    """Whether it ends something: then it is passed on whatever the component is and reports."""
+    match op:
+        case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False):
+            return True
+    return False
+
+
+def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
+    """Why a component with these capabilities is not asked this; empty if it is, also where they do not mention it."""
+    command = _command(op)
+    offered = section_of(capabilities, command.section) if command.section else {}
+    kind = command.key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
+    if isinstance(op, m.OutletOp):
+        outlets = section_of(capabilities, "outlets").get("outlets")
+        named = [one for one in outlets if isinstance(one, dict)] if isinstance(outlets, list) else []
+        offered = next((one for one in named if one.get("name") == op.outlet), {})
+    refused = any(offered.get(name) is False for name in ("available", "controls", kind))
+    name, metric = op.ref.rpartition("/")[2], command.channel.metric.format(**command.names)
+    return f"{name} takes no {metric} commands" if refused else ""
 
 
 def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:

@@ -23,6 +23,7 @@ from pebble.contract import (
     LOGS,
     MEDIA_STATUS,
     ONLINE,
+    SOUNDBOARD_FILES,
     STATUS,
     Channel,
     Kind,
@@ -36,6 +37,7 @@ from pebble.transports import Message
 from pebble.web import messages as m
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
+_MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
 LOG_LINES = 500  # of the watched component
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
@@ -142,14 +144,8 @@ class Robots:
         return {} if component is None else component.capabilities
 
     def topic(self, ref: str, section: str, key: str, channel: Channel) -> str:
-        """The topic that the capabilities name, if it is the component's own; else the channel's.
-
-        ``section`` may be one of a section: ``system.reboot``.
-        """
-        listed: Any = self.capabilities(ref)
-        for name in section.split("."):
-            listed = listed.get(name) if isinstance(listed, dict) else None
-        topic = str(listed.get(key)) if isinstance(listed, dict) else ""
+        """The topic that the capabilities name, if it is the component's own; else the channel's."""
+        topic = str(section_of(self.capabilities(ref), section).get(key))
         return topic if own_topic(ref, topic, channel.direction) else channel.topic(ref)
 
     def value(self, ref: str, metric: str) -> msgspec.Raw | None:
@@ -276,7 +272,7 @@ class Robots:
         size = len(message.payload)
         grows = size - (0 if old is None else len(bytes(old.raw)))
         if (
-            size > MAX_VALUE_BYTES
+            size > (_MAX_CLIPS_BYTES if channel is SOUNDBOARD_FILES else MAX_VALUE_BYTES)
             or (old is None and len(component.values) >= MAX_METRICS)
             or self._bytes + grows > MAX_BYTES
         ):
@@ -339,6 +335,14 @@ class Robots:
             if everybody or interest.watched == ref:
                 interest.dirty.add((ref, metric))
                 interest.notify()
+
+
+def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
+    """A section of capabilities, or one of a section: ``system.reboot``. Empty if there is none."""
+    found: Any = capabilities
+    for level in name.split("."):
+        found = found.get(level) if isinstance(found, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 def own_topic(ref: str, topic: object, direction: str) -> bool:

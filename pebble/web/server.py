@@ -23,11 +23,12 @@ from pebble.fleet.people import People
 from pebble.fleet.roles import Session
 from pebble.transports import Message
 from pebble.web import messages as m
+from pebble.web import robot_commands
 from pebble.web.broker import Broker
 from pebble.web.driving import Command, Driving
 from pebble.web.media import MediaHub
 from pebble.web.open_components import OpenComponents
-from pebble.web.robots import FLEET, SYNONYMS, Robots
+from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
 from pebble.web.settings import WebSettings
 from pebble.web.stops import Stops
 
@@ -173,15 +174,26 @@ class Server:
         return "" if component.online(time.monotonic()) is not False else f"{component.name} is silent"
 
     def refuses(self, op: m.RobotOp) -> str:
-        """Why this is not asked of a robot now; empty if it is."""
+        """Why this is not asked of a robot now; empty if it is. What ends something is always asked."""
         component = self.robots.components.get(op.ref)
         if component is None:
             return "unknown component"
         if problem := self.broker.problem:
             return f"The server cannot reach the broker: {problem}"
-        if isinstance(op, m.AutonomyOp) and op.file and component.estop.latched:
+        if robot_commands.ends(op):
+            return ""
+        if component.online(time.monotonic()) is False and not isinstance(op, m.FlagOp):  # the broker remembers flags
+            return f"{component.name} is silent"
+        why = robot_commands.refusal(op, component.capabilities)
+        return self._script_refused(component) if isinstance(op, m.AutonomyOp) and not why else why
+
+    def _script_refused(self, component: Component) -> str:
+        """Why no script may begin now; empty if one may."""
+        if component.estop.latched:
             return "Stopped: reset it first"
-        return ""
+        by = self.driving.moved_by(component.ref, clock())
+        arbitrates = section_of(component.capabilities, "drive").get("arbitrates") is True
+        return f"{by} is driving" if by and not arbitrates else ""
 
     def picture_from(self, ref: str, source: str) -> None:
         """Show the picture of ``source`` on the page of ``ref``, for everybody; "" is its own."""

@@ -9,7 +9,7 @@ export const SLOW_SPEED = 0.4;
 const LET_GO = "Let go first"; // the server says the same
 const RESET_MS = 600; // after a reset robots refuse whoever has not paused for 0.5 s
 
-/** @typedef {{code: string, text: string, action?: {label: string, kind: "take"|"take-over"|"see"|"login"|"reload"}}} Reason */
+/** @typedef {{code: string, text: string, action?: {label: string, kind: "take"|"take-over"|"see"|"login"|"reload"|"stop-script"}}} Reason */
 
 /**
  * @typedef {object} Situation
@@ -88,14 +88,19 @@ function leaseReason(s) {
 function momentReason(s) {
   if (s.loading) return reason("loading", "This screen is still loading");
   if (s.dialog) return reason("dialog", "Close the panel first");
-  if (s.script?.running && s.capabilities.drive?.arbitrates !== true)
-    return reason("script", `${s.script.file || "A script"} is driving: stop it first`);
+  if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(s.script.file);
   if (s.pictureAgeMs !== null && s.pictureAgeMs > PICTURE_OLD_MS && !s.inSight) return reason("picture", oldPicture(s), SEE);
   if (s.roundTripMs >= LATE_MS) return reason("late", `Commands are late (${Math.round(s.roundTripMs)} ms)`);
   if (s.padFrozen) return reason("pad", "The gamepad stands still: move its stick to neutral and back");
   if (s.fromKeys && !s.focus) return reason("focus", "Click this page first: keys go to another window");
   if (s.mustRelease) return reason("release", s.refusal && s.refusal !== LET_GO ? `${LET_GO}. It was: ${s.refusal}` : LET_GO);
   return null;
+}
+
+function scriptReason(file) {
+  const name = typeof file === "string" ? file.slice(0, 40) : "";
+  const action = { label: `Stop ${name || "the script"}`, kind: "stop-script" };
+  return reason("script", `${name || "A script"} is driving: stop it first`, action);
 }
 
 const SEE = { label: "I can see the robot", kind: "see" };

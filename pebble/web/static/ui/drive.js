@@ -51,6 +51,10 @@ function ReasonAction({ action }) {
       >`;
     case "see":
       return html`<button type="button" data-test="see" onClick=${() => see(driver)}>${action.label}</button>`;
+    case "stop-script":
+      return html`<button type="button" data-test="stop-script" onClick=${() => commands.stopScript(driver.ref)}>
+        ${action.label}
+      </button>`;
     case "login":
       return html`<a class="button" href="/login">${action.label}</a>`;
     case "reload":

@@ -166,7 +166,8 @@ export class CardView extends Model {
   }
 }
 
-function read(name, otherwise) {
+/** What this browser remembers. @param {string} name @param {any} otherwise @returns {any} */
+export function read(name, otherwise) {
   try {
     return JSON.parse(localStorage.getItem(`pebble ${name}`) ?? "null") ?? otherwise;
   } catch {
@@ -174,7 +175,8 @@ function read(name, otherwise) {
   }
 }
 
-function write(name, value) {
+/** @param {string} name @param {any} value */
+export function write(name, value) {
   try {
     localStorage.setItem(`pebble ${name}`, JSON.stringify(value));
   } catch {

@@ -1,0 +1,42 @@
+// Why nothing can be asked of a component now, besides driving: the first reason counts.
+
+import { useModel, usePage, useValue } from "./hooks.js";
+import { inner, isObject, nameOf } from "./words.js";
+
+/** @typedef {{store: import("../core/store.js").Store, connection: import("./models.js").Connection}} Services */
+
+/** Why this page may not even end anything; "" it may. @param {Services} page @returns {string} */
+export function whyNotEnd({ store, connection }) {
+  if (!connection.isOpen) return "No connection to the server";
+  if (store.get("", "web/broker")?.value.problem) return "The server cannot reach the broker";
+  return connection.may("drive") ? "" : "Log in as driver to use this";
+}
+
+/** @param {Services} page @param {string} ref @param {string} section of its capabilities @returns {string} "" all is well */
+export function whyNot(page, ref, section) {
+  const why = whyNotEnd(page);
+  if (why) return why;
+  const { store } = page;
+  if (store.get(ref, "web/liveness")?.value.online === false) return `${nameOf(ref)} is silent`;
+  return sectionOf(store.get(ref, "capabilities")?.value, section).controls === false
+    ? `${nameOf(ref)} takes no such commands`
+    : "";
+}
+
+/** @param {unknown} capabilities payload @param {string} name @returns {Record<string, any>} empty if there is none */
+export function sectionOf(capabilities, name) {
+  const value = inner(capabilities);
+  return isObject(value) && isObject(value[name]) ? value[name] : {};
+}
+
+const picked = ({ isOpen, you }) => `${isOpen} ${you?.role}`;
+
+/** Draw again when any of the reasons may have changed. @param {string} at @returns {any} the services of the page */
+export function useReasons(at) {
+  const page = usePage();
+  useModel(page.connection, picked);
+  useValue("", "web/broker");
+  useValue(at, "web/liveness");
+  useValue(at, "capabilities");
+  return page;
+}
