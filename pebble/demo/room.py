@@ -14,6 +14,12 @@ from pebble.media.world.world_file import read_world
 
 TAG_ID, TAG_SIZE_M = 21, 0.25  # of the tag that Goob follows, as in the world file
 CLIP, CLIP_S = "horn.wav", 1.0
+#: Further clips: the tones of each in Hz, and how long one lasts.
+_SIGNALS = {
+    "signals/beep.wav": ((880.0,), 0.15),
+    "signals/fanfare.wav": ((392.0, 523.3, 659.3, 784.0), 0.2),
+    "signals/two-tone.wav": ((440.0, 587.3) * 3, 0.4),
+}
 _RATE = 16_000
 #: After the first round of driving Goob looks at that tag, and has space for further rounds wherever it is then.
 _START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
@@ -35,14 +41,23 @@ class Room:
 
 
 def write_clip(folder: Path) -> bytes:
-    """A horn in ``folder``, which is created; returns its samples."""
-    folder.mkdir()
-    seconds = np.arange(round(CLIP_S * _RATE)) / _RATE
-    tone = np.sin(2 * np.pi * 440.0 * seconds) + np.sin(2 * np.pi * 554.4 * seconds)
-    samples = (tone * 8000).astype("<i2").tobytes()
-    with wave.open(str(folder / CLIP), "wb") as file:
+    """A horn in ``folder``, which is created, and some signals; returns the samples of the horn."""
+    (folder / "signals").mkdir(parents=True)
+    for name, (tones, seconds) in _SIGNALS.items():
+        _write(folder / name, b"".join(_sound(seconds, tone) for tone in tones))
+    horn = _sound(CLIP_S, 440.0, 554.4)
+    _write(folder / CLIP, horn)
+    return horn
+
+
+def _sound(seconds: float, *tones: float) -> bytes:
+    at = np.arange(round(seconds * _RATE)) / _RATE
+    return (sum(np.sin(2 * np.pi * tone * at) for tone in tones) * 8000).astype("<i2").tobytes()
+
+
+def _write(path: Path, samples: bytes) -> None:
+    with wave.open(str(path), "wb") as file:
         file.setnchannels(1)
         file.setsampwidth(2)
         file.setframerate(_RATE)
         file.writeframes(samples)
-    return samples

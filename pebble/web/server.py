@@ -189,6 +189,8 @@ class Server:
 
     def _script_refused(self, component: Component) -> str:
         """Why no script may begin now; empty if one may."""
+        if component.online(time.monotonic()) is not True:
+            return f"{component.name} has not been seen yet"
         if component.estop.latched:
             return "Stopped: reset it first"
         by = self.driving.moved_by(component.ref, clock())

@@ -258,3 +258,83 @@ STATES: dict[str, State] = {
         values=changed(fleet, MINE, at(GOOB, "web/picture-from", {"source": TOWER}), at(TOWER, "web/picture", flow())),
     ),
 }
+
+
+# -- lights, sounds and scripts
+
+
+def asked(**sections: Any) -> Callable[[int], Value]:
+    """Goob with what can be asked of it; ``sections`` are changed ones of its capabilities."""
+    offered = {"available": True, "controls": True}
+    more = {"lights": {"solid": True, "flash": True}, "soundboard": offered, "autonomy": offered} | sections
+    known = capabilities("zenoh")
+    return at(GOOB, "capabilities", known | {"value": known["value"] | more}, 60_000)
+
+
+def setting(key: str, label: str, kind: str, default: Any = None, **more: Any) -> dict[str, Any]:
+    return {"key": key, "label": label, "type": kind, "default": default, "arg": f"--{key}"} | more
+
+
+FOLLOW = [
+    setting("tag_id", "Tag ID", "int", min=0, max=34, step=1, required=True),
+    setting("distance_m", "Distance (m)", "float", 0.6, min=0.2, max=3.0),
+    setting("search", "Search", "bool", True),
+    setting("family", "Family of the tags", "enum", "APRILTAG_25H9", options=["APRILTAG_25H9", "APRILTAG_36H11"]),
+    setting("topic", "Topic", "string", ""),
+]
+SCRIPTS = {
+    "files": [
+        {"file": "apriltag-follow", "label": "Follow a tag", "configs": FOLLOW},
+        {"file": "wheel-odometry", "label": "Wheel odometry", "configs": []},
+    ],
+    "controls": True,
+    "timestamp": 1.0,
+}
+CLIPS = {
+    "files": ["horn.wav", "intro.mp3", *(f"speech/number {n}.wav" for n in range(140)), "warn/siren, long and loud.wav"],
+    "controls": True,
+    "timestamp": 1.0,
+}
+
+
+def script(now: int, **more: Any) -> Value:
+    """Goob's running script."""
+    config = {"tag_id": 5, "distance_m": 0.6, "search": True, "family": "APRILTAG_36H11"}
+    parts = [{"file": "wheel-odometry", "pid": 812, "running": True}]
+    status = {"running": True, "file": "apriltag-follow", "pid": 813, "dependencies": parts, "error": None}
+    return (GOOB, "autonomy-status", status | {"config": config, "timestamp": now / 1000, "controls": True} | more, 4000)
+
+
+def sound(**more: Any) -> Callable[[int], Value]:
+    return at(GOOB, "soundboard-status", {"playing": False, "file": None, "error": None, "timestamp": 1.0} | more, 2000)
+
+
+ASKED = changed(
+    fleet,
+    asked(),
+    at(GOOB, "soundboard-files", CLIPS, 9000),
+    at(GOOB, "autonomy-files", SCRIPTS, 9000),
+    sound(),
+    at(GOOB, "autonomy-status", {"running": False, "timestamp": 1.0, "error": None}, 9000),
+)
+NOT_ARBITRATED = asked(drive={"available": True, "controls": True})
+STATES |= {
+    "asked": State(GOOB_PATH, changed(ASKED, MINE), LIVE),
+    "asked-busy": State(
+        GOOB_PATH,
+        changed(ASKED, MINE, lambda now: script(now, overridden=True), sound(playing=True, file="speech/number 3.wav")),
+        LIVE,
+    ),
+    "asked-failed": State(
+        GOOB_PATH,
+        changed(
+            ASKED,
+            MINE,
+            at(GOOB, "autonomy-status", {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"}),
+            sound(error="the loudspeaker is busy (talk-back plays)"),
+        ),
+        LIVE,
+    ),
+    "asked-viewer": State(GOOB_PATH, ASKED, LIVE, VIEWER),
+    "script-drives": State(GOOB_PATH, changed(ASKED, MINE, NOT_ARBITRATED, lambda now: script(now)), LIVE),
+}

@@ -237,6 +237,13 @@ def ops(ref: str) -> dict[str, dict[str, Any]]:
         "estop-reset": {"ref": ref, "owners": [OWNER]},
         "encoding": {"ref": ref, "encoding": "json"},
         "picture-from": {"ref": ref, "source": GOOB},
+        "lights": {"ref": ref, "r": 1},
+        "soundboard": {"ref": ref, "file": "horn.wav"},
+        "autonomy": {"ref": ref, "file": "follow"},
+        "outlet": {"ref": ref, "outlet": "o1", "on": True},
+        "mcu": {"ref": ref, "uid": "imu", "name": "led", "value": {}},
+        "action": {"ref": ref, "name": "reboot"},
+        "flag": {"ref": ref, "name": "mqtt-video", "on": False},
     }
 
 

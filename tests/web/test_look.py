@@ -46,6 +46,31 @@ def _drive(page: Page) -> None:
     page.keyboard.down("KeyD")
 
 
+def _at_card(name: str) -> Callable[[Page], None]:
+    """Scroll to a card."""
+
+    def act(page: Page) -> None:
+        page.locator(f'[data-card="{name}"]').evaluate("(card) => card.scrollIntoView({ block: 'center' })")
+
+    return act
+
+
+def _mistaken(page: Page) -> None:
+    """Fill a form in, with two mistakes."""
+    page.locator('[data-test="script"]').select_option("apriltag-follow")
+    page.locator('[data-test="set-distance_m"]').fill("9")
+    page.locator('[data-test="set-search"]').uncheck()
+
+
+def _on_phone(tab_: str, then: Callable[[Page], None] = _nothing) -> Callable[[Page], None]:
+    def act(page: Page) -> None:
+        page.locator(f'[data-test="tab-{tab_}"]').click()
+        page.locator(".card button").first.wait_for()
+        then(page)
+
+    return act
+
+
 class Screen(NamedTuple):
     """One picture: a state of the server, and what a person does then."""
 
@@ -79,11 +104,13 @@ WHEN = {
     "plain-http": "not encrypted",
     "tower": "pbvz 640×360",
     "other-camera": "seen from tower-1",
+    "script-drives": "Stop apriltag-follow",
 }
 SCREENS = [
     *(
         Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
         for name in STATES
+        if not name.startswith("asked")  # below the picture
     ),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
     Screen("thumbnails", "fleet", _press(".check")),
@@ -94,6 +121,16 @@ SCREENS = [
     Screen("settings", "driving", _press(".tabs button:nth-child(3)", ".wide"), ("phone",)),
     Screen("drawer", "driving", _press(".round"), ("landscape",)),
     Screen("small", "driving", sizes=("small",)),
+    Screen("lights", "asked", _press('[data-test="colour-blue"]'), ("desktop",), _at_card("lights")),
+    Screen("sounds", "asked-busy", sizes=("desktop",), hold=_at_card("sounds")),
+    Screen("scripts", "asked-busy", sizes=("desktop",), hold=_at_card("autonomy")),
+    Screen("form", "asked", _mistaken, ("desktop",), _at_card("autonomy")),
+    Screen("failed", "asked-failed", sizes=("desktop",), hold=_at_card("autonomy")),
+    Screen("not-asked", "asked-viewer", sizes=("desktop",), hold=_at_card("autonomy")),
+    Screen("lights", "asked", _on_phone("more"), ("phone",), _at_card("lights")),
+    Screen("sounds", "asked-busy", _on_phone("sound"), ("phone",)),
+    Screen("scripts", "asked-busy", _on_phone("more"), ("phone",), _at_card("autonomy")),
+    Screen("form", "asked", _on_phone("more", _mistaken), ("phone",), _at_card("autonomy")),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 

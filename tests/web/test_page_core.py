@@ -302,12 +302,25 @@ def test_the_first_reason_counts() -> None:
     assert found[-2]["text"] == "Let go first. It was: Commands are late"
     actions = {one["code"]: one["action"]["kind"] for one in found if one is not None and "action" in one}
     expected = {"reload": "reload", "role": "login", "lease": "take-over", "free": "take", "picture": "see"}
-    assert actions == expected
+    assert actions == expected | {"script": "stop-script"}
 
 
 def test_without_server_or_broker_everything_is_off() -> None:
     steps = "result = mends.map((mend) => offReason(Object.assign(situation, mend))?.code ?? null).slice(0, 4);"
     assert reasons(steps) == ["server", "broker", None, None]
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "label"),
+    [
+        ('"april-follow"', "april-follow is driving: stop it first", "Stop april-follow"),
+        ('{ "x": 1 }', "A script is driving: stop it first", "Stop the script"),
+        ('"x".repeat(1000)', f"{'x' * 40} is driving: stop it first", f"Stop {'x' * 40}"),
+    ],
+)
+def test_a_script_that_drives_can_be_stopped(file: str, text: str, label: str) -> None:
+    steps = f"{_GOOD} result = driveReason({{ ...situation, script: {{ running: true, file: {file} }} }});"
+    assert reasons(steps) == {"code": "script", "text": text, "action": {"label": label, "kind": "stop-script"}}
 
 
 _GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
