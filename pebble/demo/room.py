@@ -51,8 +51,8 @@ def write_clip(folder: Path) -> bytes:
 
 
 def _sound(seconds: float, *tones: float) -> bytes:
-    at = np.arange(round(seconds * _RATE)) / _RATE
-    return (sum(np.sin(2 * np.pi * tone * at) for tone in tones) * 8000).astype("<i2").tobytes()
+    phases = 2 * np.pi * np.outer(tones, np.arange(round(seconds * _RATE)) / _RATE)
+    return (np.sin(phases).sum(axis=0) * 8000).astype("<i2").tobytes()
 
 
 def _write(path: Path, samples: bytes) -> None:

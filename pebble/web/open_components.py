@@ -7,22 +7,37 @@ from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from pebble.contract import CHARGING_LEVEL, CHARGING_STATUS, IMU, TOUCH_SENSORS, WHEEL_ODOMETRY, Channel
+from pebble.contract import (
+    AUTONOMY_FILES,
+    AUTONOMY_STATUS,
+    CHARGING_LEVEL,
+    CHARGING_STATUS,
+    IMU,
+    SOUNDBOARD_FILES,
+    SOUNDBOARD_STATUS,
+    TOUCH_SENSORS,
+    WHEEL_ODOMETRY,
+    Channel,
+)
 from pebble.contract.identity import Direction
 from pebble.transports import Message, Subscription
 from pebble.web.broker import Broker
-from pebble.web.robots import LOG_LINES, WATCHED, Robots, own_topic
+from pebble.web.robots import LOG_LINES, WATCHED, Robots, own_topic, section_of
 
 _KEEP_S = 5.0  # so long they are still received after the last page has closed the component
 _STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
 
-#: Channels whose topic capabilities may name, below ``telemetry``.
-_TELEMETRY: dict[str, Channel] = {
-    "touch_topic": TOUCH_SENSORS,
-    "charging_topic": CHARGING_STATUS,
-    "charging_level_topic": CHARGING_LEVEL,
-    "wheel_odometry_topic": WHEEL_ODOMETRY,
-    "imu_topic": IMU,
+#: Channels whose topic capabilities may name, by its section and key there.
+_NAMED: dict[tuple[str, str], Channel] = {
+    ("telemetry", "touch_topic"): TOUCH_SENSORS,
+    ("telemetry", "charging_topic"): CHARGING_STATUS,
+    ("telemetry", "charging_level_topic"): CHARGING_LEVEL,
+    ("telemetry", "wheel_odometry_topic"): WHEEL_ODOMETRY,
+    ("telemetry", "imu_topic"): IMU,
+    ("soundboard", "files_topic"): SOUNDBOARD_FILES,
+    ("soundboard", "status_topic"): SOUNDBOARD_STATUS,
+    ("autonomy", "files_topic"): AUTONOMY_FILES,
+    ("autonomy", "status_topic"): AUTONOMY_STATUS,
 }
 
 
@@ -90,9 +105,9 @@ class OpenComponents:
     def _filters(self, ref: str) -> dict[str, Channel | None]:
         """Every channel's own topic, and those that the capabilities name, if they are the component's own."""
         filters: dict[str, Channel | None] = {channel.filter(ref): None for channel in WATCHED}
-        listed = self._robots.capabilities(ref).get("telemetry")
-        for key, channel in _TELEMETRY.items():
-            topic = listed.get(key) if isinstance(listed, dict) else None
-            if own_topic(ref, topic, Direction.OUTGOING) and str(topic) not in filters:
+        capabilities = self._robots.capabilities(ref)
+        for (section, key), channel in _NAMED.items():
+            topic = section_of(capabilities, section).get(key)
+            if own_topic(ref, topic, Direction.OUTGOING) and str(topic) not in (*filters, channel.topic(ref)):
                 filters[str(topic)] = channel
         return filters

@@ -283,6 +283,30 @@ def test_a_robot_cannot_have_others_asked(broker, served: Served, robot: Recordi
         assert robot.received == []
 
 
+def test_clips_and_scripts_on_topics_that_the_robot_names(broker, served: Served, robot: RecordingRobot):
+    base = f"pebble/robots/asked{next(NUMBERS)}"
+    own = f"{base}/outgoing/renamed"
+    named = {"soundboard": {"files_topic": f"{own}/clips", "status_topic": f"{robot.base}/outgoing/soundboard-status"}}
+    named["autonomy"] = {"files_topic": f"{own}/scripts", "status_topic": f"{own}/script"}
+    with RecordingRobot(broker.port, base, capabilities=named) as one, served.page() as page:
+        assert page.knows(base)
+        page.send("watch", ref=base)
+        robot.publish("soundboard-status", {"playing": True, "file": "foreign"}, retain=True)
+        values = {"clips": "soundboard-files", "scripts": "autonomy-files", "script": "autonomy-status"}
+        for topic, metric in values.items():
+            one.publish(f"renamed/{topic}", {"of": topic}, retain=True)
+            assert until(lambda metric=metric: page.value(base, metric), 3), metric
+            assert page.value(base, metric) == {"of": topic}
+        assert page.value(base, "soundboard-status") is None
+
+
+def test_a_long_list_of_clips_is_passed_on(page: Page, robot: RecordingRobot):
+    files = [f"speech/number {number}, spoken by a person.wav" for number in range(6000)]  # 256 KiB of names
+    page.send("watch", ref=robot.base)
+    robot.publish("soundboard-files", {"files": files, "timestamp": 1.0}, retain=True)
+    assert until(lambda: page.value(robot.base, "soundboard-files", "files") == files, 5)
+
+
 def test_a_stopped_robot_starts_no_script_but_may_end_one(page: Page, robot: RecordingRobot):
     page.send("estop", ref=robot.base, stop="00000000000000a1")
     assert until(lambda: page.value(robot.base, "web/estop", "latched") is True)

@@ -21,20 +21,26 @@ export const Autonomy = styled("commands.css", ({ at }) => {
   const entry = useMetric(at, "autonomy-status");
   const status = statusOf(entry?.value);
   const [chosen, choose] = useState(() => status.file || lastScript(at));
-  const script = listed?.find((one) => one.file === chosen);
+  const find = (file) => listed?.find((one) => one.file === file);
+  const script = find(chosen);
+  const parts = { at, page, entry, status };
   return html`<div class="autonomy">
-    <${Running} at=${at} page=${page} entry=${entry} status=${status} script=${listed?.find((one) => one.file === status.file)} />
+    <${Running} ...${parts} script=${find(status.file)} />
     ${!listed && html`<p class="dim">No list of scripts was received yet.</p>`}
     ${listed?.length === 0 && html`<p class="dim">${nameOf(at)} has no scripts.</p>`}
     ${Boolean(listed?.length) &&
     html`<label class="field wide">
         <span>script</span>
-        <select data-test="script" value=${script ? chosen : ""} onChange=${(event) => choose(event.currentTarget.value)}>
+        <select
+          data-test="script"
+          value=${script ? chosen : ""}
+          onChange=${(event) => choose(event.currentTarget.value)}
+        >
           <option value="">choose…</option>
           ${listed.map(({ file, label }) => html`<option key=${file} value=${file}>${plain(label)}</option>`)}
         </select>
       </label>
-      <${Starter} key=${`${chosen} ${Boolean(script)}`} at=${at} page=${page} entry=${entry} status=${status} script=${script} />`}
+      <${Starter} key=${`${chosen} ${Boolean(script)}`} ...${parts} script=${script} />`}
   </div>`;
 });
 
@@ -44,7 +50,7 @@ function Running({ at, page, entry, status, script }) {
   const label = (key) => script?.fields.find((one) => one.key === key)?.label ?? key;
   if (entry) sinceOf(at).update(status, entry.at);
   const past = page.store.get(at, "web/liveness")?.value.online === false || !page.connection.isOpen;
-  return html`<div class="row now">
+  return html`<div class="ask-row ask-now">
       <p role="status" data-test="script-state">
         ${status.running
           ? html`<b>${past ? "○" : "●"} ${plain(status.file)}</b>
@@ -99,16 +105,35 @@ function Starter({ at, page, entry, status, script }) {
     set({ texts: next, version: drawn });
     remember(at, script.file, next);
   };
-  const onText = (key, text) => change(new Map([...texts].filter(([one]) => one !== key).concat(text ? [[key, text]] : [])));
+  const onText = (key, text) => {
+    const others = [...texts].filter(([one]) => one !== key);
+    change(new Map(text ? [...others, [key, text]] : others));
+  };
   return html`${script &&
-    html`<${Form} key=${version} id="script-set" fields=${script.fields} texts=${texts} mistakes=${form.mistakes} onText=${onText} />`}
+    html`<${Form}
+      key=${version}
+      id="script-set"
+      fields=${script.fields}
+      texts=${texts}
+      mistakes=${form.mistakes}
+      onText=${onText}
+    />`}
     ${script?.omitted > 0 && html`<p class="dim">… ${script.omitted} more settings cannot be shown.</p>`}
-    <div class="row">
-      <${StartButton} at=${at} page=${page} entry=${entry} why=${why} note=${note} config=${form.config} file=${script?.file}
+    <div class="ask-row">
+      <${StartButton}
+        at=${at}
+        page=${page}
+        entry=${entry}
+        why=${why}
+        note=${note}
+        config=${form.config}
+        file=${script?.file}
         >${startWords(status, script)}<//
       >
       ${texts.size > 0 &&
-      html`<button type="button" data-test="restore-all" onClick=${() => change(new Map(), version + 1)}>All defaults</button>`}
+      html`<button type="button" data-test="restore-all" onClick=${() => change(new Map(), version + 1)}>
+        All defaults
+      </button>`}
     </div>
     ${(why || note) && html`<${Why} id="why-start">${why || note}<//>`}`;
 }

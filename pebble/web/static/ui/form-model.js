@@ -5,6 +5,7 @@ import { inner, isObject, plain } from "./words.js";
 
 const MOST_SCRIPTS = 256; // of one robot; robots list no more
 const MOST_FIELDS = 64; // of one script; robots list no more
+const MOST_OPTIONS = 200; // of one setting
 const LONGEST_TEXT = 256; // characters; robots accept no more
 const LONGEST_KEY = 100;
 const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
@@ -35,7 +36,12 @@ export function scripts(payload) {
     const found = unique(usable, ({ key }) => key).slice(0, MOST_FIELDS).map(field);
     const label = isName(one.label, 100) ? one.label : one.file;
     const isShared = named.some((other) => other.file !== one.file && other.label === label);
-    return { file: one.file, label: isShared ? `${label} (${one.file})` : label, fields: found, omitted: configs.length - found.length };
+    return {
+      file: one.file,
+      label: isShared ? `${label} (${one.file})` : label,
+      fields: found,
+      omitted: configs.length - found.length,
+    };
   });
 }
 
@@ -45,7 +51,8 @@ const unique = (list, key) => [...new Map(list.map((one) => [key(one), one])).va
 
 /** @param {Record<string, any>} entry @returns {Field} */
 function field(entry) {
-  const options = Array.isArray(entry.options) ? [...new Set(entry.options.slice(0, 200).filter(isScalar).map(String))] : [];
+  const listed = Array.isArray(entry.options) ? entry.options.slice(0, MOST_OPTIONS) : [];
+  const options = [...new Set(listed.filter(isScalar).map(String))];
   const type = typeOf(entry.type, options);
   const limit = (name) => (type !== "enum" && Number.isFinite(entry[name]) ? entry[name] : null);
   return {
@@ -121,7 +128,7 @@ function typed({ type }, text) {
   return type === "int" || type === "float" ? Number(text) : text;
 }
 
-/** Why a form cannot be sent; "" it can. @param {{config: object, mistakes: Map<string, string>}} form @returns {string} */
+/** @param {{config: object, mistakes: Map<string, string>}} form @returns {string} why it cannot be sent; "" it can */
 export function whyNotSent({ config, mistakes }) {
   if (mistakes.size) return `The form has ${mistakes.size === 1 ? "1 mistake" : `${mistakes.size} mistakes`}`;
   return JSON.stringify(config).length > LONGEST_CONFIG ? "The settings are too long together" : "";
@@ -149,7 +156,10 @@ export function remembered(ref, file) {
   return new Map(found?.[2] ?? []);
 }
 
-/** The newest forms are remembered, of all robots together. @param {string} ref @param {string} file @param {Texts} texts */
+/**
+ * The newest forms are remembered, of all robots together.
+ * @param {string} ref @param {string} file @param {Texts} texts
+ */
 export function remember(ref, file, texts) {
   const others = forms().filter((one) => one[0] !== ref || one[1] !== file);
   const readable = [...texts].filter(([, text]) => text !== UNREADABLE);

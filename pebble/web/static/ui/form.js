@@ -8,7 +8,7 @@ import { plain } from "./words.js";
  * @param {{id: string, fields: import("./form-model.js").Field[], texts: import("./form-model.js").Texts,
  *   mistakes: Map<string, string>, onText: (key: string, text: string) => void}} props "" restores the default
  */
-export const Form = ({ id, fields, texts, mistakes, onText }) => html`<div class="form">
+export const Form = ({ id, fields, texts, mistakes, onText }) => html`<div class="ask-form">
   ${fields.map(
     (field, index) => html`<${FormField}
       key=${field.key}
@@ -28,9 +28,9 @@ function FormField({ id, field, text, wrong, onText }) {
     if (input) input.value = ""; // it may show what it does not report
     onText("");
   };
-  return html`<div class=${`form-field ${wrong ? "wrong" : ""}`}>
+  return html`<div class=${`ask-field ${wrong ? "wrong" : ""}`}>
     <label for=${id}>${plain(field.label)}${field.required && html` <span class="required">(required)</span>`}</label>
-    <div class="row">
+    <div class="ask-row">
       <${Input} id=${id} field=${field} text=${text} wrong=${wrong} onText=${onText} />
       ${text !== undefined &&
       field.default !== null &&

@@ -14,7 +14,7 @@ const FIRST = { colour: "#ff8800", period: 2, mode: "", steady: "off" };
 
 /** Calls the newest of what it is given, at most once in ``stepMs``. */
 export class Pacer {
-  /** @param {number} stepMs @param {() => number} [clock] ms @param {(fn: () => void, ms: number) => unknown} [later] */
+  /** @param {number} stepMs @param {() => number} [clock] @param {(fn: () => void, ms: number) => unknown} [later] */
   constructor(stepMs, clock = () => performance.now(), later = setTimeout) {
     this.stepMs = stepMs;
     this.clock = clock;
@@ -88,7 +88,10 @@ export class Lights extends Model {
   }
 }
 
-/** What to send. Lights that can only flash are off when they flash in black. @param {Lights} lights @param {boolean} solid */
+/**
+ * What to send. Lights that can only flash are off when they flash in black.
+ * @param {Pick<Lights, "colour" | "period" | "mode">} lights @param {boolean} solid whether they can be that
+ */
 export function command({ colour, period: seconds, mode }, solid) {
   const share = (at) => Math.round((1000 * parseInt(colour.slice(at, at + 2), 16)) / 255) / 1000;
   const rgb = mode === "off" ? { r: 0, g: 0, b: 0 } : { r: share(1), g: share(3), b: share(5) };

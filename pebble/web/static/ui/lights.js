@@ -27,6 +27,7 @@ export const Lights = styled("commands.css", ({ at }) => {
   const why = off ? noSolid : noSolid || noFlash;
   const because = why ? "why-lights" : undefined;
   const colour = (value) => lights.ask(page, { colour: value, mode: noSolid ? "flash" : undefined });
+  const mode = (value) => lights.ask(page, { mode: value });
   return html`<div class="lights">
     <div class="swatches" role="group" aria-label="Colour">
       ${Object.entries(COLOURS).map(
@@ -55,16 +56,12 @@ export const Lights = styled("commands.css", ({ at }) => {
         <span>other</span>
       </label>
     </div>
-    <div class="row">
-      <${ModeButton} lights=${lights} mode="solid" why=${noSolid} onPress=${() => lights.ask(page, { mode: "solid" })}
-        >Solid<//
-      >
+    <div class="ask-row">
+      <${ModeButton} lights=${lights} mode="solid" why=${noSolid} onPress=${() => mode("solid")}>Solid<//>
       <${ModeButton} lights=${lights} mode="flash" why=${noFlash} onPress=${() => toggleFlash(page, at)}
         >Flash <kbd aria-hidden="true">F</kbd><//
       >
-      <${ModeButton} lights=${lights} mode="off" why=${off ? why : ""} onPress=${() => lights.ask(page, { mode: "off" })}
-        >Off<//
-      >
+      <${ModeButton} lights=${lights} mode="off" why=${off ? why : ""} onPress=${() => mode("off")}>Off<//>
       <${Period} page=${page} lights=${lights} why=${noFlash} />
     </div>
     ${why && html`<${Why} id="why-lights">${why}<//>`}

@@ -32,7 +32,10 @@ export function soundsOf(ref) {
   return all.get(ref);
 }
 
-/** @param {any} page its services @param {string} ref @param {string} file @param {boolean} repeat @returns {string} why not */
+/**
+ * @param {any} page its services @param {string} ref @param {string} file @param {boolean} repeat
+ * @returns {string} why not; "" it was asked
+ */
 export function play(page, ref, file, repeat) {
   const why = whyNot(page, ref, "soundboard") || (file.length > LONGEST_NAME ? "Its name is too long" : "");
   if (!why) {

@@ -18,7 +18,7 @@ export const Sounds = styled("commands.css", ({ at }) => {
   const whyNotAgain = why || (last ? "" : "Play one sound first");
   return html`<div class="sounds">
     <${NowPlaying} at=${at} page=${page} />
-    <div class="row">
+    <div class="ask-row">
       <button
         type="button"
         data-test="repeat-last"
@@ -47,7 +47,7 @@ function NowPlaying({ at, page }) {
   const why = whyNotEnd(page);
   const silent = page.store.get(at, "web/liveness")?.value.online === false;
   const was = silent || !page.connection.isOpen ? "played when it was last seen" : "plays";
-  return html`<div class="row now">
+  return html`<div class="ask-row ask-now">
       <p role="status" data-test="playing">
         ${file ? html`<b>♪ ${plain(file)}</b> ${was}` : html`<span class="dim">Nothing ${was}.</span>`}
       </p>
@@ -72,7 +72,7 @@ function Clips({ at, page, sounds, why }) {
   const shown = useMemo(() => grouped(files ?? [], filter, MOST), [files, filter]);
   const now = playing(useValue(at, "soundboard-status")).file;
   if (!files) return html`<p class="dim">No list of clips was received yet.</p>`;
-  if (!files.length) return html`<p class="dim">${nameOf(at)} has no clips: put sound files into its folder of sounds.</p>`;
+  if (!files.length) return html`<p class="dim">No clips: put sound files into ${nameOf(at)}'s folder of sounds.</p>`;
   return html`<input
       type="search"
       class="wide"

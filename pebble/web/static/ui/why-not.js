@@ -12,7 +12,10 @@ export function whyNotEnd({ store, connection }) {
   return connection.may("drive") ? "" : "Log in as driver to use this";
 }
 
-/** @param {Services} page @param {string} ref @param {string} section of its capabilities @returns {string} "" all is well */
+/**
+ * Why it cannot be asked for what this section of its capabilities offers; "" it can.
+ * @param {Services} page @param {string} ref @param {string} section @returns {string}
+ */
 export function whyNot(page, ref, section) {
   const why = whyNotEnd(page);
   if (why) return why;
