@@ -138,7 +138,7 @@ export function whyNotSent({ config, mistakes }) {
 export function hint({ type, min, max, default: usual }) {
   const both = min !== null && max !== null;
   const limits = both ? [`${min} to ${max}`] : [min !== null && `at least ${min}`, max !== null && `at most ${max}`];
-  const words = [type === "int" && "a whole number", ...limits, usual !== null && `default ${option(type, usual)}`];
+  const words = [type === "int" && "a whole number", ...limits, usual && `default ${option(type, usual)}`];
   return words.filter(Boolean).join(", ");
 }
 

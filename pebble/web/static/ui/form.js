@@ -24,8 +24,9 @@ export const Form = ({ id, fields, texts, mistakes, onText }) => html`<div class
 function FormField({ id, field, text, wrong, onText }) {
   const Input = INPUTS[field.type === "bool" && field.default === null ? "enum" : field.type];
   const restore = (event) => {
-    const input = event.currentTarget.parentElement.querySelector("input[type=number]");
-    if (input) input.value = ""; // it may show what it does not report
+    const input = document.getElementById(id);
+    if (input instanceof HTMLInputElement && input.type === "number") input.value = ""; // it may show what it does not report
+    if (event.detail === 0) input?.focus(); // by a key: this button is about to go
     onText("");
   };
   return html`<div class=${`ask-field ${wrong ? "wrong" : ""}`}>
