@@ -25,7 +25,8 @@ function FormField({ id, field, text, wrong, onText }) {
   const Input = INPUTS[field.type === "bool" && field.default === null ? "enum" : field.type];
   const restore = (event) => {
     const input = document.getElementById(id);
-    if (input instanceof HTMLInputElement && input.type === "number") input.value = ""; // it may show what it does not report
+    // one for numbers may show what it does not report
+    if (input instanceof HTMLInputElement && input.type === "number") input.value = "";
     if (event.detail === 0) input?.focus(); // by a key: this button is about to go
     onText("");
   };
