@@ -7,8 +7,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from pebble.contract import CHARGING_LEVEL, CHARGING_STATUS, IMU, TOUCH_SENSORS, WHEEL_ODOMETRY, Channel
+from pebble.contract import CHARGING_LEVEL, CHARGING_STATUS, IMU, TOUCH_SENSORS, WHEEL_ODOMETRY, Channel, Kind
 from pebble.contract.identity import Direction
+from pebble.contract.payloads import AnyObject
 from pebble.transports import Message, Subscription
 from pebble.web.broker import Broker
 from pebble.web.robots import LOG_LINES, WATCHED, Robots, own_topic
@@ -80,19 +81,26 @@ class OpenComponents:
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
         def take(message: Message, now: float) -> None:
             channel = self._wanted.get(ref, {}).get(filter_)
+            before = self._robots.aliases(ref)
             if channel is None:
                 self._robots.receive(message, now)
             else:
-                self._robots.receive_as(ref, channel.metric, message, now)
+                self._robots.receive_as(ref, channel.metric, message, now, channel)
+            if self._robots.aliases(ref) != before:
+                self.update(ref)
 
         return take
 
     def _filters(self, ref: str) -> dict[str, Channel | None]:
-        """Every channel's own topic, and those that the capabilities name, if they are the component's own."""
+        """Every channel's own topic; those that capabilities and manifests name, if they are the component's own."""
         filters: dict[str, Channel | None] = {channel.filter(ref): None for channel in WATCHED}
         listed = self._robots.capabilities(ref).get("telemetry")
         for key, channel in _TELEMETRY.items():
             topic = listed.get(key) if isinstance(listed, dict) else None
             if own_topic(ref, topic, Direction.OUTGOING) and str(topic) not in filters:
                 filters[str(topic)] = channel
+        for metric in self._robots.aliases(ref):
+            filters.setdefault(
+                f"{ref}/{Direction.OUTGOING}/{metric}", Channel(metric=metric, kind=Kind.STREAM, payload=AnyObject)
+            )
         return filters
