@@ -69,7 +69,7 @@ export const CARDS = [
     title: "Microcontrollers",
     icon: "chip",
     tab: "more",
-    wants: (offers) => offers.received("mcu/"),
+    wants: (offers) => offers.metrics.some((metric) => metric.endsWith("/describe")),
     part: async () => (await withStyle(import("./mcus.js"))).Mcus,
   },
   {
