@@ -62,6 +62,7 @@ class PtyMcu:
         self.symlink = symlink
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host received
+        self._on_relay = on_relay
         self._mcu = SimulatedMcu(
             kind,
             time.monotonic(),
@@ -73,7 +74,6 @@ class PtyMcu:
             on_relay=self._switched,
             settings=settings,
         )
-        self._on_relay = on_relay
         self._tick_s = self._mcu.profile.tick_s
         is_text = self._mcu.profile.is_text
         self._splitter = LineSplitter(_TRACED_LINE) if is_text else None
