@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -20,6 +21,7 @@ from pebble.simulation.micropython.board import UID
 from pebble.simulation.pty import PtyMcu
 
 _REPORT_PERIOD_S = 0.1
+_RELAYS = (("connect", True), ("disconnect", False))
 _SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
 
 
@@ -53,7 +55,11 @@ def _run(options: argparse.Namespace) -> int:
         failsafe_s=options.failsafe,
         charging=options.charging,
         uid=options.uid,
+        settings=None if options.outlets is None else {"outlets": options.outlets},
+        on_relay=_print if not options.report else lambda _change: None,
     ) as mcu:
+        for outlet in options.unreachable:
+            mcu.connect(outlet, False)
         if options.control:
             threading.Thread(target=_run_commands, args=(mcu,), name="pebble-sim control", daemon=True).start()
         while signal.sigtimedwait(_SIGNALS, _REPORT_PERIOD_S) is None:
@@ -63,10 +69,18 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report(mcu: PtyMcu) -> bool:
-    snapshot = Snapshot(time.monotonic_ns(), mcu.plugged, mcu.host, mcu.state())
+    return _write(msgspec.json.encode(Snapshot(time.monotonic_ns(), mcu.plugged, mcu.host, mcu.state())))
+
+
+def _print(line: str) -> None:
+    _write(line.encode())
+
+
+def _write(line: bytes) -> bool:
+    """False if the reader of standard output has closed it."""
     try:
-        os.write(sys.stdout.fileno(), msgspec.json.encode(snapshot) + b"\n")
-    except BrokenPipeError:  # the reader has closed the pipe
+        os.write(sys.stdout.fileno(), line + b"\n")
+    except BrokenPipeError:
         return False
     return True
 
@@ -81,6 +95,7 @@ def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
         "discharge": lambda: mcu.charge(False),
         "disturb": lambda: mcu.disturb(True),
         "undisturb": lambda: mcu.disturb(False),
+        **{f"{word} {outlet}": partial(mcu.connect, outlet, on) for word, on in _RELAYS for outlet in mcu.outlets},
     }
 
 
@@ -113,11 +128,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--charging", action="store_true", help="start on the charger")
     parser.add_argument("--uid", type=bytes.fromhex, default=UID, metavar="HEX", help="the MCU's unique id")
+    parser.add_argument("--outlets", type=int, choices=range(1, 5), metavar="N", help="of a station: 1 to 4")
+    parser.add_argument(
+        "--unreachable", action="append", default=[], metavar="oN", help="an outlet without its relay; several times"
+    )
     parser.add_argument("--report", action="store_true", help="write the state to standard output at 10 Hz")
     parser.add_argument(
         "--control",
         action="store_true",
-        help="read unplug, replug, reset, charge, discharge, disturb, undisturb (the I2C bus) from standard input",
+        help="read unplug, replug, reset, charge, discharge, disturb, undisturb (the I2C bus), and of a station "
+        "connect oN, disconnect oN (a relay) from standard input",
     )
     return parser
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from pebble.errors import DeviceError
+from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.lines import LineSplitter
 from pebble.simulation.board import BoardState, SimulatedMcu
-from pebble.simulation.bodies import Pair
+from pebble.simulation.bodies import Outlets, Pair
 from pebble.simulation.micropython.board import UID
 from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.trace import Entry, Event, Trace, motors_entry
@@ -41,7 +41,8 @@ class PtyMcu:
     The symlink's folder must exist; only a symlink is replaced. Unplugging closes the pty but leaves the MCU powered:
     its motors stop by failsafe, as on a robot whose MCU is powered by the battery. Each replug makes a new pty behind
     the same symlink. ``motion`` is where the robot stands, used by that thread alone. With ``trace_output`` the trace
-    also has the MCU's own lines that the host received.
+    also has the MCU's own lines that the host received. ``settings`` are those of the firmware; ``on_relay`` is called
+    with ``o1 on`` when a relay has changed.
     """
 
     def __init__(
@@ -55,10 +56,13 @@ class PtyMcu:
         charging: bool = False,
         uid: bytes = UID,
         motion: RobotMotion | None = None,
+        settings: dict[str, Any] | None = None,
+        on_relay: Callable[[str], None] = lambda _change: None,
     ) -> None:
         self.symlink = symlink
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host received
+        self._on_relay = on_relay
         self._mcu = SimulatedMcu(
             kind,
             time.monotonic(),
@@ -67,6 +71,8 @@ class PtyMcu:
             uid=uid,
             motion=motion,
             on_motors=self._moved,
+            on_relay=self._switched,
+            settings=settings,
         )
         self._tick_s = self._mcu.profile.tick_s
         is_text = self._mcu.profile.is_text
@@ -126,6 +132,19 @@ class PtyMcu:
     def disturb(self, on: bool) -> None:
         """Make the devices on the board's I2C bus fail, or work again."""
         self._call(lambda: self._mcu.disturb(on))
+
+    @property
+    def outlets(self) -> tuple[str, ...]:
+        """The names of a station's outlets; others have none."""
+        body = self._mcu.body
+        return tuple(body.wires) if isinstance(body, Outlets) else ()
+
+    def connect(self, outlet: str, on: bool) -> None:
+        """Connect the relay of one of a station's outlets, or take it away. Raises ConfigError for an unknown one."""
+        body = self._mcu.body
+        if not isinstance(body, Outlets) or outlet not in body.wires:
+            raise ConfigError(f"{self._mcu.kind} has no outlet {outlet!r}")
+        self._call(lambda: body.connect(outlet, on))
 
     def place(self, pose: Pose) -> None:
         """Lift the robot and put it down at ``pose``."""
@@ -252,6 +271,11 @@ class PtyMcu:
 
     def _moved(self, now: float, motors: Pair) -> None:
         self.trace.add(motors_entry(round(now * 1e9), motors))
+
+    def _switched(self, now: float, outlet: str, on: bool) -> None:
+        change = f"{outlet} {'on' if on else 'off'}"
+        self.trace.add(Entry(round(now * 1e9), "relay", change))
+        self._on_relay(change)
 
     def _record(self, ns: int, event: Event, lines: list[bytes]) -> None:
         for line in lines:

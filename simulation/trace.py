@@ -11,16 +11,16 @@ import msgspec
 
 _RETAINED = 100_000  # entries in memory; a file has all of them
 
-Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "said"]
+Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "relay", "said"]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line from the host or (``said``) to it, a change of the port or of the motors.
+    """One line from the host or (``said``) to it, a change of the port, of the motors or of a relay.
 
     ``ns`` is time.monotonic_ns() when the line's last byte was received, just before it was written, or when the
     outputs changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot,
-    however its motors are mounted.
+    however its motors are mounted. That of ``relay`` is ``<outlet> on`` or ``<outlet> off``.
     """
 
     ns: int

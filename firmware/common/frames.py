@@ -11,7 +11,7 @@ from micropython import const
 _VERSION = const(1)
 _HEADER = "<BBBHII"
 _HEADER_SIZE = const(13)
-_AROUND = const(20)  # header, CRC, up to four lengths of COBS, the zero: payloads up to 700 bytes
+_AROUND = const(20)  # header, CRC, up to four lengths of COBS, the zero: payloads up to 1000 bytes
 _LIMIT = const(160)  # bytes of a frame to the MCU, as it is on the wire
 _LONGEST_RUN = const(255)
 #: Remainders of the upper four bits: half a byte at a time needs a sixteenth of the memory
@@ -85,7 +85,11 @@ class Decoder:
     def __init__(self) -> None:
         self.kind = self.interface = self.sequence = 0
         self._buffer = bytearray(_LIMIT)
-        self._length = 0
+        self._length = self._size = 0
+
+    def payload(self) -> bytes:
+        """Return the payload of the newest frame; the next byte may overwrite it."""
+        return bytes(self._buffer[_HEADER_SIZE : self._size])
 
     def take(self, byte: int) -> bool:
         """Whether ``byte`` completes a valid frame of at most 160 bytes and of our version."""
@@ -124,5 +128,6 @@ class Decoder:
             return False
         if crc16(buffer, size) != buffer[size] | buffer[size + 1] << 8:
             return False
+        self._size = size
         _, self.kind, _, self.interface, self.sequence, _ = struct.unpack_from(_HEADER, buffer, 0)
         return True

@@ -19,6 +19,7 @@ Goob's and Fred's is on a serial port, MiniLAMP's and BenJr's on Wi-Fi.
 
 \b
     pebble sim goob --link /tmp/goob
+    pebble sim outlets --link /tmp/outlets
     pebble sim minilamp --broker mqtt://127.0.0.1
     pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
     pebble sim world world.json
@@ -70,6 +71,26 @@ def goob_imu(link: _Link = None) -> int:
         pebble sim goob_imu --link /tmp/goob-imu
     """
     return _serial("goob_imu", link, False)
+
+
+def outlets(
+    link: _Link = None,
+    count: Annotated[int, typer.Option("--outlets", "-n", min=1, max=4, help="How many.")] = 4,
+    unreachable: Annotated[
+        list[str] | None, typer.Option(help="An outlet without its relay: o4. May be given several times.", metavar="oN")
+    ] = None,
+    trace: Annotated[Path | None, typer.Option(help="Append each change of a relay to this file.")] = None,
+) -> int:
+    """A station of switched sockets on a pseudo terminal, until Ctrl-C. It prints what each relay does.
+
+    Set serial.port of an instance in the config to the path of the link.
+
+    \b
+        pebble sim outlets --link /tmp/outlets
+        pebble sim outlets --outlets 2 --unreachable o2
+    """
+    options = ["--outlets", str(count), *(["--trace", str(trace)] if trace is not None else [])]
+    return _serial("outlets", link, False, *options, *(f"--unreachable={outlet}" for outlet in unreachable or ()))
 
 
 def minilamp(broker: _Broker, id_: _Id = None, password_file: PasswordFile = None, ca_cert: CaCert = None) -> int:
@@ -194,14 +215,14 @@ def demo(
     return run(seconds)
 
 
-def _serial(kind: str, link: Path | None, charging: bool) -> int:
+def _serial(kind: str, link: Path | None, charging: bool, *options: str) -> int:
     import tempfile
 
     from pebble.simulation.mcu import main
 
     path = Path(tempfile.gettempdir(), f"pebble-{kind}") if link is None else link
     typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
-    return main(["--kind", kind, "--link", str(path), *(["--charging"] if charging else [])])
+    return main(["--kind", kind, "--link", str(path), *(["--charging"] if charging else []), *options])
 
 
 def _wireless(kind: str, id_: str | None, broker: str, password_file: Path | None, ca_cert: Path | None) -> int:
@@ -254,7 +275,7 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (goob, fred, goob_imu, minilamp, benjr, fleet, world, loudspeaker):
+    for command in (goob, fred, goob_imu, outlets, minilamp, benjr, fleet, world, loudspeaker):
         group.command(command.__name__)(command)
     app.add_typer(group, name="sim")
     app.command("demo")(demo)

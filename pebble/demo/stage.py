@@ -13,7 +13,7 @@ from pebble.demo.broker import BrokerKind
 from pebble.demo.operator import Operator
 from pebble.demo.page import PageServer
 from pebble.demo.programs import Program, end_all
-from pebble.demo.testbed import ROBOTS, SimulatedRobot, Testbed
+from pebble.demo.testbed import ROBOTS, LinuxRobot, SimulatedRobot, Testbed
 from pebble.errors import PebbleError
 from pebble.simulation.trace import Entry
 
@@ -157,6 +157,11 @@ class Stage:
         changes = self.motors(name)
         last = next((index for index in reversed(range(len(changes))) if _runs(changes, index)), None)
         return 0 if last is None else _until(changes, last)
+
+    def relays(self, name: str) -> list[str]:
+        """Every change of its outlets' relays, oldest first: "o1 on"."""
+        robot = self.robots[name]
+        return [entry.line for entry in robot.relays()] if isinstance(robot, LinuxRobot) else []
 
     def lines(self, name: str) -> list[Entry]:
         """What its MCU received, oldest first."""

@@ -27,11 +27,14 @@ from pebble.demo.room import CLIP_S, Room, write_clip
 from pebble.simulation.loudspeaker import playbacks
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.motion import Pose
-from pebble.simulation.trace import Entry
+from pebble.simulation.trace import Entry, read_trace
 from pebble.simulation.world.program import Snapshot as WorldSnapshot
 from pebble.simulation.world.program import port_path, trace_path
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")
+IMU, OUTLETS = "goob_imu", "outlets"
+_LINES = {IMU: "imu", OUTLETS: "outlets"}  # instances of the serial bridge
+_OPTIONS = {OUTLETS: ("--unreachable", "o4")}
 CAMERA_FPS = 15
 _ROBOTS_END_S, _REST_END_S = 2.5, 1.0  # with the operator's disconnect: every process ends within five seconds
 _LONGEST_FOLDER = 40  # characters: unix sockets live below, and their paths end at 108 bytes
@@ -56,7 +59,7 @@ class SimulatedRobot(ABC):
         self._folder.mkdir()
         self.mcu_reports: deque[Snapshot] = deque(maxlen=_REPORTS)
         self.mcu: Program | None = None
-        self.imu: Program | None = None
+        self.devices: list[Program] = []  # its other MCUs
         self.launcher: Program | None = None
         self._trace = self._folder / "trace.jsonl"
         self._trace_read = 0
@@ -74,7 +77,7 @@ class SimulatedRobot(ABC):
     @property
     def mcus(self) -> list[Program]:
         """Its MCUs, which end after the processes that are connected to them."""
-        return [program for program in (self.mcu, self.imu) if program is not None]
+        return [*([] if self.mcu is None else [self.mcu]), *self.devices]
 
     def entries(self) -> list[Entry]:
         """The lines that the MCU received and the changes of its motors, oldest first."""
@@ -114,10 +117,12 @@ class LinuxRobot(SimulatedRobot):
     stop_s = 0.85  # 0.75 s watchdog, and its resolution
     has_media = True
 
-    def __init__(self, name: str, folder: Path, local_port: int, remote_port: int, *, has_imu: bool = False) -> None:
+    def __init__(self, name: str, folder: Path, local_port: int, remote_port: int, *devices: str) -> None:
+        """``devices``: self-describing MCUs that it has besides, by their kind."""
         super().__init__(name, folder)
-        self.has_imu = has_imu
-        self._port, self._imu_port = self._folder / "mcu", self._folder / "imu"
+        self.has_imu = IMU in devices
+        self._port = self._folder / "mcu"
+        self._devices = {kind: self._folder / kind for kind in devices}  # their serial ports
         self._config = self._folder / f"{name}.json"
         self._config.write_text(json.dumps(self._relocated(local_port, remote_port), indent=2))
 
@@ -125,23 +130,24 @@ class LinuxRobot(SimulatedRobot):
         """Start the MCU first, so that its port exists, then the robot."""
         self.mcu = self._start_motors()
         self.mcu.wait_until(self._port.exists, _MCU_START_S, ending)
-        if self.has_imu:
-            command = [
-                sys.executable,
-                "-m",
-                "pebble.simulation.mcu",
-                "--kind",
-                "goob_imu",
-                "--link",
-                str(self._imu_port),
-            ]
-            self.imu = Program(f"{self.name}'s IMU", command, self._folder / "imu.log")
-            self.imu.wait_until(self._imu_port.exists, _MCU_START_S, ending)
+        for kind, port in self._devices.items():
+            options = ["--kind", kind, "--link", str(port), "--trace", str(self._trace_of(kind)), *_OPTIONS.get(kind, ())]
+            command = [sys.executable, "-m", "pebble.simulation.mcu", *options]
+            self.devices.append(Program(f"{self.name}'s {kind}", command, self._folder / f"{kind}.log"))
+        for device, port in zip(self.devices, self._devices.values(), strict=True):
+            device.wait_until(port.exists, _MCU_START_S, ending)
         command = [sys.executable, "-m", "pebble.cli", "up", str(self._config)]
         self.launcher = Program(self.name, command, self._folder / "robot.log")
 
+    def relays(self) -> list[Entry]:
+        """The changes of its outlets' relays, oldest first."""
+        return [entry for entry in read_trace(self._trace_of(OUTLETS)) if entry.event == "relay"]
+
     def _start_motors(self) -> Program:
         return self._start_mcu("pebble.simulation.mcu", "--link", str(self._port))
+
+    def _trace_of(self, device: str) -> Path:
+        return self._folder / f"{device}.jsonl"
 
     def _relocated(self, local_port: int, remote_port: int) -> dict[str, Any]:
         """The robot's own config file, with only addresses and paths changed."""
@@ -153,8 +159,9 @@ class LinuxRobot(SimulatedRobot):
         services = config["services"]
         services["mqtt_bridge"]["remote_mqtt"] = {"host": "127.0.0.1", "port": remote_port}
         services["serial_mcu_bridge"]["serial"]["port"] = str(self._port)
-        if self.has_imu:
-            services["serial_mcu_bridge"]["instances"]["imu"]["serial"]["port"] = str(self._imu_port)
+        for kind, port in self._devices.items():
+            lines = services["serial_mcu_bridge"].setdefault("instances", {})
+            lines.setdefault(_LINES[kind], {"protocol": "pebble_serial_v1", "serial": {}})["serial"]["port"] = str(port)
         services["av_daemon"] = {
             "enabled": True,
             "video": {"backend": "synthetic", "width": 640, "height": 480, "fps": CAMERA_FPS},
@@ -169,7 +176,7 @@ class RoomRobot(LinuxRobot):
     has_scripts, has_counter = True, False
 
     def __init__(self, name: str, folder: Path, local_port: int, remote_port: int) -> None:
-        super().__init__(name, folder, local_port, remote_port, has_imu=True)
+        super().__init__(name, folder, local_port, remote_port, IMU, OUTLETS)
         self._room = Room(self._folder)
         self._port, self._trace = port_path(self._folder, name), trace_path(self._folder, name)
         self._clip = write_clip(self._folder / "sounds")
@@ -257,9 +264,10 @@ class Testbed:
         for broker in (remote, local):
             broker.wait(self._ending)
         self.remote_port = remote.port
-        goob = RoomRobot if self._room else partial(LinuxRobot, has_imu=True)
         makers: dict[str, Callable[[], SimulatedRobot]] = {
-            "goob": lambda: goob("goob", self.folder, local.port, remote.port),
+            "goob": partial(RoomRobot, "goob", self.folder, local.port, remote.port)
+            if self._room
+            else partial(LinuxRobot, "goob", self.folder, local.port, remote.port, IMU, OUTLETS),
             "fred": lambda: LinuxRobot("fred", self.folder, local.port, remote.port),
             "minilamp": lambda: McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
             "benjr": lambda: McuRobot("benjr", self.folder, "ESP8266", remote.port),

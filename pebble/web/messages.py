@@ -216,6 +216,7 @@ class State(_ToPage, frozen=True, kw_only=True, tag="state"):
     """The newest value of everything that changed: ``[ref, metric, value, age in ms]``; ``gone``: removed components.
 
     Metrics are those of the contract, with their payload as JSON, and some of the server's own, below ``web/``.
+    null: the value was removed.
     """
 
     now: float

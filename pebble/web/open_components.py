@@ -18,8 +18,10 @@ from pebble.contract import (
     TOUCH_SENSORS,
     WHEEL_ODOMETRY,
     Channel,
+    Kind,
 )
 from pebble.contract.identity import Direction
+from pebble.contract.payloads import AnyObject
 from pebble.transports import Message, Subscription
 from pebble.web.broker import Broker
 from pebble.web.robots import LOG_LINES, WATCHED, Robots, own_topic, section_of
@@ -95,19 +97,26 @@ class OpenComponents:
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
         def take(message: Message, now: float) -> None:
             channel = self._wanted.get(ref, {}).get(filter_)
+            before = self._robots.aliases(ref)
             if channel is None:
                 self._robots.receive(message, now)
             else:
-                self._robots.receive_as(ref, channel.metric, message, now)
+                self._robots.receive_as(ref, channel.metric, message, now, channel)
+            if self._robots.aliases(ref) != before:
+                self.update(ref)
 
         return take
 
     def _filters(self, ref: str) -> dict[str, Channel | None]:
-        """Every channel's own topic, and those that the capabilities name, if they are the component's own."""
+        """Every channel's own topic; those that capabilities and manifests name, if they are the component's own."""
         filters: dict[str, Channel | None] = {channel.filter(ref): None for channel in WATCHED}
         capabilities = self._robots.capabilities(ref)
         for (section, key), channel in _NAMED.items():
             topic = section_of(capabilities, section).get(key)
             if own_topic(ref, topic, Direction.OUTGOING) and str(topic) not in (*filters, channel.topic(ref)):
                 filters[str(topic)] = channel
+        for metric in self._robots.aliases(ref):
+            filters.setdefault(
+                f"{ref}/{Direction.OUTGOING}/{metric}", Channel(metric=metric, kind=Kind.STREAM, payload=AnyObject)
+            )
         return filters

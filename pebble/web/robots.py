@@ -5,9 +5,11 @@ No queue forms: a slow page receives the newest value less often. A page that co
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
+from itertools import chain
 from typing import Any, NamedTuple
 
 import msgspec
@@ -21,6 +23,7 @@ from pebble.contract import (
     CHARGING_STATUS,
     ESTOP_STATE,
     LOGS,
+    MCU_DESCRIBE,
     MEDIA_STATUS,
     ONLINE,
     SOUNDBOARD_FILES,
@@ -29,8 +32,9 @@ from pebble.contract import (
     Kind,
     channel_of,
     codec,
+    is_reserved,
 )
-from pebble.contract.identity import Direction, parse_topic
+from pebble.contract.identity import LEVEL, Direction, parse_topic
 from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
@@ -40,9 +44,11 @@ MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
 LOG_LINES = 500  # of the watched component
+MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
 _SILENT_S = 1.5  # a component is not called silent before
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often
+_LONGEST_ALIAS = 200  # characters
 _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
 #: What the page shows of every component, and what only of the one that is open.
@@ -58,6 +64,9 @@ WATCHED = tuple(
     and channel not in SYNONYMS
     and channel.kind is not Kind.EVENT
 )
+
+
+_is_level = re.compile(LEVEL).search
 
 
 class _Value(NamedTuple):
@@ -78,6 +87,7 @@ class Component:
         self.capabilities: dict[str, Any] = {}
         self.known: dict[str, Message] = {}  # what a stop needs to know of it, by topic
         self.values: dict[str, _Value] = {}
+        self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
         self._stamps: deque[int] = deque(maxlen=_STAMPS)
@@ -148,16 +158,25 @@ class Robots:
         topic = str(section_of(self.capabilities(ref), section).get(key))
         return topic if own_topic(ref, topic, channel.direction) else channel.topic(ref)
 
+    def aliases(self, ref: str) -> list[str]:
+        """The metrics, none of the contract's, under which its microcontrollers say that they publish."""
+        component = self.components.get(ref)
+        declared = () if component is None else component.aliases.values()
+        return list(dict.fromkeys(chain.from_iterable(declared)))[:MAX_ALIASES]
+
     def value(self, ref: str, metric: str) -> msgspec.Raw | None:
         """The newest value; that of a server's metric as well."""
         found = self._find(ref, metric)
         return None if found is None else found.raw
 
     def take(self, interest: Interest, now: float) -> tuple[tuple[str, str, Any, float], ...]:
-        """What this page has not received yet; it counts as received from now on."""
+        """What this page has not received yet, None for what was removed; it counts as received from now on."""
         dirty, interest.dirty = interest.dirty, set()
         found = ((ref, metric, self._find(ref, metric)) for ref, metric in dirty)
-        return tuple((ref, metric, one.raw, 1000 * (now - one.at)) for ref, metric, one in found if one is not None)
+        return tuple(
+            (ref, metric, None, 0.0) if one is None else (ref, metric, one.raw, 1000 * (now - one.at))
+            for ref, metric, one in found
+        )
 
     def _find(self, ref: str, metric: str) -> _Value | None:
         if metric.startswith("web/"):
@@ -205,10 +224,12 @@ class Robots:
             return
         self.receive_as(address.identity.base, address.metric, message, now)
 
-    def receive_as(self, ref: str, metric: str, message: Message, now: float) -> None:
-        """Take a message as the metric that it carries, whatever its topic is called."""
+    def receive_as(
+        self, ref: str, metric: str, message: Message, now: float, channel: Channel | None = None
+    ) -> None:
+        """Take a message as the metric that it carries, whatever its topic is called; ``channel``: not the contract's."""
         component = self.components.get(ref) or self._add(ref, retained=message.retain)
-        channel = _channel(metric)
+        channel = channel or _channel(metric)
         if component is None or channel is None:
             return
         if channel is LOGS:
@@ -216,7 +237,7 @@ class Robots:
         elif not message.payload:
             self._remove_value(component, metric, message)
         elif self._store(component, metric, channel, message, now):
-            self._interpret(component, channel, message, now)
+            self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
         """Remove a component; it comes back with its next message."""
@@ -293,15 +314,19 @@ class Robots:
         old = component.values.pop(metric, None)
         if old is not None:
             self._bytes -= len(bytes(old.raw))
+            self._mark(component.ref, metric)
+        component.aliases.pop(metric, None)
         component.known.pop(message.topic, None)
         component.estop.receive(message)
 
-    def _interpret(self, component: Component, channel: Channel, message: Message, now: float) -> None:
+    def _interpret(self, component: Component, metric: str, channel: Channel, message: Message, now: float) -> None:
         if channel in (CAPABILITIES, ESTOP_STATE, ONLINE):
             component.known[message.topic] = message
         component.estop.receive(message)
         if channel is CAPABILITIES:
             component.capabilities = _capabilities(message.payload) or component.capabilities
+        elif channel is MCU_DESCRIBE:
+            component.aliases[metric] = _aliases(message.payload)
         elif channel is ONLINE or channel in SYNONYMS:
             self._heartbeat(component, message, now)
 
@@ -357,6 +382,30 @@ def own_topic(ref: str, topic: object, direction: str) -> bool:
 
 def _channel(metric: str) -> Channel | None:
     return channel_of(f"{Direction.OUTGOING}/{metric}")
+
+
+def _aliases(payload: bytes) -> tuple[str, ...]:
+    """What a manifest declares besides the contract's metrics, however strange the rest of it is."""
+    manifest = codec.plain(MCU_DESCRIBE, payload)
+    interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
+    outgoing = [
+        str(one.get("channel"))
+        for one in (interfaces if isinstance(interfaces, list) else ())
+        if isinstance(one, dict) and one.get("dir") == "out" and isinstance(one.get("channel"), str)
+    ]
+    return tuple(filter(_may_be_alias, outgoing[:MAX_ALIASES]))
+
+
+def _may_be_alias(metric: str) -> bool:
+    """Whether this is a metric that nothing else defines: neither the contract nor the server itself."""
+    family = metric.partition("/")[0]
+    return (
+        _channel(metric) is None
+        and not is_reserved(metric)
+        and family not in ("web", "mcu")
+        and len(metric) <= _LONGEST_ALIAS
+        and all(map(_is_level, metric.split("/")))
+    )
 
 
 def _capabilities(payload: bytes) -> dict[str, Any]:

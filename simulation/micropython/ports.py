@@ -57,4 +57,8 @@ ESP32_C6: Final = Port("esp32", "ESP32C6 module with ESP32C6", _esp_pin, 3.3, 16
 ESP8266: Final = Port("esp8266", "ESP module with ESP8266", _esp_pin, 1.0, 80_000_000, _esp8266_wdt)
 
 #: The board type of each robot
-OF_ROBOT: Final = {"goob": SAMD21, "fred": SAMD21, "goob_imu": SAMD21, "minilamp": ESP32_C6, "benjr": ESP8266}
+OF_ROBOT: Final = {
+    **dict.fromkeys(("goob", "fred", "goob_imu", "outlets"), SAMD21),
+    "minilamp": ESP32_C6,
+    "benjr": ESP8266,
+}

@@ -19,7 +19,8 @@ STOCK, FULL = "official image", "image with select"
 #: And on an ESP8266: the official image with a ROM file system, from which code runs in place, or the plain one.
 ROM, PLAIN = "image with ROMFS", "plain image"
 _UNUSED = {STOCK: ("usb",), FULL: ("console", "uart")}  # modules that are never loaded there
-_SCRIPTS = ("board", "net", "workload_serial", "workload_imu", "workload_network", "heap")
+_SCRIPTS = ("board", "net", "workload_serial", "workload_described", "workload_network", "heap")
+_DESCRIBED = ("goob_imu", "outlets")  # by pebble_serial_v1
 _HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage
 _SETTINGS = {
     "wifi": {"ssid": "Lab", "password": "geheim123"},
@@ -48,7 +49,7 @@ LIMITS: dict[Case, int | None] = {
     Case("minilamp"): None,  # its board has hundreds of kilobytes
     Case("benjr", ROM): MIDDLE,
     Case("benjr", PLAIN): None,
-    **{Case(robot, image): SMALL for robot in ("goob", "fred", "goob_imu") for image in (STOCK, FULL)},
+    **{Case(robot, image): SMALL for robot in ("goob", "fred", *_DESCRIBED) for image in (STOCK, FULL)},
 }
 CASES = tuple(LIMITS)
 
@@ -123,8 +124,8 @@ def _fill(root: Path, code: Path, case: Case, files: list[Path]) -> None:
     # with a ROM file system, that is the working folder
     (root / "start.py").write_text("import sys\nsys.path.append('/')\nfrom heap import turn\n")
     workload = (
-        "workload_imu"
-        if case.robot == "goob_imu"
+        "workload_described"
+        if case.robot in _DESCRIBED
         else "workload_serial"
         if case.firmware.is_report
         else "workload_network"

@@ -13,7 +13,7 @@ from tests.support import some
 _PEAK = 7  # column of the table
 
 
-@pytest.mark.parametrize("case", some(CASES, 9), ids=str)
+@pytest.mark.parametrize("case", some(CASES, 11), ids=str)
 def test_heap(case: Case, tmp_path: Path) -> None:
     cost = measure(case, tmp_path)
     limit = LIMITS[case]

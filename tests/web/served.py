@@ -194,6 +194,10 @@ class RecordingRobot:
         topic = f"{self.base}/outgoing/{metric}"
         self._transport.publish(topic, msgspec.json.encode(value), qos=QoS.DELIVERED, retain=retain)
 
+    def remove(self, metric: str) -> None:
+        """Remove a retained value."""
+        self._transport.publish(f"{self.base}/outgoing/{metric}", b"", qos=QoS.DELIVERED, retain=True)
+
     def silent(self) -> None:
         """Stop the heartbeats."""
         self._ending.set()

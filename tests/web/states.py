@@ -6,6 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import msgspec
+
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
+from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.web.canned import State, Value
 
 GOOB, FRED, LAMP, BENJR = (f"pebble/robots/{name}" for name in ("goob", "fred", "minilamp", "benjr"))
@@ -159,6 +163,53 @@ def fleet(now: int) -> list[Value]:
     ]
 
 
+def outlet(name: str, *, on: bool = False, bound: bool = True, reachable: bool = True, label: str = "") -> dict[str, Any]:
+    """What a station reports of one outlet, as its robot publishes it."""
+    value = {"bound": bound, "reachable": reachable, "on": on}
+    return sample("hs105-sta", f"{name}_state", value, profile="outlet.switch.v1") | ({"label": label} if label else {})
+
+
+def sample(uid: str, interface: str, value: dict[str, Any], *, profile: str = "") -> dict[str, Any]:
+    """What a robot publishes of an interface of a microcontroller."""
+    head = {"t": 1_700_000_000_000, "seq": 7, "mcu_ms": 700, "device_uid": uid, "interface": interface}
+    return head | {"profile": profile, "value": value}
+
+
+def described(mcu: wire.M) -> Any:
+    """The manifest of a microcontroller as its robot publishes it."""
+    return msgspec.to_builtins(parse_describe(mcu.describe()).payload())
+
+
+LAMP_MCU = wire.LAMP.but(
+    interfaces=(
+        *wire.LAMP.interfaces,
+        wire.I(5, "arm", wire.IN, wire.KIND_COMMAND, (wire.F("angle", wire.I16, 0.1, 0.0, "deg"), wire.F("k", wire.F32))),
+    )
+)
+
+
+def devices(now: int) -> list[Value]:
+    """Goob with a station of outlets and another microcontroller."""
+    listed = [{"name": f"o{n}", "controls": n != 3} for n in range(1, 6)]
+    known = capabilities("zenoh")
+    known["value"]["outlets"] = {"available": True, "controls": True, "outlets": listed}
+    return [
+        *fleet(now),
+        (GOOB, "capabilities", known, 60_000),
+        (GOOB, "outlets/o1/status", outlet("o1", on=True, label="Desk lamp"), 9000),
+        (GOOB, "outlets/o2/status", outlet("o2"), 9000),
+        (GOOB, "outlets/o3/status", outlet("o3", on=True), 9000),
+        (GOOB, "outlets/o4/status", outlet("o4", reachable=False), 9000),
+        (GOOB, "outlets/o5/status", outlet("o5", bound=False, reachable=False), 9000),
+        (GOOB, "mcu/hs105-sta/describe", described(wire.STATION), 60_000),
+        (GOOB, "mcu/hs105-sta/o1_state", outlet("o1", on=True), 9000),
+        (GOOB, "mcu/lamp-1/describe", described(LAMP_MCU), 60_000),
+        (GOOB, "mcu/lamp-1/lamp", sample("lamp-1", "lamp", {"level": 62.5}), 3000),
+        (GOOB, "mcu/lamp-1/glow", sample("lamp-1", "glow", {"lux": 300 + now // 200 % 10 * 7.5}), 20),
+        (GOOB, "lights/lamp", sample("lamp-1", "lamp", {"level": 62.5}), 3000),
+    ]
+
+
 def changed(values: Values, *changes: Callable[[int], Value]) -> Values:
     """These values, and others instead of or besides them."""
 
@@ -251,6 +302,8 @@ STATES: dict[str, State] = {
     "plain-http": replace(DRIVING, welcome={"drives": False}),
     "tower": State(f"/r/{TOWER}", fleet, LIVE),
     "person": State(f"/r/{EVE}", fleet, LIVE),
+    "devices": State(GOOB_PATH, changed(devices, MINE), {**LIVE, "mcu/lamp-1/glow": 0.2}),
+    "devices-viewer": State(GOOB_PATH, devices, LIVE, VIEWER),
     "satellite": State(f"/r/{SAT}", satellite, LIVE),
     "no-camera": State(f"/r/{LAMP}", fleet, LIVE),
     "other-camera": replace(

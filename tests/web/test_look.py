@@ -41,6 +41,19 @@ def _press(*selectors: str) -> Callable[[Page], None]:
     return act
 
 
+def _at(card: str, *selectors: str) -> Callable[[Page], None]:
+    """Show this card below the header, once these were pressed in it."""
+
+    def act(page: Page) -> None:
+        for selector in selectors:
+            page.locator(f'[data-card="{card}"] {selector}').first.click()
+        page.evaluate(
+            "(card) => scrollBy(0, document.querySelector(`[data-card='${card}']`).getBoundingClientRect().top - 90)", card
+        )
+
+    return act
+
+
 def _drive(page: Page) -> None:
     page.keyboard.down("KeyW")
     page.keyboard.down("KeyD")
@@ -120,6 +133,14 @@ SCREENS = [
     Screen("more", "driving", _press(".tabs button:nth-child(3)"), ("phone",)),
     Screen("settings", "driving", _press(".tabs button:nth-child(3)", ".wide"), ("phone",)),
     Screen("drawer", "driving", _press(".round"), ("landscape",)),
+    Screen("outlets", "devices", sizes=("desktop",), hold=_at("outlets")),
+    Screen("outlets", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at("outlets")),
+    Screen("outlets-viewer", "devices-viewer", _press(".tabs button:nth-child(3)"), ("phone",), _at("outlets")),
+    Screen("mcus", "devices", sizes=("desktop",), hold=_at("mcus", '[data-test="reading-lux"]')),
+    Screen(
+        "mcus", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at("mcus", '[data-test="reading-lux"]')
+    ),
+    Screen("values", "devices", sizes=("desktop",), hold=_at("values", "summary")),
     Screen("small", "driving", sizes=("small",)),
     Screen("lights", "asked", _press('[data-test="colour-blue"]'), ("desktop",), _at_card("lights")),
     Screen("sounds", "asked-busy", sizes=("desktop",), hold=_at_card("sounds")),

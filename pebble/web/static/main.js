@@ -34,6 +34,7 @@ function join() {
     },
     onRefused: (message) => {
       driver.refused(message);
+      connection.refusal = message;
       if (message.cmd !== "drive") connection.show(`Not done: ${message.why}`);
     },
   });

@@ -106,7 +106,10 @@ export class ControlSocket {
     if (this.outdated) this.options.store.clear(); // the first state of a connection has all that there is
     this.outdated = false;
     for (const ref of message.gone ?? []) this.options.store.remove(ref);
-    for (const [ref, metric, value, age] of message.set) this.options.store.set(ref, metric, value, age);
+    for (const [ref, metric, value, age] of message.set) {
+      if (value === null) this.options.store.drop(ref, metric);
+      else this.options.store.set(ref, metric, value, age);
+    }
   }
 
   check() {

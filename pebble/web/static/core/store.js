@@ -109,14 +109,21 @@ export class Store {
     }
   }
 
+  /** @param {string} ref @param {string} metric */
+  drop(ref, metric) {
+    if (!this.components.get(ref)?.delete(metric)) return;
+    this.mark("\n" + ref);
+    this.mark(metric + "\n" + ref);
+  }
+
   /** Remove everything: after a new connection the server sends all that there is. */
   clear() {
     for (const ref of [...this.components.keys()]) this.remove(ref);
   }
 
   /**
-   * Call ``fn`` after changes: of one metric; with ``metric`` null when a component receives a metric it had not;
-   * with both null when a component appears or disappears.
+   * Call ``fn`` after changes: of one metric; with ``metric`` null when a component receives a metric it had not, or
+   * loses one; with both null when a component appears or disappears.
    * @param {string | null} ref @param {string | null} metric @param {() => void} fn @returns {() => void} unsubscribe
    */
   subscribe(ref, metric, fn) {

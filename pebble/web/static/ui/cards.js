@@ -1,5 +1,6 @@
 // Which cards there are, in their fixed order. A new one is a line here, and a module that is fetched when it is shown.
 
+import { fetchStyle } from "./hooks.js";
 import { Telemetry } from "./telemetry.js";
 
 /**
@@ -8,6 +9,9 @@ import { Telemetry } from "./telemetry.js";
  * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
  *   part: () => Promise<any>}} CardKind
  */
+
+/** @template T @param {Promise<T>} one of those that share a style sheet */
+const withStyle = async (part) => (await Promise.all([part, fetchStyle("devices.css")]))[0];
 
 /** @type {CardKind[]} */
 export const CARDS = [
@@ -41,8 +45,8 @@ export const CARDS = [
     title: "Outlets",
     icon: "plug",
     tab: "more",
-    wants: (offers) => offers.section("outlets").available === true,
-    part: async () => (await import("./outlets.js")).Outlets,
+    wants: (offers) => offers.section("outlets").available === true || offers.received("outlets/"),
+    part: async () => (await withStyle(import("./outlets.js"))).Outlets,
   },
   {
     id: "map",
@@ -65,8 +69,8 @@ export const CARDS = [
     title: "Microcontrollers",
     icon: "chip",
     tab: "more",
-    wants: (offers) => offers.received("mcu/"),
-    part: async () => (await import("./mcus.js")).Mcus,
+    wants: (offers) => offers.metrics.some((metric) => metric.endsWith("/describe")),
+    part: async () => (await withStyle(import("./mcus.js"))).Mcus,
   },
   {
     id: "logs",
@@ -90,7 +94,7 @@ export const CARDS = [
     icon: "list",
     tab: "more",
     wants: () => true,
-    part: async () => (await import("./values.js")).Values,
+    part: async () => (await withStyle(import("./values.js"))).Values,
   },
 ];
 

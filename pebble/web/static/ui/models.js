@@ -27,6 +27,8 @@ export class Connection extends Model {
     this.version = version;
     this.socket = null; // set by main.js
     this.bye = null;
+    /** @type {{cmd: string, ref: string, why: string} | null} */
+    this.refusal = null; // the last one
     /** @type {{text: string, at: number} | null} */
     this.notice = null;
   }

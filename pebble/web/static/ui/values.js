@@ -1,31 +1,45 @@
-// Everything that was received of a component, whatever its type.
+// Everything that was received of a component, whatever its type: a group of lines for each metric.
 
-import { html, useMetric, useMetrics, useTick } from "./hooks.js";
-import { inner, plain, roughly } from "./words.js";
+import { html, useMetric, useMetrics, useState, useTick } from "./hooks.js";
+import { Lines } from "./lines.js";
+import { plain, roughly } from "./words.js";
 
 const MOST = 120;
-const LONG = 90; // characters
+const SHORT = 6; // lines that are always shown
 
 export function Values({ at }) {
   const metrics = useMetrics(at)
     .filter((metric) => !metric.startsWith("web/"))
     .sort();
   if (!metrics.length) return html`<p class="dim">Nothing was received yet.</p>`;
-  return html`<dl class="values raw">
-      ${metrics.slice(0, MOST).map((metric) => html`<${ValueRow} key=${metric} at=${at} metric=${metric} />`)}
+  return html`<dl class="all-values">
+      ${metrics.slice(0, MOST).map((metric) => html`<${Metric} key=${metric} at=${at} metric=${metric} />`)}
     </dl>
     ${metrics.length > MOST && html`<p class="dim">… ${metrics.length - MOST} more</p>`}`;
 }
 
-function ValueRow({ at, metric }) {
+function Metric({ at, metric }) {
   useTick(1000);
   const entry = useMetric(at, metric);
+  const [open, show] = useState(false);
   if (!entry) return null;
-  const text = plain(inner(entry.value));
-  const age = html`<small>${roughly(entry.age)} ago</small>`;
-  const long = html`<details><summary>${text.slice(0, LONG / 2)}… ${age}</summary>${text}</details>`;
-  return html`<div>
-    <dt>${metric}</dt>
-    <dd>${text.length > LONG ? long : html`${text} ${age}`}</dd>
+  const { lines, omitted } = new Lines(entry.value);
+  const rate = entry.period > 0 ? `${plain(Number((1000 / entry.period).toPrecision(2)))}/s · ` : "";
+  const count = lines.length + omitted;
+  const all = () => html`<ul>
+    ${lines.map(
+      ({ depth, key, text }, index) => html`<li key=${index} class=${`depth-${depth}`}>
+        ${key && html`<span class="dim">${key}</span> `}${text}
+      </li>`,
+    )}
+    ${omitted > 0 && html`<li class="dim">… ${omitted} more</li>`}
+  </ul>`;
+  const details = () => html`<details open=${open} onToggle=${(event) => show(event.currentTarget.open)}>
+    <summary>${count} lines</summary>
+    ${open && all()}
+  </details>`;
+  return html`<div data-test=${`value-${metric}`}>
+    <dt>${metric} <small>${rate}${roughly(entry.age)} ago</small></dt>
+    <dd>${count > SHORT ? details() : all()}</dd>
   </div>`;
 }

@@ -1,10 +1,12 @@
-"""A minute of Goob's IMU: samples at 100 Hz, requests for its manifest, pings, noise."""
+"""A minute of a board that describes itself: requests for its manifest, samples or commands, noise."""
 
 import board
 
 _MINUTE_MS = 60_000
 # DESCRIBE_REQ with zeros, as in the protocol's description; PING likewise
 _DESCRIBE = b"\x03\x01\x02\x01\x01\x01\x01\x01\x01\x01\x01\x01\x01\x03\x85\x6b\x00"
+_COMMAND = b"\x03\x01\x20\x02\x03\x02\x01\x01\x01\x01\x01\x01\x01\x04\x01\x9b\x7c\x00"  # interface 3, payload 01
+_LEAST = {"goob_imu": 60 * 100 * 30, "outlets": 30 * 700}  # bytes
 _NOISE = bytes([index * 37 & 0xFF for index in range(300)])
 
 
@@ -13,6 +15,8 @@ class Workload:
         if case["stock"]:
             board.modules["select"] = board.Nothing
             del board.Stdin.buffer, board.Stdout.buffer
+        self._switches = case["robot"] == "outlets"
+        self._least = _LEAST[case["robot"]]
         self._output = 0
         self._asked = 0
 
@@ -30,7 +34,10 @@ class Workload:
         if second % 20 == 11:
             board.to_board.put(_NOISE)
             return "noise"
+        if self._switches:
+            board.to_board.put(_COMMAND)
+            return "switching"
         return "sampling"
 
     def check(self, robot):
-        assert self._output > 60 * 100 * 30, "the board has sent hardly anything"
+        assert self._output > self._least, "the board has sent hardly anything"

@@ -1,0 +1,162 @@
+// A section for each self-describing microcontroller: what it measures, and what it takes as commands.
+
+import { isLevel, useRefusal, useWhyNot } from "./asking.js";
+import { html, useMetric, usePage, useRef, useState, useTick, useValue } from "./hooks.js";
+import { command, fieldOf, range, readManifest, step, text, unsendable } from "./manifest.js";
+import { Icon, Why } from "./parts.js";
+import { Spark, remember } from "./spark.js";
+import { clockTime, plain, roughly } from "./words.js";
+
+const MOST = 16;
+const GONE_MS = 10_000;
+
+export function Mcus({ at, offers }) {
+  const whyNot = useWhyNot(at, "to send commands");
+  const uids = offers.metrics
+    .map((metric) => /^mcu\/([^/]+)\/describe$/.exec(metric)?.[1])
+    .filter(Boolean)
+    .sort();
+  return html`${uids
+    .slice(0, MOST)
+    .map((uid, index) => html`<${Mcu} key=${uid} at=${at} uid=${uid} id=${`mcu-${index}`} whyNot=${whyNot} />`)}
+  ${uids.length > MOST && html`<p class="dim">… ${uids.length - MOST} more</p>`}`;
+}
+
+function Mcu({ at, uid, id, whyNot }) {
+  const manifest = readManifest(useValue(at, `mcu/${uid}/describe`));
+  const rows = manifest?.interfaces.map((one, index) => {
+    if (one.isOut) return html`<${Readings} key=${index} at=${at} uid=${uid} one=${one} />`;
+    return html`<${Form} key=${index} at=${at} uid=${uid} one=${one} id=${`${id}-${index}`} whyNot=${whyNot} />`;
+  });
+  return html`<section class="mcu" aria-labelledby=${id} data-test=${`mcu-${uid}`}>
+    <h3 id=${id}>${text(uid)}</h3>
+    ${!manifest && html`<p class="bad">What it says of itself cannot be read.</p>`}
+    ${manifest &&
+    html`<p class="dim">${manifest.model || "unknown model"} · firmware ${manifest.firmware || "unknown"}</p>
+      ${rows}
+      ${manifest.omitted > 0 && html`<p class="dim">… ${manifest.omitted} more</p>`}`}
+  </section>`;
+}
+
+/** The newest payload of an interface, under its own topic or under its alias. */
+function useReading(at, uid, one) {
+  const own = useMetric(at, `mcu/${uid}/${one.name}`);
+  const alias = useMetric(at, one.channel);
+  return own ?? alias;
+}
+
+function Readings({ at, uid, one }) {
+  useTick(1000);
+  const entry = useReading(at, uid, one);
+  const online = useValue(at, "web/liveness")?.online !== false;
+  const history = useRef(/** @type {import("./spark.js").Point[]} */ ([]));
+  if (entry) remember(history.current, entry);
+  const { age = 0, period = 0 } = entry ?? {};
+  const repeats = one.kind === "sample" || one.rateHz > 0; // others are sent when they change
+  const gone = Boolean(entry) && (!online || (repeats && period > 0 && age > Math.max(GONE_MS, 3 * period)));
+  const late = repeats && period > 0 && age > 2 * period + 250;
+  const rate = period > 0 && repeats && !gone ? `${plain(Number((1000 / period).toPrecision(2)))}/s` : "";
+  const since = entry ? `${roughly(age)} ago` : one.isPrivate ? "stays on the robot" : "nothing received yet";
+  return html`<div class="mcu-out" data-test=${`mcu-out-${one.name}`}>
+    <h4>
+      ${one.label} ${one.profile && html`<small>${one.profile}</small>`}
+      <small class=${late ? "late" : ""}>${[rate, since].filter(Boolean).join(" · ")}</small>
+    </h4>
+    <ul>
+      ${one.fields.map((field) => {
+        const value = entry && fieldOf(entry.value, field.name);
+        return html`<${Reading} key=${field.name} field=${field} value=${value} gone=${gone} history=${history} />`;
+      })}
+    </ul>
+    ${one.omitted > 0 && html`<p class="dim">… ${one.omitted} more</p>`}
+  </div>`;
+}
+
+/** One field; pressing it shows its last minute. */
+function Reading({ field, value, gone, history }) {
+  const [open, show] = useState(false);
+  const unit = field.unit && ` ${field.unit}`;
+  const words = value === undefined ? "–" : gone ? `– (was ${plain(value)}${unit})` : `${plain(value)}${unit}`;
+  const name = html`<span class="dim">${text(field.name)}</span>`;
+  const shown = html`<span class=${gone ? "dim" : ""}>${words}</span>`;
+  if (typeof value !== "number" && typeof value !== "boolean") return html`<li class="reading">${name}${shown}</li>`;
+  return html`<li>
+    <button
+      type="button"
+      class="reading quiet"
+      data-test=${`reading-${field.name}`}
+      aria-expanded=${String(open)}
+      onClick=${() => show(!open)}
+    >
+      ${name}${shown}<${Icon} name=${open ? "up" : "plot"} />
+    </button>
+    ${open && html`<${Spark} field=${field} history=${history} />`}
+  </li>`;
+}
+
+function Form({ at, uid, one, id, whyNot }) {
+  const { commands, connection } = usePage();
+  const [entered, enter] = useState(/** @type {Map<string, string | boolean>} */ (new Map()));
+  const [asked, ask] = useState(/** @type {{at: number, refusal: unknown} | null} */ (null));
+  const refused = useRefusal(at, "mcu", asked);
+  const names = isLevel(uid) && isLevel(one.name);
+  const own = unsendable(one) || (names ? "" : "its name cannot be part of a topic");
+  const { value, problems } = command(one, entered);
+  const why = own || whyNot || problems.join("; ");
+  const send = (event) => {
+    event.preventDefault();
+    if (why) return;
+    const { refusal } = connection;
+    if (commands.commandMcu(at, uid, one.name, value)) ask({ at: Date.now(), refusal });
+  };
+  const change = (name, what) => enter(new Map(entered).set(name, what));
+  return html`<form class="mcu-in" data-test=${`mcu-in-${one.name}`} noValidate onSubmit=${send}>
+    <h4>${one.label} ${one.profile && html`<small>${one.profile}</small>`}</h4>
+    ${one.fields.map((field) => html`<${Entry} key=${field.name} field=${field} entered=${entered} change=${change} />`)}
+    ${one.omitted > 0 && html`<p class="dim">… ${one.omitted} more</p>`}
+    <button
+      type="submit"
+      data-test=${`send-${one.name}`}
+      aria-label=${`Send ${one.label}`}
+      aria-describedby=${why ? id : undefined}
+      disabled=${Boolean(why)}
+    >
+      Send
+    </button>
+    ${why && html`<${Why} id=${id}>${why}<//>`}
+    ${asked &&
+    html`<span class=${refused ? "bad" : "dim"} role="status"
+      >${refused ? `not done: ${refused}` : `sent at ${clockTime(asked.at)}`}</span
+    >`}
+  </form>`;
+}
+
+function Entry({ field, entered, change }) {
+  const value = entered.get(field.name);
+  const label = html`<span>${text(field.name)}${field.unit && html` <small>${field.unit}</small>`}</span>`;
+  const test = `field-${field.name}`;
+  if (field.type === "bool") {
+    return html`<label class="check"
+      ><input
+        type="checkbox"
+        role="switch"
+        data-test=${test}
+        checked=${value === true}
+        onChange=${(event) => change(field.name, event.currentTarget.checked)}
+      />${label}</label
+    >`;
+  }
+  const [least, most] = range(field) ?? [undefined, undefined];
+  return html`<label class="mcu-number"
+    >${label}<input
+      type="number"
+      data-test=${test}
+      min=${least}
+      max=${most}
+      step=${step(field)}
+      value=${value ?? ""}
+      onInput=${(event) => change(field.name, event.currentTarget.value)}
+    />
+    ${least !== undefined && html`<small>${least} to ${most}</small>`}</label
+  >`;
+}

@@ -1,0 +1,108 @@
+// Switched sockets: what their station reports of each, and what was asked of it.
+
+import { isLevel, useRefusal, useWhyNot } from "./asking.js";
+import { html, useEffect, useMetric, usePage, useState, useTick, useValue } from "./hooks.js";
+import { Why } from "./parts.js";
+import { inner, isObject } from "./words.js";
+
+const MOST = 64;
+const LONG = 64; // characters of a name
+const CONFIRMED_MS = 3000;
+
+export function Outlets({ at, offers }) {
+  const whyNot = useWhyNot(at, "to switch outlets");
+  const all = outletsOf(offers);
+  return html`${whyNot && html`<${Why} id="why-outlets">${whyNot}<//>`}
+    <ul class="outlets">
+      ${all
+        .slice(0, MOST)
+        .map((one, index) => html`<${Outlet} key=${one.name} ...${one} at=${at} id=${index} whyNot=${whyNot} />`)}
+    </ul>
+    ${!all.length && html`<p class="dim">No outlet is connected.</p>`}
+    ${all.length > MOST && html`<p class="dim">… ${all.length - MOST} more</p>`}`;
+}
+
+/**
+ * The outlets that the capabilities list, and those that have reported; of a component without such capabilities it is
+ * assumed that they can be switched.
+ * @param {import("./models.js").Offers} offers @returns {{name: string, controls: boolean}[]}
+ */
+export function outletsOf(offers) {
+  const section = offers.section("outlets");
+  /** @type {Map<string, boolean>} */
+  const found = new Map();
+  for (const one of Array.isArray(section.outlets) ? section.outlets : []) {
+    if (isObject(one) && typeof one.name === "string" && one.name) found.set(one.name, one.controls !== false);
+  }
+  for (const metric of offers.metrics) {
+    const name = /^outlets\/([^/]+)\/status$/.exec(metric)?.[1];
+    if (name && !found.has(name)) found.set(name, section.available !== true);
+  }
+  return [...found].map(([name, controls]) => ({ name, controls }));
+}
+
+/**
+ * Why this one cannot be switched; "" it can. What is not reported is no obstacle.
+ * @param {string} name @param {boolean} controls @param {Record<string, unknown>} report
+ */
+export function obstacle(name, controls, report) {
+  if (!controls) return "this outlet cannot be switched from here: its robot lists no control";
+  if (!isLevel(name)) return "its name cannot be part of a topic";
+  if (report.bound === false) return "no device is bound to this outlet";
+  if (report.reachable === false) return "outlet is unreachable";
+  return "";
+}
+
+function Outlet({ at, id, name, controls, whyNot }) {
+  const { commands, connection } = usePage();
+  const payload = useMetric(at, `outlets/${name}/status`)?.value;
+  const online = useValue(at, "web/liveness")?.online !== false;
+  const report = isObject(inner(payload)) ? inner(payload) : {};
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number, refusal: unknown} | null} */ (null));
+  const refused = useRefusal(at, "outlet", asked);
+  const waits = asked !== null && report.on !== asked.on && !refused;
+  useEffect(() => {
+    if (asked && report.on === asked.on) ask(null);
+  }, [asked, report.on]);
+  useTick(waits ? 500 : 0);
+  const late = waits && performance.now() - asked.at > CONFIRMED_MS;
+  const own = obstacle(name, controls, report);
+  const words = report.on === true ? "on" : report.on === false ? "off" : "unknown";
+  const press = () => {
+    const on = !(waits && !late ? asked.on : report.on === true);
+    const { refusal } = connection;
+    if (commands.switchOutlet(at, name, on)) ask({ on, at: performance.now(), refusal });
+  };
+  const why = [whyNot && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
+  return html`<li class="outlet">
+    <span class="outlet-name">
+      <b id=${`outlet-${id}`}>${labelOf(payload, name)}</b>
+      <span data-test=${`outlet-state-${name}`}>${online ? words : `was ${words}`}</span>
+      ${waits &&
+      html`<span class=${late ? "bad" : "late"} role="status" data-test=${`outlet-asked-${name}`}
+        >asked: ${asked.on ? "on" : "off"}${late ? ", not confirmed" : ""}</span
+      >`}
+      ${refused && html`<span class="bad" role="status">not done: ${refused}</span>`}
+      ${own && html`<${Why} id=${`why-outlet-${id}`}>${own}<//>`}
+    </span>
+    <button
+      type="button"
+      role="switch"
+      class=${`switch ${waits ? "waits" : ""}`}
+      data-test=${`outlet-${name}`}
+      aria-checked=${String(report.on === true)}
+      aria-labelledby=${`outlet-${id}`}
+      aria-describedby=${why || undefined}
+      disabled=${Boolean(whyNot || own)}
+      onClick=${press}
+    >
+      <span aria-hidden="true"></span>
+    </button>
+  </li>`;
+}
+
+function labelOf(payload, name) {
+  const label = isObject(payload) && typeof payload.label === "string" ? payload.label.trim() : "";
+  const text = label && label !== name ? `${label} (${name})` : name;
+  return text.length > LONG ? `${text.slice(0, LONG)}…` : text;
+}

@@ -1,0 +1,69 @@
+// The last minute of one field, as a line on a canvas.
+
+import { html, useEffect, useMedia, useRef, useTick } from "./hooks.js";
+import { fieldOf } from "./manifest.js";
+import { plain } from "./words.js";
+
+const SPAN_MS = 60_000;
+const APART_MS = 240; // at most so many points are kept as the span has of these
+const DRAWN_MS = 250;
+const CALM_MS = 2000;
+const EDGE = 3; // pixels
+
+/** @typedef {{at: number, value: unknown}} Point ``value``: the whole payload */
+
+/** Add the newest payload, and forget what is too old. @param {Point[]} history @param {import("../core/store.js").Value} entry */
+export function remember(history, entry) {
+  const last = history.at(-1);
+  if (last && entry.receivedAt - last.at < APART_MS) return;
+  history.push({ at: entry.receivedAt, value: entry.value });
+  while (history[0].at < entry.receivedAt - SPAN_MS) history.shift();
+}
+
+/** The numbers of one field, oldest first. @param {Point[]} history @param {string} name @returns {[number, number][]} */
+export function series(history, name) {
+  return history
+    .map(({ at, value }) => /** @type {[number, number]} */ ([at, Number(fieldOf(value, name))]))
+    .filter(([, number]) => Number.isFinite(number));
+}
+
+/** @param {{field: import("./manifest.js").Field, history: {current: Point[]}}} props */
+export function Spark({ field, history }) {
+  const calm = useMedia("(prefers-reduced-motion: reduce)");
+  useTick(calm ? CALM_MS : DRAWN_MS);
+  const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+  const points = series(history.current, field.name);
+  useEffect(() => {
+    if (canvas.current) draw(canvas.current, points);
+  });
+  const numbers = points.map(([, number]) => number);
+  const unit = field.unit && ` ${field.unit}`;
+  const words = numbers.length ? `${plain(Math.min(...numbers))} to ${plain(Math.max(...numbers))}${unit}` : "no values";
+  return html`<div class="spark">
+    <canvas ref=${canvas} role="img" aria-label=${`${field.name}, last minute: ${words}`} data-test="spark"></canvas>
+    <small>last minute: ${words}</small>
+  </div>`;
+}
+
+/** @param {HTMLCanvasElement} canvas @param {[number, number][]} points */
+function draw(canvas, points) {
+  const ratio = devicePixelRatio || 1;
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  canvas.width = width * ratio;
+  canvas.height = height * ratio;
+  const context = canvas.getContext("2d");
+  if (!context || !points.length) return;
+  const now = performance.now();
+  const numbers = points.map(([, number]) => number);
+  const [low, high] = [Math.min(...numbers), Math.max(...numbers)];
+  const x = (at) => EDGE + (width - 2 * EDGE) * (1 - (now - at) / SPAN_MS);
+  const y = (number) => (high > low ? height - EDGE - ((number - low) / (high - low)) * (height - 2 * EDGE) : height / 2);
+  context.scale(ratio, ratio);
+  context.strokeStyle = getComputedStyle(canvas).color;
+  context.lineWidth = 2;
+  context.lineJoin = "round";
+  context.beginPath();
+  for (const [at, number] of points) context.lineTo(x(at), y(number));
+  context.lineTo(x(now), y(numbers[numbers.length - 1])); // it holds until the next one
+  context.stroke();
+}

@@ -1,0 +1,97 @@
+"""The simulated station of switched sockets behind its pty, seen from a host."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.errors import ConfigError
+from pebble.simulation.pty import PtyMcu
+from pebble.simulation.trace import read_trace
+from tests.services.serial_mcu_bridge import mcu_wire as wire
+from tests.support import until
+
+
+class Host:
+    """Sends frames, and collects those that it receives."""
+
+    def __init__(self, link: Path) -> None:
+        assert until(link.exists)
+        self._port = os.open(link, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        self._received = b""
+
+    def send(self, kind: int, payload: bytes = b"", interface: int = 0) -> None:
+        os.write(self._port, wire.frame(kind, payload, interface, sequence=7))
+
+    def received(self, kind: int) -> list[wire.Received]:
+        try:
+            self._received += os.read(self._port, 65536)
+        except BlockingIOError:
+            pass
+        whole = self._received[: self._received.rfind(b"\0") + 1]
+        return [one for one in map(wire.received, filter(None, whole.split(b"\0"))) if one.kind == kind]
+
+    def close(self) -> None:
+        os.close(self._port)
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[PtyMcu]:
+    with PtyMcu("outlets", tmp_path / "port", trace=tmp_path / "trace.jsonl") as running:
+        yield running
+
+
+def test_a_command_on_the_line_switches_a_relay_and_the_trace_has_it(station: PtyMcu, tmp_path: Path) -> None:
+    host = Host(tmp_path / "port")
+    host.send(wire.CMD, b"\1", interface=3)
+    assert until(lambda: host.received(wire.ACK))
+    host.send(wire.CMD, b"\0", interface=3)
+    relays = lambda: [entry.line for entry in read_trace(tmp_path / "trace.jsonl") if entry.event == "relay"]
+    assert until(lambda: relays() == ["o2 on", "o2 off"])
+    host.close()
+
+
+def test_a_relay_that_is_taken_away_is_reported(station: PtyMcu, tmp_path: Path) -> None:
+    host = Host(tmp_path / "port")
+    host.send(wire.DESCRIBE_REQ)
+    assert until(lambda: len(host.received(wire.STATE)) == 4)
+    station.connect("o4", False)
+    assert until(lambda: host.received(wire.STATE)[4:])
+    assert (host.received(wire.STATE)[4].interface, host.received(wire.STATE)[4].payload) == (8, b"\1\0\0")
+    host.send(wire.CMD, b"\1", interface=7)
+    assert until(lambda: [one.payload for one in host.received(wire.NACK)] == [b"command_failed"])
+    host.close()
+
+
+def test_only_outlets_that_are_there_can_be_taken_away(station: PtyMcu, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="outlets has no outlet 'o9'"):
+        station.connect("o9", False)
+    with PtyMcu("goob_imu", tmp_path / "imu") as imu, pytest.raises(ConfigError, match="goob_imu has no outlet"):
+        imu.connect("o1", False)
+
+
+def test_the_program_prints_what_its_relays_do(tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "outlets", "--link", str(link)]
+    options = ["--outlets", "2", "--unreachable", "o2", "--control"]
+    with subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as program:
+        assert program.stdin is not None
+        assert program.stdout is not None
+        host = Host(link)
+        host.send(wire.CMD, b"\1", interface=1)
+        assert program.stdout.readline() == b"o1 on\n"
+        host.send(wire.CMD, b"\1", interface=3)
+        assert until(lambda: host.received(wire.NACK))
+        program.stdin.write(b"connect o2\n")
+        program.stdin.flush()
+        assert until(lambda: [one for one in host.received(wire.STATE) if one.payload == b"\1\1\0"])
+        host.send(wire.CMD, b"\1", interface=3)
+        assert program.stdout.readline() == b"o2 on\n"
+        host.close()
+        program.stdin.close()
+    assert program.returncode == 0

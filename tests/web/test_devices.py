@@ -1,0 +1,135 @@
+"""What the server passes on of outlets and microcontrollers, and what it publishes: a real broker, no browser."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from pebble.transports import Message
+from pebble.web.robots import MAX_ALIASES, Interest, Robots
+from tests.services.serial_mcu_bridge import mcu_wire as wire
+from tests.support import until
+from tests.web.served import Page, RecordingRobot, Served
+from tests.web.states import described, outlet, sample
+
+BASE = "pebble/robots/lampy"
+DESCRIBE = "mcu/lamp-1/describe"
+
+
+@pytest.fixture
+def robot(served: Served) -> Iterator[RecordingRobot]:
+    made = RecordingRobot(served.broker_port, BASE)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
+    with served.page() as opened:
+        assert opened.knows(BASE)
+        opened.send("watch", ref=BASE)
+        yield opened
+
+
+def manifest(*channels: Any) -> dict[str, Any]:
+    interfaces = [{"name": f"i{n}", "dir": "out", "channel": channel} for n, channel in enumerate(channels)]
+    return described(wire.LAMP) | {"interfaces": interfaces}
+
+
+def test_what_an_mcu_publishes_under_an_alias_arrives(page: Page, robot: RecordingRobot) -> None:
+    robot.publish(DESCRIBE, described(wire.LAMP), retain=True)
+    robot.publish("lights/lamp", sample("lamp-1", "lamp", {"level": 62.5}), retain=True)
+    assert until(lambda: page.value(BASE, "lights/lamp", "value") == {"level": 62.5})
+    assert page.value(BASE, DESCRIBE, "device_uid") == "lamp-1"
+    robot.publish("lights/other", {"value": 1}, retain=True)
+    robot.publish("mcu/lamp-1/glow", sample("lamp-1", "glow", {"lux": 1.5}))
+    assert until(lambda: page.value(BASE, "mcu/lamp-1/glow", "value") == {"lux": 1.5})
+    assert page.value(BASE, "lights/other") is None
+    robot.remove(DESCRIBE)
+    robot.remove("lights/lamp")
+
+
+def test_what_is_removed_is_gone_on_the_page(page: Page, robot: RecordingRobot) -> None:
+    robot.publish("outlets/o1/status", outlet("o1"), retain=True)
+    assert until(lambda: page.value(BASE, "outlets/o1/status"))
+    robot.remove("outlets/o1/status")
+    assert until(lambda: page.state[BASE, "outlets/o1/status"] is None)
+
+
+def test_commands_go_to_the_components_own_topics(page: Page, robot: RecordingRobot) -> None:
+    page.send("outlet", ref=BASE, outlet="o1", on=True)
+    page.send("mcu", ref=BASE, uid="lamp-1", name="lamp", value={"level": 50, "on": False})
+    topics = {f"{BASE}/incoming/outlets/o1/power", f"{BASE}/incoming/mcu/lamp-1/lamp"}
+    assert until(lambda: topics <= robot.topics())
+    payloads = {topic: payload for _, topic, payload in robot.received if topic in topics}
+    assert list(payloads.values()) == [{"on": True}, {"level": 50, "on": False}]
+
+
+# -- without a broker
+
+
+def receive(robots: Robots, metric: str, payload: Any) -> None:
+    raw = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
+    robots.receive(Message(f"{BASE}/outgoing/{metric}", raw), 1.0)
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [
+        "drive-values",  # the contract's, in the other direction only: nothing arrives there
+        "a/b",
+    ],
+)
+def test_a_free_channel_becomes_an_alias(channel: str) -> None:
+    robots = Robots()
+    receive(robots, DESCRIBE, manifest(channel, channel))
+    assert robots.aliases(BASE) == [channel]
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [
+        "", 1, None, True, [], {"a": 1},
+        "front-camera", "audio", "logs", "online", "capabilities",
+        "estop/base", "estops", "control/x", "by/x",
+        "web/estop", "web/driver", "web", "mcu/other/lamp", "mcu/x/y/z", "mcu",
+        "#", "a/#", "+", "a/+/b", "/a", "a//b", "a/", "$SYS", "a\0b", "a\nb", "a" * 65, "/".join(["a" * 30] * 8),
+    ],
+)  # fmt: skip
+def test_what_is_defined_elsewhere_does_not(channel: Any) -> None:
+    robots = Robots()
+    receive(robots, DESCRIBE, manifest(channel))
+    assert robots.aliases(BASE) == []
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [[], "x", 7, {}, {"interfaces": 1}, {"interfaces": [1, None, [], "x", {}, {"dir": "in", "channel": "a/b"}]}],
+)
+def test_a_manifest_of_any_shape_is_read(payload: Any) -> None:
+    robots = Robots()
+    receive(robots, DESCRIBE, payload)
+    assert robots.aliases(BASE) == []
+    assert robots.value(BASE, DESCRIBE) is not None
+
+
+def test_there_is_an_end_to_aliases() -> None:
+    robots = Robots()
+    for device in range(4):
+        receive(robots, f"mcu/m{device}/describe", manifest(*(f"x/{device}-{n}" for n in range(100))))
+    assert len(robots.aliases(BASE)) == MAX_ALIASES
+
+
+def test_aliases_end_with_their_manifest() -> None:
+    robots = Robots()
+    interest = Interest(lambda: None)
+    robots.join(interest)
+    robots.watch(interest, BASE)
+    receive(robots, DESCRIBE, manifest("a/b"))
+    assert [value[:2] for value in robots.take(interest, 2.0)] == [(BASE, DESCRIBE)]
+    receive(robots, DESCRIBE, b"")
+    assert robots.aliases(BASE) == []
+    assert robots.take(interest, 3.0) == ((BASE, DESCRIBE, None, 0.0),)

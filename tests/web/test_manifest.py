@@ -1,0 +1,228 @@
+"""What the page makes of manifests, of what is entered into their forms, and of values of any shape; in Node.js."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from typing import Any
+
+import pytest
+
+from tests.services.serial_mcu_bridge import mcu_wire as wire
+from tests.support import ROOT
+from tests.web.states import LAMP_MCU, described
+
+UI = ROOT / "pebble" / "web" / "static" / "ui"
+
+
+@pytest.fixture(autouse=True)
+def _node() -> None:
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+
+
+def run(expression: str, *values: Any) -> Any:
+    """What ``expression`` makes of ``v``, the ``values``."""
+    names = {
+        "manifest": "readManifest, command, unsendable, range, step, fieldOf",
+        "lines": "Lines",
+        "outlets": "outletsOf, obstacle",
+        "models": "Offers",
+        "spark": "remember, series",
+    }
+    imports = [f"import {{ {what} }} from {json.dumps((UI / f'{file}.js').as_uri())};" for file, what in names.items()]
+    program = "\n".join(
+        [*imports, f"const v = JSON.parse(process.argv[1]);\nconsole.log(JSON.stringify({expression}));"]
+    )
+    command = ["node", "--input-type=module", "-e", program, "--", json.dumps(values)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_manifest_is_read() -> None:
+    read = run("readManifest(v[0])", described(LAMP_MCU))
+    assert (read["model"], read["firmware"], read["omitted"]) == ("board", "1.0", 0)
+    assert [(one["name"], one["isOut"], one["channel"]) for one in read["interfaces"]] == [
+        ("lamp", False, "lights/lamp"),
+        ("lamp", True, "lights/lamp"),
+        ("button", True, ""),
+        ("glow", True, ""),
+        ("arm", False, ""),
+    ]
+    level = read["interfaces"][0]["fields"][0]
+    assert level == {"name": "level", "type": "u8", "scale": 0.5, "offset": 0, "unit": "%"}
+
+
+def test_an_interface_that_stays_on_the_robot_takes_no_commands() -> None:
+    private = wire.M("m", (wire.I(1, "a", wire.IN, wire.KIND_COMMAND, (wire.F("x", wire.U8),), flags=wire.LOCAL_ONLY),))
+    assert run("unsendable(readManifest(v[0]).interfaces[0])", described(private)).startswith("it takes commands from")
+
+
+HOSTILE = [
+    None, 7, "x", [], {}, {"interfaces": None}, {"interfaces": {"0": {}}},
+    {"interfaces": [None, 7, "x", [], {}, {"name": "", "dir": "out"}, {"name": 7, "dir": "in"}, {"name": "a"}]},
+    {"model": {"a": [1]}, "firmware_version": ["x"] * 1000, "interfaces": [{"name": "a", "dir": "in", "encoding": 7}]},
+    {"interfaces": [{"name": "a", "dir": "out", "channel": {}, "rate_hz": "fast", "encoding": {"fields": "none"}}]},
+    {"interfaces": [{"name": "a", "dir": "in", "encoding": {"fields": [{"name": "x", "scale": 0, "type": []}]}}]},
+    {"value": {"interfaces": []}, "interfaces": "x"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("payload", HOSTILE)
+def test_a_manifest_of_any_shape_is_read_without_an_exception(payload: Any) -> None:
+    run("[readManifest(v[0])?.interfaces.map((one) => [unsendable(one), command(one, new Map()), range, step])]", payload)
+
+
+def test_what_is_too_much_is_counted() -> None:
+    fields = [{"name": f"f{n}", "type": "u8"} for n in range(44)]
+    one = {"name": "a", "dir": "out", "encoding": {"fields": fields}}
+    read = run("readManifest(v[0])", {"interfaces": [one | {"name": f"i{n}"} for n in range(70)]})
+    assert (len(read["interfaces"]), read["omitted"]) == (64, 6)
+    assert (len(read["interfaces"][0]["fields"]), read["interfaces"][0]["omitted"]) == (32, 12)
+
+
+def interface(*fields: dict[str, Any]) -> dict[str, Any]:
+    return {"interfaces": [{"name": "a", "dir": "in", "encoding": {"fields": list(fields)}}]}
+
+
+COMMAND = "command(readManifest(v[0]).interfaces[0], new Map(v[1]))"
+
+
+@pytest.mark.parametrize(
+    ("field", "entered", "value"),
+    [
+        ({"type": "bool"}, True, True),
+        ({"type": "bool"}, None, False),
+        ({"type": "u8"}, "255", 255),
+        ({"type": "i8"}, " -128 ", -128),
+        ({"type": "u32"}, "4294967295", 4294967295),
+        ({"type": "i32"}, "-2147483648", -2147483648),
+        ({"type": "f32"}, "1.5e3", 1500),
+        ({"type": "f32"}, "-0.25", -0.25),
+        ({"type": "u8", "scale": 0.5}, "127.5", 127.5),
+        ({"type": "i16", "scale": -0.1, "offset": 10}, "3286.8", 3286.8),
+    ],
+)
+def test_what_is_entered_becomes_json_of_the_fields_type(field: dict[str, Any], entered: Any, value: Any) -> None:
+    made = run(COMMAND, interface({"name": "x", **field}), [["x", entered], ["y", "7"]])
+    assert made == {"value": {"x": value}, "problems": []}
+    assert type(made["value"]["x"]) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("field", "entered", "problem"),
+    [
+        ({"type": "u8"}, "", "x: 0 to 255"),
+        ({"type": "u8"}, "256", "x: 0 to 255"),
+        ({"type": "u8"}, "-1", "x: 0 to 255"),
+        ({"type": "u8"}, "1.5", "x: a whole number, 0 to 255"),
+        ({"type": "u8"}, "0x1g", "x: 0 to 255"),
+        ({"type": "u8"}, True, "x: 0 to 255"),
+        ({"type": "u8", "scale": 0.5, "unit": "%"}, "128", "x: 0 to 127.5 %"),
+        ({"type": "f32", "unit": "m"}, "far", "x: a number m"),
+        ({"type": "f32"}, "1e39", "x: a number"),
+        ({"type": "f32"}, "Infinity", "x: a number"),
+    ],
+)
+def test_what_the_field_cannot_hold_is_not_sent(field: dict[str, Any], entered: Any, problem: str) -> None:
+    made = run(COMMAND, interface({"name": "x", **field}), [["x", entered]])
+    assert made == {"value": {}, "problems": [problem]}
+
+
+def test_names_of_fields_are_only_names() -> None:
+    names = ["__proto__", "constructor", "toString"]
+    fields = [{"name": name, "type": "u8"} for name in names]
+    made = run(COMMAND, interface(*fields), [[name, "1"] for name in names])
+    assert made["value"] == dict.fromkeys(names, 1)
+    assert run("[fieldOf(v[0], 'constructor'), fieldOf(v[0], 'a')]", {"value": {"a": 1}}) == [None, 1]
+
+
+def test_a_command_that_the_server_would_not_take_is_not_sent() -> None:
+    fields = [{"name": "\x01" * 200 + str(n), "type": "bool"} for n in range(32)]
+    assert run(COMMAND, interface(*fields), [])["problems"] == ["it is too long to be sent"]
+    long = [{"name": "x" * 300, "type": "bool"}]
+    assert run("unsendable(readManifest(v[0]).interfaces[0])", interface(*long)) == "one of its fields cannot be read"
+
+
+# -- values
+
+
+def lines(payload: Any) -> list[list[Any]]:
+    made = run("new Lines(v[0])", payload)
+    assert made["omitted"] == 0
+    return [[line["depth"], line["key"], line["text"]] for line in made["lines"]]
+
+
+def test_nested_objects_become_lines_farther_in() -> None:
+    payload = {"t": 1, "value": {"pose": {"x": 1.25, "y": [1, 2]}, "ok": True}, "seq": 9}
+    assert lines(payload) == [
+        [0, "pose", ""],
+        [1, "x", "1.25"],
+        [1, "y", "[1, 2]"],
+        [0, "ok", "true"],
+        [0, "seq", "9"],
+    ]
+
+
+def test_a_plain_value_has_its_unit() -> None:
+    assert lines({"value": 7.92, "unit": "v"}) == [[0, "", "7.92 v"]]
+    assert lines(7) == [[0, "", "7"]]
+    assert lines([]) == [[0, "", "[]"]]
+
+
+def test_values_of_any_depth_and_length_have_an_end() -> None:
+    deep: Any = 1
+    for _ in range(30):
+        deep = {"a": [deep, {"b": deep}]} if _ < 3 else {"a": deep}
+    assert max(line[0] for line in lines(deep)) <= 4
+    wide = run("new Lines(v[0])", {"value": {str(n): {"x": n} for n in range(5000)}})
+    assert len(wide["lines"]) <= 101
+    assert wide["omitted"] >= 4900
+
+
+# -- outlets
+
+
+def outlets(capabilities: Any, *metrics: str) -> dict[str, bool]:
+    made = run("outletsOf(new Offers('pebble/robots/a', v[0], v[1]))", capabilities, metrics)
+    return {one["name"]: one["controls"] for one in made}
+
+
+def test_outlets_are_those_that_are_listed_and_those_that_report() -> None:
+    listed = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
+    assert outlets(listed, "outlets/o1/status", "outlets/o9/status") == {"o1": False, "o2": True, "o9": False}
+    assert outlets(None, "outlets/o1/status", "outlets/o1/other", "outlets/x") == {"o1": True}
+    assert outlets({"value": {"outlets": {"available": True, "outlets": [1, None, {}, {"name": 7}, {"name": ""}]}}}) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "controls", "report", "why"),
+    [
+        ("o1", True, {}, ""),
+        ("o1", True, {"bound": True, "reachable": True, "on": False}, ""),
+        ("o1", True, {"reachable": False}, "outlet is unreachable"),
+        ("o1", True, {"bound": False, "reachable": False}, "no device is bound to this outlet"),
+        ("o1", False, {}, "this outlet cannot be switched from here: its robot lists no control"),
+        ("a/b", True, {}, "its name cannot be part of a topic"),
+        ("x" * 65, True, {}, "its name cannot be part of a topic"),
+        ("😀" * 64, True, {}, ""),
+    ],
+)
+def test_why_an_outlet_cannot_be_switched(name: str, controls: bool, report: dict[str, Any], why: str) -> None:
+    assert run("obstacle(...v)", name, controls, report) == why
+
+
+def test_a_sparkline_has_the_last_minute() -> None:
+    steps = """(() => {
+      const history = [];
+      for (let at = 0; at <= 90_000; at += 100) remember(history, { receivedAt: at, value: { value: { x: at } } });
+      remember(history, { receivedAt: 95_000, value: "odd" });
+      const points = series(history, "x");
+      return [points.length, points[0][0], points.at(-1)];
+    })()"""
+    count, first, last = run(steps)
+    assert 150 < count <= 250
+    assert first >= 35_000
+    assert last[0] == last[1]
