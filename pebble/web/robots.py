@@ -34,10 +34,11 @@ from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
+from pebble.web.log_lines import LogLines
+from pebble.web.restarts import Restarts
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
-LOG_LINES = 500  # of the watched component
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
 _SILENT_S = 1.5  # a component is not called silent before
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often
@@ -78,6 +79,7 @@ class Component:
         self.values: dict[str, _Value] = {}
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
+        self.restarts = Restarts()
         self._stamps: deque[int] = deque(maxlen=_STAMPS)
 
     @property
@@ -129,10 +131,9 @@ class Robots:
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
         self.on_message: list[Callable[[Message, float], None]] = []  # of every component, before it is interpreted
-        self.logs: dict[str, deque[tuple[int, msgspec.Raw]]] = {}  # of watched components: number and line
+        self.logs: dict[str, LogLines] = {}  # of watched components
         self._server: dict[tuple[str, str], _Value] = {}
         self._bytes = 0
-        self._log_number = 0
 
     # -- reading
 
@@ -201,6 +202,10 @@ class Robots:
         if old is None or bytes(old.raw) != bytes(raw):
             self._server[ref, metric] = _Value(raw, time.monotonic())
             self._mark(ref, metric, everybody=True)
+
+    def remove_server_metric(self, ref: str, metric: str) -> None:
+        """Pages have its last value until they receive another one."""
+        self._server.pop((ref, metric), None)
 
     def receive(self, message: Message, now: float) -> None:
         """Take a message of any component."""
@@ -308,6 +313,8 @@ class Robots:
             component.capabilities = _capabilities(message.payload) or component.capabilities
         elif channel is ONLINE or channel in SYNONYMS:
             self._heartbeat(component, message, now)
+        elif channel is STATUS and component.restarts.receive(message.payload, int(1000 * time.time())):
+            self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
 
     def _heartbeat(self, component: Component, message: Message, now: float) -> None:
         if message.retain:
@@ -321,14 +328,9 @@ class Robots:
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)
-        if lines is None or message.retain or len(message.payload) > MAX_VALUE_BYTES:
+        if lines is None or message.retain or not message.payload:
             return
-        try:
-            codec.plain(LOGS, message.payload)
-        except PayloadError:
-            return
-        self._log_number += 1
-        lines.append((self._log_number, msgspec.Raw(message.payload)))
+        lines.add(message.payload)
         for interest in self.interests:
             if interest.watched == component.ref:
                 interest.notify()

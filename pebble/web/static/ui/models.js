@@ -29,6 +29,11 @@ export class Connection extends Model {
     this.bye = null;
     /** @type {{text: string, at: number} | null} */
     this.notice = null;
+    /** @type {any} what the server last did or refused to do, of what this page asked */
+    this.answer = null;
+    /** @type {((message: any) => void) | null} */
+    this.onLogs = null;
+    this.unread = 0; // notices
   }
 
   get state() {
@@ -96,11 +101,12 @@ export class Settings extends Model {
     this.theme = read("theme", "auto");
     this.thumbnails = read("thumbnails", false) === true;
     this.sort = read("sort", "name");
+    this.name = String(read("name", ""));
     this.forgotten = new Set(list(read("forgotten", [])));
     this.apply();
   }
 
-  /** @param {"theme" | "thumbnails" | "sort"} name @param {any} value */
+  /** @param {"theme" | "thumbnails" | "sort" | "name"} name @param {any} value */
   set(name, value) {
     this[name] = value;
     write(name, value);
@@ -139,6 +145,7 @@ export class CardView extends Model {
     const stored = read(this.key, {});
     this.closed = new Set(list(stored?.closed));
     this.hidden = new Set(list(stored?.hidden));
+    this.wanted = ""; // a card that is to be looked at now
   }
 
   isClosed(id) {
@@ -160,13 +167,21 @@ export class CardView extends Model {
     this.save();
   }
 
+  /** Show a card, open, in sight. */
+  reveal(id) {
+    this.hidden.delete(id);
+    this.closed.delete(id);
+    this.wanted = id;
+    this.save();
+  }
+
   save() {
     write(this.key, { closed: [...this.closed], hidden: [...this.hidden] });
     this.changed();
   }
 }
 
-function read(name, otherwise) {
+export function read(name, otherwise) {
   try {
     return JSON.parse(localStorage.getItem(`pebble ${name}`) ?? "null") ?? otherwise;
   } catch {
@@ -174,7 +189,7 @@ function read(name, otherwise) {
   }
 }
 
-function write(name, value) {
+export function write(name, value) {
   try {
     localStorage.setItem(`pebble ${name}`, JSON.stringify(value));
   } catch {
@@ -203,7 +218,7 @@ export class Offers {
   /** Whether it has a section that people use; assumed of a robot without capabilities, as the original page does. */
   has(name) {
     const section = this.section(name);
-    return this.assumed || section.available === true || (name === "system" && Object.keys(section).length > 0);
+    return this.assumed || section.available === true || (name === "system" && Object.keys({ ...section, ...this.section("reboot") }).length > 0);
   }
 
   /** @param {string} prefix @returns {boolean} whether any such metric was received */
