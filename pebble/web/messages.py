@@ -152,7 +152,7 @@ class AutonomyOp(_FromPage, frozen=True, kw_only=True, tag="autonomy"):
 
     ref: Ref
     file: Annotated[str, Meta(max_length=200)]
-    config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}  # noqa: RUF012 - a Struct
+    config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}
 
 
 class OutletOp(_FromPage, frozen=True, kw_only=True, tag="outlet"):
@@ -191,8 +191,8 @@ class FlagOp(_FromPage, frozen=True, kw_only=True, tag="flag"):
 RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp
 
 FromPage: TypeAlias = (
-    Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp
-    | RobotOp
+    Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp
+    | PictureFromOp | RobotOp
 )  # fmt: skip
 
 

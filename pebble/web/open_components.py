@@ -89,9 +89,9 @@ class OpenComponents:
         """Subscribe and unsubscribe until what is received is what is wanted."""
         try:
             done = self._subscriptions.setdefault(ref, {})
-            if not done:
-                self._show_flags(ref, FlagsView())  # those that were removed meanwhile do not arrive
             while True:
+                if not done:
+                    self._show_flags(ref, FlagsView())  # those that were removed meanwhile do not arrive
                 wanted = self._wanted[ref] = self._filters(ref) if ref in self._pages else {}
                 for filter_ in [filter_ for filter_ in done if filter_ not in wanted]:
                     await self._broker.unsubscribe(done.pop(filter_))

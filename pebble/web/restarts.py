@@ -46,7 +46,7 @@ def _counts(status: bytes) -> dict[str, int]:
     if not isinstance(services, dict):
         return {}
     found = {name: one.get("restarts") for name, one in services.items() if isinstance(one, dict)}
-    return {name: count for name, count in found.items() if type(count) is int and 0 <= count and len(name) <= MAX_NAME}
+    return {name: count for name, count in found.items() if type(count) is int and count >= 0 and len(name) <= MAX_NAME}
 
 
 def _is_status(value: Any) -> bool:

@@ -107,9 +107,15 @@ def test_only_the_newest_restarts_of_some_services_are_remembered() -> None:
 
 @given(
     st.recursive(
-        st.none() | st.booleans() | st.integers() | st.text(max_size=5) | st.floats(allow_nan=False),
-        lambda inside: st.lists(inside, max_size=3)
-        | st.dictionaries(st.sampled_from(["value", "services", "a", "restarts"]), inside, max_size=3),
+        st.none()
+        | st.booleans()
+        | st.integers()
+        | st.text(max_size=5)
+        | st.floats(allow_nan=False, allow_infinity=False),
+        lambda inside: (
+            st.lists(inside, max_size=3)
+            | st.dictionaries(st.sampled_from(["value", "services", "a", "restarts"]), inside, max_size=3)
+        ),
     )
 )
 def test_a_status_may_be_of_any_shape(value: object) -> None:

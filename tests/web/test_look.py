@@ -41,7 +41,7 @@ def _press(*selectors: str) -> Callable[[Page], None]:
     return act
 
 
-def _tell(page: Page) -> None:
+def _trouble(page: Page) -> None:
     """Robots go and come back, batteries are low, and a service ends: the bell counts it."""
     page.locator("[data-test=announcement]").wait_for(state="attached")
     page.evaluate(
@@ -62,9 +62,9 @@ def _tell(page: Page) -> None:
     )
 
 
-def _tell_and_press(*selectors: str) -> Callable[[Page], None]:
+def _trouble_and_press(*selectors: str) -> Callable[[Page], None]:
     def act(page: Page) -> None:
-        _tell(page)
+        _trouble(page)
         _press(*selectors)(page)
 
     return act
@@ -131,13 +131,19 @@ SCREENS = [
     Screen("logs", "operating", _press("[data-test=tab-more]"), ("phone",), _scroll_to(".log-foot")),
     Screen("system", "operating", sizes=("desktop",), hold=_scroll_to(".system .flag:last-child")),
     Screen("system", "operating", _press("[data-test=tab-more]"), ("phone",), _scroll_to(".system .flag:last-child")),
-    Screen("services", "operating", _press("[data-test=tab-sensors]"), ("phone",), _scroll_to(".services-list li:last-child")),
+    Screen(
+        "services",
+        "operating",
+        _press("[data-test=tab-sensors]"),
+        ("phone",),
+        _scroll_to(".services-list li:last-child"),
+    ),
     Screen("system-ask", "operating", _press("[data-test=service-restart]"), ("desktop",)),
     Screen("system-ask", "operating", _press("[data-test=tab-more]", "[data-test=service-restart]"), ("phone",)),
-    Screen("notices", "fleet", _tell_and_press("[data-test=bell]"), ("desktop",)),
-    Screen("notices", "fleet", _tell_and_press(".me"), ("phone",)),
-    Screen("limits", "fleet", _tell_and_press("[data-test=bell]", "[data-test=limits]"), ("desktop",)),
-    Screen("bell", "driving", _tell, ("desktop", "phone")),
+    Screen("notices", "fleet", _trouble_and_press("[data-test=bell]"), ("desktop",)),
+    Screen("notices", "fleet", _trouble_and_press(".me"), ("phone",)),
+    Screen("limits", "fleet", _trouble_and_press("[data-test=bell]", "[data-test=limits]"), ("desktop",)),
+    Screen("bell", "driving", _trouble, ("desktop", "phone")),
     Screen("own-name", "operating", _press(".me"), ("desktop",)),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.web import open_components
+from pebble.web.broker import Broker as BrokerOfPages
+from pebble.web.open_components import OpenComponents
+from pebble.web.robots import Robots
 from tests.support import Broker, until
+from tests.web.attacker import Hall
 from tests.web.served import Page, RecordingRobot, Served
 
 NAMES = itertools.count(1)
@@ -130,7 +137,7 @@ def test_logs_of_another_component_are_not_sent(page, robot, served, broker) -> 
 
 
 def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
-    flags = lambda: page.value(robot.base, "web/flags")  # noqa: E731
+    flags = lambda: page.value(robot.base, "web/flags")
     assert flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": None}
     page.send("flag", ref=robot.base, name="mqtt-video", on=True)
     assert until(lambda: flags()["mqtt_video"] is True)
@@ -185,6 +192,19 @@ def test_an_action_goes_to_the_topic_that_the_capabilities_name(served, broker, 
     assert until(lambda: [one.detail for one in _audit(served, base)] == ["name service-restart", "name reboot"])
 
 
+@pytest.mark.parametrize(
+    ("role", "may"), [("viewer", set()), ("driver", {"mqtt-video"}), ("maintainer", {"mqtt-video", "reboot"})]
+)
+def test_what_each_role_may_ask(broker, tmp_path: Path, role: str, may: set[str]) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    with Hall(broker.port, tmp_path) as hall, RecordingRobot(broker.port, base) as robot, hall.page(role) as page:
+        assert page.knows(base)
+        page.send("flag", ref=base, name="mqtt-video", on=True)
+        page.send("action", ref=base, name="reboot")
+        assert until(lambda: len(page.refused) == 2 - len(may))
+        assert until(lambda: robot.topics() == {f"{base}/incoming/flags/{name}" for name in may})
+
+
 def test_an_action_never_goes_to_another_robot(served, broker) -> None:
     base = f"pebble/robots/rig{next(NAMES)}"
     lie = {"system": {"reboot": {"flag_topic": "pebble/robots/other/incoming/flags/reboot"}}}
@@ -215,6 +235,59 @@ def test_restarts_are_dated_for_pages_that_come_later(served, broker, robot) -> 
         assert until(lambda: later.value(robot.base, "web/restarts") is not None)
 
 
+# -- opened and closed
+
+
+class SlowBroker:
+    """Subscribes and unsubscribes as slowly as the test lets it."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        self.filters: set[str] = set()
+        self.may_unsubscribe = asyncio.Event()
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        return asyncio.get_running_loop()
+
+    def on_state(self, watcher: Callable[[], None]) -> None:
+        pass
+
+    async def subscribe(self, filter_: str, _handler: object, **_options: object) -> str:
+        self.filters.add(filter_)
+        return filter_
+
+    async def unsubscribe(self, filter_: str) -> None:
+        await self.may_unsubscribe.wait()
+        self.filters.discard(filter_)
+
+
+def test_a_component_that_is_opened_while_it_is_being_closed_is_received(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(open_components, "_KEEP_S", 0)
+    monkeypatch.setattr(open_components, "_STEP_S", 0)
+    base = "pebble/robots/rig"
+
+    async def work() -> None:
+        broker, robots, tasks = SlowBroker(), Robots(), []
+        opened = OpenComponents(
+            cast(BrokerOfPages, broker), robots, lambda work: tasks.append(asyncio.ensure_future(work))
+        )
+        opened.open(base)
+        await asyncio.gather(*tasks)
+        everything = set(broker.filters)
+        opened.close(base)
+        while len(tasks) == 1:
+            await asyncio.sleep(0)
+        opened.open(base)
+        broker.may_unsubscribe.set()
+        await asyncio.gather(*tasks)
+        assert broker.filters == everything
+        assert base in robots.logs
+
+    asyncio.run(work())
+
+
 # -- names
 
 
@@ -230,4 +303,10 @@ def test_without_a_login_a_page_says_who_it_is(served, robot) -> None:
         alice.send("estop", ref=robot.base, stop="00112233445566ff", why="test")
         assert until(lambda: other.value(robot.base, "web/estop", "latched") is True)
         assert "Alice" in other.value(robot.base, "web/estop", "by")
-    assert until(lambda: any(entry.user == "Alice ?" and entry.what == "stop" for entry in served.app.state.audit.read(9)))
+    audit = served.app.state.audit
+    assert until(lambda: ("Alice ?", "stop") in [(entry.user, entry.what) for entry in audit.read(9)])
+
+
+def test_with_a_login_the_name_of_the_user_counts(broker, tmp_path: Path) -> None:
+    with Hall(broker.port, tmp_path) as hall, hall.page("driver", name="Alice") as page:
+        assert page.welcome["user"] == "driver"

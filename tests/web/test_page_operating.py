@@ -145,7 +145,8 @@ def test_a_refusal_is_the_end() -> None:
 
 
 def test_boots_are_compared_by_owner() -> None:
-    steps = """result = [bootsOf([{ owner: "b", boot: "1" }, { owner: "a", boot: "2" }]), bootsOf(undefined), bootsOf("x")];"""
+    owners = json.dumps([{"owner": "b", "boot": "1"}, {"owner": "a", "boot": "2"}])
+    steps = f"result = [bootsOf({owners}), bootsOf(undefined), bootsOf('x')];"
     assert run("outcome.js", "bootsOf", steps) == ["a 2,b 1", "", ""]
 
 
@@ -226,7 +227,8 @@ def test_a_script_that_fails() -> None:
 
 def test_a_service_that_ends_again_and_again() -> None:
     steps = """
-    const services = (state, restarts, last_exit) => watcher.services("a", { imu: { state, restarts, last_exit } }, ++at);
+    const services = (state, restarts, last_exit) =>
+      watcher.services("a", { imu: { state, restarts, last_exit } }, ++at);
     services("ready", 3); services("ready", 3); services("restarting", 3, "signal 9"); services("ready", 4, "signal 9");
     const first = texts(); services("ready", 5, "signal 9"); services("failed", 5, "exit code 1");
     services("failed", 5, "exit code 1"); services("ready", 0); result = [first, texts()];"""
@@ -248,7 +250,7 @@ def test_per_cent_are_low_below_20_unless_the_user_says_otherwise() -> None:
     assert notices("level(15, { unit: '%', limit: 10 });") == []
 
 
-@pytest.mark.parametrize("odd", ["null", "3", "[]", '"x"', "{}", '{ services: 1, __proto__: null }'])
+@pytest.mark.parametrize("odd", ["null", "3", "[]", '"x"', "{}", "{ services: 1, __proto__: null }"])
 def test_states_of_any_shape_are_no_notices(odd: str) -> None:
     steps = f"for (const name of ['online', 'stop', 'script', 'services']) watcher[name]('a', {odd}, 1);"
     assert notices(steps) == []

@@ -27,7 +27,7 @@ function join() {
     onOpen: () => driver.opened(),
     onLost: () => driver.lost(),
     onChange: () => connection.changed(),
-    name: () => settings.name,
+    name: () => String(settings.name).slice(0, 32),
     onLogs: (message) => connection.onLogs?.(message),
     onDone: (message) => answered(message),
     onBye: (message) => {

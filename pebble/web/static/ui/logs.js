@@ -130,7 +130,8 @@ function Lines({ view, lines }) {
 
 function draw({ number, t, level, service, text, gap }) {
   if (gap) return html`<li key=${number} class="log-gap">${text}</li>`;
-  return html`<li key=${number} class=${`log-line ${level.toLowerCase()}`}>
+  const known = LEVELS.includes(level); // a robot must not choose a class
+  return html`<li key=${number} class=${`log-line ${known ? level.toLowerCase() : ""}`}>
     <time title=${t === null ? "" : new Date(t).toLocaleString()}>${stamp(t)}</time>
     <b class="log-level"><i aria-hidden="true">${SIGNS[level] ?? "○"}</i> ${level}</b>
     <span class="log-service">${service}</span>

@@ -101,7 +101,7 @@ export class Settings extends Model {
     this.theme = read("theme", "auto");
     this.thumbnails = read("thumbnails", false) === true;
     this.sort = read("sort", "name");
-    this.name = String(read("name", ""));
+    this.name = read("name", "");
     this.forgotten = new Set(list(read("forgotten", [])));
     this.apply();
   }
@@ -218,7 +218,7 @@ export class Offers {
   /** Whether it has a section that people use; assumed of a robot without capabilities, as the original page does. */
   has(name) {
     const section = this.section(name);
-    return this.assumed || section.available === true || (name === "system" && Object.keys({ ...section, ...this.section("reboot") }).length > 0);
+    return this.assumed || section.available === true || (name === "system" && ("reboot" in this.value || Object.keys(section).length > 0));
   }
 
   /** @param {string} prefix @returns {boolean} whether any such metric was received */

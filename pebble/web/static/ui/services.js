@@ -21,7 +21,14 @@ function ServicesBody({ at, view }) {
     ${names
       .slice(0, MOST)
       .map(
-        (name) => html`<${Service} key=${name} at=${at} view=${view} name=${name} one=${services[name]} times=${times[name] ?? []} />`,
+        (name) => html`<${Service}
+          key=${name}
+          at=${at}
+          view=${view}
+          name=${name}
+          one=${services[name]}
+          times=${Object.hasOwn(times, name) ? times[name] : []}
+        />`,
       )}
     ${names.length > MOST && html`<li class="dim">… ${names.length - MOST} more</li>`}
   </ul>`;
@@ -37,7 +44,7 @@ function Service({ at, view, name, one, times }) {
     view?.reveal("logs");
   };
   return html`<li class=${bad ? "bad" : ""} data-test=${`service-${name}`}>
-    <i aria-hidden="true">${SIGNS[state] ?? "○"}</i>
+    <i aria-hidden="true">${Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
     <span class="services-name">${name.replaceAll("_", " ")}</span>
     <span class="services-state">${state}</span>
     <button type="button" class="quiet" aria-label=${`Log lines of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
