@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from pebble.client.connection import password as broker_password
 from pebble.client.url import settings_of as settings_of_url
@@ -72,14 +72,14 @@ def serve(
     if (config is None) == (url is None):
         raise PebbleError("which robots is missing: name either a robot's config file or --url mqtt://BROKER")
     require_packages()
-    folder = _tls_folder(tls)
-    options = {"host": host, "port": port, "names": tuple(name or ())}
+    folder = None if tls is None else tls.absolute()
+    empty = folder is not None and not _has_certificate(folder)
+    options = {"host": host, "port": port, "names": tuple(name or ()), "people": people}
     if url is not None:
-        settings, plain = _of_url(_broker(url, password_file, ca_cert), options, folder), False
+        settings, plain = _of_url(_broker(url, password_file, ca_cert), options, None if empty else folder), False
     else:
-        settings, plain = _of_config(Path(str(config)), options, folder)
-    settings = replace(settings, people=people or settings.people)
-    if missing := _missing(settings, plain=plain):
+        settings, plain = _of_config(Path(str(config)), options, None if empty else folder)
+    if missing := _missing(settings, plain=plain, empty=empty):
         _print_missing(settings, missing, folder or default_folder() / TLS)
         return 2
     return _run(settings)
@@ -92,9 +92,16 @@ class _Group(TyperGroup):
         return super().parse_args(ctx, args if args and args[0] in self.commands else ["serve", *args])
 
 
+class _Serve(TyperCommand):
+    """Its help shows the command line without ``serve``."""
+
+    def format_usage(self, ctx: Any, formatter: Any) -> None:
+        formatter.write_usage(ctx.parent.command_path, " ".join(self.collect_usage_pieces(ctx)))
+
+
 def register(app: typer.Typer) -> None:
     group = typer.Typer(cls=_Group, help="Serve the operator page.", rich_markup_mode=None)
-    group.command("serve")(serve)
+    group.command("serve", cls=_Serve)(serve)
     web_people.register(group)
     app.add_typer(group, name="web")
 
@@ -113,7 +120,7 @@ def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) 
     from pebble.web.settings import WebSettings
 
     given = {key: value for key, value in options.items() if value is not None}
-    settings = WebSettings(broker=broker, people=default_folder() / PEOPLE, **given)
+    settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **given})
     folder = folder or _default_tls_folder(settings.host)
     if folder is not None:
         settings = replace(
@@ -124,7 +131,7 @@ def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) 
 
 def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
     """The settings, and whether the config allows plain http."""
-    from pebble.web.from_config import settings_of
+    from pebble.web.from_config import settings_or_all_problems
 
     config = load(file)
     web = config.web_interface
@@ -137,18 +144,11 @@ def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tupl
         tls = WebTls(certificate=folder / SERVER_CERT, key=folder / SERVER_KEY, ca=folder / CA_CERT)
         web = msgspec.structs.replace(web, tls=tls)
     allowed = msgspec.structs.replace(web, plain_http=True)  # what is missing is reported with the commands for it
-    return settings_of(msgspec.structs.replace(config, web_interface=allowed)), web.plain_http
+    return settings_or_all_problems(msgspec.structs.replace(config, web_interface=allowed)), web.plain_http
 
 
-def _tls_folder(folder: Path | None) -> Path | None:
-    """The folder as an absolute path. Raises PebbleError if it has no certificate."""
-    if folder is None:
-        return None
-    for file in (SERVER_CERT, SERVER_KEY):
-        if not (folder / file).is_file():
-            names = " ".join(_own_names())
-            raise PebbleError(f"--tls {folder} has no {file}: pebble cert init --folder {folder} {names}")
-    return folder.absolute()
+def _has_certificate(folder: Path) -> bool:
+    return all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
 
 
 def _default_tls_folder(host: str) -> Path | None:
@@ -156,11 +156,11 @@ def _default_tls_folder(host: str) -> Path | None:
     return folder if not is_loopback(host) and (folder / SERVER_CERT).is_file() else None
 
 
-def _missing(settings: WebSettings, *, plain: bool) -> list[str]:
-    """Those of "certificate" and "user" that this address needs and does not have."""
-    if not settings.login:
+def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
+    """Those of "certificate" and "user" that are needed and not there. ``empty``: --tls names a folder without one."""
+    if not settings.login and not empty:
         return []
-    missing = [] if settings.certificate is not None or plain else ["certificate"]
+    missing = [] if (settings.certificate is not None or plain) and not empty else ["certificate"]
     with opened(settings.people) as database:
         return missing if database.list() else [*missing, "user"]
 

@@ -41,6 +41,7 @@ _LONGEST_FOLDER = 40  # characters: unix sockets live below, and their paths end
 _MCU_START_S = 10.0
 _REPORTS = 600  # a minute of reports
 _ENTRIES = 5_000  # minutes of commands
+_RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 
 
 class SimulatedRobot(ABC):
@@ -158,6 +159,7 @@ class LinuxRobot(SimulatedRobot):
         config["local_mqtt"] = {"host": "127.0.0.1", "port": local_port}
         services = config["services"]
         services["mqtt_bridge"]["remote_mqtt"] = {"host": "127.0.0.1", "port": remote_port}
+        services["mqtt_bridge"]["service_restart_control"] = {"command": _RESTART}
         services["serial_mcu_bridge"]["serial"]["port"] = str(self._port)
         for kind, port in self._devices.items():
             lines = services["serial_mcu_bridge"].setdefault("instances", {})

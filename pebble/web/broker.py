@@ -62,16 +62,25 @@ class Broker:
         return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
 
     async def subscribe(
-        self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, deferred: bool = False
+        self,
+        filter_: str,
+        handler: Handler,
+        *,
+        qos: QoS = QoS.DELIVERED,
+        deferred: bool = False,
+        on_refused: Callable[[], None] = lambda: None,
     ) -> Subscription:
         """Deliver what matches ``filter_`` until it is unsubscribed.
 
         ``deferred``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
-        for each heartbeat of a hundred robots costs more than the heartbeats.
+        for each heartbeat of a hundred robots costs more than the heartbeats. ``on_refused`` is called on the
+        transport's thread for a message that is dropped because too many have arrived.
         """
 
         def take(message: Message) -> None:
-            if self._arrived.put(handler, message, time.monotonic(), deferred=deferred) and not deferred:
+            if not self._arrived.put(handler, message, time.monotonic(), deferred=deferred):
+                on_refused()
+            elif not deferred:
                 self._wake()
 
         return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 import secrets
 import time
@@ -59,7 +60,8 @@ class Control:
         self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
         self._drives = True
         self._why_not = ""  # why this page may not drive at all
-        self._logs_sent = 0
+        self._reads_logs = False
+        self._logs_sent = "", 0  # the origin and number of the last line
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
     async def serve(self) -> None:
@@ -95,6 +97,9 @@ class Control:
             raise Leave("the first message must be hello", again=True)
         server, settings = self._server, self._server.settings
         self._tab.device = _printable(hello.device)
+        if not settings.login and (name := _printable(hello.name).strip()):
+            self._session = dataclasses.replace(self._session, user=name)
+            self._tab.user = name
         self._drives = settings.plain_http_drive or self._is_secure()
         version = self._websocket.app.state.version
         if not self._drives:
@@ -177,6 +182,8 @@ class Control:
                 self._reset(op)
             case m.Watch():
                 self._watch(op.ref)
+            case m.ReadLogs():
+                self._read_logs(op)
             case m.Lease():
                 self._lease(op)
             case m.EncodingOp():
@@ -255,11 +262,15 @@ class Control:
         if ref == before:
             return
         self._server.robots.watch(self._interest, ref)
-        self._logs_sent = 0
+        self._reads_logs = False
         if ref:
             self._server.watch(ref)
         if before:
             self._server.unwatch(before)
+
+    def _read_logs(self, op: m.ReadLogs) -> None:
+        if op.ref == self._interest.watched:
+            self._reads_logs, self._logs_sent = op.on, (op.origin, op.after)
 
     def _lease(self, op: m.Lease) -> None:
         server = self._server
@@ -330,12 +341,19 @@ class Control:
         await self._send_logs()
 
     async def _send_logs(self) -> None:
+        """A part of them: what is left is sent the next time, and echoes in between."""
         ref = self._interest.watched
-        lines = [(number, line) for number, line in self._server.robots.logs.get(ref, ()) if number > self._logs_sent]
-        if lines:
-            self._logs_sent = lines[-1][0]
-            message = m.Logs(ref=ref, first=lines[0][0], lines=tuple(line for _, line in lines))
-            await self._websocket.send_text(encode(message))
+        lines = self._server.robots.logs.get(ref) if self._reads_logs else None
+        if lines is None:
+            return
+        origin, number = self._logs_sent
+        run = lines.after(number if origin == lines.origin else 0)
+        if run is not None:
+            self._logs_sent = lines.origin, run.first + len(run.lines) - 1
+            self._wake.set()
+            await self._websocket.send_text(
+                encode(m.Logs(ref=ref, origin=lines.origin, first=run.first, lines=run.lines))
+            )
 
     async def _check_session(self) -> None:
         session = await asyncio.to_thread(self._check)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pebble.config import Config, Mqtt
+from pebble.config.web import WebInterface
 from pebble.errors import ConfigError
 from pebble.fleet.people import People
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
@@ -16,7 +17,7 @@ PEOPLE = "people.sqlite"  # in the state directory
 def settings_of(config: Config) -> WebSettings:
     """How ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
 
-    The user who is needed where ``login`` is true is in a database: :func:`require_user`.
+    Whether there is a user, where ``login`` is true, is seen only in a database: :func:`ready_settings_of`.
     """
     web = config.web_interface
     if not web.local and web.tls.certificate is None and not web.plain_http:
@@ -32,8 +33,8 @@ def settings_of(config: Config) -> WebSettings:
         port=web.port,
         names=web.names,
         server=web.server or "",
-        login=not web.local or web.tls.certificate is not None,
-        people=web.people or config.state_dir() / PEOPLE,
+        login=_has_login(web),
+        people=_people(config),
         certificate=web.tls.certificate,
         key=web.tls.key,
         authority=web.tls.ca,
@@ -41,19 +42,44 @@ def settings_of(config: Config) -> WebSettings:
     )
 
 
-def require_user(settings: WebSettings) -> None:
-    """Raise ConfigError if a login is needed and there is no user."""
-    if not settings.login:
-        return
-    people = People(settings.people)
+def ready_settings_of(config: Config) -> WebSettings:
+    """As settings_of, of a page that people can use. Raises ConfigError with everything that is missing."""
+    settings = settings_or_all_problems(config)
+    if problems := _without_user(config):
+        raise ConfigError(problems)
+    return settings
+
+
+def settings_or_all_problems(config: Config) -> WebSettings:
+    """As settings_of; the error also says whether a user is missing, so that it is not found only after the rest."""
     try:
-        if not people.list():
-            raise ConfigError(
-                f"web_interface.people: {settings.people} has no user: run "
-                f"`pebble web user add NAME --people {settings.people}` as the user who runs the robot"
-            )
+        return settings_of(config)
+    except ConfigError as error:
+        raise ConfigError([*error.problems, *_without_user(config)]) from None
+
+
+def _without_user(config: Config) -> list[str]:
+    """The problem that a login is needed and there is no user; empty if all is well."""
+    if not _has_login(config.web_interface):
+        return []
+    people = People(_people(config))
+    try:
+        if people.list():
+            return []
     finally:
         people.close()
+    return [
+        f"web_interface.people: {_people(config)} has no user: run "
+        f"`pebble web user add NAME --people {_people(config)}` as the user who runs the robot"
+    ]
+
+
+def _has_login(web: WebInterface) -> bool:
+    return not web.local or web.tls.certificate is not None
+
+
+def _people(config: Config) -> Path:
+    return config.web_interface.people or config.state_dir() / PEOPLE
 
 
 def _broker(config: Config) -> Mqtt:

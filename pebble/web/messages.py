@@ -31,6 +31,7 @@ class Hello(_FromPage, frozen=True, kw_only=True, tag="hello"):
 
     version: Short  # of the page; another one than the server's may not drive
     device: Short = ""  # what others see beside the user's name: "phone"
+    name: Annotated[str, Meta(max_length=32)] = ""  # of the user, where there is no login; else it is ignored
     token: Short = ""
 
 
@@ -45,6 +46,15 @@ class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
     """The component whose page is open; "" is none. Its further metrics are sent from now on."""
 
     ref: Ref
+
+
+class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
+    """Send the log lines of the watched component, or no longer. The page has those of ``origin`` up to ``after``."""
+
+    ref: Ref
+    on: bool
+    origin: Short = ""
+    after: Number = 0
 
 
 class Lease(_FromPage, frozen=True, kw_only=True, tag="lease"):
@@ -142,7 +152,7 @@ class AutonomyOp(_FromPage, frozen=True, kw_only=True, tag="autonomy"):
 
     ref: Ref
     file: Annotated[str, Meta(max_length=200)]
-    config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}  # noqa: RUF012 - a Struct
+    config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}
 
 
 class OutletOp(_FromPage, frozen=True, kw_only=True, tag="outlet"):
@@ -181,8 +191,8 @@ class FlagOp(_FromPage, frozen=True, kw_only=True, tag="flag"):
 RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp
 
 FromPage: TypeAlias = (
-    Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp
-    | RobotOp
+    Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp
+    | PictureFromOp | RobotOp
 )  # fmt: skip
 
 
@@ -225,9 +235,13 @@ class State(_ToPage, frozen=True, kw_only=True, tag="state"):
 
 
 class Logs(_ToPage, frozen=True, kw_only=True, tag="logs"):
-    """Log lines of the watched component; ``first`` is the number of the first one."""
+    """Log lines of the watched component, if it asked for them. ``first`` is the number of the first one.
+
+    Numbers that are left out are of lines that were dropped. They count within one ``origin``.
+    """
 
     ref: str
+    origin: str
     first: int
     lines: tuple[Any, ...]
 
@@ -350,6 +364,12 @@ class FlagsView(Struct, frozen=True, kw_only=True):
     mqtt_video: bool | None = None
 
 
+class RestartsView(Struct, frozen=True, kw_only=True):
+    """``web/restarts``: when services of the component were seen to restart, in epoch ms; the newest 16 of each."""
+
+    times: dict[str, tuple[int, ...]]
+
+
 SERVER_METRICS: dict[str, type] = {
     "web/liveness": Liveness,
     "web/estop": EstopView,
@@ -357,5 +377,6 @@ SERVER_METRICS: dict[str, type] = {
     "web/picture": PictureView,
     "web/picture-from": PictureFrom,
     "web/flags": FlagsView,
+    "web/restarts": RestartsView,
     "web/broker": BrokerView,
 }

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Coroutine
 from typing import Any
+
+from msgspec.structs import replace
 
 from pebble.contract import (
     AUTONOMY_FILES,
@@ -13,20 +15,29 @@ from pebble.contract import (
     CHARGING_LEVEL,
     CHARGING_STATUS,
     IMU,
+    LOGS,
+    MQTT_AUDIO,
+    MQTT_VIDEO,
+    REMOTE_MIRROR,
     SOUNDBOARD_FILES,
     SOUNDBOARD_STATUS,
     TOUCH_SENSORS,
     WHEEL_ODOMETRY,
     Channel,
     Kind,
+    codec,
 )
 from pebble.contract.identity import Direction
 from pebble.contract.payloads import AnyObject
+from pebble.errors import PayloadError
 from pebble.transports import Message, Subscription
 from pebble.web.broker import Broker
-from pebble.web.robots import LOG_LINES, WATCHED, Robots, own_topic, section_of
+from pebble.web.log_lines import LogLines
+from pebble.web.messages import FlagsView
+from pebble.web.robots import WATCHED, Robots, own_topic, section_of
 
 _KEEP_S = 5.0  # so long they are still received after the last page has closed the component
+_FLAGS_METRIC = "web/flags"
 _STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
 
 #: Channels whose topic capabilities may name, by its section and key there.
@@ -41,6 +52,13 @@ _NAMED: dict[tuple[str, str], Channel] = {
     ("autonomy", "files_topic"): AUTONOMY_FILES,
     ("autonomy", "status_topic"): AUTONOMY_STATUS,
 }
+#: By section of the capabilities that may name its topic, each flag and its field of FlagsView.
+_FLAGS: dict[str, tuple[Channel, str]] = {
+    "": (REMOTE_MIRROR, "remote_mirror"),
+    "audio": (MQTT_AUDIO, "mqtt_audio"),
+    "video": (MQTT_VIDEO, "mqtt_video"),
+}
+_FLAG_FIELDS = dict(_FLAGS.values())
 
 
 class OpenComponents:
@@ -53,11 +71,13 @@ class OpenComponents:
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
         self._following: set[str] = set()  # components whose task runs
         self._wanted: dict[str, dict[str, Channel | None]] = {}  # filters, and what else than their own name they carry
+        self._flags: dict[str, FlagsView] = {}
+        broker.on_state(self._forget_flags)
 
     def open(self, ref: str) -> None:
         """A page has opened this component."""
         self._pages[ref] += 1
-        self._robots.logs.setdefault(ref, deque(maxlen=LOG_LINES))
+        self._robots.logs.setdefault(ref, LogLines())
         self.update(ref)
 
     def close(self, ref: str) -> None:
@@ -79,13 +99,19 @@ class OpenComponents:
         try:
             done = self._subscriptions.setdefault(ref, {})
             while True:
+                if not done:
+                    self._show_flags(ref, FlagsView())  # those that were removed meanwhile do not arrive
                 wanted = self._wanted[ref] = self._filters(ref) if ref in self._pages else {}
                 for filter_ in [filter_ for filter_ in done if filter_ not in wanted]:
                     await self._broker.unsubscribe(done.pop(filter_))
                 for filter_ in [filter_ for filter_ in wanted if filter_ not in done]:
-                    done[filter_] = await self._broker.subscribe(filter_, self._receiver(ref, filter_))
+                    done[filter_] = await self._subscribe(ref, filter_)
                 if not wanted:
+                    if ref in self._pages:  # opened again meanwhile
+                        continue
                     self._robots.logs.pop(ref, None)
+                    self._flags.pop(ref, None)
+                    self._robots.remove_server_metric(ref, _FLAGS_METRIC)
                     self._subscriptions.pop(ref)
                     return
                 await asyncio.sleep(_STEP_S)
@@ -94,12 +120,26 @@ class OpenComponents:
         finally:
             self._following.discard(ref)
 
+    async def _subscribe(self, ref: str, filter_: str) -> Subscription:
+        receiver = self._receiver(ref, filter_)
+        if filter_ != LOGS.topic(ref):
+            return await self._broker.subscribe(filter_, receiver)
+
+        def count() -> None:
+            lines = self._robots.logs.get(ref)
+            if lines is not None:
+                lines.refused += 1
+
+        return await self._broker.subscribe(filter_, receiver, on_refused=count)
+
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
         def take(message: Message, now: float) -> None:
             channel = self._wanted.get(ref, {}).get(filter_)
             before = self._robots.aliases(ref)
             if channel is None:
                 self._robots.receive(message, now)
+            elif channel.kind is Kind.FLAG:
+                self._receive_flag(ref, channel, message)
             else:
                 self._robots.receive_as(ref, channel.metric, message, now, channel)
             if self._robots.aliases(ref) != before:
@@ -107,8 +147,27 @@ class OpenComponents:
 
         return take
 
+    def _receive_flag(self, ref: str, channel: Channel, message: Message) -> None:
+        """Its newest value; an empty message removes what was retained."""
+        try:
+            value = codec.decode(channel, message.payload) if message.payload else None
+        except PayloadError:
+            return
+        view = replace(self._flags.get(ref, FlagsView()), **{_FLAG_FIELDS[channel]: value})
+        self._show_flags(ref, view)
+
+    def _show_flags(self, ref: str, view: FlagsView) -> None:
+        self._flags[ref] = view
+        self._robots.set_server_metric(ref, _FLAGS_METRIC, view)
+
+    def _forget_flags(self) -> None:
+        """They arrive again with the next connection, except those that are removed meanwhile."""
+        if not self._broker.connected:
+            for ref in list(self._flags):
+                self._show_flags(ref, FlagsView())
+
     def _filters(self, ref: str) -> dict[str, Channel | None]:
-        """Every channel's own topic; those that capabilities and manifests name, if they are the component's own."""
+        """Every channel's own topic, its flags, and topics of its own that capabilities and manifests name."""
         filters: dict[str, Channel | None] = {channel.filter(ref): None for channel in WATCHED}
         capabilities = self._robots.capabilities(ref)
         for (section, key), channel in _NAMED.items():
@@ -119,4 +178,6 @@ class OpenComponents:
             filters.setdefault(
                 f"{ref}/{Direction.OUTGOING}/{metric}", Channel(metric=metric, kind=Kind.STREAM, payload=AnyObject)
             )
+        for section, (flag, _) in _FLAGS.items():
+            filters[self._robots.topic(ref, section, "flag_topic", flag)] = flag
         return filters

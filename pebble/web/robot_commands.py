@@ -27,11 +27,7 @@ class _Command(NamedTuple):
     right: str = "drive"
 
 
-_ACTIONS = {
-    "reboot": (c.REBOOT, "reboot"),
-    "service-restart": (c.SERVICE_RESTART, "service_restart"),
-    "git-pull": (c.GIT_PULL, "git_pull"),
-}
+_ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
 _FLAGS = {
     "remote-mirror": (c.REMOTE_MIRROR, ""),
     "mqtt-audio": (c.MQTT_AUDIO, "audio"),
@@ -70,12 +66,23 @@ def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:
     """What to publish."""
     command = _command(op)
     channel = command.channel
-    if command.section:
+    if isinstance(op, m.ActionOp):
+        topic = _action_topic(op, channel, topic_of)
+    elif command.section:
         topic = topic_of(op.ref, command.section, command.key, channel)
     else:
         topic = channel.topic(op.ref, **command.names)
     qos = QoS(channel.default_qos)
     return Message(topic, codec.encode(channel, command.value), qos=qos, retain=channel.default_retain)
+
+
+def _action_topic(op: m.ActionOp, channel: Channel, topic_of: TopicOf) -> str:
+    """The first that the capabilities name in one of the spellings that the original page understands."""
+    usual = channel.topic(op.ref)
+    names = (op.name.replace("-", "_"), op.name)
+    sections = [f"system.{name}" for name in names] + list(names)
+    topics = (topic_of(op.ref, section, key, channel) for section in sections for key in ("flag_topic", "topic"))
+    return next((topic for topic in topics if topic != usual), usual)
 
 
 def _command(op: m.RobotOp) -> _Command:
@@ -98,8 +105,7 @@ def _command(op: m.RobotOp) -> _Command:
         case m.McuOp(uid=uid, name=name, value=value):
             return _Command(c.MCU_COMMAND, value, names={"uid": uid, "name": name})
         case m.ActionOp(name=name):
-            channel, key = _ACTIONS[name]
-            return _Command(channel, True, f"system.{key}", "flag_topic", right="system")
+            return _Command(_ACTIONS[name], True, right="system")
         case m.FlagOp(name=name, on=on):
             channel, section = _FLAGS[name]
             return _Command(channel, on, section, "flag_topic")

@@ -13,7 +13,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
 from pebble.web.extra import require_packages
-from pebble.web.from_config import require_user, settings_of
+from pebble.web.from_config import ready_settings_of
 from pebble.web.settings import WebSettings
 
 log = logging.getLogger(__name__)
@@ -27,9 +27,8 @@ def main(arguments: list[str]) -> int:
     try:
         config = load(Path(arguments[0]))
         logging.getLogger().setLevel(config.log_level_of("web_handler"))
-        settings = settings_of(config)
+        settings = ready_settings_of(config)
         require_packages()
-        require_user(settings)
         return _Page(settings).run()
     except PebbleError as error:
         for line in str(error).splitlines():

@@ -39,11 +39,12 @@ from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
+from pebble.web.log_lines import LogLines
+from pebble.web.restarts import Restarts
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
-LOG_LINES = 500  # of the watched component
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
 _SILENT_S = 1.5  # a component is not called silent before
@@ -90,6 +91,7 @@ class Component:
         self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
+        self.restarts = Restarts()
         self._stamps: deque[int] = deque(maxlen=_STAMPS)
 
     @property
@@ -141,10 +143,9 @@ class Robots:
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
         self.on_message: list[Callable[[Message, float], None]] = []  # of every component, before it is interpreted
-        self.logs: dict[str, deque[tuple[int, msgspec.Raw]]] = {}  # of watched components: number and line
+        self.logs: dict[str, LogLines] = {}  # of watched components
         self._server: dict[tuple[str, str], _Value] = {}
         self._bytes = 0
-        self._log_number = 0
 
     # -- reading
 
@@ -216,6 +217,10 @@ class Robots:
         if old is None or bytes(old.raw) != bytes(raw):
             self._server[ref, metric] = _Value(raw, time.monotonic())
             self._mark(ref, metric, everybody=True)
+
+    def remove_server_metric(self, ref: str, metric: str) -> None:
+        """Pages have its last value until they receive another one."""
+        self._server.pop((ref, metric), None)
 
     def receive(self, message: Message, now: float) -> None:
         """Take a message of any component."""
@@ -329,6 +334,8 @@ class Robots:
             component.aliases[metric] = _aliases(message.payload)
         elif channel is ONLINE or channel in SYNONYMS:
             self._heartbeat(component, message, now)
+        elif channel is STATUS and component.restarts.receive(message.payload, int(1000 * time.time())):
+            self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
 
     def _heartbeat(self, component: Component, message: Message, now: float) -> None:
         if message.retain:
@@ -342,14 +349,9 @@ class Robots:
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)
-        if lines is None or message.retain or len(message.payload) > MAX_VALUE_BYTES:
+        if lines is None or message.retain or not message.payload:
             return
-        try:
-            codec.plain(LOGS, message.payload)
-        except PayloadError:
-            return
-        self._log_number += 1
-        lines.append((self._log_number, msgspec.Raw(message.payload)))
+        lines.add(message.payload)
         for interest in self.interests:
             if interest.watched == component.ref:
                 interest.notify()

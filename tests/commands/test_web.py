@@ -131,6 +131,37 @@ def test_plain_http_for_others_is_a_matter_of_the_config(run: Run, served: list[
     assert (served[0].login, served[0].certificate, served[0].plain_http_drive) == (True, None, False)
 
 
+def test_a_folder_without_a_certificate_and_the_missing_user_are_named_at_once(
+    run: Run, served: list[WebSettings], tmp_path: Path, state: Path
+) -> None:
+    assert run("web", "--url", "mqtt://broker.example", "--tls", tmp_path) == 2
+    lines = run.err.splitlines()
+    assert lines[0] == "pebble: a page with --tls has a login, so the page needs a certificate and a user:"
+    assert lines[1].startswith(f"    pebble cert init --folder {tmp_path} ")
+    assert lines[2].startswith("    pebble web user add ")
+    assert lines[3] == f"    pebble web --url mqtt://broker.example --tls {tmp_path}"
+    assert run(*lines[1].split()[1:]) == 0, run.err
+    assert run("web", "--url", "mqtt://broker.example", "--tls", tmp_path) == 2
+    assert run.err.splitlines()[0].endswith("so the page needs a user:")
+
+
+def test_an_unreadable_certificate_and_the_missing_user_are_named_at_once(
+    run: Run, served: list[WebSettings], tmp_path: Path
+) -> None:
+    web = {"host": "0.0.0.0", "tls": {"certificate": "server.pem", "key": "server.key"}, "people": "people.sqlite"}
+    assert run("web", config_file(tmp_path, web_interface=web, **BROKER)) == 1
+    assert [line.partition(":")[0] for line in run.err.removeprefix("pebble: ").splitlines()] == [
+        "web_interface.tls.certificate", "web_interface.people",
+    ]  # fmt: skip
+
+
+def test_the_help_shows_the_command_line_that_people_use(run: Run) -> None:
+    assert run("web", "--help") == 0
+    assert run.out.split("\n\n")[0].strip() == "Usage: pebble web [OPTIONS] [CONFIG]"
+    assert run("web", "user", "add", "--help") == 0
+    assert "Usage: pebble web user add" in run.out
+
+
 def test_tls_on_this_machine_has_a_login(run: Run, served: list[WebSettings], tmp_path: Path) -> None:
     run("cert", "init", "--folder", tmp_path / "tls", "localhost")
     assert run("web", "--url", "mqtt://broker.example", "--tls", tmp_path / "tls") == 2
@@ -146,7 +177,6 @@ def test_tls_on_this_machine_has_a_login(run: Run, served: list[WebSettings], tm
         (["--url", "http://a"], "--url must be mqtt://"),
         (["--url", "zenoh:/tmp"], "the operator page needs MQTT"),
         (["--url", f"mqtt://me:{SECRET}@a"], "--url holds a password"),
-        (["--url", "mqtt://a", "--tls", "/nowhere"], "--tls /nowhere has no server.pem: pebble cert init --folder"),
     ],
 )
 def test_mistakes_are_one_line(run: Run, served: list[WebSettings], arguments: list[str], why: str) -> None:

@@ -54,6 +54,7 @@ class State:
     pictures: bool = True  # whether cameras send any
     freezes: bool = False  # pictures end a moment after the first
     silent: bool = False  # the server answers nothing any more once everything is shown
+    logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
 
 
 class CannedServer:
@@ -135,7 +136,12 @@ class CannedServer:
         tasks = [asyncio.ensure_future(self._ping(websocket)), asyncio.ensure_future(self._repeat(websocket, state))]
         try:
             while True:
-                self._note(json.loads(await websocket.receive_text()))
+                message = json.loads(await websocket.receive_text())
+                self._note(message)
+                if message["op"] == "read-logs" and message["on"]:
+                    lines = state.logs(_now())
+                    logs = {"op": "logs", "ref": message["ref"], "origin": "canned", "first": 213, "lines": lines}
+                    await self._send(websocket, logs)
         except (WebSocketDisconnect, RuntimeError):
             pass
         finally:

@@ -71,7 +71,14 @@ class Page:
     """What a page's control socket does: hello, echoes, and whatever a test sends."""
 
     def __init__(
-        self, served: Served, *, device: str = "test", token: str = "", version: str | None = None, cookie: str = ""
+        self,
+        served: Served,
+        *,
+        device: str = "test",
+        name: str = "",
+        token: str = "",
+        version: str | None = None,
+        cookie: str = "",
     ) -> None:
         headers = {"cookie": cookie} if cookie else None
         self.state: dict[tuple[str, str], Any] = {}
@@ -86,7 +93,8 @@ class Page:
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.send("hello", version=served.version if version is None else version, device=device, token=token)
+        version = served.version if version is None else version
+        self.send("hello", version=version, device=device, name=name, token=token)
         assert until(lambda: self.welcome or self.closed, 5)
 
     def send(self, op: str, **fields: Any) -> None:

@@ -39,6 +39,11 @@ def capabilities(kind: str, *, video: bool = True, drive: bool = True) -> dict[s
             "transport": {"kind": kind},
             "video": {"available": video, "controls": video, "encodings": ["h264", "pbvz", "pbvd", "json"]},
             "drive": {"available": drive, "controls": drive, "arbitrates": True},
+            "system": {
+                "reboot": {"available": True, "controls": drive},
+                "service_restart": {"available": True, "controls": drive},
+                "git_pull": {"available": True, "controls": False},
+            },
             **({"estop": {"available": True, "owners": ["base"]}} if drive else {}),
         },
     }
@@ -110,6 +115,24 @@ def services() -> dict[str, Any]:
     return {"t": 0, "value": {"services": value}}
 
 
+def logs(now: int) -> list[Any]:
+    """Of goob: records, a wrapped one, plain text, and a line that is too long for one row."""
+    long = "the reader of the serial line was restarted after a checksum error in frame 0x1f3a; " * 3
+    lines = [
+        ("INFO", "mqtt_bridge", "connected to broker.example:8883"),
+        ("DEBUG", "serial_mcu_bridge", "M 0.600 0.600"),
+        ("WARNING", "serial_mcu_bridge", long.strip()),
+        ("ERROR", "autonomy_manager", "ended: signal 9"),
+        ("WARNING", "launcher", "autonomy_manager is started again in 0.5 s"),
+        ("CRITICAL", "autonomy_manager", "<img src=x onerror=alert(1)>"),
+    ]
+    records = [
+        {"t": now - 9000 + 700 * index, "level": level, "service": service, "message": f"[{service}] {text}"}
+        for index, (level, service, text) in enumerate(lines)
+    ]
+    return [*records, {"value": {"t": now, "level": "INFO", "msg": "wrapped"}}, "plain text of an old robot"]
+
+
 def media(now: int) -> dict[str, Any]:
     camera = {"running": True, "doing": "h264 640x360, 10 fps, 212 kbit/s"}
     return {"t": now, "value": {"camera_publisher": camera, "audio_publisher": {"running": False}}}
@@ -138,6 +161,8 @@ def goob(now: int) -> list[Value]:
         (GOOB, "touch-sensors", {"value": {"a0": 512, "a1": 498, "a2": 730}, "unit": "adc"}, 20),
         (GOOB, "media-status", media(now), 2000),
         (GOOB, "status", services(), 4000),
+        (GOOB, "web/restarts", {"times": {"autonomy_manager": [now - 42_000, now - 6000]}}, 0),
+        (GOOB, "web/flags", {"remote_mirror": None, "mqtt_audio": False, "mqtt_video": True}, 0),
     ]
 
 
@@ -243,7 +268,12 @@ def satellite(now: int) -> list[Value]:
 
 
 MINE = at(GOOB, "web/driver", driver("alice", "laptop", you=True))
-DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE)
+DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE, logs=logs)
+#: May restart robots, and is not logged in.
+OPERATING = replace(
+    DRIVING,
+    welcome={"user": "local", "role": "admin", "rights": ["drive", "people", "reset", "system"], "login": False},
+)
 
 STATES: dict[str, State] = {
     "fleet": State("/", changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
@@ -253,6 +283,10 @@ STATES: dict[str, State] = {
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
     "driving": DRIVING,
+    "operating": OPERATING,
+    "system-offline": replace(
+        OPERATING, values=changed(fleet, at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2)))
+    ),
     "free": State(GOOB_PATH, fleet, LIVE),
     "taken": State(GOOB_PATH, changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
     "viewer": State(GOOB_PATH, fleet, LIVE, VIEWER),

@@ -50,8 +50,37 @@ def _at(card: str, *selectors: str) -> Callable[[Page], None]:
         page.evaluate(
             "(card) => scrollBy(0, document.querySelector(`[data-card='${card}']`).getBoundingClientRect().top - 90)", card
         )
+def _trouble(page: Page) -> None:
+    """Robots go and come back, batteries are low, and a service ends: the bell counts it."""
+    page.locator("[data-test=announcement]").wait_for(state="attached")
+    page.evaluate(
+        """async () => {
+          const set = (name, metric, value) => pebble.store.set(`pebble/robots/${name}`, metric, value);
+          const later = () => new Promise((resolve) => setTimeout(resolve, 150));
+          for (let i = 0; i < 3; i++) {
+            set("fred", "web/liveness", { online: i % 2 === 1, silent_s: 0, latency_ms: 1, whole_seconds: false });
+            await later();
+          }
+          const estop = pebble.store.get("pebble/robots/minilamp", "web/estop").value;
+          set("minilamp", "web/estop", { ...estop, latched: true, by: "eve on phone" });
+          const imu = { state: "failed", restarts: 5, last_exit: "exit code 1" };
+          set("goob", "status", { value: { services: { autonomy_manager: imu } } });
+          set("goob", "charging-level", { value: 12, unit: "%" });
+          await later();
+        }"""
+    )
+
+
+def _trouble_and_press(*selectors: str) -> Callable[[Page], None]:
+    def act(page: Page) -> None:
+        _trouble(page)
+        _press(*selectors)(page)
 
     return act
+
+
+def _scroll_to(selector: str) -> Callable[[Page], None]:
+    return lambda page: page.locator(selector).first.scroll_into_view_if_needed()
 
 
 def _drive(page: Page) -> None:
@@ -152,6 +181,24 @@ SCREENS = [
     Screen("sounds", "asked-busy", _on_phone("sound"), ("phone",)),
     Screen("scripts", "asked-busy", _on_phone("more"), ("phone",), _at_card("autonomy")),
     Screen("form", "asked", _on_phone("more", _mistaken), ("phone",), _at_card("autonomy")),
+    Screen("logs", "operating", sizes=("desktop",), hold=_scroll_to(".log-foot")),
+    Screen("logs", "operating", _press("[data-test=tab-more]"), ("phone",), _scroll_to(".log-foot")),
+    Screen("system", "operating", sizes=("desktop",), hold=_scroll_to(".system .flag:last-child")),
+    Screen("system", "operating", _press("[data-test=tab-more]"), ("phone",), _scroll_to(".system .flag:last-child")),
+    Screen(
+        "services",
+        "operating",
+        _press("[data-test=tab-sensors]"),
+        ("phone",),
+        _scroll_to(".services-list li:last-child"),
+    ),
+    Screen("system-ask", "operating", _press("[data-test=service-restart]"), ("desktop",)),
+    Screen("system-ask", "operating", _press("[data-test=tab-more]", "[data-test=service-restart]"), ("phone",)),
+    Screen("notices", "fleet", _trouble_and_press("[data-test=bell]"), ("desktop",)),
+    Screen("notices", "fleet", _trouble_and_press(".me"), ("phone",)),
+    Screen("limits", "fleet", _trouble_and_press("[data-test=bell]", "[data-test=limits]"), ("desktop",)),
+    Screen("bell", "driving", _trouble, ("desktop", "phone")),
+    Screen("own-name", "operating", _press(".me"), ("desktop",)),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 

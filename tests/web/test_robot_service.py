@@ -52,6 +52,12 @@ def test_a_login_needs_a_user(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
     )
 
 
+def test_everything_that_is_missing_is_named_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert robot_service.main([str(written(tmp_path, {"host": "0.0.0.0", "mqtt": {"host": "127.0.0.1"}}))]) == 1
+    keys = [record.message.partition(":")[0] for record in caplog.records]
+    assert keys == ["web_interface.host", "web_interface.people"]
+
+
 def test_missing_packages_are_named_with_the_command_that_installs_them(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,9 @@ function join() {
     onOpen: () => driver.opened(),
     onLost: () => driver.lost(),
     onChange: () => connection.changed(),
-    onLogs: () => {},
+    name: () => String(settings.name).slice(0, 32),
+    onLogs: (message) => connection.onLogs?.(message),
+    onDone: (message) => answered(message),
     onBye: (message) => {
       connection.bye = message.again ? null : message;
       connection.changed();
@@ -35,9 +37,14 @@ function join() {
     onRefused: (message) => {
       driver.refused(message);
       connection.refusal = message;
+      answered(message);
       if (message.cmd !== "drive") connection.show(`Not done: ${message.why}`);
     },
   });
+  const answered = (message) => {
+    connection.answer = message;
+    connection.changed();
+  };
   const estop = new Estop(socket);
   const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
   connection.socket = socket;
@@ -77,6 +84,12 @@ function commands(socket, driver, estop) {
     act: (ref, name) => socket.send({ op: "action", ref, name }),
     /** @param {string} ref @param {"remote-mirror" | "mqtt-audio" | "mqtt-video"} name @param {boolean} on */
     setFlag: (ref, name, on) => socket.send({ op: "flag", ref, name, on }),
+    readLogs: (ref, on, origin = "", after = 0) => socket.send({ op: "read-logs", ref, on, origin, after }),
+    /** What others see of who this is, where there is no login; it connects anew. */
+    setName(name) {
+      settings.set("name", name);
+      socket.restart();
+    },
     async logOut() {
       const headers = { "content-type": "application/json" };
       await fetch("/api/logout", { method: "POST", headers, body: "{}" }).catch(() => {});

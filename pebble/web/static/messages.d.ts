@@ -4,6 +4,7 @@ export interface Hello {
   op: "hello";
   version: string;
   device?: string;
+  name?: string;
   token?: string;
 }
 
@@ -16,6 +17,14 @@ export interface Echo {
 export interface Watch {
   op: "watch";
   ref: string;
+}
+
+export interface ReadLogs {
+  op: "read-logs";
+  ref: string;
+  on: boolean;
+  origin?: string;
+  after?: number;
 }
 
 export interface Lease {
@@ -152,6 +161,7 @@ export interface State {
 export interface Logs {
   op: "logs";
   ref: string;
+  origin: string;
   first: number;
   lines: any[];
 }
@@ -248,6 +258,10 @@ export interface FlagsView {
   mqtt_video?: boolean | null;
 }
 
+export interface RestartsView {
+  times: Record<string, number[]>;
+}
+
 export interface BrokerView {
   connected: boolean;
   problem: string;
@@ -261,9 +275,10 @@ export interface Metrics {
   "web/picture": PictureView;
   "web/picture-from": PictureFrom;
   "web/flags": FlagsView;
+  "web/restarts": RestartsView;
   "web/broker": BrokerView;
 }
 
-export type FromPage = Hello | Echo | Watch | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
+export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
 
 export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Series | Bye;

@@ -8,7 +8,7 @@ const CHECK_MS = 250;
 const CONNECT_MS = 8000; // a phone far from its access point needs seconds for TCP, TLS and the handshake
 const TOKEN = "pebble-token"; // restores the driver lease after a reload
 
-/** @typedef {{store: any, version: string, onOpen?: () => void, onLost?: () => void,
+/** @typedef {{store: any, version: string, name?: () => string, onOpen?: () => void, onLost?: () => void,
  *   onRefused?: (message: any) => void, onDone?: (message: any) => void, onLogs?: (message: any) => void,
  *   onSeries?: (message: any) => void, onBye?: (message: any) => void,
  *   onChange?: () => void}} Options */
@@ -61,8 +61,8 @@ export class ControlSocket {
 
   hello(socket) {
     const token = sessionStorage.getItem(TOKEN) ?? "";
-    const { version } = this.options;
-    socket.send(JSON.stringify({ op: "hello", version, device: device(), token }));
+    const { version, name } = this.options;
+    socket.send(JSON.stringify({ op: "hello", version, device: device(), name: name?.() ?? "", token }));
   }
 
   receive(message) {

@@ -1,6 +1,6 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
-import { html, useMetric, useModel, usePage, useRefs, useTick, useValue } from "./hooks.js";
+import { Boundary, html, useMetric, useModel, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
 import { Route } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
@@ -16,6 +16,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     ${at && wide && html`<${Vital} at=${at} />`}
     <div class="top-space"></div>
     ${wide && html`<${ConnectionState} />`}
+    <${Boundary} what="Notices"><${Notices} wide=${wide} panel=${panel} onPanel=${onPanel} /><//>
     ${layout === "immersive" &&
     html`<button
         type="button"
@@ -153,11 +154,20 @@ function ConnectionState() {
   return html`<span class=${`chip plain ${socket.roundTripMs > 300 ? "late" : ""}`}>connected${round}</span>`;
 }
 
+const BELL = async () => (await import("./notices.js")).Bell;
+
+/** Fetched later. Where there is little room only their number is shown, with the settings. */
+function Notices(props) {
+  const { body } = usePart(BELL);
+  return body ? html`<${body} ...${props} />` : null;
+}
+
 function Me({ panel, onPanel, wide }) {
   const { connection } = usePage();
   useModel(connection);
   const { you } = connection;
-  const text = you?.login ? `${you.user} (${you.role})` : "Settings";
+  const user = you?.login ? `${you.user} (${you.role})` : "Settings";
+  const text = connection.unread && !wide ? `${user}, ${connection.unread} new notices` : user;
   return html`<button
     type="button"
     class="quiet me"
@@ -167,5 +177,6 @@ function Me({ panel, onPanel, wide }) {
     onClick=${onPanel}
   >
     <${Icon} name=${you?.login ? "person" : "settings"} />${wide && html`<span>${text}</span>`}
+    ${!wide && connection.unread > 0 && html`<b class="unread" aria-hidden="true">${connection.unread}</b>`}
   </button>`;
 }

@@ -31,6 +31,11 @@ export class Connection extends Model {
     this.refusal = null; // the last one
     /** @type {{text: string, at: number} | null} */
     this.notice = null;
+    /** @type {any} what the server last did or refused to do, of what this page asked */
+    this.answer = null;
+    /** @type {((message: any) => void) | null} */
+    this.onLogs = null;
+    this.unread = 0; // notices
   }
 
   get state() {
@@ -98,11 +103,12 @@ export class Settings extends Model {
     this.theme = read("theme", "auto");
     this.thumbnails = read("thumbnails", false) === true;
     this.sort = read("sort", "name");
+    this.name = read("name", "");
     this.forgotten = new Set(list(read("forgotten", [])));
     this.apply();
   }
 
-  /** @param {"theme" | "thumbnails" | "sort"} name @param {any} value */
+  /** @param {"theme" | "thumbnails" | "sort" | "name"} name @param {any} value */
   set(name, value) {
     this[name] = value;
     write(name, value);
@@ -141,6 +147,7 @@ export class CardView extends Model {
     const stored = read(this.key, {});
     this.closed = new Set(list(stored?.closed));
     this.hidden = new Set(list(stored?.hidden));
+    this.wanted = ""; // a card that is to be looked at now
   }
 
   isClosed(id) {
@@ -159,6 +166,14 @@ export class CardView extends Model {
 
   show(id) {
     this.hidden.delete(id);
+    this.save();
+  }
+
+  /** Show a card, open, in sight. */
+  reveal(id) {
+    this.hidden.delete(id);
+    this.closed.delete(id);
+    this.wanted = id;
     this.save();
   }
 
@@ -207,7 +222,7 @@ export class Offers {
   /** Whether it has a section that people use; assumed of a robot without capabilities, as the original page does. */
   has(name) {
     const section = this.section(name);
-    return this.assumed || section.available === true || (name === "system" && Object.keys(section).length > 0);
+    return this.assumed || section.available === true || (name === "system" && ("reboot" in this.value || Object.keys(section).length > 0));
   }
 
   /** @param {string} prefix @returns {boolean} whether any such metric was received */

@@ -71,6 +71,10 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
   const has = (id) => (id === "drive" ? first : id === "more" || cards.some((card) => tabOf(card) === id));
   const tabs = TABS.filter(({ id }) => has(id));
   const tab = tabs.some(({ id }) => id === chosen) ? chosen : tabs[0].id;
+  useEffect(() => {
+    const card = cards.find(({ id }) => id === view.wanted);
+    if (card) choose(tabOf(card));
+  }, [view.wanted]);
   return html`<div class="robot">
     <h1 class="sr">${nameOf(at)}</h1>
     ${tab === "drive" &&
@@ -149,18 +153,23 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
 }
 
 const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
-    <${Icon} name="settings" />Settings and who I am
+    <${Icon} name="settings" /><${SettingsWords} />
   </button>
   ${document.fullscreenElement &&
   html`<button type="button" class="wide" onClick=${() => document.exitFullscreen()}>
     <${Icon} name="small" />Leave full screen
   </button>`}`;
 
+function SettingsWords() {
+  const { unread } = useModel(usePage().connection, (one) => one.unread);
+  return `Settings and notices${unread ? ` (${unread} new)` : ""}`;
+}
+
 const wanted = (offers, view) => CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id));
 
 function CardOf({ card, at, offers, view }) {
   return html`<${Card} id=${card.id} title=${card.title} icon=${card.icon} view=${view}>
-    <${Boundary} what=${card.title}><${Part} part=${card.part} at=${at} offers=${offers} /><//>
+    <${Boundary} what=${card.title}><${Part} part=${card.part} at=${at} offers=${offers} view=${view} /><//>
   <//>`;
 }
 

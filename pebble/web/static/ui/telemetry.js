@@ -1,10 +1,12 @@
 // What the component reports of itself, in words and numbers.
 
 import { html, useMetric, useModel, usePage, useTick, useValue } from "./hooks.js";
-import { Live } from "./parts.js";
+import { Live, Part } from "./parts.js";
 import { battery, charging, inner, isObject, number, plain, roughly, span } from "./words.js";
 
-export function Telemetry({ at }) {
+const SERVICES = async () => (await import("./services.js")).Services;
+
+export function Telemetry({ at, view }) {
   const { connection } = usePage();
   useModel(connection);
   const online = useValue(at, "web/liveness")?.online !== false && connection.isOpen;
@@ -18,7 +20,7 @@ export function Telemetry({ at }) {
     <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online}>${touch}<//>
     <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online}>${(value) => plain(inner(value))}<//>
     <${Media} at=${at} online=${online} />
-    <${Services} at=${at} />
+    <${Services} at=${at} view=${view} />
   </dl>`;
 }
 
@@ -91,28 +93,10 @@ function mediaWords(report) {
   return report.running ? String(report.doing ?? "running") : "rests";
 }
 
-const SERVICE = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
-
-function Services({ at }) {
-  const services = inner(useValue(at, "status"))?.services;
-  if (!isObject(services)) return null;
+function Services({ at, view }) {
+  if (!isObject(inner(useValue(at, "status"))?.services)) return null;
   return html`<div class="services">
     <dt>Services</dt>
-    <dd>
-      <ul>
-        ${Object.entries(services)
-          .slice(0, 40)
-          .map(([name, one]) => {
-            const state = String(one?.state ?? one);
-            const bad = state === "failed" || state === "restarting";
-            const more = [one?.restarts > 0 && `restarted ${one.restarts}×`, bad && one?.last_exit].filter(Boolean);
-            return html`<li key=${name} class=${bad ? "bad" : ""}>
-              <i aria-hidden="true">${SERVICE[state] ?? "○"}</i>
-              <span>${name.replaceAll("_", " ")}</span>
-              <span class="service-state">${[state, ...more].join(", ")}</span>
-            </li>`;
-          })}
-      </ul>
-    </dd>
+    <dd><${Part} part=${SERVICES} at=${at} view=${view} /></dd>
   </div>`;
 }

@@ -1,0 +1,70 @@
+// The services of a robot: which are well, which restart, and where their log lines are.
+
+import { html, usePage, useTick, useValue } from "./hooks.js";
+import { logViewOf } from "./log-view.js";
+import { styled } from "./styled.js";
+import { inner, isObject, plain, roughly } from "./words.js";
+
+const MOST = 64;
+const RECENT_MS = 600_000;
+const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
+
+export const Services = styled("system.css", ServicesBody);
+
+function ServicesBody({ at, view }) {
+  const services = inner(useValue(at, "status"))?.services;
+  const times = useValue(at, "web/restarts")?.times ?? {};
+  useTick(5000);
+  if (!isObject(services)) return null;
+  const names = Object.keys(services);
+  return html`<ul class="services-list">
+    ${names
+      .slice(0, MOST)
+      .map(
+        (name) => html`<${Service}
+          key=${name}
+          at=${at}
+          view=${view}
+          name=${name}
+          one=${services[name]}
+          times=${Object.hasOwn(times, name) ? times[name] : []}
+        />`,
+      )}
+    ${names.length > MOST && html`<li class="dim">… ${names.length - MOST} more</li>`}
+  </ul>`;
+}
+
+function Service({ at, view, name, one, times }) {
+  const { store } = usePage();
+  const state = plain(isObject(one) ? one.state : one);
+  const bad = state === "failed" || state === "restarting";
+  const words = restartWords(isObject(one) ? one : {}, times, store.now());
+  const logs = () => {
+    logViewOf(at).choose({ service: name, rank: 0, search: "" });
+    view?.reveal("logs");
+  };
+  return html`<li class=${bad ? "bad" : ""} data-test=${`service-${name}`}>
+    <i aria-hidden="true">${Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
+    <span class="services-name">${name.replaceAll("_", " ")}</span>
+    <span class="services-state">${state}</span>
+    <button type="button" class="quiet" aria-label=${`Log lines of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
+      Logs
+    </button>
+    ${words && html`<span class="services-more">${words}</span>`}
+  </li>`;
+}
+
+/** @param {Record<string, any>} one @param {readonly number[]} times epoch ms @param {number} now @returns {string} */
+function restartWords(one, times, now) {
+  const count = Number.isFinite(one.restarts) ? one.restarts : 0;
+  if (count <= 0) return "";
+  const recent = times.filter((t) => now - t < RECENT_MS).length;
+  const last = times.length ? `the last time ${roughly(Math.max(0, now - times[times.length - 1]))} ago` : "before the server looked";
+  return [
+    `restarted ${count}×, ${last}`,
+    recent > 1 && `${recent}× in the last 10 min`,
+    one.last_exit && `last exit: ${plain(one.last_exit)}`,
+  ]
+    .filter(Boolean)
+    .join("; ");
+}

@@ -1,0 +1,259 @@
+// What can be done to the whole robot: restart, reboot, update; and the flags that allow pictures and sound.
+
+import { Outcome, bootsOf, lacks } from "../core/outcome.js";
+import { html, useEffect, useModel, usePage, useState, useTick, useValue } from "./hooks.js";
+import { logViewOf } from "./log-view.js";
+import { Model } from "./models.js";
+import { Panel } from "./panel.js";
+import { HoldButton, Icon, Why } from "./parts.js";
+import { styled } from "./styled.js";
+import { clockTime, driverName, nameOf, plain } from "./words.js";
+
+/** @typedef {import("../core/outcome.js").Action} Action */
+
+/** @type {Record<Action, {title: string, effects: (name: string) => string[]}>} */
+const ACTIONS = {
+  "service-restart": {
+    title: "Restart Pebble",
+    effects: (name) => [
+      `All programs of ${name} end and start anew. It is away for some seconds.`,
+      "It stops driving; its script, pictures and sound end. A latched stop stays latched.",
+    ],
+  },
+  reboot: {
+    title: "Reboot",
+    effects: (name) => [
+      `The computer of ${name} restarts. It is away for a minute, or longer.`,
+      "If it does not come back, you have to go to it.",
+    ],
+  },
+  "git-pull": {
+    title: "Update",
+    effects: (name) => [
+      `${name} fetches new software. It runs after the next restart of Pebble.`,
+      "What comes of it is in its log lines.",
+    ],
+  },
+};
+
+export const System = styled("system.css", SystemBody);
+
+function SystemBody({ at, offers, view }) {
+  const { connection } = usePage();
+  useModel(connection);
+  const [asked, ask] = useState(/** @type {Action | ""} */ (""));
+  const online = useValue(at, "web/liveness")?.online;
+  useEffect(() => ask(""), [at]);
+  return html`<div class="system">
+    <div class="system-actions">
+      ${Object.keys(ACTIONS).map((action) => {
+        const why = whyNot(connection, offers, action, at, online);
+        const id = `why-${action}`;
+        return html`<div key=${action}>
+          <button
+            type="button"
+            data-test=${action}
+            disabled=${Boolean(why)}
+            aria-describedby=${why ? id : undefined}
+            onClick=${() => ask(/** @type {Action} */ (action))}
+          >
+            ${ACTIONS[action].title}…
+          </button>
+          ${why && html`<${Why} id=${id}>${why}<//>`}
+        </div>`;
+      })}
+    </div>
+    ${asked && html`<${Ask} at=${at} action=${asked} offers=${offers} online=${online} onClose=${() => ask("")} />`}
+    <${LastOutcome} at=${at} view=${view} />
+    <${Flags} at=${at} offers=${offers} />
+  </div>`;
+}
+
+/** Why an action is off now; "" it is not. */
+function whyNot(connection, offers, action, at, online) {
+  if (!connection.isOpen) return "No connection to the server";
+  if (!connection.may("system")) return "Log in as maintainer to do this";
+  return lacks(action, offers.known ? offers.value : undefined) || (online === false ? `${nameOf(at)} is offline` : "");
+}
+
+function Ask({ at, action, offers, online, onClose }) {
+  const page = usePage();
+  useModel(page.connection);
+  const name = nameOf(at);
+  const { title, effects } = ACTIONS[action];
+  const why = whyNot(page.connection, offers, action, at, online);
+  const held = () => {
+    begin(page, at, action);
+    onClose();
+  };
+  return html`<${Panel} id="ask" title=${`${title}: ${name}`} onClose=${onClose}>
+    <div class="system-ask">
+      <ul>
+        ${effects(name).map((text) => html`<li key=${text}>${text}</li>`)}
+        <${Now} at=${at} />
+      </ul>
+      <p class="dim">The robot does not acknowledge this. The page shows what is seen of it.</p>
+      <${HoldButton} test="ask-hold" disabled=${Boolean(why)} describedBy=${why ? "ask-why" : undefined} onHeld=${held}
+        >Hold 1 s: ${title}<//
+      >
+      ${why && html`<${Why} id="ask-why">${why}<//>`}
+      <button type="button" data-test="ask-leave" onClick=${onClose}>Leave it</button>
+    </div>
+  <//>`;
+}
+
+/** Who or what moves it at this moment. */
+function Now({ at }) {
+  const driver = useValue(at, "web/driver");
+  const script = useValue(at, "autonomy-status");
+  return html`${driver?.by && !driver.you && html`<li><b>${driverName(driver)} has control of it.</b></li>`}
+  ${script?.running === true && html`<li><b>The script ${plain(script.file)} is running.</b></li>`}`;
+}
+
+// -- what came of it
+
+/** Follows the states of one robot after an action was asked for, whatever is shown meanwhile. */
+class Watch extends Model {
+  /** @param {any} page @param {string} ref @param {Action} action */
+  constructor(page, ref, action) {
+    super();
+    this.page = page;
+    this.ref = ref;
+    this.outcome = new Outcome(action, page.store.now(), boots(page.store, ref));
+    this.answer = page.connection.answer; // the last one before
+    const see = () => this.see();
+    this.ends = [
+      page.store.subscribe(ref, "web/liveness", see),
+      page.store.subscribe(ref, "web/estop", see),
+      page.connection.onChange(see),
+    ];
+    this.timer = setInterval(see, 1000);
+  }
+
+  see() {
+    const { store, connection } = this.page;
+    const { answer } = connection;
+    if (answer !== this.answer && answer?.cmd === "action" && answer.ref === this.ref) {
+      this.answer = answer;
+      if (answer.op === "refused") this.outcome.refused = String(answer.why);
+    }
+    const entry = store.get(this.ref, "web/liveness");
+    const silent = entry?.value.silent_s;
+    this.outcome.see(
+      {
+        connected: connection.isOpen && !connection.socket.outdated,
+        online: entry?.value.online ?? null,
+        heartbeatAt: typeof silent === "number" ? store.now() - 1000 * silent - entry.age : null,
+        boots: boots(store, this.ref),
+      },
+      store.now(),
+    );
+    if (this.outcome.isOver(store.now())) this.end();
+    this.changed();
+  }
+
+  end() {
+    clearInterval(this.timer);
+    this.ends.splice(0).forEach((end) => end());
+  }
+}
+
+const boots = (store, ref) => bootsOf(store.get(ref, "web/estop")?.value?.owners);
+
+const NOTHING = new Model();
+/** @type {Map<string, Watch>} */
+const watches = new Map();
+const begun = new Model();
+
+function begin(page, ref, action) {
+  watches.get(ref)?.end();
+  const watch = new Watch(page, ref, action);
+  watches.set(ref, watch);
+  if (!page.commands.act(ref, action)) watch.outcome.refused = "no connection to the server";
+  begun.changed();
+}
+
+function LastOutcome({ at, view }) {
+  const { store } = usePage();
+  useModel(begun);
+  const watch = watches.get(at);
+  useModel(watch ?? NOTHING);
+  useTick(watch ? 1000 : 0);
+  if (!watch) return html`<div role="status"></div>`;
+  const { outcome } = watch;
+  const words = outcome.words(store.now(), clockTime);
+  const logs = () => {
+    logViewOf(at).choose({ service: "", rank: 0, search: outcome.action });
+    view?.reveal("logs");
+  };
+  return html`<div class="system-outcome" data-test="outcome">
+    <p><b>${ACTIONS[outcome.action].title}:</b> ${words.join("; ")}</p>
+    <button type="button" data-test="outcome-logs" onClick=${logs}><${Icon} name="list" />Its log lines</button>
+  </div>`;
+}
+
+// -- flags
+
+const FLAGS = /** @type {const} */ ([
+  ["mqtt-video", "mqtt_video", "Pictures", "The camera may run when a page wants its pictures"],
+  ["mqtt-audio", "mqtt_audio", "Sound", "Microphone and loudspeaker may run when a page wants them"],
+  ["remote-mirror", "remote_mirror", "Mirror", "Commands on the robot's own broker are copied to this one, to debug"],
+]);
+const ECHO_MS = 5000;
+
+function Flags({ at, offers }) {
+  const flags = useValue(at, "web/flags");
+  const has = { mqtt_video: offers.hasVideo, mqtt_audio: offers.has("audio"), remote_mirror: offers.transport !== "mcu" };
+  const shown = FLAGS.filter(([, field]) => has[field] || typeof flags?.[field] === "boolean");
+  if (!shown.length) return null;
+  return html`<section class="system" aria-labelledby="flags-title">
+    <h3 id="flags-title">Allowed, as the broker remembers it</h3>
+    ${shown.map(
+      ([name, field, title, meaning]) =>
+        html`<${Flag} key=${`${at} ${name}`} at=${at} name=${name} title=${title} meaning=${meaning} value=${flags?.[field]} known=${Boolean(flags)} />`,
+    )}
+  </section>`;
+}
+
+function Flag({ at, name, title, meaning, value, known }) {
+  const { commands, connection } = usePage();
+  useModel(connection);
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number} | null} */ (null));
+  const pending = asked && asked.on !== (value ?? null) ? asked : null;
+  useTick(pending ? 500 : 0);
+  const why = flagReason(connection, known);
+  const change = (event) => {
+    const on = event.currentTarget.checked;
+    commands.setFlag(at, name, on);
+    ask({ on, at: performance.now() });
+  };
+  const id = `flag-${name}`;
+  return html`<div class="flag">
+    <label class="check"
+      ><input
+        type="checkbox"
+        role="switch"
+        data-test=${id}
+        checked=${pending ? pending.on : value === true}
+        disabled=${Boolean(why)}
+        aria-describedby=${`${id}-why`}
+        onChange=${change}
+      /><span>${title}</span></label
+    >
+    <span class="flag-state" role="status">${flagWords(pending, value)}</span>
+    <${Why} id=${`${id}-why`}>${why || meaning}<//>
+  </div>`;
+}
+
+function flagReason(connection, known) {
+  if (!connection.isOpen) return "No connection to the server";
+  if (!connection.may("drive")) return "Log in as driver to change it";
+  return known ? "" : "Not received yet";
+}
+
+function flagWords(pending, value) {
+  const now = value === true ? "on" : value === false ? "off" : "never set";
+  if (!pending) return now;
+  if (performance.now() - pending.at < ECHO_MS) return `asked: ${pending.on ? "on" : "off"}…`;
+  return `✖ not confirmed: ${now}`;
+}

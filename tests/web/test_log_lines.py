@@ -1,0 +1,122 @@
+"""The log lines that the server has for pages, and when services were seen to restart."""
+
+from __future__ import annotations
+
+import json
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pebble.web.log_lines import MAX_BYTES, MAX_LINE_BYTES, MAX_LINES, PART_BYTES, LogLines, line_of
+from pebble.web.restarts import MAX_SERVICES, MAX_TIMES, Restarts
+
+
+def read(lines: LogLines, after: int = 0) -> list[tuple[int, list[object]]]:
+    """All runs behind this number, each with the number of its first line."""
+    found = []
+    while (run := lines.after(after)) is not None:
+        found.append((run.first, [json.loads(bytes(line)) for line in run.lines]))
+        after = run.first + len(run.lines) - 1
+    return found
+
+
+def test_lines_are_numbered_from_1_and_sent_once() -> None:
+    lines = LogLines()
+    for text in (b'{"message":"a"}', b'"b"'):
+        lines.add(text)
+    assert read(lines) == [(1, [{"message": "a"}, "b"])]
+    assert read(lines, 1) == [(2, ["b"])]
+    assert read(lines, 2) == []
+
+
+def test_what_is_dropped_leaves_a_gap() -> None:
+    lines = LogLines()
+    lines.add(b'"a"')
+    lines.add(b'"' + b"x" * MAX_LINE_BYTES + b'"')
+    lines.add(b"[" * 1000)
+    lines.add(b'"b"')
+    lines.refused += 3
+    lines.add(b'"c"')
+    assert read(lines) == [(1, ["a"]), (4, ["b"]), (8, ["c"])]
+
+
+def test_a_page_that_is_too_slow_sees_from_where_there_are_lines() -> None:
+    lines = LogLines()
+    for number in range(MAX_LINES + 20):
+        lines.add(str(number).encode())
+    runs = read(lines, 5)
+    assert runs[0][0] == 21
+    assert sum(len(run) for _, run in runs) == MAX_LINES
+
+
+def test_plain_text_becomes_a_string() -> None:
+    assert bytes(line_of(b"hello [x") or b"") == b'"hello [x"'
+    assert bytes(line_of(b"\xff\x00") or b"") == json.dumps("\ufffd\0", ensure_ascii=False).encode()
+    assert line_of(b"\x01" * (MAX_LINE_BYTES // 2)) is None  # six bytes each, as JSON
+
+
+@given(st.lists(st.binary(max_size=2000), max_size=40), st.integers(0, 50))
+def test_whatever_arrives_is_bounded_and_valid_json(payloads: list[bytes], after: int) -> None:
+    lines = LogLines()
+    for payload in payloads * 8:
+        lines.add(payload)
+    runs = read(lines, after)
+    sizes = [sum(len(json.dumps(line)) for line in run) for _, run in runs]
+    assert sum(sizes) <= 6 * MAX_BYTES  # Python escapes what msgspec does not
+    assert sum(len(run) for _, run in runs) <= MAX_LINES
+    numbers = [first + index for first, run in runs for index in range(len(run))]
+    assert numbers == sorted(set(numbers))
+    assert not numbers or (numbers[0] > after and numbers[-1] <= len(payloads) * 8)
+
+
+def test_a_message_to_a_page_is_short_but_has_a_line() -> None:
+    lines = LogLines()
+    for _ in range(30):
+        lines.add(json.dumps("x" * 2000).encode())
+    for size in (len(json.dumps(run)) for _, run in read(lines)):
+        assert size <= PART_BYTES + 100
+    long = LogLines()
+    long.add(json.dumps("x" * (MAX_LINE_BYTES - 10)).encode())
+    assert len(read(long)) == 1
+
+
+def status(**restarts: object) -> bytes:
+    return json.dumps({"value": {"services": {name: {"restarts": count} for name, count in restarts.items()}}}).encode()
+
+
+def test_restarts_are_dated_when_they_are_seen() -> None:
+    seen = Restarts()
+    assert not seen.receive(status(a=3, b=0), 1000)  # how long ago these were is unknown
+    assert not seen.receive(status(a=3, b=0), 2000)
+    assert seen.receive(status(a=3, b=2), 3000)
+    assert seen.receive(status(a=4, b=2), 4000)
+    assert seen.view().times == {"b": (3000, 3000), "a": (4000,)}
+    assert not seen.receive(status(a=0, b=0), 5000)  # the whole robot was restarted
+    assert seen.receive(status(a=1, b=0), 6000)
+    assert seen.view().times["a"] == (4000, 6000)
+
+
+def test_only_the_newest_restarts_of_some_services_are_remembered() -> None:
+    seen = Restarts()
+    names = [f"s{number}" for number in range(MAX_SERVICES + 10)]
+    seen.receive(status(**dict.fromkeys(names, 0)), 1)
+    seen.receive(status(**dict.fromkeys(names, 10**30)), 2)
+    assert len(seen.view().times) == MAX_SERVICES
+    assert set(map(len, seen.view().times.values())) == {MAX_TIMES}
+
+
+@given(
+    st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers()
+        | st.text(max_size=5)
+        | st.floats(allow_nan=False, allow_infinity=False),
+        lambda inside: (
+            st.lists(inside, max_size=3)
+            | st.dictionaries(st.sampled_from(["value", "services", "a", "restarts"]), inside, max_size=3)
+        ),
+    )
+)
+def test_a_status_may_be_of_any_shape(value: object) -> None:
+    Restarts().receive(json.dumps(value).encode(), 1)

@@ -1,0 +1,312 @@
+"""What a page needs to operate whole robots, at a real server and broker: logs, flags, actions, and its own name."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.web import open_components
+from pebble.web.broker import Broker as BrokerOfPages
+from pebble.web.open_components import OpenComponents
+from pebble.web.robots import Robots
+from tests.support import Broker, until
+from tests.web.attacker import Hall
+from tests.web.served import Page, RecordingRobot, Served
+
+NAMES = itertools.count(1)
+
+
+class Reader(Page):
+    """A page that collects log lines."""
+
+    def __init__(self, served: Served, **options: Any) -> None:
+        self.logs: list[dict[str, Any]] = []
+        self.done: list[dict[str, Any]] = []
+        super().__init__(served, **options)
+
+    @property
+    def lines(self) -> list[object]:
+        return [line for message in list(self.logs) for line in message["lines"]]
+
+    def _take(self, message: dict[str, Any]) -> None:
+        match message["op"]:
+            case "logs":
+                self.logs.append(message)
+            case "done":
+                self.done.append(message)
+            case _:
+                super()._take(message)
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[RecordingRobot]:
+    with RecordingRobot(broker.port, f"pebble/robots/rig{next(NAMES)}") as one:
+        yield one
+
+
+@pytest.fixture
+def page(served: Served, robot: RecordingRobot) -> Iterator[Reader]:
+    with Reader(served) as one:
+        assert one.knows(robot.base)
+        one.send("watch", ref=robot.base)
+        assert until(lambda: one.value(robot.base, "web/flags") is not None)
+        yield one
+
+
+def publish(broker: Broker, topic: str, payload: bytes, *, retain: bool = False) -> None:
+    transport = create("mqtt", "somewhere", MqttSettings(host="127.0.0.1", port=broker.port))
+    transport.open()
+    transport.publish(topic, payload, qos=QoS.DELIVERED, retain=retain)
+    assert until(lambda: transport.outgoing.waiting == 0)
+    transport.close()
+
+
+def retained(broker: Broker, topic: str) -> bytes:
+    """What a new subscriber receives."""
+    received: list[Message] = []
+    transport = create("mqtt", "reader", MqttSettings(host="127.0.0.1", port=broker.port))
+    transport.open()
+    transport.subscribe(topic, received.append, direct=True)
+    assert until(lambda: received)
+    transport.close()
+    assert received[0].retain
+    return received[0].payload
+
+
+# -- logs
+
+
+def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(page, robot, broker) -> None:
+    assert until(lambda: _logged(robot, page, "first"))
+    assert page.logs == []  # it has not asked
+    page.send("read-logs", ref=robot.base, on=True)
+    assert until(lambda: page.lines)
+    robot.publish("logs", {"t": 1, "level": "INFO", "service": "a", "message": "second"})
+    publish(broker, f"{robot.base}/outgoing/logs", b"plain text")
+    assert until(lambda: page.lines[-1:] == ["plain text"])
+    first = page.logs[0]
+    assert page.lines[-2]["message"] == "second"
+    page.send("read-logs", ref=robot.base, on=False)
+    robot.publish("logs", {"message": "unread"})
+    robot.publish("charging-level", {"value": 3.5})
+    assert until(lambda: page.value(robot.base, "charging-level") is not None)
+    assert page.lines[-1] == "plain text"
+    seen = len(page.lines)
+    page.send("read-logs", ref=robot.base, on=True, origin=first["origin"], after=seen)
+    assert until(lambda: page.lines[-1] == {"message": "unread"})
+    assert len(page.lines) == seen + 1
+
+
+def _logged(robot: RecordingRobot, page: Reader, text: str) -> bool:
+    """Publish until the server receives it: it subscribes a moment after the page has opened the robot."""
+    robot.publish("logs", {"message": text})
+    robot.publish("status", {"value": {"text": text}})
+    return page.value(robot.base, "status", "value") == {"text": text}
+
+
+def test_lines_that_the_server_drops_leave_a_gap(page, robot, broker) -> None:
+    page.send("read-logs", ref=robot.base, on=True)
+    assert until(lambda: _logged(robot, page, "ready"))
+    publish(broker, f"{robot.base}/outgoing/logs", b"x" * 20_000)
+    robot.publish("logs", {"message": "last"})
+    assert until(lambda: page.lines[-1:] == [{"message": "last"}])
+    last = page.logs[-1]
+    before = page.logs[-2]
+    assert last["first"] == before["first"] + len(before["lines"]) + 1
+
+
+def test_logs_of_another_component_are_not_sent(page, robot, served, broker) -> None:
+    with RecordingRobot(broker.port, f"{robot.base}b") as other:
+        page.send("read-logs", ref=other.base, on=True)
+        page.send("read-logs", ref=robot.base, on=True)
+        assert until(lambda: _logged(robot, page, "mine"))
+        other.publish("logs", {"message": "theirs"})
+        robot.publish("logs", {"message": "end"})
+        assert until(lambda: {"message": "end"} in page.lines)
+        assert {"message": "theirs"} not in page.lines
+
+
+# -- flags
+
+
+def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
+    flags = lambda: page.value(robot.base, "web/flags")
+    assert flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": None}
+    page.send("flag", ref=robot.base, name="mqtt-video", on=True)
+    assert until(lambda: flags()["mqtt_video"] is True)
+    assert retained(broker, f"{robot.base}/incoming/flags/mqtt-video") == b'{"value":true}'
+    publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b'{"enabled": false}', retain=True)
+    assert until(lambda: flags()["mqtt_audio"] is False)
+    publish(broker, f"{robot.base}/incoming/flags/mqtt-video", b'"odd"')
+    publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b"", retain=True)
+    assert until(lambda: flags()["mqtt_audio"] is None)
+    assert flags()["mqtt_video"] is True
+
+
+def test_a_flag_is_read_where_the_capabilities_say_but_only_of_the_robot_itself(served, broker) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    named = {
+        "video": {"available": True, "flag_topic": f"{base}/incoming/flags/eye"},
+        "audio": {"available": True, "flag_topic": "pebble/robots/other/incoming/flags/mqtt-audio"},
+    }
+    publish(broker, f"{base}/incoming/flags/eye", b"true", retain=True)
+    publish(broker, f"{base}/incoming/flags/mqtt-audio", b"true", retain=True)
+    publish(broker, "pebble/robots/other/incoming/flags/mqtt-audio", b"false", retain=True)
+    with RecordingRobot(broker.port, base, capabilities=named) as robot, Reader(served) as page:
+        assert page.knows(base)
+        page.send("watch", ref=base)
+        wanted = {"remote_mirror": None, "mqtt_audio": True, "mqtt_video": True}
+        assert until(lambda: page.value(base, "web/flags") == wanted), page.value(base, "web/flags")
+        page.send("flag", ref=base, name="mqtt-video", on=False)
+        assert until(lambda: f"{base}/incoming/flags/eye" in robot.topics())
+
+
+# -- actions
+
+SPELLINGS: dict[str, Any] = {
+    "ours": {"system": {"service_restart": {"flag_topic": "{}/incoming/flags/again"}}},
+    "with a dash": {"system": {"service-restart": {"flag_topic": "{}/incoming/flags/again"}}},
+    "topic": {"system": {"service_restart": {"topic": "{}/incoming/flags/again"}}},
+    "at the top": {"service_restart": {"flag_topic": "{}/incoming/flags/again"}},
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_an_action_goes_to_the_topic_that_the_capabilities_name(served, broker, spelling: str) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    capabilities = json.loads(json.dumps(SPELLINGS[spelling]).replace("{}/", f"{base}/"))
+    with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, Reader(served) as page:
+        assert page.knows(base)
+        page.send("action", ref=base, name="service-restart")
+        page.send("action", ref=base, name="reboot")
+        wanted = [(f"{base}/incoming/flags/again", {"value": True}), (f"{base}/incoming/flags/reboot", {"value": True})]
+        assert until(lambda: [(topic, value) for _, topic, value in robot.received] == wanted), robot.received
+        assert until(lambda: [one["cmd"] for one in page.done] == ["action", "action"])
+    assert until(lambda: [one.detail for one in _audit(served, base)] == ["name service-restart", "name reboot"])
+
+
+@pytest.mark.parametrize(
+    ("role", "may"), [("viewer", set()), ("driver", {"mqtt-video"}), ("maintainer", {"mqtt-video", "reboot"})]
+)
+def test_what_each_role_may_ask(broker, tmp_path: Path, role: str, may: set[str]) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    with Hall(broker.port, tmp_path) as hall, RecordingRobot(broker.port, base) as robot, hall.page(role) as page:
+        assert page.knows(base)
+        page.send("flag", ref=base, name="mqtt-video", on=True)
+        page.send("action", ref=base, name="reboot")
+        assert until(lambda: len(page.refused) == 2 - len(may))
+        assert until(lambda: robot.topics() == {f"{base}/incoming/flags/{name}" for name in may})
+
+
+def test_an_action_never_goes_to_another_robot(served, broker) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    lie = {"system": {"reboot": {"flag_topic": "pebble/robots/other/incoming/flags/reboot"}}}
+    with RecordingRobot(broker.port, base, capabilities=lie) as robot, Reader(served) as page:
+        assert page.knows(base)
+        page.send("action", ref=base, name="reboot")
+        assert until(lambda: robot.topics() == {f"{base}/incoming/flags/reboot"})
+
+
+def _audit(served: Served, ref: str) -> list[Any]:
+    return [entry for entry in served.app.state.audit.read(100) if entry.ref == ref and entry.what == "action"]
+
+
+# -- restarts
+
+
+def test_restarts_are_dated_for_pages_that_come_later(served, broker, robot) -> None:
+    def services(count: int) -> dict[str, Any]:
+        return {"value": {"services": {"imu": {"state": "ready", "restarts": count, "last_exit": "signal 9"}}}}
+
+    with Reader(served) as page:
+        assert page.knows(robot.base)
+        robot.publish("status", services(1), retain=True)
+        assert until(lambda: page.value(robot.base, "status") == services(1))
+        robot.publish("status", services(2), retain=True)
+        assert until(lambda: len((page.value(robot.base, "web/restarts") or {}).get("times", {}).get("imu", [])) == 1)
+    with Reader(served) as later:
+        assert until(lambda: later.value(robot.base, "web/restarts") is not None)
+
+
+# -- opened and closed
+
+
+class SlowBroker:
+    """Subscribes and unsubscribes as slowly as the test lets it."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        self.filters: set[str] = set()
+        self.may_unsubscribe = asyncio.Event()
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        return asyncio.get_running_loop()
+
+    def on_state(self, watcher: Callable[[], None]) -> None:
+        pass
+
+    async def subscribe(self, filter_: str, _handler: object, **_options: object) -> str:
+        self.filters.add(filter_)
+        return filter_
+
+    async def unsubscribe(self, filter_: str) -> None:
+        await self.may_unsubscribe.wait()
+        self.filters.discard(filter_)
+
+
+def test_a_component_that_is_opened_while_it_is_being_closed_is_received(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(open_components, "_KEEP_S", 0)
+    monkeypatch.setattr(open_components, "_STEP_S", 0)
+    base = "pebble/robots/rig"
+
+    async def work() -> None:
+        broker, robots, tasks = SlowBroker(), Robots(), []
+        opened = OpenComponents(
+            cast(BrokerOfPages, broker), robots, lambda work: tasks.append(asyncio.ensure_future(work))
+        )
+        opened.open(base)
+        await asyncio.gather(*tasks)
+        everything = set(broker.filters)
+        opened.close(base)
+        while len(tasks) == 1:
+            await asyncio.sleep(0)
+        opened.open(base)
+        broker.may_unsubscribe.set()
+        await asyncio.gather(*tasks)
+        assert broker.filters == everything
+        assert base in robots.logs
+
+    asyncio.run(work())
+
+
+# -- names
+
+
+def test_without_a_login_a_page_says_who_it_is(served, robot) -> None:
+    with Reader(served, name="Alice \u202e", device="phone") as alice, Reader(served) as other:
+        assert alice.welcome["user"] == "Alice ?"
+        assert other.welcome["user"] == "local"
+        assert other.knows(robot.base)
+        assert alice.knows(robot.base)
+        assert alice.take(robot.base)
+        assert until(lambda: other.value(robot.base, "web/driver", "by") == "Alice ?")
+        assert other.value(robot.base, "web/driver", "device") == "phone"
+        alice.send("estop", ref=robot.base, stop="00112233445566ff", why="test")
+        assert until(lambda: other.value(robot.base, "web/estop", "latched") is True)
+        assert "Alice" in other.value(robot.base, "web/estop", "by")
+    audit = served.app.state.audit
+    assert until(lambda: ("Alice ?", "stop") in [(entry.user, entry.what) for entry in audit.read(9)])
+
+
+def test_with_a_login_the_name_of_the_user_counts(broker, tmp_path: Path) -> None:
+    with Hall(broker.port, tmp_path) as hall, hall.page("driver", name="Alice") as page:
+        assert page.welcome["user"] == "driver"
