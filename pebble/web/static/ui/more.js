@@ -8,7 +8,7 @@ const WATCHING = ["help", "mute"]; // what can be asked of a screen that only wa
 const STEP = 0.1; // of the speed, for each press
 const SLOWEST = 0.05; // as the slider's
 const CHECK_MS = 1000;
-const RELOAD_MS = 60_000; // without anybody there who presses a button
+const RELOAD_MS = 5000; // where nobody is there to press a button
 
 /** To be called once. @param {any} page */
 export function install(page) {
@@ -27,14 +27,13 @@ export function install(page) {
 class Doer {
   constructor(page) {
     this.page = page;
-    this.talks = false;
   }
 
   /** @param {string} id @param {"down" | "up"} phase */
   act(id, phase) {
     const { page } = this;
     const { ref } = page.driver;
-    if (page.route.watching && !WATCHING.includes(id)) return undefined;
+    if (phase === "down" && page.route.watching && !WATCHING.includes(id)) return undefined;
     switch (id) {
       case "help":
         return page.panels.toggle("help");
@@ -43,9 +42,9 @@ class Doer {
       case "slower":
         return this.changeSpeed(-STEP);
       case "flash":
-        return this.fetched(async () => (await import("./lights-model.js")).toggleFlash(page, ref));
+        return this.say(import("./lights-model.js").then((lights) => lights.toggleFlash(page, ref)));
       case "repeat":
-        return this.fetched(async () => (await import("./sounds-model.js")).repeatLast(page, ref));
+        return this.say(import("./sounds-model.js").then((sounds) => sounds.repeatLast(page, ref)));
       case "mute":
         return page.sound?.toggleMute();
       case "talk":
@@ -60,13 +59,10 @@ class Doer {
     driver.changed();
   }
 
-  /** @param {() => Promise<void>} work */
-  async fetched(work) {
-    try {
-      await work();
-    } catch (error) {
-      this.page.connection.show(`Not done: ${error.message}`);
-    }
+  /** @param {Promise<string>} answer why it was not done; "" it was */
+  async say(answer) {
+    const why = await answer.catch((error) => error.message);
+    if (why) this.page.connection.show(`Not done: ${why}`);
   }
 }
 
