@@ -265,6 +265,42 @@ def test_axes_cannot_be_left_out_and_values_may_be_no_numbers() -> None:
     assert learning("learning.skip(); take(pad([NaN, Infinity, null])); result = learning.at;") == 0
 
 
+# -- the screen that stays on
+
+_AWAKE = """
+globalThis.document = { hidden: false };
+let [asked, released, granted] = [0, 0, true];
+const locks = { async request() {
+  asked += 1;
+  if (!granted) throw new Error("the battery is low");
+  return { released: false, async release() { this.released = true; released += 1; } };
+} };
+const awake = new Awake(locks);
+"""
+
+
+def awake(steps: str) -> Any:
+    return run("awake.js", "Awake", f"{_AWAKE}{steps}\nresult = [asked, released];")
+
+
+def test_the_screen_stays_on_from_when_it_is_wanted_until_it_is_not() -> None:
+    assert awake("for (const on of [false, true, true, false, false]) await awake.want(on);") == [1, 1]
+
+
+def test_what_the_browser_has_taken_away_is_asked_for_again_when_the_page_is_seen() -> None:
+    steps = "await awake.want(true); awake.lock.released = document.hidden = true; await awake.want(true);"
+    assert awake(f"{steps} document.hidden = false; await awake.want(true);") == [2, 0]
+
+
+def test_what_is_granted_too_late_is_given_back() -> None:
+    assert awake("const late = awake.want(true); awake.want(true); await awake.want(false); await late;") == [1, 1]
+
+
+def test_a_browser_that_refuses_is_asked_again_and_one_that_cannot_is_left_alone() -> None:
+    assert awake("granted = false; await awake.want(true); granted = true; await awake.want(true);") == [2, 0]
+    assert awake("await new Awake(undefined).want(true);") == [0, 0]
+
+
 # -- QR codes, read by OpenCV
 
 

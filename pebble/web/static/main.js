@@ -11,7 +11,7 @@ import { Connection, Panels, Route, Settings } from "./ui/models.js";
 import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
 
-const WATCHING = ["estop", "stop", "watch"]; // all that a screen sends that only watches
+const WATCHING = ["estop", "stop", "watch", "read-logs"]; // all that a screen sends that only watches
 const REST_MS = 3000; // after the start what is not shown yet is fetched, so that it is here without a server, too
 
 const version = document.querySelector("meta[name=pebble-version]")?.getAttribute("content") ?? "";

@@ -53,7 +53,10 @@ export function App() {
       />
     <//>
     <${Boundary} what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
-    ${shown && html`<${Boundary} what="This panel"><${Part} part=${PARTS.panels} shown=${shown} /><//>`}
+    ${shown &&
+    html`<${Boundary} what="This panel"
+      ><${Part} part=${PARTS.panels} shown=${shown} onClose=${() => panels.show("")}
+    /><//>`}
     <main id="main" tabindex="-1">
       <${Boundary} what="This screen">
         ${ref

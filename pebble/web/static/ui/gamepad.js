@@ -9,13 +9,13 @@ import { Why } from "./parts.js";
 
 const SAMPLE_MS = 50;
 
-export function GamepadPanel() {
+export function GamepadPanel({ onClose }) {
   const { driver } = usePage();
   useTick(SAMPLE_MS);
   useEffect(() => tryButtons(driver, true));
   useEffect(() => () => tryButtons(driver, false), []);
   const { pad } = driver;
-  return html`<${Panel} id="gamepad" title="Gamepad">
+  return html`<${Panel} id="gamepad" onClose=${onClose} title="Gamepad">
     ${pad
       ? html`<${Wizard} key=${pad.id} pad=${pad} />`
       : html`<p class="panel-text">
@@ -140,7 +140,9 @@ function Summary({ pad, own, onLearn }) {
       ${own &&
       html`<button type="button" data-test="pad-forget" onClick=${() => set(null)}>Usual layout</button>`}
     </div>
-    <p class="dim">Let go of everything before you begin. Nothing moves while this panel is open.</p>`;
+    <p class="dim">
+      Let go of everything before you begin. While this panel is open nothing moves; the buttons that stop, stop.
+    </p>`;
 }
 
 const axisWords = ({ axis, invert }) => `axis ${axis + 1}${invert ? ", reversed" : ""}`;

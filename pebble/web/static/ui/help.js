@@ -6,8 +6,8 @@ import { useKeyNames } from "./keyboard.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
 
-export function HelpPanel() {
-  return html`<${Panel} id="help" title="Keys, gamepad, and how stopping works" className="wide-panel">
+export function HelpPanel({ onClose }) {
+  return html`<${Panel} id="help" onClose=${onClose} title="Keys, gamepad, and how stopping works" className="wide-panel">
     <section class="panel-text">
       <h3>How stopping works</h3>
       <ul class="plain-list">

@@ -23,6 +23,8 @@ export class Model {
   }
 }
 
+const isWatching = () => new URLSearchParams(location.search).has("watch");
+
 /** The state of the control socket, and what the server last refused. */
 export class Connection extends Model {
   constructor(version) {
@@ -52,7 +54,7 @@ export class Connection extends Model {
   }
 
   may(right) {
-    return this.isOpen && (this.you?.rights ?? []).includes(right);
+    return this.isOpen && !isWatching() && (this.you?.rights ?? []).includes(right);
   }
 
   /** Show a text for a few seconds. @param {string} text */
@@ -82,7 +84,7 @@ export class Route extends Model {
 
   /** Whether this screen only watches: nothing but stops is sent. It is in the address, so it outlives everything. */
   get watching() {
-    return new URLSearchParams(location.search).has("watch");
+    return isWatching();
   }
 
   static path(ref) {

@@ -3,9 +3,9 @@
 import { html, useEffect, usePage, useRef } from "./hooks.js";
 import { Icon } from "./parts.js";
 
-/** @param {{id: string, title: string, className?: string, children?: any}} props */
-export function Panel({ id, title, className = "", children }) {
-  const { driver, panels } = usePage();
+/** @param {{id: string, title: string, onClose: () => void, className?: string, children?: any}} props */
+export function Panel({ id, title, onClose, className = "", children }) {
+  const { driver } = usePage();
   const element = useRef(null);
   useEffect(() => {
     const before = /** @type {HTMLElement | null} */ (document.activeElement);
@@ -16,7 +16,6 @@ export function Panel({ id, title, className = "", children }) {
       before?.focus?.();
     };
   }, []);
-  const close = () => panels.show("");
   return html`<dialog
     open
     class=${`panel ${className}`}
@@ -24,11 +23,17 @@ export function Panel({ id, title, className = "", children }) {
     tabindex="-1"
     data-test=${`panel-${id}`}
     aria-labelledby=${`${id}-title`}
-    onKeyDown=${(event) => event.key === "Escape" && close()}
+    onKeyDown=${(event) => event.key === "Escape" && onClose()}
   >
     <div class="card-head">
       <h2 id=${`${id}-title`}>${title}</h2>
-      <button type="button" class="quiet" data-test="close-panel" aria-label=${`Close: ${title}`} onClick=${close}>
+      <button
+        type="button"
+        class="quiet"
+        data-test=${`close-${id}`}
+        aria-label=${`Close ${title.toLowerCase()}`}
+        onClick=${onClose}
+      >
         <${Icon} name="close" />
       </button>
     </div>

@@ -11,5 +11,5 @@ const PANELS = { settings: SettingsPanel, help: HelpPanel, gamepad: GamepadPanel
 /** @returns {Promise<any>} what draws the panel that is shown */
 export async function fetched() {
   await fetchStyle("panels.css");
-  return ({ shown }) => html`<${PANELS[shown]} key=${shown} />`;
+  return ({ shown, onClose }) => html`<${PANELS[shown]} key=${shown} onClose=${onClose} />`;
 }

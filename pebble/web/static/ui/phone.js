@@ -8,9 +8,9 @@ import { nameOf } from "./words.js";
 
 const QUIET = 4; // modules around the code
 
-export function PhonePanel() {
+export function PhonePanel({ onClose }) {
   const { ref } = useModel(usePage().route);
-  return html`<${Panel} id="phone" title="Open on a phone">
+  return html`<${Panel} id="phone" onClose=${onClose} title="Open on a phone">
     ${isLoopback(location.hostname) ? html`<${OnlyHere} />` : html`<${Code} at=${ref} />`}
   <//>`;
 }

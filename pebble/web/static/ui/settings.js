@@ -14,11 +14,11 @@ const MORE = [
   { name: "phone", icon: "phone", text: "Open on a phone" },
 ];
 
-export function SettingsPanel() {
+export function SettingsPanel({ onClose }) {
   const { settings, driver, panels } = usePage();
   useModel(settings);
   useModel(driver);
-  return html`<${Panel} id="settings" title="Settings">
+  return html`<${Panel} id="settings" onClose=${onClose} title="Settings">
     <${WhoAmI} />
     <${Choice} name="theme" title="Colours" choices=${THEMES} />
     <${Choice} name="side" title="Stick, on a phone" choices=${SIDES} />
