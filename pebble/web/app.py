@@ -78,8 +78,9 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
 
 async def _page(request: Request) -> Response:
     if login.session_of(request) is None:
-        wanted = "" if request.url.path == "/" else f"?next={quote(request.url.path)}"
-        return Response(status_code=303, headers={"location": f"/login{wanted}", **NO_STORE})
+        wanted = request.url.path + ("?watch" if "watch" in request.query_params else "")
+        then = "" if wanted == "/" else f"?next={quote(wanted)}"
+        return Response(status_code=303, headers={"location": f"/login{then}", **NO_STORE})
     return _static_of(request).page(request, NO_STORE)
 
 

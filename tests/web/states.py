@@ -282,11 +282,13 @@ STATES: dict[str, State] = {
     ),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
+    "fleet-watching": State("/?watch", fleet, LIVE),
     "driving": DRIVING,
     "operating": OPERATING,
     "system-offline": replace(
         OPERATING, values=changed(fleet, at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2)))
     ),
+    "watching": State(f"{GOOB_PATH}?watch", changed(fleet, stopped(FRED, "eve on phone")), LIVE),
     "free": State(GOOB_PATH, fleet, LIVE),
     "taken": State(GOOB_PATH, changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
     "viewer": State(GOOB_PATH, fleet, LIVE, VIEWER),

@@ -50,6 +50,10 @@ def _at(card: str, *selectors: str) -> Callable[[Page], None]:
         page.evaluate(
             "(card) => scrollBy(0, document.querySelector(`[data-card='${card}']`).getBoundingClientRect().top - 90)", card
         )
+
+    return act
+
+
 def _trouble(page: Page) -> None:
     """Robots go and come back, batteries are low, and a service ends: the bell counts it."""
     page.locator("[data-test=announcement]").wait_for(state="attached")
@@ -79,8 +83,25 @@ def _trouble_and_press(*selectors: str) -> Callable[[Page], None]:
     return act
 
 
+def _do(script: str, *selectors: str) -> Callable[[Page], None]:
+    def act(page: Page) -> None:
+        page.evaluate(f"() => {{ {script} }}")
+        page.wait_for_timeout(200)
+        _press(*selectors)(page)
+
+    return act
+
+
 def _scroll_to(selector: str) -> Callable[[Page], None]:
     return lambda page: page.locator(selector).first.scroll_into_view_if_needed()
+
+
+#: A gamepad in use, and its panel.
+_PAD = """const buttons = Array.from({ length: 11 }, (_, i) => ({ pressed: i === 3 }));
+const one = { id: "Logitech Logitech Attack 3", index: 0, connected: true, timestamp: 1, mapping: "",
+  axes: [0.31, -0.84, 1], buttons };
+navigator.getGamepads = () => [one];
+pebble.panels.show("gamepad");"""
 
 
 def _drive(page: Page) -> None:
@@ -157,6 +178,12 @@ SCREENS = [
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
     Screen("thumbnails", "fleet", _press(".check")),
     Screen("settings", "driving", _press(".me"), ("desktop",)),
+    Screen("help", "driving", _do("pebble.panels.show('help')")),
+    Screen("gamepad", "driving", _do(_PAD)),
+    Screen("gamepad-asks", "driving", _do(_PAD, "[data-test=pad-learn]")),
+    Screen("no-gamepad", "driving", _do("pebble.panels.show('gamepad')"), ("desktop",)),
+    Screen("open-on-phone", "fleet", _press("[data-test=phone]")),
+    Screen("left-handed", "driving", _do("pebble.settings.set('side', 'left')"), ("landscape",)),
     Screen("reset-asked", "stopped", _press(".banner-actions button")),
     Screen("sensors", "driving", _press(".tabs button:nth-child(2)"), ("phone",)),
     Screen("more", "driving", _press(".tabs button:nth-child(3)"), ("phone",)),

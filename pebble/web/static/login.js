@@ -7,13 +7,13 @@ const submit = /** @type {HTMLButtonElement} */ (document.getElementById("submit
 const why = document.getElementById("why");
 
 /**
- * Where to go after the login: the page of a robot that was asked for, else the fleet. Never to another site.
+ * Where to go after the login: the screen that was asked for, else the fleet. Never to another site.
  * @param {string} search the query of this page, `?next=/r/pebble/robots/goob`
  * @returns {string}
  */
 export function nextPage(search) {
   const next = new URLSearchParams(search).get("next") ?? "";
-  return /^\/r\/[^\\\s]*$/.test(next) ? next : "/";
+  return /^\/(r\/[^\\\s]*|\?watch)$/.test(next) ? next : "/";
 }
 
 /**

@@ -7,10 +7,11 @@ import { Estop } from "./core/estop.js";
 import { Store } from "./core/store.js";
 import { App, PARTS } from "./ui/app.js";
 import { Page, fetchPart, isHere } from "./ui/hooks.js";
-import { Connection, Route, Settings } from "./ui/models.js";
+import { Connection, Panels, Route, Settings } from "./ui/models.js";
 import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
 
+const WATCHING = ["estop", "stop", "watch", "read-logs"]; // all that a screen sends that only watches
 const REST_MS = 3000; // after the start what is not shown yet is fetched, so that it is here without a server, too
 
 const version = document.querySelector("meta[name=pebble-version]")?.getAttribute("content") ?? "";
@@ -18,12 +19,14 @@ const store = new Store();
 const connection = new Connection(version);
 const route = new Route();
 const settings = new Settings();
+const panels = new Panels();
 const video = new Video(store);
 
 function join() {
   const socket = new ControlSocket({
     store,
     version,
+    maySend: (op) => !route.watching || WATCHING.includes(op),
     onOpen: () => driver.opened(),
     onLost: () => driver.lost(),
     onChange: () => connection.changed(),
@@ -50,13 +53,14 @@ function join() {
   connection.socket = socket;
   estop.onChange = () => connection.changed();
   driver.onControlLost = (by) => connection.show(by ? `${by} took over` : "Your control has ended: take it again");
+  driver.mappingOf = (id) => settings.mappingOf(id);
   driver.loading = () => !isHere(PARTS.robot);
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
   video.pictures = new Pictures(
     (bitmap, info) => video.draw(bitmap, info),
     (state) => video.report(state),
   );
-  return { store, connection, route, settings, video, driver, estop, commands: commands(socket, driver, estop) };
+  return { store, connection, route, settings, panels, video, driver, estop, commands: commands(socket, driver, estop) };
 }
 
 /** Everything that widgets can ask for. */
@@ -70,6 +74,12 @@ function commands(socket, driver, estop) {
     reset: (ref, owners) => estop.reset(ref, owners),
     take: (over) => driver.take(over),
     release: () => driver.release(),
+    /** Whether this screen only watches; then it drives nothing any more. */
+    watchOnly(on) {
+      const mine = on ? store.refs().filter((ref) => store.get(ref, "web/driver")?.value.you) : [];
+      for (const ref of mine) socket.send({ op: "lease", ref, take: false });
+      route.watch(on);
+    },
     setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
     setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
     /** @param {string} ref @param {{r: number, g: number, b: number, period?: number}} colour each 0..1; seconds */
@@ -106,4 +116,12 @@ follow();
 render(h(Page.Provider, { value: page }, h(App)), document.getElementById("app"));
 page.connection.socket.connect();
 setTimeout(() => Promise.allSettled(Object.values(PARTS).map(fetchPart)), REST_MS);
+fetchMore();
+
+/** What keys, gamepad and wall screens do besides; as often as it takes. */
+function fetchMore() {
+  const retry = () => setTimeout(fetchMore, REST_MS);
+  import("./ui/more.js").then((more) => more.install(page), retry);
+}
+
 Object.assign(window, { pebble: page }); // for tests, and for people who look into it

@@ -10,7 +10,7 @@ const TOKEN = "pebble-token"; // restores the driver lease after a reload
 
 /** @typedef {{store: any, version: string, name?: () => string, onOpen?: () => void, onLost?: () => void,
  *   onRefused?: (message: any) => void, onDone?: (message: any) => void, onLogs?: (message: any) => void,
- *   onSeries?: (message: any) => void, onBye?: (message: any) => void,
+ *   onSeries?: (message: any) => void, onBye?: (message: any) => void, maySend?: (op: string) => boolean,
  *   onChange?: () => void}} Options */
 
 export class ControlSocket {
@@ -47,8 +47,13 @@ export class ControlSocket {
   /** @param {Record<string, any>} op @returns {boolean} whether it was sent */
   send(op) {
     if (this.state !== "open" || this.socket?.readyState !== WebSocket.OPEN) return false;
+    if (!this.maySend(op.op)) return false;
     this.socket.send(JSON.stringify(op));
     return true;
+  }
+
+  maySend(op) {
+    return this.options.maySend?.(op) ?? true;
   }
 
   /** Give the connection up, and make a new one: its clock is not to be trusted any more. */
@@ -60,7 +65,7 @@ export class ControlSocket {
   }
 
   hello(socket) {
-    const token = sessionStorage.getItem(TOKEN) ?? "";
+    const token = (this.maySend("lease") && sessionStorage.getItem(TOKEN)) || "";
     const { version, name } = this.options;
     socket.send(JSON.stringify({ op: "hello", version, device: device(), name: name?.() ?? "", token }));
   }

@@ -1,14 +1,12 @@
 /** Ties inputs, gesture and control socket together: from events of the browser to drive commands. */
 
 import { Gesture, PERIOD_MS, STALL_MS } from "./gesture.js";
-import { DRIVE_KEYS, Inputs } from "./inputs.js";
+import { DRIVE_KEYS, Inputs, PAD_ESTOP, USUAL } from "./inputs.js";
 import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
 
 const SUSPENDED_MS = 500; // between the wall clock and the page's own
 const TWICE_MS = 600; // Escape, pressed twice
 const TYPING = "input:not([type=range]):not([type=checkbox]):not([type=radio]), select, textarea, [contenteditable]";
-const PAD_STOP = 0;
-const PAD_ESTOP = [8, 9];
 
 export class Driver {
   /** @param {{socket: any, store: any, estop: any, reload: () => boolean}} parts */
@@ -28,11 +26,17 @@ export class Driver {
     this.loading = () => false;
     /** @type {(by: string) => void} called when this page loses the lease: to ``by``, or "" */
     this.onControlLost = () => {};
+    /** @type {(id: string, phase: "down" | "up") => void} what else keys and buttons do; "up" is of those that are held */
+    this.onAction = () => {};
+    /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
+    this.actions = null;
+    /** @type {(id: string) => import("./inputs.js").Mapping} of a gamepad */
+    this.mappingOf = () => USUAL;
     this.mine = false;
     this.padName = "";
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
-    this.padStopped = false;
+    this.padStopped = this.padLatched = false;
     this.updatedAt = -Infinity;
     this.latchedAt = -Infinity; // when the component was last seen stopped
     this.refusal = ""; // why the server has ended the last gesture
@@ -153,6 +157,7 @@ export class Driver {
   interrupt() {
     this.inputs.clear();
     this.gesture.interrupt(performance.now());
+    this.actions?.clear();
     this.output = { x: 0, z: 0, y: 0 };
     this.changed();
   }
@@ -201,6 +206,7 @@ export class Driver {
   }
 
   keyUp(event) {
+    this.actions?.keyUp(event.code);
     if (isMeta(event)) this.leave();
     else if (this.inputs.keyUp(event.code)) this.update();
   }
@@ -227,7 +233,7 @@ export class Driver {
       if (document.querySelector("dialog[open]")) return;
       this.inputs.keyDown(event.code, event.repeat || isOld(event.timeStamp));
       this.update();
-    }
+    } else if (!isOld(event.timeStamp) && this.actions?.keyDown(event)) event.preventDefault();
   }
 
   latch(why) {
@@ -258,19 +264,29 @@ export class Driver {
     this.socket.restart();
   }
 
-  readPad() {
+  /** @returns {Gamepad | null} the one that drives */
+  get pad() {
     const pads = [...(navigator.getGamepads?.() ?? [])].filter((pad) => pad !== null && pad.connected !== false);
-    const pad = pads.find((one) => /attack 3/i.test(one.id)) ?? pads[0] ?? null;
+    return pads.find((one) => /attack 3/i.test(one.id)) ?? pads[0] ?? null;
+  }
+
+  readPad() {
+    const { pad } = this;
     this.padName = pad?.id ?? "";
-    this.inputs.padSample(document.hasFocus() ? pad : null, performance.now());
+    const mapping = this.mappingOf(this.padName);
+    const focused = document.hasFocus() ? pad : null;
+    this.inputs.padSample(focused, performance.now(), mapping);
+    this.actions?.padSample(focused, mapping);
     const pressed = (index) => pad?.buttons[index]?.pressed === true;
-    if (pad && document.hasFocus() && PAD_ESTOP.every(pressed)) {
-      if (!this.padStopped) this.latch("gamepad");
-      this.padStopped = true;
-    } else if (pad && pressed(PAD_STOP)) {
-      if (!this.padStopped) this.space();
-      this.padStopped = true;
-    } else this.padStopped = false;
+    if (focused && PAD_ESTOP.every(pressed)) {
+      if (!this.padLatched) this.latch("gamepad");
+      this.padLatched = this.padStopped = true;
+    } else {
+      const stop = pressed(mapping.buttons.stop);
+      if (stop && !this.padStopped) this.space();
+      this.padStopped = stop;
+      this.padLatched = false;
+    }
   }
 
   update() {

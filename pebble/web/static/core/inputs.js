@@ -1,19 +1,46 @@
 /** What keys, stick, buttons and gamepad ask for, as one vector. Pure: events are passed in by driver.js. */
 
-const LEFT = ["KeyA", "ArrowLeft"];
-const RIGHT = ["KeyD", "ArrowRight"];
-const FORWARD = ["KeyW", "ArrowUp"];
-const BACK = ["KeyS", "ArrowDown"];
-const UP = ["KeyQ"];
-const DOWN = ["KeyE"];
+export const LEFT = ["KeyA", "ArrowLeft"];
+export const RIGHT = ["KeyD", "ArrowRight"];
+export const FORWARD = ["KeyW", "ArrowUp"];
+export const BACK = ["KeyS", "ArrowDown"];
+export const UP = ["KeyQ"];
+export const DOWN = ["KeyE"];
 export const DRIVE_KEYS = new Set([...LEFT, ...RIGHT, ...FORWARD, ...BACK, ...UP, ...DOWN]);
 
 const DEAD_ZONE = 0.1;
 const FROZEN_MS = 3000; // a deflected gamepad whose time stands still may be gone
-const AUXILIARY_BUTTON = 1; // while held, the horizontal axis is the auxiliary one
+export const PAD_ESTOP = [8, 9]; // buttons that no mapping has
+export const MOST = 32; // axes, and buttons
 
 /** @typedef {{speed: number, turn: number, balance: number}} Sliders speed and turn 0..1, balance -1..1 */
 /** @typedef {{id: string, axes: readonly number[], buttons: readonly {pressed: boolean}[], timestamp: number}} Pad */
+/** @typedef {{axis: number, invert: boolean}} Axis */
+/**
+ * What of a gamepad does what. ``auxiliary``, while held: the horizontal axis is the auxiliary one. Buttons of other
+ * actions are where actions.js says unless they are here, too; -1 is none.
+ * @typedef {{x: Axis, z: Axis, deadZone: number, buttons: Record<string, number>}} Mapping
+ */
+
+/** @type {Mapping} of the standard layout, and of the Attack 3 */
+export const USUAL = {
+  x: { axis: 0, invert: false },
+  z: { axis: 1, invert: true },
+  deadZone: DEAD_ZONE,
+  buttons: { stop: 0, auxiliary: 1 },
+};
+
+const isIndex = (value) => Number.isInteger(value) && value >= -1 && value < MOST;
+
+/** @param {any} value that was stored, perhaps by another version @returns {Mapping} the usual one for what is none */
+export function validMapping(value) {
+  const axis = (one) => ({ axis: one?.axis, invert: one?.invert === true });
+  const [x, z, deadZone] = [axis(value?.x), axis(value?.z), Number(value?.deadZone)];
+  const valid = isIndex(x.axis) && isIndex(z.axis) && x.axis !== z.axis && deadZone >= 0.02 && deadZone < 0.6;
+  if (!valid) return USUAL;
+  const kept = Object.entries(value.buttons ?? {}).filter(([, at]) => isIndex(at) && !PAD_ESTOP.includes(at));
+  return { x, z, deadZone, buttons: { ...USUAL.buttons, ...Object.fromEntries(kept.slice(0, MOST)) } };
+}
 
 export class Inputs {
   constructor() {
@@ -78,13 +105,14 @@ export class Inputs {
 
   /**
    * What the gamepad shows now; null: there is none.
-   * @param {Pad|null} pad @param {number} now milliseconds
+   * @param {Pad|null} pad @param {number} now milliseconds @param {Mapping} [mapping]
    */
-  padSample(pad, now) {
+  padSample(pad, now, mapping = USUAL) {
     if (pad === null) return this.padGone();
-    const across = zone(pad.axes[0] ?? 0);
-    const auxiliary = pad.buttons[AUXILIARY_BUTTON]?.pressed === true;
-    const sample = { x: auxiliary ? 0 : across, z: -zone(pad.axes[1] ?? 0), y: auxiliary ? across : 0 };
+    const read = ({ axis, invert }) => zone(pad.axes[axis] ?? 0, mapping.deadZone) * (invert ? -1 : 1);
+    const across = read(mapping.x);
+    const auxiliary = pad.buttons[mapping.buttons.auxiliary]?.pressed === true;
+    const sample = { x: auxiliary ? 0 : across, z: read(mapping.z), y: auxiliary ? across : 0 };
     const neutral = sample.x === 0 && sample.z === 0 && sample.y === 0;
     if (pad.timestamp !== this.padStamp || neutral) {
       this.padStamp = pad.timestamp;
@@ -160,9 +188,9 @@ export function balanced(x, z, balance) {
   return { x: (left - right) / 2 / most, z: (left + right) / 2 / most };
 }
 
-function zone(value) {
+function zone(value, dead = DEAD_ZONE) {
   const size = Math.abs(value);
-  return !(size > DEAD_ZONE) ? 0 : Math.sign(value) * Math.min(1, (size - DEAD_ZONE) / (1 - DEAD_ZONE));
+  return !(size > dead) ? 0 : Math.sign(value) * Math.min(1, (size - dead) / (1 - dead));
 }
 
 function limit(value) {

@@ -10,7 +10,7 @@ import { nameOf } from "./words.js";
 export const PARTS = {
   fleet: async () => (await import("./fleet.js")).Fleet,
   robot: async () => (await import("./robot.js")).Robot,
-  settings: async () => (await import("./settings.js")).SettingsPanel,
+  panels: async () => (await import("./panels.js")).fetched(),
 };
 
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */
@@ -29,32 +29,34 @@ export function useLayout() {
 }
 
 export function App() {
-  const { route, settings } = usePage();
+  const { route, settings, panels } = usePage();
   const { ref } = useModel(route);
   useModel(settings);
   const layout = useLayout();
-  const [panel, setPanel] = useState(false);
+  const { shown } = useModel(panels);
   const [drawer, setDrawer] = useState(false);
   useEffect(() => {
     document.title = ref ? `${nameOf(ref)} – Pebble` : "Pebble";
     setDrawer(false);
   }, [ref]);
-  const toggle = () => setPanel(!panel);
+  const toggle = () => panels.toggle("settings");
   return html`<div class=${`app ${layout} ${ref ? "at-robot" : "at-fleet"}`}>
     <a class="skip" href="#main">Skip to content</a>
     <${Boundary} what="The header">
       <${Header}
         at=${ref}
         layout=${layout}
-        panel=${panel}
+        panel=${shown === "settings"}
         onPanel=${toggle}
         drawer=${drawer}
         onDrawer=${() => setDrawer(!drawer)}
       />
     <//>
     <${Boundary} what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
-    ${panel &&
-    html`<${Boundary} what="Settings"><${Part} part=${PARTS.settings} onClose=${toggle} /><//>`}
+    ${shown &&
+    html`<${Boundary} what="This panel"
+      ><${Part} part=${PARTS.panels} shown=${shown} onClose=${() => panels.show("")}
+    /><//>`}
     <main id="main" tabindex="-1">
       <${Boundary} what="This screen">
         ${ref

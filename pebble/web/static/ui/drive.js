@@ -1,7 +1,7 @@
 // Driving: who may, why not, the stick, and how fast.
 
 import { html, useCalm, useEffect, useModel, usePage, useValue } from "./hooks.js";
-import { Card, HoldButton, Icon } from "./parts.js";
+import { Card, HoldButton, Icon, Part } from "./parts.js";
 import { Stick } from "./stick.js";
 import { driverName, nameOf } from "./words.js";
 
@@ -9,10 +9,17 @@ export function DriveCard({ at }) {
   return html`<${Card} id="drive" title="Drive" icon="wheel" className="drive">
     <${WhyLine} at=${at} />
     <${DrivePad} />
-    <${Keys} />
+    <${Hints} />
     <${Speed} />
     <${DriveSettings} />
   <//>`;
+}
+
+const keyHints = async () => (await import("./key-hints.js")).KeyHints;
+
+function Hints() {
+  const { hints } = useModel(usePage().settings);
+  return hints ? html`<div style=${{ minHeight: "126px" }}><${Part} part=${keyHints} /></div>` : null;
 }
 
 /** Why it cannot be driven now, and what can be done about it; or that it can. */
@@ -26,7 +33,6 @@ export function WhyLine({ at }) {
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
   const keys = driver.typing ? " Keys go to the field you have chosen: click beside it." : "";
   const text = why ?? (mine ? `You are driving ${nameOf(at)}.${keys}` : "");
-  useWakeLock(mine);
   return html`<div class=${`why-line ${reason ? "off" : "on"}`}>
     <p id="why-drive" data-test="why"><i aria-hidden="true">${reason ? "○" : "●"}</i><span>${text}</span></p>
     <span class="sr" role="status">${useCalm(text)}</span>
@@ -69,26 +75,6 @@ function see(driver) {
   driver.changed();
 }
 
-/** The screen stays on while somebody drives, where browsers allow it. */
-function useWakeLock(wanted) {
-  useEffect(() => {
-    if (!wanted || !navigator.wakeLock) return undefined;
-    let lock = null;
-    let over = false;
-    navigator.wakeLock.request("screen").then(
-      (granted) => {
-        lock = granted;
-        if (over) lock.release();
-      },
-      () => {}, // the battery is low, or the page is hidden
-    );
-    return () => {
-      over = true;
-      lock?.release();
-    };
-  }, [wanted]);
-}
-
 /** The stick with what it asks for, in words. */
 export function DrivePad() {
   const { driver } = usePage();
@@ -101,29 +87,6 @@ export function DrivePad() {
   return html`<div class="pad">
     <${Stick} driver=${driver} />
     <p class="pad-words">${words || (driver.reason() ? "" : "drag the stick")}</p>
-  </div>`;
-}
-
-const KEYS = [
-  ["KeyQ", "Q"],
-  ["KeyW", "W"],
-  ["KeyE", "E"],
-  ["KeyA", "A"],
-  ["KeyS", "S"],
-  ["KeyD", "D"],
-];
-
-/** Hints: which keys drive. They light up while they are held. */
-function Keys() {
-  const { driver } = usePage();
-  useModel(driver);
-  return html`<div class="keys" aria-hidden="true">
-    <div class="key-grid">
-      ${KEYS.map(
-        ([code, letter]) => html`<kbd key=${code} class=${driver.inputs.keys.has(code) ? "on" : ""}>${letter}</kbd>`,
-      )}
-    </div>
-    <p><b>W A S D</b> or arrows drive,<br /><b>space</b> stops,<br /><b>Esc Esc</b> is STOP</p>
   </div>`;
 }
 

@@ -83,7 +83,8 @@ function sorted(store, refs, by) {
 }
 
 function FleetTools({ filter, onFilter }) {
-  const { settings } = usePage();
+  const { commands, panels, route, settings } = usePage();
+  useModel(route);
   return html`<div class="fleet-tools">
     <input
       type="search"
@@ -112,6 +113,17 @@ function FleetTools({ filter, onFilter }) {
         onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
       /><span>Thumbnails</span></label
     >
+    <label class="check"
+      ><input
+        type="checkbox"
+        data-test="watch"
+        checked=${route.watching}
+        onChange=${(event) => commands.watchOnly(event.currentTarget.checked)}
+      /><span>Only watch</span></label
+    >
+    <button type="button" data-test="phone" onClick=${() => panels.show("phone")}>
+      <${Icon} name="phone" />Open on a phone
+    </button>
   </div>`;
 }
 
@@ -135,8 +147,9 @@ export const iconOf = (ref) => ICONS[typeOf(ref)] ?? "thing";
 const TRANSPORTS = { mqtt: "MQTT", zenoh: "Zenoh", mcu: "MCU" };
 
 function FleetCard({ at }) {
-  const { commands, settings, connection } = usePage();
+  const { commands, settings, connection, route } = usePage();
   useModel(settings);
+  useModel(route);
   useModel(connection, (one) => one.state);
   const offers = new Offers(at, useValue(at, "capabilities"));
   const estop = useValue(at, "web/estop");
@@ -156,7 +169,7 @@ function FleetCard({ at }) {
       </div>
       <${Liveness} at=${at} />
     </div>
-    ${settings.thumbnails && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
+    ${(settings.thumbnails || route.watching) && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
       <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} />

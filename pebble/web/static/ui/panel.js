@@ -1,20 +1,30 @@
-// A panel, not a modal dialog: STOP stays in reach. Opening one ends the gesture.
+// The frame of all panels: no modal dialogs, because STOP stays in reach. While one is open, nothing is driven.
 
 import { html, useEffect, usePage, useRef } from "./hooks.js";
 import { Icon } from "./parts.js";
 
-/** @param {{id: string, title: string, onClose: () => void, children: any}} props */
-export function Panel({ id, title, onClose, children }) {
+/** @param {{id: string, title: string, onClose: () => void, className?: string, children?: any}} props */
+export function Panel({ id, title, onClose, className = "", children }) {
   const { driver } = usePage();
-  const panel = useRef(/** @type {HTMLElement | null} */ (null));
+  const element = useRef(null);
   useEffect(() => {
     const before = /** @type {HTMLElement | null} */ (document.activeElement);
     driver.interrupt();
-    panel.current?.focus();
-    return () => before?.focus?.();
+    element.current.focus();
+    return () => {
+      driver.interrupt();
+      before?.focus?.();
+    };
   }, []);
-  const key = (event) => event.key === "Escape" && onClose();
-  return html`<dialog open class="panel" ref=${panel} tabindex="-1" aria-labelledby=${`${id}-title`} onKeyDown=${key}>
+  return html`<dialog
+    open
+    class=${`panel ${className}`}
+    ref=${element}
+    tabindex="-1"
+    data-test=${`panel-${id}`}
+    aria-labelledby=${`${id}-title`}
+    onKeyDown=${(event) => event.key === "Escape" && onClose()}
+  >
     <div class="card-head">
       <h2 id=${`${id}-title`}>${title}</h2>
       <button

@@ -1,4 +1,4 @@
-// A panel, not a modal dialog: STOP stays in reach. Who I am, and how the page looks.
+// Who I am, and how the page looks and is used in this browser.
 
 import { html, useModel, usePage } from "./hooks.js";
 import { NoticeList } from "./notices.js";
@@ -8,12 +8,18 @@ import { styled } from "./styled.js";
 import { nameOf } from "./words.js";
 
 const THEMES = { auto: "as the system", light: "light", dark: "dark" };
+const SIDES = { left: "on the left", right: "on the right" };
 const RIGHTS = { drive: "drive", reset: "reset stops", system: "restart and update robots", people: "manage users" };
+const MORE = [
+  { name: "help", icon: "help", text: "Keys, gamepad, and how stopping works" },
+  { name: "gamepad", icon: "pad", text: "Set up a gamepad" },
+  { name: "phone", icon: "phone", text: "Open on a phone" },
+];
 
 export const SettingsPanel = styled("notices.css", SettingsBody);
 
 function SettingsBody({ onClose }) {
-  const { settings, driver } = usePage();
+  const { settings, driver, panels } = usePage();
   useModel(settings);
   useModel(driver);
   const narrow = !document.querySelector(".bell"); // else the list is behind a button of its own
@@ -24,39 +30,69 @@ function SettingsBody({ onClose }) {
       <h3 id="notices-heading">Notices</h3>
       <${NoticeList} onGo=${onClose} />
     </section>`}
+    <${Choice} name="theme" title="Colours" choices=${THEMES} />
+    <${Choice} name="side" title="Stick, on a phone" choices=${SIDES} />
     <fieldset>
-      <legend>Colours</legend>
-      <div class="choices">
-        ${Object.entries(THEMES).map(
-          ([value, text]) => html`<label key=${value} class="check"
-            ><input
-              type="radio"
-              data-test=${`theme-${value}`}
-              name="theme"
-              checked=${settings.theme === value}
-              onChange=${() => settings.set("theme", value)}
-            /><span>${text}</span></label
-          >`,
-        )}
-      </div>
-    </fieldset>
-    ${driver.ref &&
-    html`<fieldset>
-      <legend>Driving, in this tab</legend>
-      <label class="check"
-        ><input
-          type="checkbox"
-          data-test="in-sight"
-          checked=${driver.inSight}
-          onChange=${(event) => {
-            driver.inSight = event.currentTarget.checked;
-            driver.changed();
-          }}
-        /><span>I can see ${nameOf(driver.ref)}: drive with an old picture, too</span></label
+      <legend>Driving</legend>
+      <${Check} test="hints" checked=${settings.hints} onChange=${(checked) => settings.set("hints", checked)}>
+        Show which keys drive
+      <//>
+      ${driver.ref &&
+      html`<${Check}
+        test="in-sight"
+        checked=${driver.inSight}
+        onChange=${(checked) => {
+          driver.inSight = checked;
+          driver.changed();
+        }}
       >
-    </fieldset>`}
+        I can see ${nameOf(driver.ref)}: drive with an old picture, too. In this tab
+      <//>`}
+    </fieldset>
+    <div class="panel-links">
+      ${MORE.map(
+        ({ name, icon, text }) => html`<button
+          key=${name}
+          type="button"
+          class="wide"
+          data-test=${`open-${name}`}
+          onClick=${() => panels.show(name)}
+        >
+          <${Icon} name=${icon} />${text}
+        </button>`,
+      )}
+    </div>
   <//>`;
 }
+
+function Choice({ name, title, choices }) {
+  const { settings } = usePage();
+  return html`<fieldset>
+    <legend>${title}</legend>
+    <div class="choices">
+      ${Object.entries(choices).map(
+        ([value, text]) => html`<label key=${value} class="check"
+          ><input
+            type="radio"
+            data-test=${`${name}-${value}`}
+            name=${name}
+            checked=${settings[name] === value}
+            onChange=${() => settings.set(name, value)}
+          /><span>${text}</span></label
+        >`,
+      )}
+    </div>
+  </fieldset>`;
+}
+
+const Check = ({ test, checked, onChange, children }) => html`<label class="check"
+  ><input
+    type="checkbox"
+    data-test=${test}
+    checked=${checked}
+    onChange=${(event) => onChange(event.currentTarget.checked)}
+  /><span>${children}</span></label
+>`;
 
 function WhoAmI() {
   const { connection, commands } = usePage();

@@ -1,0 +1,99 @@
+/** Learns which axis and button of a gamepad does what, from what is moved when the page asks for it. Pure. */
+
+import { ACTIONS, PAD_ACTIONS } from "./actions.js";
+import { MOST, PAD_ESTOP } from "./inputs.js";
+
+const MOVED = 0.6; // an axis that was pushed on purpose
+const STILL = 0.25; // one that was let go
+const OFF_CENTRE = 0.4; // of an axis at rest: it is a lever, or a trigger
+const [LEAST_ZONE, MOST_ZONE] = [0.1, 0.35];
+
+/** @typedef {{id: string, kind: "axis" | "button", ask: string}} Step */
+
+/** @type {readonly Step[]} in the order in which they are asked for */
+export const STEPS = [
+  { id: "z", kind: "axis", ask: "Push the stick forward, and hold it" },
+  { id: "x", kind: "axis", ask: "Push the stick to the right, and hold it" },
+  ...PAD_ACTIONS.map(({ id, words }) => ({ id, kind: /** @type {"button"} */ ("button"), ask: `Press the button for: ${words}` })),
+];
+
+/** @typedef {{axes: readonly number[], buttons: readonly {pressed: boolean}[]}} Sample */
+
+export class Learning {
+  /** @param {Sample} sample while nothing is touched */
+  constructor(sample) {
+    this.rest = sample;
+    this.at = 0;
+    this.released = true; // what was moved for the step before
+    this.problem = "";
+    /** @type {Record<string, import("./inputs.js").Axis>} */
+    this.axes = {};
+    /** @type {Record<string, number>} */
+    this.buttons = {};
+  }
+
+  /** @returns {Step | undefined} undefined: all is known */
+  get step() {
+    return STEPS[this.at];
+  }
+
+  /** @param {Sample} sample what the gamepad shows now */
+  take(sample) {
+    const axis = this.movedAxis(sample, this.released ? MOVED : STILL);
+    const button = sample.buttons.slice(0, MOST).findIndex((one, index) => one.pressed && !this.rest.buttons[index]?.pressed);
+    if (!this.released) this.released = axis < 0 && button < 0;
+    else if (this.step?.kind === "axis" && axis >= 0) this.takeAxis(axis, sample);
+    else if (this.step?.kind === "button" && button >= 0) this.takeButton(button);
+  }
+
+  /** Without a button for this step. Axes cannot be left out. */
+  skip() {
+    if (this.step?.kind !== "button") return;
+    this.buttons[this.step.id] = -1;
+    this.next();
+  }
+
+  /** @returns {import("./inputs.js").Mapping} what was learned */
+  mapping() {
+    const noise = Math.max(...Object.values(this.axes).map(({ axis }) => Math.abs(this.rest.axes[axis])));
+    const deadZone = Math.round(100 * Math.min(MOST_ZONE, Math.max(LEAST_ZONE, noise + 0.05))) / 100;
+    return { x: this.axes.x, z: this.axes.z, deadZone, buttons: this.buttons };
+  }
+
+  next() {
+    this.problem = "";
+    this.at += 1;
+    this.released = false;
+  }
+
+  refuse(why) {
+    this.problem = why;
+    this.released = false;
+  }
+
+  movedAxis({ axes }, limit) {
+    const moved = axes.slice(0, MOST).map((value, index) => Math.abs(value - (this.rest.axes[index] ?? 0)));
+    const most = Math.max(0, ...moved);
+    return most > limit ? moved.indexOf(most) : -1;
+  }
+
+  takeAxis(axis, sample) {
+    const rest = this.rest.axes[axis] ?? 0;
+    if (Math.abs(rest) > OFF_CENTRE) return this.refuse("This axis does not rest in the middle: use another one");
+    if (Object.values(this.axes).some((one) => one.axis === axis)) {
+      return this.refuse("That is the axis that you pushed before: push the other way");
+    }
+    this.axes[this.step.id] = { axis, invert: sample.axes[axis] < rest };
+    this.next();
+  }
+
+  takeButton(button) {
+    if (PAD_ESTOP.includes(button)) {
+      return this.refuse(`${PAD_ESTOP.map((one) => `Button ${one + 1}`).join(" and ")} together are STOP: use another`);
+    }
+    const taken = Object.keys(this.buttons).find((id) => this.buttons[id] === button);
+    if (taken) return this.refuse(`That button is taken: ${ACTIONS.find(({ id }) => id === taken)?.words}`);
+    this.buttons[this.step.id] = button;
+    this.next();
+  }
+}

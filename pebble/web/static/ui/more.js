@@ -1,0 +1,99 @@
+// What is not needed at once: actions of keys and gamepad besides driving, the screen that stays on, and wall screens.
+
+import { Actions } from "../core/actions.js";
+import { Awake } from "../core/awake.js";
+import { fetchStyle } from "./hooks.js";
+
+const WATCHING = ["help", "mute"]; // what can be asked of a screen that only watches
+const STEP = 0.1; // of the speed, for each press
+const SLOWEST = 0.05; // as the slider's
+const CHECK_MS = 1000;
+const RELOAD_MS = 5000; // where nobody is there to press a button
+
+/** To be called once. @param {any} page */
+export function install(page) {
+  const { driver } = page;
+  const doer = new Doer(page);
+  driver.onAction = (id, phase) => doer.act(id, phase);
+  driver.actions = new Actions(
+    (id, phase) => driver.onAction(id, phase),
+    () => driver.ref !== "",
+  );
+  fetchStyle("panels.css").catch(() => {}); // the panels fetch it again
+  new Wall(page).start();
+}
+
+/** Does what an action means. What other modules do is fetched with the first press. */
+class Doer {
+  constructor(page) {
+    this.page = page;
+  }
+
+  /** @param {string} id @param {"down" | "up"} phase */
+  act(id, phase) {
+    const { page } = this;
+    const { ref } = page.driver;
+    if (phase === "down" && page.route.watching && !WATCHING.includes(id)) return undefined;
+    switch (id) {
+      case "help":
+        return page.panels.toggle("help");
+      case "faster":
+        return this.changeSpeed(STEP);
+      case "slower":
+        return this.changeSpeed(-STEP);
+      case "flash":
+        return this.say(import("./lights-model.js").then((lights) => lights.toggleFlash(page, ref)));
+      case "repeat":
+        return this.say(import("./sounds-model.js").then((sounds) => sounds.repeatLast(page, ref)));
+      case "mute":
+        return page.sound?.toggleMute();
+      case "talk":
+        return page.sound?.talk(phase === "down");
+    }
+  }
+
+  changeSpeed(step) {
+    const { driver } = this.page;
+    const speed = Math.round(100 * (driver.sliders.speed + step)) / 100;
+    driver.sliders.speed = Math.min(1, Math.max(SLOWEST, speed));
+    driver.changed();
+  }
+
+  /** @param {Promise<string>} answer why it was not done; "" it was */
+  async say(answer) {
+    const why = await answer.catch((error) => error.message);
+    if (why) this.page.connection.show(`Not done: ${why}`);
+  }
+}
+
+/** A screen that nobody touches for days. */
+class Wall {
+  constructor(page) {
+    this.page = page;
+    this.awake = new Awake(navigator.wakeLock);
+    this.uselessSince = Infinity;
+  }
+
+  start() {
+    const { route } = this.page;
+    const mark = () => document.documentElement.toggleAttribute("data-watch", route.watching);
+    route.onChange(mark);
+    mark();
+    setInterval(() => this.check(), CHECK_MS);
+    document.addEventListener("visibilitychange", () => this.check());
+  }
+
+  check() {
+    const { connection, driver, route, store } = this.page;
+    const drives = connection.isOpen && store.get(driver.ref, "web/driver")?.value.you === true;
+    this.awake.want(route.watching || drives);
+    if (route.watching) this.recover(connection);
+  }
+
+  /** Load the page again when it is older than the server, or the server has ended its session. */
+  recover({ bye, isOld }) {
+    if (!bye && !isOld) this.uselessSince = Infinity;
+    else if (this.uselessSince === Infinity) this.uselessSince = performance.now();
+    else if (performance.now() - this.uselessSince > RELOAD_MS) location.reload();
+  }
+}

@@ -1,0 +1,314 @@
+"""Keys and buttons besides driving, a gamepad of one's own, and screens that only watch; asserted at robot and broker."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Route
+
+from tests.web.browser import Tab, tab
+from tests.web.canned import serving
+from tests.web.console import FORWARD, RIGHT, Console, Wire, console, pad, used
+from tests.web.stage import Stage
+from tests.web.states import STATES
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+
+#: What other parts of the page would do, as a list of calls.
+_MODULES = {
+    "lights-model.js": "export const toggleFlash = (page, ref) => { calls.push(['flash', ref]); return ''; };",
+    "sounds-model.js": "export const repeatLast = (page, ref) => { calls.push(['repeat', ref]); return 'No, why'; };",
+}
+_SOUND = """() => {
+  window.calls = [];
+  pebble.sound = { talk: (on) => calls.push(["talk", on]), toggleMute: () => calls.push(["mute"]) };
+}"""
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    """BenJr alone: its motors have more speeds than on and off."""
+    with Stage("benjr") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def wire(stage: Stage) -> Iterator[Wire]:
+    running = Wire(stage)
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
+def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
+    with console(browser, stage, "benjr") as opened:
+        for name, source in _MODULES.items():
+            opened.page.route(f"**/ui/{name}", _answer(source))
+        opened.tab.until("!!window.pebble?.driver.actions")
+        opened.page.evaluate(_SOUND)
+        yield opened
+
+
+@pytest.fixture
+def at_benjr(_benjr_page: Console) -> Iterator[Console]:
+    with used(_benjr_page) as ready:
+        ready.page.evaluate("() => { calls.length = 0 }")
+        yield ready
+
+
+def _answer(source: str) -> Any:
+    def fulfil(route: Route) -> None:
+        route.fulfill(body=source, content_type="text/javascript")
+
+    return fulfil
+
+
+def _calls(robot: Console) -> Any:
+    return robot.page.evaluate("calls")
+
+
+# -- keys
+
+
+def test_plus_and_minus_change_the_speed_of_the_wheels_while_they_turn(at_benjr: Console) -> None:
+    assert at_benjr.drive()
+    for key, speed in [("+", 0.7), ("+", 0.8), ("-", 0.7), ("-", 0.6)]:
+        at_benjr.page.keyboard.press(key)
+        assert at_benjr.tab.until(lambda speed=speed: at_benjr.speeds == pytest.approx((speed, speed), abs=0.01), 1)
+    at_benjr.let_go()
+    assert at_benjr.rests()
+
+
+def test_the_help_ends_a_gesture_and_leaves_stop_in_reach(at_benjr: Console, wire: Wire) -> None:
+    assert at_benjr.drive()
+    at_benjr.page.keyboard.press("?")
+    assert at_benjr.rests()
+    assert at_benjr.test("panel-help").is_visible()
+    assert "no safety-rated stop" in at_benjr.test("panel-help").inner_text()
+    at_benjr.let_go()
+    at_benjr.down("KeyW")
+    assert at_benjr.stays_at_rest()
+    at_benjr.test("stop-one").click()
+    assert at_benjr.tab.until(lambda: wire.latched("benjr"), 2)
+    at_benjr.page.keyboard.press("?")
+    assert at_benjr.tab.until("document.querySelector('dialog[open]') === null", 2)
+    at_benjr.take()
+    assert at_benjr.press_anew()
+
+
+def test_keys_call_what_they_are_for_and_end_no_gesture(at_benjr: Console) -> None:
+    assert at_benjr.drive()
+    for key in ("KeyF", "KeyP", "KeyM"):
+        at_benjr.page.keyboard.press(key)
+    at_benjr.down("KeyT")
+    assert at_benjr.tab.until(lambda: len(_calls(at_benjr)) == 4, 2)
+    assert sorted(_calls(at_benjr)) == [["flash", at_benjr.ref], ["mute"], ["repeat", at_benjr.ref], ["talk", True]]
+    assert "Not done: No, why" in at_benjr.page.inner_text(".banners")
+    assert at_benjr.wheels == FORWARD
+    at_benjr.let_go()
+    assert at_benjr.rests()
+    assert at_benjr.tab.until(lambda: _calls(at_benjr)[-1] == ["talk", False], 1)
+
+
+@pytest.mark.parametrize(
+    "interruption",
+    [
+        "dispatchEvent(new Event('blur'))",
+        "document.dispatchEvent(new Event('freeze'))",
+        "document.dispatchEvent(new Event('contextmenu'))",
+        "pebble.panels.show('settings')",
+        "pebble.route.go('')",
+    ],
+)
+def test_talking_ends_as_a_gesture_does_and_not_before(at_benjr: Console, interruption: str) -> None:
+    at_benjr.down("KeyT")
+    assert at_benjr.tab.until(lambda: _calls(at_benjr) == [["talk", True]], 1)
+    at_benjr.page.wait_for_timeout(120)
+    assert len(_calls(at_benjr)) == 1
+    at_benjr.page.evaluate(f"() => {{ {interruption} }}")
+    assert at_benjr.tab.until(lambda: _calls(at_benjr) == [["talk", True], ["talk", False]], 1)
+    at_benjr.page.keyboard.down("KeyT")  # it repeats
+    at_benjr.page.evaluate("() => { pebble.panels.show(''); pebble.route.ref || history.back() }")
+    at_benjr.let_go()
+    assert len(_calls(at_benjr)) == 2
+
+
+def test_keys_in_text_and_shortcuts_do_nothing(at_benjr: Console) -> None:
+    at_benjr.page.evaluate("document.querySelector('main').append(document.createElement('input'))")
+    at_benjr.page.locator("main > input").click()
+    at_benjr.page.keyboard.type("fpmt?+-")
+    at_benjr.page.evaluate("document.querySelector('main > input').remove()")
+    for shortcut in ("Control+KeyM", "Alt+KeyT"):
+        at_benjr.page.keyboard.press(shortcut)
+    at_benjr.page.wait_for_timeout(100)
+    assert _calls(at_benjr) == []
+    assert at_benjr.page.evaluate("pebble.driver.sliders.speed") == pytest.approx(0.6)
+    assert at_benjr.test("panel-help").count() == 0
+
+
+# -- gamepads
+
+_SWAPPED = {
+    "x": {"axis": 3, "invert": True},
+    "z": {"axis": 2, "invert": True},
+    "deadZone": 0.2,
+    "buttons": {"stop": 5, "talk": 2, "auxiliary": -1},
+}
+
+
+def _pad(*axes: float, pressed: tuple[int, ...] = ()) -> dict[str, Any]:
+    return {**pad(0, 0, *pressed, name="Odd pad"), "axes": list(axes or (0, 0, 0, 0))}
+
+
+def _turns(robot: Console, wheels: tuple[int, int], *axes: float) -> bool:
+    """From neutral, push these axes until the wheels turn so."""
+
+    def neutral() -> None:
+        robot.pads(_pad())
+        robot.page.wait_for_timeout(120)
+
+    neutral()
+    return robot.persists(lambda: robot.pads(_pad(*axes)), lambda: robot.wheels == wheels, neutral)
+
+
+@pytest.fixture
+def with_odd_pad(at_benjr: Console) -> Iterator[Console]:
+    """A gamepad whose mapping was set up in this browser."""
+    at_benjr.page.evaluate("(mapping) => pebble.settings.setMapping('Odd pad', mapping)", _SWAPPED)
+    yield at_benjr
+    at_benjr.pads(_pad())
+    at_benjr.page.wait_for_timeout(120)
+    at_benjr.page.evaluate("() => pebble.settings.setMapping('Odd pad', null)")
+
+
+def test_a_mapping_decides_what_a_gamepad_drives(with_odd_pad: Console) -> None:
+    robot = with_odd_pad
+    assert _turns(robot, FORWARD, 0, 0, -1, 0)
+    assert _turns(robot, RIGHT, 0, 0, 0, -1)
+    robot.pads(_pad(1, 1, 0.1, 0.1))
+    assert robot.rests()
+    assert robot.stays_at_rest()
+    robot.pads(_pad(pressed=(2,)))
+    assert robot.tab.until(lambda: _calls(robot) == [["talk", True]], 1)
+    robot.pads(_pad())
+    assert robot.tab.until(lambda: _calls(robot)[-1] == ["talk", False], 1)
+
+
+def test_the_buttons_of_a_mapping_stop_and_the_emergency_stop_is_always_there(
+    with_odd_pad: Console, wire: Wire
+) -> None:
+    robot = with_odd_pad
+    assert _turns(robot, FORWARD, 0, 0, -1, 0)
+    robot.pads(_pad(0, 0, -1, 0, pressed=(5,)))
+    assert robot.rests()
+    assert not wire.latched("benjr")
+    robot.pads(_pad(0, 0, -1, 0, pressed=(5, 8)))
+    robot.page.wait_for_timeout(120)
+    robot.pads(_pad(0, 0, -1, 0, pressed=(5, 8, 9)))
+    assert robot.tab.until(lambda: wire.latched("benjr"), 2)
+    assert robot.stays_at_rest()
+    robot.pads(_pad())
+    robot.take()
+
+
+def test_the_wizard_learns_a_gamepad_without_moving_anything(at_benjr: Console) -> None:
+    robot, began = at_benjr, time.monotonic_ns()
+    robot.pads(_pad())
+    robot.test("settings").click()
+    robot.test("open-gamepad").click()
+    robot.test("pad-learn").click()
+    for asked, shown in [
+        ("stick forward", _pad(0, 0, 0, 1)),
+        ("stick to the right", _pad(0, -1, 0, 0)),
+        ("Stop for now", _pad(pressed=(3,))),
+    ]:
+        assert robot.tab.until(lambda asked=asked: asked in robot.test("pad-ask").inner_text(), 2)
+        robot.pads(shown)
+        assert robot.tab.until(lambda asked=asked: asked not in robot.test("pad-ask").inner_text(), 2)
+        robot.pads(_pad())
+    while robot.test("pad-skip").count():
+        assert robot.tab.until(lambda: robot.test("pad-ask").inner_text() != "Let go", 2)
+        robot.test("pad-skip").click()
+        robot.page.wait_for_timeout(120)
+    assert not robot.stage.wheels_turning("benjr", since_ns=began)
+    stored = json.loads(robot.page.evaluate("localStorage.getItem('pebble pads')"))["Odd pad"]
+    assert stored["z"] == {"axis": 3, "invert": False}
+    assert stored["x"] == {"axis": 1, "invert": True}
+    assert stored["buttons"]["stop"] == 3
+    robot.pads(_pad(0, 0, 0, 1))
+    assert robot.tab.until(lambda: "forward 100 %" in robot.test("pad-result").inner_text(), 2)
+    assert robot.stays_at_rest()
+    robot.page.keyboard.press("Escape")
+    assert robot.stays_at_rest()  # it is still pushed
+    assert _turns(robot, FORWARD, 0, 0, 0, 1)
+    robot.pads(_pad())
+    assert robot.rests()
+    robot.page.evaluate("() => pebble.settings.setMapping('Odd pad', null)")
+
+
+# -- screens that only watch
+
+
+@contextmanager
+def _watching(browser: Browser, url: str) -> Iterator[Tab]:
+    with tab(browser, f"{url}?watch", script="window.__pads = []; navigator.getGamepads = () => window.__pads;") as opened:
+        assert opened.until("!!window.pebble?.connection.you && document.documentElement.hasAttribute('data-watch')")
+        yield opened
+
+
+def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser) -> None:
+    with serving(STATES["driving"]) as canned, _watching(browser, f"{canned.url}{canned.state.path}") as opened:
+        for key in ("KeyW", "KeyA", "KeyQ", "KeyF", "KeyP", "KeyT", "KeyM", "Minus", "Space"):
+            opened.page.keyboard.press(key, delay=60)
+        opened.page.evaluate(
+            "() => { for (const one of document.querySelectorAll('main button, .banners button')) one.click() }"
+        )
+        opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.setFlag(pebble.driver.ref, 'a', true) }")
+        opened.page.keyboard.press("Control+Space")
+        assert opened.until(lambda: bool(canned.sent("estop")), 2)
+        assert {message["op"] for message in canned.received} <= {"hello", "watch", "stop", "estop"}
+        assert [message["token"] for message in canned.sent("hello")] == [""]
+
+
+def test_it_takes_back_no_lease_after_a_reload(browser: Browser) -> None:
+    with serving(STATES["driving"]) as canned, tab(browser, canned.url + canned.state.path) as opened:
+        assert opened.until(lambda: len(canned.sent("hello")) == 1)
+        opened.page.goto(canned.url)
+        assert opened.until("window.pebble?.connection.isOpen")
+        assert canned.sent("hello")[-1]["token"] == "canned"
+        opened.test("watch").check()
+        assert opened.page.url == f"{canned.url}/?watch"
+        assert [message["take"] for message in canned.sent("lease")] == [False]
+        opened.page.reload()
+        assert opened.until("window.pebble?.connection.isOpen")
+        assert canned.sent("hello")[-1]["token"] == ""
+        opened.page.locator("[data-test=card-goob] a").click()
+        assert opened.page.url.endswith("/r/pebble/robots/goob?watch")
+        assert opened.complaints() == []
+
+
+def test_it_stops_robots_and_never_drives(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with _watching(browser, stage.robot_url("benjr")) as opened:
+        assert opened.until("window.pebble.store.get(pebble.driver.ref, 'web/liveness')?.value.online === true")
+        before = len(wire.all("benjr/incoming/drive-values"))
+        opened.page.keyboard.press("KeyW", delay=200)
+        assert opened.page.evaluate("pebble.store.get(pebble.driver.ref, 'web/driver')?.value.by") == ""
+        assert len(wire.all("benjr/incoming/drive-values")) == before
+        opened.test("stop-one").click()
+        assert opened.until(lambda: wire.latched("benjr"), 2)
+        assert opened.page.locator("[data-test=reset]:visible").count() == 0
+        assert opened.complaints() == []
+    with console(browser, stage, "benjr") as robot:
+        robot.take()  # resets it
+
+
+@pytest.mark.thorough
+def test_after_an_update_it_loads_itself_again(browser: Browser, stage: Stage) -> None:
+    with _watching(browser, stage.url) as opened:
+        opened.page.evaluate("() => { window.before = true; pebble.connection.version = 'old' }")
+        assert opened.until("window.before === undefined && !!window.pebble?.connection.you", 12)
