@@ -7,7 +7,15 @@ from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from pebble.contract import CHARGING_LEVEL, CHARGING_STATUS, IMU, TOUCH_SENSORS, WHEEL_ODOMETRY, Channel
+from pebble.contract import (
+    CHARGING_LEVEL,
+    CHARGING_STATUS,
+    IMU,
+    TOUCH_SENSORS,
+    VIDEO_OVERLAYS,
+    WHEEL_ODOMETRY,
+    Channel,
+)
 from pebble.contract.identity import Direction
 from pebble.transports import Message, Subscription
 from pebble.web.broker import Broker
@@ -15,6 +23,9 @@ from pebble.web.robots import LOG_LINES, WATCHED, Robots, own_topic
 
 _KEEP_S = 5.0  # so long they are still received after the last page has closed the component
 _STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
+
+#: The component and channel of what a topic carries, where its own name does not tell them.
+_Carried = tuple[str, Channel] | None
 
 #: Channels whose topic capabilities may name, below ``telemetry``.
 _TELEMETRY: dict[str, Channel] = {
@@ -35,12 +46,13 @@ class OpenComponents:
         self._pages: Counter[str] = Counter()
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
         self._following: set[str] = set()  # components whose task runs
-        self._wanted: dict[str, dict[str, Channel | None]] = {}  # filters, and what else than their own name they carry
+        self._wanted: dict[str, dict[str, _Carried]] = {}  # by component and filter
 
     def open(self, ref: str) -> None:
         """A page has opened this component."""
         self._pages[ref] += 1
         self._robots.logs.setdefault(ref, deque(maxlen=LOG_LINES))
+        self._robots.recent.open(ref)
         self.update(ref)
 
     def close(self, ref: str) -> None:
@@ -69,6 +81,7 @@ class OpenComponents:
                     done[filter_] = await self._broker.subscribe(filter_, self._receiver(ref, filter_))
                 if not wanted:
                     self._robots.logs.pop(ref, None)
+                    self._robots.recent.close(ref)
                     self._subscriptions.pop(ref)
                     return
                 await asyncio.sleep(_STEP_S)
@@ -79,20 +92,27 @@ class OpenComponents:
 
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
         def take(message: Message, now: float) -> None:
-            channel = self._wanted.get(ref, {}).get(filter_)
-            if channel is None:
+            carried = self._wanted.get(ref, {}).get(filter_)
+            if carried is None:
                 self._robots.receive(message, now)
             else:
-                self._robots.receive_as(ref, channel.metric, message, now)
+                self._robots.receive_as(carried[0], carried[1].metric, message, now)
 
         return take
 
-    def _filters(self, ref: str) -> dict[str, Channel | None]:
-        """Every channel's own topic, and those that the capabilities name, if they are the component's own."""
-        filters: dict[str, Channel | None] = {channel.filter(ref): None for channel in WATCHED}
-        listed = self._robots.capabilities(ref).get("telemetry")
+    def _filters(self, ref: str) -> dict[str, _Carried]:
+        """Every channel's own topic, those that the capabilities name, and what is drawn over another's picture."""
+        filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
         for key, channel in _TELEMETRY.items():
-            topic = listed.get(key) if isinstance(listed, dict) else None
-            if own_topic(ref, topic, Direction.OUTGOING) and str(topic) not in filters:
-                filters[str(topic)] = channel
+            self._add(filters, ref, "telemetry", key, channel)
+        source = self._robots.sources.get(ref, ref)
+        filters.setdefault(VIDEO_OVERLAYS.filter(source), None)
+        self._add(filters, source, "video", "overlays_topic", VIDEO_OVERLAYS)
         return filters
+
+    def _add(self, filters: dict[str, _Carried], ref: str, section: str, key: str, channel: Channel) -> None:
+        """The topic that the capabilities name, if it is the component's own."""
+        listed = self._robots.capabilities(ref).get(section)
+        topic = listed.get(key) if isinstance(listed, dict) else None
+        if own_topic(ref, topic, Direction.OUTGOING):
+            filters.setdefault(str(topic), (ref, channel))

@@ -28,6 +28,7 @@ function join() {
     onLost: () => driver.lost(),
     onChange: () => connection.changed(),
     onLogs: () => {},
+    onSeries: (message) => store.set(message.ref, `web/series/${message.metric}`, message),
     onBye: (message) => {
       connection.bye = message.again ? null : message;
       connection.changed();
@@ -62,6 +63,7 @@ function commands(socket, driver, estop) {
     reset: (ref, owners) => estop.reset(ref, owners),
     take: (over) => driver.take(over),
     release: () => driver.release(),
+    askSeries: (ref) => socket.send({ op: "watch", ref, series: true }),
     setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
     setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
     /** @param {string} ref @param {{r: number, g: number, b: number, period?: number}} colour each 0..1; seconds */

@@ -166,7 +166,7 @@ export class CardView extends Model {
   }
 }
 
-function read(name, otherwise) {
+export function read(name, otherwise) {
   try {
     return JSON.parse(localStorage.getItem(`pebble ${name}`) ?? "null") ?? otherwise;
   } catch {
@@ -174,7 +174,7 @@ function read(name, otherwise) {
   }
 }
 
-function write(name, value) {
+export function write(name, value) {
   try {
     localStorage.setItem(`pebble ${name}`, JSON.stringify(value));
   } catch {
