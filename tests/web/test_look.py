@@ -46,6 +46,16 @@ def _drive(page: Page) -> None:
     page.keyboard.down("KeyD")
 
 
+def _show_card(name: str) -> Callable[[Page], None]:
+    def act(page: Page) -> None:
+        card = page.locator(f"[data-card={name}]")
+        card.scroll_into_view_if_needed()
+        card.evaluate("(card) => scrollTo(0, card.getBoundingClientRect().top + scrollY - 90)")
+        page.wait_for_timeout(1200)  # drawn once a second where less motion is wanted
+
+    return act
+
+
 class Screen(NamedTuple):
     """One picture: a state of the server, and what a person does then."""
 
@@ -85,6 +95,10 @@ SCREENS = [
         Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
         for name in STATES
     ),
+    Screen("plots", "odometry", hold=_show_card("plots"), sizes=("desktop",)),
+    Screen("plots", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("plots")),
+    Screen("map", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("map")),
+    Screen("stream-open", "own-stream", _press("[data-test=open-stream]")),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
     Screen("thumbnails", "fleet", _press(".check")),
     Screen("settings", "driving", _press(".me"), ("desktop",)),

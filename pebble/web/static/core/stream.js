@@ -20,7 +20,7 @@ export function reported(status) {
  */
 export function refusal(address, page) {
   const url = parsed(address);
-  if (!url || url.username || url.password) {
+  if (!url || url.username || url.password || url.port === "0") {
     return "The robot reports an address that is not shown: only http and https are, without a login";
   }
   if (bare(url.hostname) === bare(page.hostname)) {

@@ -120,9 +120,15 @@ class View {
       event.preventDefault();
       this.zoom(2 ** (-event.deltaY / 200));
     });
-    on("pointerdown", (event) => event.pointerType === "mouse" && this.canvas.setPointerCapture(event.pointerId));
+    let mouse = { x: 0, y: 0 };
+    on("pointerdown", (event) => {
+      mouse = { x: event.clientX, y: event.clientY };
+      if (event.pointerType === "mouse") this.canvas.setPointerCapture(event.pointerId);
+    });
     on("pointermove", (event) => {
-      if (event.pointerType === "mouse" && event.buttons & 1) this.move(event.movementX, event.movementY);
+      if (event.pointerType !== "mouse" || !(event.buttons & 1)) return;
+      this.move(event.clientX - mouse.x, event.clientY - mouse.y);
+      mouse = { x: event.clientX, y: event.clientY };
     });
     /** @type {{x: number, y: number, apart: number} | null} */
     let before = null;
@@ -148,6 +154,7 @@ class View {
     const style = getComputedStyle(canvas);
     const colours = ["--line", "--edge", "--accent", "--dim", "--fg"].map((name) => style.getPropertyValue(name).trim());
     const { x, y } = this.centre;
+    canvas.dataset.scale = String(this.scale); // for tests
     const drawn = JSON.stringify([series.version, this.scale, x, y, width, height, pixels, colours]);
     if (drawn === this.drawn || width < 2) return;
     this.drawn = drawn;
