@@ -12,6 +12,7 @@ from pebble.web.robots import Robots
 KEYS: Final = ("webrtc_url", "webrtcUrl", "url")  # of the status; robots of the original use all of them
 MAX_ORIGINS: Final = 16  # in one header
 _MAX_URL: Final = 500
+_MAX_STATUS: Final = 8 * 1024  # bytes of a status: those of 500 robots are read for a page
 #: Nothing else may stand in a header; the page compares with the same rule.
 _URL: Final = re.compile(
     r"(https?)://([a-z0-9](?:[a-z0-9.-]{0,252}[a-z0-9])?|\[[0-9a-f:.]{2,45}\])(:[0-9]{1,5})?(?:[/?#][!-~]*)?",
@@ -35,17 +36,21 @@ def origin(url: object, own_host: str) -> str:
 
 def origins(robots: Robots, ref: str, own_host: str) -> list[str]:
     """Of all that robots report now; those for the page of ``ref`` first."""
-    first = [ref, robots.sources.get(ref, ref)]
-    found = (origin(_reported(robots, one), own_host) for one in [*first, *robots.components])
-    return list(dict.fromkeys(filter(None, found)))[:MAX_ORIGINS]
+    found: dict[str, None] = {}
+    for one in (ref, robots.sources.get(ref, ref), *robots.components):
+        if allowed := origin(_reported(robots, one), own_host):
+            found[allowed] = None
+        if len(found) == MAX_ORIGINS:
+            break
+    return list(found)
 
 
 def _reported(robots: Robots, ref: str) -> object:
-    raw = robots.value(ref, STATUS.metric)
-    if raw is None or b"rl" not in bytes(raw):
+    raw = bytes(robots.value(ref, STATUS.metric) or b"")
+    if b"rl" not in raw or len(raw) > _MAX_STATUS:
         return None
     try:
-        payload: Any = codec.plain(STATUS, bytes(raw))
+        payload: Any = codec.plain(STATUS, raw)
     except PayloadError:
         return None
     value = payload.get("value") if isinstance(payload, dict) else None

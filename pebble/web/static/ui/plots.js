@@ -41,7 +41,7 @@ export function Plots({ at }) {
       />`,
     )}
     <div class="plot-tools">
-      <button type="button" data-test="plots-pause" aria-pressed=${paused} onClick=${() => pause(!paused)}>
+      <button type="button" data-test="plots-pause" onClick=${() => pause(!paused)}>
         <${Icon} name=${paused ? "play" : "halt"} />${paused ? "Go on" : "Pause"}
       </button>
       <${Add} at=${at} metrics=${metrics} added=${added} onAdd=${(plot) => change([...added, plot])} />

@@ -18,9 +18,10 @@ export function recorderOf(page, ref) {
 }
 
 class Recorder {
-  constructor({ store, connection, commands }, ref) {
+  constructor({ store, connection, commands, driver }, ref) {
     this.store = store;
     this.commands = commands;
+    this.driver = driver;
     this.ref = ref;
     /** @type {Map<string, Series>} */
     this.all = new Map();
@@ -51,6 +52,7 @@ class Recorder {
   }
 
   ask() {
+    if (this.driver.ref !== this.ref) return; // another one is open meanwhile
     if (this.commands.askSeries(this.ref)) this.askedAt = this.store.clock();
   }
 

@@ -13,7 +13,8 @@ export function Robot({ at, layout, drawer, onPanel }) {
   const [view] = useState(() => new CardView(at));
   useModel(view);
   const source = useValue(at, "web/picture-from")?.source || at;
-  const hasVideo = offers.hasVideo || source !== at || Boolean(inner(useValue(at, "status"))?.webrtc_url);
+  const status = inner(useValue(at, "status"));
+  const hasVideo = offers.hasVideo || source !== at || Boolean(status?.webrtc_url); // it streams by itself
   const known = useKnown(at);
   const video = useVideo(at, hasVideo && known ? source : "");
   const parts = { at, offers, view, video: hasVideo ? video : null, source };
