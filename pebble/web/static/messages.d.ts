@@ -16,6 +16,7 @@ export interface Echo {
 export interface Watch {
   op: "watch";
   ref: string;
+  series?: boolean;
 }
 
 export interface Lease {
@@ -174,6 +175,7 @@ export interface Series {
   op: "series";
   ref: string;
   metric: string;
+  now: number;
   points: [number, any][];
 }
 
