@@ -20,9 +20,9 @@ from starlette.websockets import WebSocket
 
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
-from pebble.web import login
+from pebble.web import login, robot_streams
 from pebble.web.control import CHECK_S, Control
-from pebble.web.guard import Guard
+from pebble.web.guard import CONTENT_SECURITY_POLICY, Guard
 from pebble.web.messages import EstopOp
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
@@ -81,7 +81,16 @@ async def _page(request: Request) -> Response:
         wanted = request.url.path + ("?watch" if "watch" in request.query_params else "")
         then = "" if wanted == "/" else f"?next={quote(wanted)}"
         return Response(status_code=303, headers={"location": f"/login{then}", **NO_STORE})
-    return _static_of(request).page(request, NO_STORE)
+    return _static_of(request).page(request, {**NO_STORE, **_policy(request)})
+
+
+def _policy(request: Request) -> dict[str, str]:
+    """The page may show the streams of robots in a frame: exactly the origins that they report now."""
+    robots, ref = request.app.state.robots, request.path_params.get("ref", "")
+    allowed = robot_streams.origins(robots, ref, request.url.hostname or "")
+    if not allowed:
+        return {}
+    return {"content-security-policy": f"{CONTENT_SECURITY_POLICY}; frame-src {' '.join(allowed)}"}
 
 
 async def _static(request: Request) -> Response:

@@ -62,6 +62,7 @@ class Control:
         self._why_not = ""  # why this page may not drive at all
         self._reads_logs = False
         self._logs_sent = "", 0  # the origin and number of the last line
+        self._series: deque[str] = deque()  # metrics of the watched component whose past is still to be sent
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
     async def serve(self) -> None:
@@ -170,6 +171,7 @@ class Control:
         match op:
             case m.Echo():
                 self._tab.clock.echo(op.n, op.t, clock())
+                self._post_series()
             case m.DriveOp():
                 self._drive(op)
             case m.StopOp():
@@ -182,6 +184,8 @@ class Control:
                 self._reset(op)
             case m.Watch():
                 self._watch(op.ref)
+                if op.series:
+                    self._series = deque(self._server.robots.recent.metrics(op.ref))
             case m.ReadLogs():
                 self._read_logs(op)
             case m.Lease():
@@ -263,6 +267,7 @@ class Control:
             return
         self._server.robots.watch(self._interest, ref)
         self._reads_logs = False
+        self._series.clear()
         if ref:
             self._server.watch(ref)
         if before:
@@ -305,6 +310,13 @@ class Control:
         self._server.audit.write(what, ref=ref, user=session.user, device=device, address=address, detail=detail)
 
     # -- to the page
+
+    def _post_series(self) -> None:
+        """One at each echo: on a slow connection pings never wait behind more than that."""
+        if self._series:
+            ref, metric = self._interest.watched, self._series.popleft()
+            points = self._server.robots.recent.points(ref, metric, time.monotonic())
+            self._post(m.Series(ref=ref, metric=metric, now=1000 * time.time(), points=points))
 
     def _post(self, message: m.ToPage) -> None:
         self._waiting.append(message)

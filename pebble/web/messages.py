@@ -43,9 +43,13 @@ class Echo(_FromPage, frozen=True, kw_only=True, tag="echo"):
 
 
 class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
-    """The component whose page is open; "" is none. Its further metrics are sent from now on."""
+    """The component whose page is open; "" is none. Its further metrics are sent from now on.
+
+    ``series``: also what the server has of them from before, now; a page that opens plots asks this again.
+    """
 
     ref: Ref
+    series: bool = False
 
 
 class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
@@ -267,6 +271,7 @@ class Series(_ToPage, frozen=True, kw_only=True, tag="series"):
 
     ref: str
     metric: str
+    now: float
     points: tuple[tuple[float, Any], ...]
 
 

@@ -22,6 +22,7 @@ from pebble.contract import (
     SOUNDBOARD_FILES,
     SOUNDBOARD_STATUS,
     TOUCH_SENSORS,
+    VIDEO_OVERLAYS,
     WHEEL_ODOMETRY,
     Channel,
     Kind,
@@ -39,6 +40,9 @@ from pebble.web.robots import WATCHED, Robots, own_topic, section_of
 _KEEP_S = 5.0  # so long they are still received after the last page has closed the component
 _FLAGS_METRIC = "web/flags"
 _STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
+
+#: The component and channel of what a topic carries, where its own name does not tell them.
+_Carried = tuple[str, Channel] | None
 
 #: Channels whose topic capabilities may name, by its section and key there.
 _NAMED: dict[tuple[str, str], Channel] = {
@@ -70,7 +74,7 @@ class OpenComponents:
         self._pages: Counter[str] = Counter()
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
         self._following: set[str] = set()  # components whose task runs
-        self._wanted: dict[str, dict[str, Channel | None]] = {}  # filters, and what else than their own name they carry
+        self._wanted: dict[str, dict[str, _Carried]] = {}  # by component and filter
         self._flags: dict[str, FlagsView] = {}
         broker.on_state(self._forget_flags)
 
@@ -78,6 +82,7 @@ class OpenComponents:
         """A page has opened this component."""
         self._pages[ref] += 1
         self._robots.logs.setdefault(ref, LogLines())
+        self._robots.recent.open(ref)
         self.update(ref)
 
     def close(self, ref: str) -> None:
@@ -112,6 +117,7 @@ class OpenComponents:
                     self._robots.logs.pop(ref, None)
                     self._flags.pop(ref, None)
                     self._robots.remove_server_metric(ref, _FLAGS_METRIC)
+                    self._robots.recent.close(ref)
                     self._subscriptions.pop(ref)
                     return
                 await asyncio.sleep(_STEP_S)
@@ -134,14 +140,14 @@ class OpenComponents:
 
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
         def take(message: Message, now: float) -> None:
-            channel = self._wanted.get(ref, {}).get(filter_)
+            carried = self._wanted.get(ref, {}).get(filter_)
             before = self._robots.aliases(ref)
-            if channel is None:
+            if carried is None:
                 self._robots.receive(message, now)
-            elif channel.kind is Kind.FLAG:
-                self._receive_flag(ref, channel, message)
+            elif carried[1].kind is Kind.FLAG:
+                self._receive_flag(ref, carried[1], message)
             else:
-                self._robots.receive_as(ref, channel.metric, message, now, channel)
+                self._robots.receive_as(carried[0], carried[1].metric, message, now, carried[1])
             if self._robots.aliases(ref) != before:
                 self.update(ref)
 
@@ -166,18 +172,23 @@ class OpenComponents:
             for ref in list(self._flags):
                 self._show_flags(ref, FlagsView())
 
-    def _filters(self, ref: str) -> dict[str, Channel | None]:
-        """Every channel's own topic, its flags, and topics of its own that capabilities and manifests name."""
-        filters: dict[str, Channel | None] = {channel.filter(ref): None for channel in WATCHED}
-        capabilities = self._robots.capabilities(ref)
+    def _filters(self, ref: str) -> dict[str, _Carried]:
+        """Every channel's own topic, its flags, topics that capabilities and manifests name, and overlays of its picture."""
+        filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
         for (section, key), channel in _NAMED.items():
-            topic = section_of(capabilities, section).get(key)
-            if own_topic(ref, topic, Direction.OUTGOING) and str(topic) not in (*filters, channel.topic(ref)):
-                filters[str(topic)] = channel
+            self._add(filters, ref, section, key, channel)
         for metric in self._robots.aliases(ref):
-            filters.setdefault(
-                f"{ref}/{Direction.OUTGOING}/{metric}", Channel(metric=metric, kind=Kind.STREAM, payload=AnyObject)
-            )
+            alias = Channel(metric=metric, kind=Kind.STREAM, payload=AnyObject)
+            filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", (ref, alias))
         for section, (flag, _) in _FLAGS.items():
-            filters[self._robots.topic(ref, section, "flag_topic", flag)] = flag
+            filters[self._robots.topic(ref, section, "flag_topic", flag)] = (ref, flag)
+        source = self._robots.sources.get(ref, ref)
+        filters.setdefault(VIDEO_OVERLAYS.filter(source), None)
+        self._add(filters, source, "video", "overlays_topic", VIDEO_OVERLAYS)
         return filters
+
+    def _add(self, filters: dict[str, _Carried], ref: str, section: str, key: str, channel: Channel) -> None:
+        """The topic that the capabilities name, if it is the component's own."""
+        topic = section_of(self._robots.capabilities(ref), section).get(key)
+        if own_topic(ref, topic, Direction.OUTGOING) and topic != channel.topic(ref):
+            filters.setdefault(str(topic), (ref, channel))

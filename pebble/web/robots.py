@@ -28,6 +28,7 @@ from pebble.contract import (
     ONLINE,
     SOUNDBOARD_FILES,
     STATUS,
+    VIDEO_OVERLAYS,
     Channel,
     Kind,
     channel_of,
@@ -40,6 +41,7 @@ from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.log_lines import LogLines
+from pebble.web.recent import Recent
 from pebble.web.restarts import Restarts
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
@@ -144,6 +146,8 @@ class Robots:
         self.interests: set[Interest] = set()
         self.on_message: list[Callable[[Message, float], None]] = []  # of every component, before it is interpreted
         self.logs: dict[str, LogLines] = {}  # of watched components
+        self.recent = Recent()
+        self.sources: dict[str, str] = {}  # the components whose pictures are shown on the pages of others
         self._server: dict[tuple[str, str], _Value] = {}
         self._bytes = 0
 
@@ -242,6 +246,7 @@ class Robots:
         elif not message.payload:
             self._remove_value(component, metric, message)
         elif self._store(component, metric, channel, message, now):
+            self.recent.receive(ref, metric, message, now)
             self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
@@ -250,6 +255,7 @@ class Robots:
         if component is None:
             return
         self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
+        self.recent.forget(ref)
         for key in [key for key in self._server if key[0] == ref]:
             del self._server[key]
         for interest in self.interests:
@@ -357,9 +363,11 @@ class Robots:
                 interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
-        everybody = everybody or _channel(metric) in FLEET
+        channel = _channel(metric)
+        everybody = everybody or channel in FLEET
         for interest in self.interests:
-            if everybody or interest.watched == ref:
+            drawn = channel is VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
+            if everybody or drawn or interest.watched == ref:
                 interest.dirty.add((ref, metric))
                 interest.notify()
 

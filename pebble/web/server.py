@@ -205,6 +205,10 @@ class Server:
 
     def _show_picture_from(self, ref: str) -> None:
         source = self.people.get(f"picture-from {ref}") or ""
+        self.robots.sources.pop(ref, None)
+        if source:
+            self.robots.sources[ref] = source
+        self.open_components.update(ref)  # what is drawn over the picture comes from there
         self.robots.set_server_metric(ref, "web/picture-from", m.PictureFrom(source=source))
 
     # -- what is open

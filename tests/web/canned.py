@@ -25,7 +25,7 @@ import uvicorn
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
@@ -50,6 +50,8 @@ class State:
     path: str = "/"
     values: Callable[[int], list[Value]] = field(default=lambda _now: [])
     repeated: dict[str, float] = field(default_factory=dict)  # metrics that arrive again and again: seconds between
+    series: Callable[[], dict[tuple[str, str], list[Any]]] = field(default=dict)  # points from before, as in messages.Series
+    frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
     welcome: dict[str, Any] = field(default_factory=dict)  # instead of the usual one's fields
     pictures: bool = True  # whether cameras send any
     freezes: bool = False  # pictures end a moment after the first
@@ -74,6 +76,7 @@ class CannedServer:
                 Route("/login", self._page),
                 Route("/r/{ref:path}", self._page),
                 Route("/static/{version}/{name:path}", self._static),
+                Route("/stream", self._stream),
                 Route("/api/snapshot.jpg", self._snapshot),
                 Route("/api/{name}", self._post, methods=["POST"]),
                 WebSocketRoute("/ws/control", self._control),
@@ -109,7 +112,17 @@ class CannedServer:
     # -- http
 
     async def _page(self, request: Request) -> Response:
-        return self.static.page(request, _headers())
+        headers = _headers()
+        if self.state.frames:
+            headers["content-security-policy"] += f"; frame-src {self._filled(self.state.frames)}"
+        return self.static.page(request, headers)
+
+    async def _stream(self, _request: Request) -> Response:
+        """A page that a robot may show in a frame."""
+        return HTMLResponse("<body style='background: #2a6; color: #fff'>The robot's own stream<script>self.ran = 1</script>")
+
+    def _filled(self, text: str) -> str:
+        return text.replace("{port}", str(self.port))
 
     async def _static(self, request: Request) -> Response:
         return self.static.answer(request, request.path_params["name"], _headers())
@@ -142,6 +155,8 @@ class CannedServer:
                     lines = state.logs(_now())
                     logs = {"op": "logs", "ref": message["ref"], "origin": "canned", "first": 213, "lines": lines}
                     await self._send(websocket, logs)
+                if message["op"] == "watch" and message.get("series"):
+                    await self._send_series(websocket, state, message["ref"])
         except (WebSocketDisconnect, RuntimeError):
             pass
         finally:
@@ -187,9 +202,15 @@ class CannedServer:
             if values:
                 await self._send(websocket, _state(values))
 
+    async def _send_series(self, websocket: WebSocket, state: State, watched: str) -> None:
+        for (ref, metric), points in state.series().items():
+            if ref == watched:
+                series = {"op": "series", "ref": ref, "metric": metric, "now": _now(), "points": points}
+                await self._send(websocket, series)
+
     async def _send(self, websocket: WebSocket, message: dict[str, Any]) -> None:
         if websocket.application_state is WebSocketState.CONNECTED:
-            await websocket.send_text(json.dumps(message))
+            await websocket.send_text(self._filled(json.dumps(message)))
 
     async def _media(self, websocket: WebSocket) -> None:
         await websocket.accept()

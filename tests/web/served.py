@@ -83,6 +83,7 @@ class Page:
         headers = {"cookie": cookie} if cookie else None
         self.state: dict[tuple[str, str], Any] = {}
         self.refused: list[dict[str, Any]] = []
+        self.series: list[dict[str, Any]] = []
         self.welcome: dict[str, Any] = {}
         self.bye: dict[str, Any] = {}
         self.closed = False
@@ -153,6 +154,8 @@ class Page:
                 self.state |= {(ref, metric): value for ref, metric, value, _ in message["set"]}
                 for ref in message["gone"]:
                     self.state = {key: value for key, value in self.state.items() if key[0] != ref}
+            case "series":
+                self.series.append(message)
             case "refused":
                 self.refused.append(message)
             case "welcome":

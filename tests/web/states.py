@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -24,6 +26,8 @@ LIVE = {
     "charging-level": 5.0,
     "online": 1.0,
     "position": 1.0,
+    "wheel-odometry": 0.1,
+    "video-overlays": 0.1,
 }
 VIEWER = {"user": "visitor", "role": "viewer", "rights": []}
 
@@ -267,6 +271,51 @@ def satellite(now: int) -> list[Value]:
     ]
 
 
+def odometry(seconds: float) -> dict[str, Any]:
+    """On a loop of 1.6 m, as the script wheel-odometry publishes it."""
+    angle = seconds / 8
+    value = {
+        "x_mm": 800 * math.sin(angle),
+        "y_mm": 500 * math.sin(2 * angle),
+        "heading_rad": math.atan2(1000 * math.cos(2 * angle), 800 * math.cos(angle)),
+        "distance_mm": 100 * seconds,
+    }
+    return {"value": value, "unit": "mm", "source": "wheel-odometry", "timestamp": seconds}
+
+
+def attitude(now: int) -> dict[str, Any]:
+    """The inertial sensor of a robot that drives on a loop."""
+    payload, seconds = imu(now), now / 1000
+    payload["value"] |= {
+        "gyro_dps": {"x": 2 * math.sin(seconds), "y": math.cos(2 * seconds), "z": 20 * math.sin(seconds / 5)},
+        "orientation_deg": {"roll": 3 * math.sin(seconds / 7), "pitch": -2 * math.cos(seconds / 9)},
+        "accel_norm_g": 1 + 0.05 * math.sin(3 * seconds),
+    }
+    return payload
+
+
+def touch(now: int) -> dict[str, Any]:
+    seconds = now / 1000
+    value = {f"a{pin}": round(500 + 200 * math.sin(seconds / (pin + 2))) for pin in range(3)}
+    return {"value": value, "unit": "adc"}
+
+
+def past() -> dict[tuple[str, str], list[Any]]:
+    """What the server remembers of goob; there was no connection to it for 20 s."""
+    now = time.time()
+
+    def points(made: Callable[[float], Any], every: float, span: float) -> list[Any]:
+        ages = [every * number for number in range(int(span / every), 0, -1)]
+        return [[1000 * age, made(now - age)] for age in ages if not 40 < age < 60]
+
+    return {
+        (GOOB, "charging-level"): points(lambda at: {"value": 7.92 + (now - at) / 4000, "unit": "v"}, 5, 600),
+        (GOOB, "wheel-odometry"): points(odometry, 0.2, 45),
+        (GOOB, "sensors/imu"): points(lambda at: attitude(int(1000 * at)), 0.5, 120),
+        (GOOB, "touch-sensors"): points(lambda at: touch(int(1000 * at)), 0.25, 120),
+    }
+
+
 MINE = at(GOOB, "web/driver", driver("alice", "laptop", you=True))
 DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE, logs=logs)
 #: May restart robots, and is not logged in.
@@ -274,6 +323,27 @@ OPERATING = replace(
     DRIVING,
     welcome={"user": "local", "role": "admin", "rights": ["drive", "people", "reset", "system"], "login": False},
 )
+
+SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
+OVERLAYS = {"source": "apriltag-locations", "shapes": [SQUARE], "labels": [{"marker_id": 7, "center_norm": [0.5, 0.5]}]}
+SENSORS = replace(
+    DRIVING,
+    values=changed(
+        fleet,
+        MINE,
+        lambda now: (GOOB, "sensors/imu", attitude(now), 0),
+        lambda now: (GOOB, "touch-sensors", touch(now), 0),
+        lambda now: (GOOB, "wheel-odometry", odometry(now / 1000), 0),
+    ),
+    series=past,
+)
+STREAM = "http://localhost:{port}"
+
+
+def with_stream(address: str) -> Callable[[int], Value]:
+    """Goob reports a stream of its own."""
+    return lambda now: (GOOB, "status", {"t": now, "value": {"webrtc_url": address}}, 100)
+
 
 STATES: dict[str, State] = {
     "fleet": State("/", changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
@@ -290,6 +360,9 @@ STATES: dict[str, State] = {
     ),
     "watching": State(f"{GOOB_PATH}?watch", changed(fleet, stopped(FRED, "eve on phone")), LIVE),
     "free": State(GOOB_PATH, fleet, LIVE),
+    "odometry": SENSORS,
+    "overlays": replace(DRIVING, values=changed(fleet, MINE, at(GOOB, "video-overlays", OVERLAYS))),
+    "own-stream": replace(DRIVING, values=changed(fleet, MINE, with_stream(f"{STREAM}/stream")), frames=STREAM),
     "taken": State(GOOB_PATH, changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
     "viewer": State(GOOB_PATH, fleet, LIVE, VIEWER),
     "stopped": State(

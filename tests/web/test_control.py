@@ -315,6 +315,55 @@ def test_a_picture_of_another_component_is_remembered(served, page, robot):
     assert until(lambda: page.value(robot.base, "web/picture-from", "source") == other)
 
 
+def test_a_page_that_opens_a_plot_is_sent_what_was_before(served, page, robot):
+    page.send("watch", ref=robot.base)
+
+    def received():
+        robot.publish("sensors/imu", {"value": {"accel_norm_g": 0}})
+        return page.value(robot.base, "sensors/imu")
+
+    assert until(received)
+    for number in range(1, 6):
+        time.sleep(0.2)  # at most 10 a second are remembered
+        robot.publish("sensors/imu", {"value": {"accel_norm_g": number}})
+    robot.publish("charging-level", {"value": 7.9, "unit": "v"})
+    assert until(lambda: page.value(robot.base, "charging-level"))
+    assert page.series == []
+    with served.page() as other:
+        assert other.knows(robot.base)
+        other.send("watch", ref=robot.base, series=True)
+        assert until(lambda: len(other.series) == 2, 3)
+        battery, imu = other.series
+    assert (battery["metric"], imu["metric"]) == ("charging-level", "sensors/imu")
+    assert [value["value"]["accel_norm_g"] for _, value in imu["points"]][-5:] == [1, 2, 3, 4, 5]
+    ages = [age for age, _ in imu["points"]]
+    assert ages == sorted(ages, reverse=True)
+    assert 0 <= ages[-1] < ages[0] < 10_000
+    assert abs(imu["now"] - 1000 * time.time()) < 5000
+
+
+def test_what_is_drawn_over_a_picture_comes_with_it(served, broker, page, robot):
+    with RecordingRobot(broker.port, f"{robot.base}-eye") as eye:
+        assert page.knows(eye.base)
+        page.send("picture-from", ref=robot.base, source=eye.base)
+        page.send("watch", ref=robot.base)
+
+        def drawn():
+            eye.publish("video-overlays", {"shapes": [[[0, 0], [1, 1]]]})
+            eye.publish("sensors/imu", {"value": 1})
+            return page.value(eye.base, "video-overlays")
+
+        assert until(drawn)
+        assert page.value(eye.base, "sensors/imu") is None
+        page.send("picture-from", ref=robot.base, source="")
+        assert until(lambda: page.value(robot.base, "web/picture-from", "source") == "")
+        page.state.pop((eye.base, "video-overlays"))
+        eye.publish("video-overlays", {"shapes": [[[0, 0], [1, 0]]]})
+        eye.publish("charging-level", {"value": 7.0})
+        assert until(lambda: page.value(eye.base, "charging-level"))
+        assert page.value(eye.base, "video-overlays") is None
+
+
 def test_what_was_done_is_in_the_audit(served, page, robot):
     assert page.take(robot.base)
     page.drive(robot.base, 1, z=0.5)

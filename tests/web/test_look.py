@@ -134,6 +134,16 @@ def _on_phone(tab_: str, then: Callable[[Page], None] = _nothing) -> Callable[[P
     return act
 
 
+def _show_card(name: str) -> Callable[[Page], None]:
+    def act(page: Page) -> None:
+        card = page.locator(f"[data-card={name}]")
+        card.scroll_into_view_if_needed()
+        card.evaluate("(card) => scrollTo(0, card.getBoundingClientRect().top + scrollY - 90)")
+        page.wait_for_timeout(1200)  # drawn once a second where less motion is wanted
+
+    return act
+
+
 class Screen(NamedTuple):
     """One picture: a state of the server, and what a person does then."""
 
@@ -175,6 +185,10 @@ SCREENS = [
         for name in STATES
         if not name.startswith("asked")  # below the picture
     ),
+    Screen("plots", "odometry", hold=_show_card("plots"), sizes=("desktop",)),
+    Screen("plots", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("plots")),
+    Screen("map", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("map")),
+    Screen("stream-open", "own-stream", _press("[data-test=open-stream]")),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
     Screen("thumbnails", "fleet", _press(".check")),
     Screen("settings", "driving", _press(".me"), ("desktop",)),

@@ -33,6 +33,7 @@ function join() {
     name: () => String(settings.name).slice(0, 32),
     onLogs: (message) => connection.onLogs?.(message),
     onDone: (message) => answered(message),
+    onSeries: (message) => store.set(message.ref, `web/series/${message.metric}`, message),
     onBye: (message) => {
       connection.bye = message.again ? null : message;
       connection.changed();
@@ -80,6 +81,7 @@ function commands(socket, driver, estop) {
       for (const ref of mine) socket.send({ op: "lease", ref, take: false });
       route.watch(on);
     },
+    askSeries: (ref) => socket.send({ op: "watch", ref, series: true }),
     setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
     setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
     /** @param {string} ref @param {{r: number, g: number, b: number, period?: number}} colour each 0..1; seconds */

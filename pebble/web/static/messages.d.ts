@@ -17,6 +17,7 @@ export interface Echo {
 export interface Watch {
   op: "watch";
   ref: string;
+  series?: boolean;
 }
 
 export interface ReadLogs {
@@ -184,6 +185,7 @@ export interface Series {
   op: "series";
   ref: string;
   metric: string;
+  now: number;
   points: [number, any][];
 }
 

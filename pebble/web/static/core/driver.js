@@ -20,7 +20,7 @@ export class Driver {
     this.gesture = new Gesture((command) => this.socket.send({ op: "drive", ref: this.ref, ...command }));
     this.sliders = { speed: 0.6, turn: 0.6, balance: 0 };
     this.inSight = false; // the driver sees the robot itself
-    /** @type {() => number|null} the age of the picture in ms; null: none is wanted on this page */
+    /** @type {() => number|null} the age of the picture in ms; NaN: unknown; null: none is wanted here */
     this.pictureAge = () => null;
     /** @type {() => boolean} whether what shows the picture and the reasons is not here yet */
     this.loading = () => false;

@@ -53,7 +53,7 @@ export const CARDS = [
     title: "Map",
     icon: "map",
     tab: "sensors",
-    wants: (offers) => offers.section("telemetry").wheel_odometry === true,
+    wants: (offers) => offers.received("wheel-odometry") || offers.received("localization-pose"),
     part: async () => (await import("./map.js")).Odometry,
   },
   {

@@ -6,14 +6,15 @@ import { Boundary, html, useEffect, useMetric, useMetrics, useModel, usePage, us
 import { CardView, Offers } from "./models.js";
 import { Card, Icon, Part } from "./parts.js";
 import { NoCamera, PictureSettings, Stage, useVideo } from "./video.js";
-import { nameOf, typeOf } from "./words.js";
+import { inner, nameOf, typeOf } from "./words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
   const offers = new Offers(at, useValue(at, "capabilities"), useMetrics(at));
   const [view] = useState(() => new CardView(at));
   useModel(view);
   const source = useValue(at, "web/picture-from")?.source || at;
-  const hasVideo = offers.hasVideo || source !== at;
+  const status = inner(useValue(at, "status"));
+  const hasVideo = offers.hasVideo || source !== at || Boolean(status?.webrtc_url); // it streams by itself
   const known = useKnown(at);
   const video = useVideo(at, hasVideo && known ? source : "");
   const parts = { at, offers, view, video: hasVideo ? video : null, source };

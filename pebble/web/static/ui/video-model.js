@@ -27,6 +27,7 @@ export class Video extends Model {
     this.drawnAt = -Infinity;
     this.interval = 0; // ms between pictures
     this.state = null;
+    this.stream = ""; // the address of the robot's own one, while it is shown instead
   }
 
   /** Show pictures of ``ref``; "" none. @param {string} ref */
@@ -84,6 +85,7 @@ export class Video extends Model {
 
   /** How old the picture is in ms: since it was taken, or, if the component's clock is wrong, since it arrived. */
   age() {
+    if (this.stream) return { ms: NaN, since: "unknown" };
     const captured = this.info?.capturedMs;
     if (typeof captured === "number" && captured > 0 && this.clockIsRight) {
       const ms = this.store.now() - captured;

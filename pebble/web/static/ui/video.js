@@ -1,11 +1,19 @@
 // The live picture: how old it is, how it comes, and where from.
 
-import { html, useEffect, useModel, usePage, useRef, useState, useTick, useRefs, useValue } from "./hooks.js";
+import { html, useEffect, useModel, usePage, usePart, useRef, useState, useTick, useRefs, useValue } from "./hooks.js";
 import { Offers } from "./models.js";
 import { Icon, Why } from "./parts.js";
 import { nameOf, span } from "./words.js";
 
 const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
+
+const EXTRAS = async () => (await import("./picture-extras.js")).extras();
+
+/** What belongs to a picture besides it, as soon as it was fetched. @param {any} props */
+function Extra({ part, ...props }) {
+  const { body } = usePart(EXTRAS);
+  return body ? html`<${body[part]} ...${props} />` : null;
+}
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
 export function useVideo(at, source) {
@@ -40,14 +48,16 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   }, []);
   const cover = useCover(control, source);
   const stale = cover !== "";
+  const info = video.stream ? null : video.info;
   video.canvas.setAttribute("role", "img");
   video.canvas.setAttribute("aria-label", `What ${nameOf(source)} sees`);
   return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Live picture">
     <div class="picture">
       <div class="canvas" ref=${place}></div>
+      <${Extra} part="Layer" source=${source} />
       ${cover && html`<p class="cover" data-test="cover">${cover}</p>`}
-      ${video.info && html`<span class="tag tag-how">${howWords(video, useValue(source, "web/picture"))}</span>`}
-      ${video.info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`}>${ageWords(video)}</span>`}
+      ${info && html`<span class="tag tag-how">${howWords(video, useValue(source, "web/picture"))}</span>`}
+      ${info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`}>${ageWords(video)}</span>`}
       ${source !== at && html`<span class="tag tag-from">seen from ${nameOf(source)}</span>`}
     </div>
     ${!immersive &&
@@ -65,6 +75,7 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
           ? "Leave full screen"
           : "Full screen"}
       </button>
+      <${Extra} part="Tools" source=${source} wanted=${control.wanted} />
       ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
     </div>`}
   </section>`;
@@ -80,6 +91,7 @@ function useCover(control, source) {
   const view = useValue(source, "web/picture");
   const online = useValue(source, "web/liveness")?.online;
   if (!control.wanted) return "Video is stopped";
+  if (video.stream) return "";
   const old = video.info ? ` · this picture is ${span(video.age().ms)} old` : "";
   if (!connection.isOpen) return `No connection to the server${old}`;
   if (video.info && !video.isStale) return "";
@@ -117,8 +129,9 @@ export function PictureSettings({ at, source, offers, video }) {
   return html`<div class="picture-settings">
     ${video &&
     html`<button type="button" data-test="video" onClick=${video.toggle}>
-      ${video.wanted ? "Stop video" : "Start video"}
-    </button>`}
+        ${video.wanted ? "Stop video" : "Start video"}
+      </button>
+      <${Extra} part="Tools" source=${source} wanted=${video.wanted} />`}
     <label class="field"
       ><span>Encoding</span>
       <select

@@ -1,0 +1,46 @@
+/** The stream that a robot serves itself: whether its address may be shown in a frame of the page. Pure. */
+
+const KEYS = ["webrtc_url", "webrtcUrl", "url"]; // robots of the original use all of them
+const LONGEST = 500;
+/** The same rule as the server's: what that does not allow, the page's policy refuses. */
+const ADDRESS = /^https?:\/\/([a-z0-9]([a-z0-9.-]{0,252}[a-z0-9])?|\[[0-9a-f:.]{2,45}\])(:[0-9]{1,5})?([/?#][!-~]*)?$/i;
+
+/** @param {any} status payload @returns {string} the address that it reports; "" none */
+export function reported(status) {
+  const value = status?.value;
+  if (typeof value !== "object" || value === null) return "";
+  const key = KEYS.find((one) => value[one]);
+  return key && typeof value[key] === "string" ? value[key] : "";
+}
+
+/**
+ * Why this address is not shown, for people; "" it may be. Browsers send cookies to every port of a host: hence none of
+ * the page's own.
+ * @param {string} address @param {{protocol: string, hostname: string}} page its location
+ */
+export function refusal(address, page) {
+  const url = parsed(address);
+  if (!url || url.username || url.password || url.port === "0") {
+    return "The robot reports an address that is not shown: only http and https are, without a login";
+  }
+  if (bare(url.hostname) === bare(page.hostname)) {
+    return "The robot reports an address on this page's own host, to which browsers would send your login";
+  }
+  if (page.protocol === "https:" && url.protocol === "http:" && !isLoopback(url.hostname)) return MIXED;
+  return "";
+}
+
+export const MIXED = "This page came by https; browsers show no stream in it that comes by http";
+
+/** @param {string} address @returns {URL | null} */
+function parsed(address) {
+  if (address.length > LONGEST || !ADDRESS.test(address)) return null;
+  try {
+    return new URL(address);
+  } catch {
+    return null; // a port above 65535, for example
+  }
+}
+
+const bare = (host) => host.toLowerCase().replace(/\.$/, "");
+const isLoopback = (host) => host === "localhost" || host === "127.0.0.1" || host === "[::1]";

@@ -1,0 +1,218 @@
+// Where a component was and is, by its odometry: a trail over a grid.
+
+import { differs, pieces, poseOf } from "../core/trail.js";
+import { fetchStyle, html, useEffect, useMetrics, usePage, usePart, useRef, useState, useTick } from "./hooks.js";
+import { recorderOf } from "./recorder.js";
+import { number } from "./words.js";
+
+const LIMITS = { spanMs: 3_600_000, most: 4000, differs };
+const SOURCES = { "wheel-odometry": "by its wheels", "localization-pose": "in its map" };
+const STEP_MS = 100; // between two drawings
+const WORDS_MS = 500;
+const ZOOM = { start: 120, least: 2, most: 1200 }; // pixels per metre
+const GRIDS = [0.5, 1, 5, 10, 50, 100, 500]; // metres
+const GRID_PIXELS = 24; // lines are not nearer
+
+const STYLE = async () => {
+  await fetchStyle("map.css");
+  return Trail;
+};
+
+export function Odometry({ at }) {
+  const { body, failed } = usePart(STYLE);
+  if (failed) return html`<p class="failed" role="alert">The style of the map could not be fetched.</p>`;
+  return body ? html`<${body} at=${at} />` : html`<p class="dim">Loading…</p>`;
+}
+
+function Trail({ at }) {
+  const page = usePage();
+  const metrics = useMetrics(at);
+  const sources = Object.keys(SOURCES).filter((one) => metrics.includes(one));
+  const [chosen, choose] = useState("");
+  const source = sources.includes(chosen) ? chosen : (sources[0] ?? "wheel-odometry");
+  const series = recorderOf(page, at).follow("poses", source, poseOf, LIMITS);
+  const canvas = useRef(null);
+  const view = useRef(/** @type {View | null} */ (null));
+  useEffect(() => {
+    const own = (view.current = new View(canvas.current, series));
+    return () => own.close();
+  }, [series]);
+  useTick(WORDS_MS);
+  return html`<div class="map">
+    <canvas ref=${canvas} class="map-canvas" role="img" aria-label="Trail of the odometry" data-test="map"></canvas>
+    <p class="map-words" data-test="map-pose">${poseWords(series.newest)}</p>
+    <div class="map-tools">
+      <button type="button" data-test="map-in" aria-label="Zoom in" onClick=${() => view.current?.zoom(1.5)}>+</button>
+      <button type="button" data-test="map-out" aria-label="Zoom out" onClick=${() => view.current?.zoom(1 / 1.5)}>−</button>
+      <button type="button" data-test="map-centre" onClick=${() => view.current?.follow()}>Centre</button>
+      <button type="button" data-test="map-clear" onClick=${() => series.clear(page.store.clock())}>Clear trail</button>
+      ${sources.length > 1 &&
+      html`<label class="field"
+        ><span>Position</span
+        ><select data-test="map-source" value=${source} onChange=${(event) => choose(event.currentTarget.value)}>
+          ${sources.map((one) => html`<option key=${one} value=${one}>${SOURCES[one]}</option>`)}
+        </select></label
+      >`}
+    </div>
+  </div>`;
+}
+
+function poseWords(pose) {
+  if (!pose) return "No position was received yet.";
+  const degrees = ((pose.heading * 180) / Math.PI).toFixed(0);
+  return `x ${number(pose.x, 2)} m · y ${number(pose.y, 2)} m · heading ${degrees}°`;
+}
+
+/** The drawing, and how it is moved: by buttons, mouse and two fingers; one finger scrolls the page. */
+class View {
+  /** @param {HTMLCanvasElement} canvas @param {import("../core/series.js").Series} series */
+  constructor(canvas, series) {
+    this.canvas = canvas;
+    this.series = series;
+    this.scale = ZOOM.start;
+    /** @type {{x: number, y: number} | null} what is in the middle; null: the component */
+    this.middle = null;
+    this.drawn = "";
+    this.seen = true;
+    this.timer = setInterval(() => this.seen && !document.hidden && this.draw(), STEP_MS);
+    this.sizes = new ResizeObserver(() => this.draw());
+    this.sizes.observe(canvas);
+    this.sight = new IntersectionObserver((entries) => (this.seen = entries[entries.length - 1].isIntersecting));
+    this.sight.observe(canvas);
+    this.listen();
+  }
+
+  close() {
+    clearInterval(this.timer);
+    this.sizes.disconnect();
+    this.sight.disconnect();
+    this.abort.abort();
+  }
+
+  /** Keep the component in the middle. */
+  follow() {
+    this.middle = null;
+    this.draw();
+  }
+
+  /** @param {number} factor */
+  zoom(factor) {
+    this.scale = Math.min(ZOOM.most, Math.max(ZOOM.least, this.scale * factor));
+    this.draw();
+  }
+
+  /** @param {number} dx @param {number} dy pixels */
+  move(dx, dy) {
+    const { x, y } = this.centre;
+    this.middle = { x: x - dx / this.scale, y: y + dy / this.scale };
+    this.draw();
+  }
+
+  get centre() {
+    return this.middle ?? this.series.newest ?? { x: 0, y: 0 };
+  }
+
+  listen() {
+    this.abort = new AbortController();
+    const on = (name, fn) => this.canvas.addEventListener(name, fn, { passive: false, signal: this.abort.signal });
+    on("wheel", (event) => {
+      if (!event.ctrlKey && !event.metaKey) return; // the page scrolls; a pinch on a trackpad comes with ctrlKey
+      event.preventDefault();
+      this.zoom(2 ** (-event.deltaY / 200));
+    });
+    let mouse = { x: 0, y: 0 };
+    on("pointerdown", (event) => {
+      mouse = { x: event.clientX, y: event.clientY };
+      if (event.pointerType === "mouse") this.canvas.setPointerCapture(event.pointerId);
+    });
+    on("pointermove", (event) => {
+      if (event.pointerType !== "mouse" || !(event.buttons & 1)) return;
+      this.move(event.clientX - mouse.x, event.clientY - mouse.y);
+      mouse = { x: event.clientX, y: event.clientY };
+    });
+    /** @type {{x: number, y: number, apart: number} | null} */
+    let before = null;
+    const touch = (event) => {
+      before = event.touches.length === 2 ? fingers(event.touches) : null;
+      if (before) event.preventDefault();
+    };
+    for (const name of ["touchstart", "touchend", "touchcancel"]) on(name, touch);
+    on("touchmove", (event) => {
+      if (!before || event.touches.length !== 2) return;
+      event.preventDefault();
+      const now = fingers(event.touches);
+      this.move(now.x - before.x, now.y - before.y);
+      this.zoom(now.apart / before.apart);
+      before = now;
+    });
+  }
+
+  draw() {
+    const { canvas, series } = this;
+    const { width, height } = canvas.getBoundingClientRect();
+    const pixels = devicePixelRatio || 1;
+    const style = getComputedStyle(canvas);
+    const colours = ["--line", "--edge", "--accent", "--dim", "--fg"].map((name) => style.getPropertyValue(name).trim());
+    const { x, y } = this.centre;
+    canvas.dataset.scale = String(this.scale); // for tests
+    const drawn = JSON.stringify([series.version, this.scale, x, y, width, height, pixels, colours]);
+    if (drawn === this.drawn || width < 2) return;
+    this.drawn = drawn;
+    const [line, edge, accent, dim, ink] = colours;
+    Object.assign(canvas, { width: Math.round(width * pixels), height: Math.round(height * pixels) });
+    const context = canvas.getContext("2d");
+    context.scale(pixels, pixels);
+    const place = (pose) => [width / 2 + (pose.x - x) * this.scale, height / 2 - (pose.y - y) * this.scale];
+    this.drawGrid(context, { width, height, x, y, line, edge, dim });
+    context.lineWidth = 2.5;
+    context.lineJoin = "round";
+    context.strokeStyle = accent;
+    for (const piece of pieces(series.times, series.rows)) {
+      context.beginPath();
+      for (const pose of piece) context.lineTo(...place(pose));
+      context.stroke();
+    }
+    if (series.newest) drawArrow(context, place(series.newest), series.newest.heading, ink, accent);
+  }
+
+  drawGrid(context, { width, height, x, y, line, edge, dim }) {
+    const step = GRIDS.find((one) => one * this.scale >= GRID_PIXELS) ?? GRIDS[GRIDS.length - 1];
+    const draw = (index, vertical) => {
+      const at = index * step;
+      const place = vertical ? width / 2 + (at - x) * this.scale : height / 2 - (at - y) * this.scale;
+      context.strokeStyle = index === 0 ? edge : line; // the axes
+      context.beginPath();
+      context.moveTo(vertical ? place : 0, vertical ? 0 : place);
+      context.lineTo(vertical ? place : width, vertical ? height : place);
+      context.stroke();
+    };
+    context.lineWidth = 1;
+    const half = { x: width / 2 / this.scale, y: height / 2 / this.scale };
+    for (let i = Math.ceil((x - half.x) / step); i <= (x + half.x) / step; i++) draw(i, true);
+    for (let i = Math.ceil((y - half.y) / step); i <= (y + half.y) / step; i++) draw(i, false);
+    context.fillStyle = dim;
+    context.font = "12px system-ui, sans-serif";
+    context.fillText(`grid ${step} m`, 8, height - 8);
+  }
+}
+
+function drawArrow(context, [x, y], heading, ink, fill) {
+  context.save();
+  context.translate(x, y);
+  context.rotate(-heading);
+  context.beginPath();
+  for (const [forward, left] of [[13, 0], [-9, 8], [-5, 0], [-9, -8]]) context.lineTo(forward, -left);
+  context.closePath();
+  context.fillStyle = fill;
+  context.strokeStyle = ink;
+  context.lineWidth = 1.5;
+  context.fill();
+  context.stroke();
+  context.restore();
+}
+
+/** Middle and distance of two fingers. @param {TouchList} touches */
+function fingers([a, b]) {
+  const apart = Math.max(1, Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY));
+  return { x: (a.clientX + b.clientX) / 2, y: (a.clientY + b.clientY) / 2, apart };
+}

@@ -1,0 +1,103 @@
+"""The server's memory of what pages plot: thinned, bounded, and small enough for one message."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import msgspec
+
+from pebble.transports import Message
+from pebble.web import messages as m
+from pebble.web import recent as module
+from pebble.web.recent import LIMITS, MESSAGE_BYTES, Recent
+from pebble.web.server import encode
+
+REF = "pebble/robots/goob"
+IMU, TOUCH, BATTERY, ODOMETRY = "sensors/imu", "touch-sensors", "charging-level", "wheel-odometry"
+
+
+def message(value: Any, *, retain: bool = False) -> Message:
+    return Message("topic", value if isinstance(value, bytes) else json.dumps(value).encode(), retain=retain)
+
+
+def filled(metric: str, period_s: float, count: int, *, ref: str = REF, recent: Recent | None = None) -> Recent:
+    """With the numbers 0, 1, 2 … at their times; the component is open."""
+    recent = recent or Recent()
+    recent.open(ref)
+    for number in range(count):
+        recent.receive(ref, metric, message(number), number * period_s)
+    return recent
+
+
+def values(recent: Recent, metric: str, now: float, ref: str = REF) -> list[tuple[float, int]]:
+    return [(age, msgspec.json.decode(value)) for age, value in recent.points(ref, metric, now)]
+
+
+def test_values_have_their_age() -> None:
+    assert values(filled(IMU, 0.2, 3), IMU, 1.0) == [(1000, 0), (800, 1), (600, 2)]
+
+
+def test_what_is_too_old_is_left_out() -> None:
+    assert [number for _, number in values(filled(IMU, 10, 20), IMU, 190)] == list(range(7, 20))
+
+
+def test_fast_ones_are_thinned_to_their_rate() -> None:
+    shown = values(filled(TOUCH, 0.02, 500), TOUCH, 10)  # 50 Hz for 10 s, at most 20 are remembered
+    assert 195 <= len(shown) <= 202
+    shown = values(filled(ODOMETRY, 0.05, 200), ODOMETRY, 10)
+    assert 98 <= len(shown) <= 102
+
+
+def test_only_the_battery_of_components_that_are_not_open() -> None:
+    recent = Recent()
+    for metric in (IMU, BATTERY, "status"):
+        recent.receive(REF, metric, message(1), 0)
+    assert recent.metrics(REF) == [BATTERY]
+
+
+def test_a_component_that_is_closed_or_removed_takes_no_room() -> None:
+    recent = filled(IMU, 0.2, 10)
+    recent.receive(REF, BATTERY, message(1), 0)
+    recent.close(REF)
+    assert recent.metrics(REF) == [BATTERY]
+    recent.forget(REF)
+    assert recent.bytes == 0
+
+
+def test_retained_and_long_values_are_left_out() -> None:
+    recent = Recent()
+    recent.receive(REF, BATTERY, message(1, retain=True), 0)
+    recent.receive(REF, BATTERY, message(b"1" * 2049), 0)
+    assert recent.metrics(REF) == []
+
+
+def test_each_metric_fits_into_one_message_evenly() -> None:
+    recent = Recent()
+    recent.open(REF)
+    for number in range(600):
+        recent.receive(REF, IMU, message({"n": number, "text": "x" * (40 + 400 * (number % 3 == 0))}), number * 0.2)
+    points = recent.points(REF, IMU, 120)
+    text = encode(m.Series(ref=REF, metric=IMU, now=0, points=points))
+    assert len(text) < MESSAGE_BYTES + 500
+    numbers = [json.loads(bytes(value))["n"] for _, value in points]
+    assert numbers[-1] == 599
+    steps = {b - a for a, b in zip(numbers, numbers[1:], strict=False)}
+    assert len(steps) == 1
+    assert len(numbers) > 40
+
+
+def test_all_of_them_are_bounded_in_bytes() -> None:
+    recent = Recent()
+    value = message(b'"' + b"x" * 2000 + b'"')
+    for number in range(200):
+        for metric in LIMITS:
+            recent.open(f"a/b/{number}")
+            for at in range(0, 120):
+                recent.receive(f"a/b/{number}", metric, value, float(at))
+    assert recent.bytes <= module.MAX_BYTES
+    held = sum(len(bytes(one)) for ring in recent._rings.values() for _, one in ring.points)
+    assert held < module.MAX_BYTES
+    for number in range(200):
+        recent.forget(f"a/b/{number}")
+    assert recent.bytes == 0

@@ -1,0 +1,180 @@
+"""The streams that robots serve themselves: only the origins that they report may be shown, and none by a trick.
+
+What the server allows is in the policy of the page; the page checks each address again.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from pebble.web.guard import CONTENT_SECURITY_POLICY
+from pebble.web.robot_streams import MAX_ORIGINS, origin
+from tests.support import ROOT, Broker, until
+from tests.web.served import RecordingRobot, Served
+
+STREAM = ROOT / "pebble" / "web" / "static" / "core" / "stream.js"
+HOST = "pebble.local"
+
+GOOD = {
+    "http://pitcam.local:8889/cam": "http://pitcam.local:8889",
+    "https://pitcam.local/cam/?controls=false#top": "https://pitcam.local",
+    "HTTP://PitCam.Local": "http://pitcam.local",
+    "http://10.0.0.7:8889": "http://10.0.0.7:8889",
+    "http://[fe80::1]:8889/cam": "http://[fe80::1]:8889",
+    "http://a.b/@c": "http://a.b",
+}
+BAD = [
+    "javascript:alert(1)",
+    "JavaScript:alert(1)//http://a.b",
+    "data:text/html,<script>alert(1)</script>",
+    "blob:http://a.b/1",
+    "file:///etc/passwd",
+    "ftp://a.b/",
+    "//a.b/cam",
+    "/cam",
+    "",
+    "http://",
+    "http:///a.b",
+    "http:a.b",
+    "http://user:secret@a.b/",
+    "http://user@a.b/",
+    "http://@a.b/",
+    "http://pebble.local:80@evil.test/",
+    "http://a.b\\@evil.test/",
+    "http://a.b:8889\\@evil.test/",
+    "http://a.b:/",
+    "http://a.b:0/",
+    "http://a.b:65536/",
+    "http://a.b:8889:80/",
+    "http://a.b:8889evil/",
+    "http://*/",
+    "http://*.b/",
+    "http://a.b; script-src *",
+    "http://a.b;script-src/",
+    "http://a.b,c/",
+    "http://a b/",
+    " http://a.b/",
+    "http://a.b/ x",
+    "http://a.b/\nx",
+    "http://a.b\r\nset-cookie:x",
+    "http://a.b/\u00e9",
+    "http://\u0430.b/",
+    "http://a'b/",
+    "http://[::1",
+    "http://a_b/",
+    "http://-a.b/",
+    "http://a.b/" + "x" * 500,
+    # the page's own host, on any port: browsers send its cookies there as well
+    "http://pebble.local/",
+    "http://pebble.local:8889/cam",
+    "https://PEBBLE.LOCAL:1/",
+    "http://pebble.local./",
+]
+
+
+@pytest.mark.parametrize("url", GOOD)
+def test_an_origin_is_scheme_host_and_port(url: str) -> None:
+    assert origin(url, HOST) == GOOD[url]
+
+
+@pytest.mark.parametrize("url", BAD)
+def test_tricks_are_no_origin(url: str) -> None:
+    assert origin(url, HOST) == ""
+
+
+@pytest.mark.parametrize("value", [None, 7, True, {"url": "http://a.b"}, ["http://a.b"]])
+def test_what_is_no_text_is_no_origin(value: object) -> None:
+    assert origin(value, HOST) == ""
+
+
+def test_the_page_refuses_the_same() -> None:
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    addresses = [*GOOD, *BAD, "http://0x7f.1:8889/", "http://2130706433/", "http://127.1/"]
+    program = f"""
+    import {{ refusal, reported }} from {json.dumps(STREAM.as_uri())};
+    const page = {{ protocol: "http:", hostname: {json.dumps(HOST)} }};
+    const own = {{ protocol: "http:", hostname: "127.0.0.1" }};
+    const secure = {{ protocol: "https:", hostname: {json.dumps(HOST)} }};
+    const addresses = {json.dumps(addresses)};
+    const status = [{{ value: {{ webrtc_url: "a" }} }}, {{ value: {{ webrtcUrl: "a" }} }}, {{ value: {{ url: "a" }} }},
+      {{ value: {{ url: 7 }} }}, {{ value: null }}, {{ value: [] }}, null, 7, undefined];
+    console.log(JSON.stringify({{
+      shown: addresses.filter((one) => !refusal(one, page)),
+      own: addresses.slice(-3).filter((one) => !refusal(one, own)),
+      secure: addresses.filter((one) => !refusal(one, secure)),
+      reported: status.map(reported),
+    }}));"""
+    done = subprocess.run(["node", "--input-type=module", "-e", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["shown"][: len(GOOD)] == list(GOOD)
+    assert set(found["shown"][len(GOOD) :]) <= set(addresses[-3:])
+    assert found["own"] == []
+    assert found["secure"] == [url for url in GOOD if url.startswith("https")]
+    assert found["reported"] == ["a", "a", "a", "", "", "", "", "", ""]
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[RecordingRobot]:
+    with RecordingRobot(broker.port, "pebble/robots/pitcam") as one:
+        yield one
+        one.publish("status", {"value": {}}, retain=True)
+
+
+def policy(served: Served, path: str = "/", host: str = "127.0.0.1") -> str:
+    found: str = httpx.get(f"http://{host}:{served.port}{path}").headers["content-security-policy"]
+    return found
+
+
+def report(served: Served, robot: RecordingRobot, url: object, key: str = "webrtc_url") -> None:
+    """Publish it, and wait until the server has it."""
+    robot.publish("status", {"t": 1, "value": {key: url}}, retain=True)
+    robots = served.app.state.robots
+    assert until(lambda: json.dumps(url).encode() in bytes(robots.value(robot.base, "status") or b"").replace(b" ", b""))
+
+
+@pytest.mark.parametrize("key", ["webrtc_url", "webrtcUrl", "url"])
+def test_the_page_may_show_exactly_what_robots_report(served: Served, robot: RecordingRobot, key: str) -> None:
+    assert policy(served) == CONTENT_SECURITY_POLICY
+    report(served, robot, "http://pitcam.local:8889/cam", key)
+    for path in ("/", f"/r/{robot.base}", "/r/pebble/robots/other"):
+        assert policy(served, path) == f"{CONTENT_SECURITY_POLICY}; frame-src http://pitcam.local:8889"
+    assert policy(served, "/login") == CONTENT_SECURITY_POLICY
+    report(served, robot, "https://pitcam.local/")
+    assert policy(served) == f"{CONTENT_SECURITY_POLICY}; frame-src https://pitcam.local"
+
+
+@pytest.mark.parametrize("url", ["javascript:alert(1)", "http://a.b; script-src *", "http://u:p@a.b/", 7, ["x"]])
+def test_what_may_not_be_shown_changes_no_policy(served: Served, robot: RecordingRobot, url: object) -> None:
+    report(served, robot, url)
+    assert policy(served) == policy(served, f"/r/{robot.base}") == CONTENT_SECURITY_POLICY
+
+
+def test_the_own_host_is_refused_by_whichever_name_the_page_was_opened(served: Served, robot: RecordingRobot) -> None:
+    report(served, robot, "http://localhost:8889/cam")
+    assert "frame-src http://localhost:8889" in policy(served)
+    assert policy(served, host="localhost") == CONTENT_SECURITY_POLICY
+
+
+def test_the_open_robot_comes_first_and_the_header_stays_short(
+    served: Served, broker: Broker, robot: RecordingRobot
+) -> None:
+    robots = [RecordingRobot(broker.port, f"pebble/robots/cam{number}") for number in range(MAX_ORIGINS + 2)]
+    try:
+        for number, one in enumerate(robots):
+            report(served, one, f"http://cam{number}.local/")
+        last = robots[-1]
+        listed = policy(served, f"/r/{last.base}").partition("frame-src ")[2].split()
+        assert listed[0] == f"http://cam{len(robots) - 1}.local"
+        assert len(listed) == len(set(listed)) == MAX_ORIGINS
+    finally:
+        for one in robots:
+            one.publish("status", {"value": {}}, retain=True)
+            one.close()
