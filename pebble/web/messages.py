@@ -262,6 +262,14 @@ class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
     again: bool
 
 
+class TalkAnswer(Struct, frozen=True, kw_only=True):
+    """On the sound socket, as text: whether the page's talk of that number lasts. One that is over never goes on."""
+
+    talk: int
+    on: bool
+    why: str = ""  # it is not, for people
+
+
 ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Series | Bye
 
 
@@ -327,6 +335,17 @@ class PictureView(Struct, frozen=True, kw_only=True):
     pinned: str
 
 
+class SoundView(Struct, frozen=True, kw_only=True):
+    """``web/sound``: the sound of a component, as it comes from it, and who talks to it."""
+
+    state: str  # "rest", "starting", "flowing", "silent" or "refused"
+    why: str
+    encoding: str
+    kbits: float
+    listeners: int
+    talker: str  # "": nobody
+
+
 class BrokerView(Struct, frozen=True, kw_only=True):
     """``web/broker`` of ref "": the server's connection to the broker."""
 
@@ -354,6 +373,7 @@ SERVER_METRICS: dict[str, type] = {
     "web/estop": EstopView,
     "web/driver": DriverView,
     "web/picture": PictureView,
+    "web/sound": SoundView,
     "web/picture-from": PictureFrom,
     "web/flags": FlagsView,
     "web/broker": BrokerView,

@@ -9,6 +9,9 @@ import { Telemetry } from "./telemetry.js";
  *   part: () => Promise<any>}} CardKind
  */
 
+/** Listening and talking; a desktop has them below the picture. */
+export const VOICE = async () => (await import("./sound.js")).load();
+
 /** @type {CardKind[]} */
 export const CARDS = [
   { id: "telemetry", title: "Telemetry", icon: "gauge", tab: "sensors", wants: () => true, part: async () => Telemetry },
@@ -19,6 +22,14 @@ export const CARDS = [
     tab: "more",
     wants: (offers) => offers.hasLights,
     part: async () => (await import("./lights.js")).Lights,
+  },
+  {
+    id: "voice",
+    title: "Listen and talk",
+    icon: "mic",
+    tab: "sound",
+    wants: (offers) => offers.has("audio"),
+    part: VOICE,
   },
   {
     id: "sounds",
