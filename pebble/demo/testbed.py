@@ -152,6 +152,7 @@ class LinuxRobot(SimulatedRobot):
         config["local_mqtt"] = {"host": "127.0.0.1", "port": local_port}
         services = config["services"]
         services["mqtt_bridge"]["remote_mqtt"] = {"host": "127.0.0.1", "port": remote_port}
+        services["mqtt_bridge"].setdefault("media", {})["audio_receiver"] = {"command": self._loudspeaker()}
         services["serial_mcu_bridge"]["serial"]["port"] = str(self._port)
         if self.has_imu:
             services["serial_mcu_bridge"]["instances"]["imu"]["serial"]["port"] = str(self._imu_port)
@@ -161,6 +162,15 @@ class LinuxRobot(SimulatedRobot):
             "audio": {"source": "synthetic"},
         }
         return config
+
+    @property
+    def voice(self) -> Path:
+        """Where its loudspeaker records what it plays of operators' voices; see pebble.simulation.loudspeaker."""
+        return self._folder / "voice"
+
+    def _loudspeaker(self) -> list[str]:
+        raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
+        return [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self.voice), *raw]
 
 
 class RoomRobot(LinuxRobot):

@@ -46,6 +46,14 @@ def _drive(page: Page) -> None:
     page.keyboard.down("KeyD")
 
 
+def _listen(page: Page) -> None:
+    tab_of_sound = page.locator("[data-test=tab-sound]")
+    if tab_of_sound.count():
+        tab_of_sound.click()
+    page.locator("[data-test=listen]").click()
+    page.locator("[data-test=sound-state]", has_text="buffered").wait_for()
+
+
 class Screen(NamedTuple):
     """One picture: a state of the server, and what a person does then."""
 
@@ -75,6 +83,8 @@ WHEN = {
     "silent": "goob is silent since",
     "old-picture": "The picture is ",
     "no-picture": "There is no picture yet",
+    "listening": "Listen",
+    "no-sound": "Listen",
     "old-page": "older than the server",
     "plain-http": "not encrypted",
     "tower": "pbvz 640×360",
@@ -85,13 +95,15 @@ SCREENS = [
         Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
         for name in STATES
     ),
+    Screen("listening-now", "listening", _listen),
+    Screen("sound", "no-sound", _press("[data-test=tab-sound]"), ("phone",)),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
     Screen("thumbnails", "fleet", _press(".check")),
     Screen("settings", "driving", _press(".me"), ("desktop",)),
     Screen("reset-asked", "stopped", _press(".banner-actions button")),
-    Screen("sensors", "driving", _press(".tabs button:nth-child(2)"), ("phone",)),
-    Screen("more", "driving", _press(".tabs button:nth-child(3)"), ("phone",)),
-    Screen("settings", "driving", _press(".tabs button:nth-child(3)", ".wide"), ("phone",)),
+    Screen("sensors", "driving", _press("[data-test=tab-sensors]"), ("phone",)),
+    Screen("more", "driving", _press("[data-test=tab-more]"), ("phone",)),
+    Screen("settings", "driving", _press("[data-test=tab-more]", ".wide"), ("phone",)),
     Screen("drawer", "driving", _press(".round"), ("landscape",)),
     Screen("small", "driving", sizes=("small",)),
 ]
