@@ -341,7 +341,6 @@ class SoundView(Struct, frozen=True, kw_only=True):
     state: str  # "rest", "starting", "flowing", "silent" or "refused"
     why: str
     encoding: str
-    kbits: float
     listeners: int
     talker: str  # "": nobody
 

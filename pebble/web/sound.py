@@ -181,12 +181,11 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
     def _listening(self) -> list[frozenset[str]]:
         return [viewer.can for viewer in self.viewers if viewer.can]
 
-    def _make_view(self, state: str, why: str, _rate: float, kbits: float) -> SoundView:
+    def _make_view(self, state: str, why: str, _rate: float, _kbits: float) -> SoundView:
         return SoundView(
             state=state,
             why=why,
             encoding=self._encoding,
-            kbits=kbits,
             listeners=len(self._listening()),
             talker="" if self._talker is None else self._talker.session.user,
         )
@@ -235,7 +234,7 @@ def best(offered: tuple[str, ...], listeners: list[frozenset[str]]) -> str | Non
 
 def rest() -> SoundView:
     """What is shown of a robot whose sound no page uses."""
-    return SoundView(state="rest", why="", encoding="", kbits=0, listeners=0, talker="")
+    return SoundView(state="rest", why="", encoding="", listeners=0, talker="")
 
 
 def _encoding(payload: bytes) -> str:

@@ -86,7 +86,7 @@ def flow(state: str = "flowing", why: str = "") -> dict[str, Any]:
 
 
 def sound(state: str = "rest", why: str = "", *, talker: str = "") -> dict[str, Any]:
-    return {"state": state, "why": why, "encoding": "pcm", "kbits": 266.0, "listeners": 1, "talker": talker}
+    return {"state": state, "why": why, "encoding": "pcm", "listeners": 1, "talker": talker}
 
 
 def imu(now: int) -> dict[str, Any]:

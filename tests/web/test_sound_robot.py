@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,23 +22,17 @@ from pebble.simulation.loudspeaker import playbacks
 from pebble.transports import Message, MqttSettings, create
 from tests.support import until
 from tests.web.browser import chromium, tab
+from tests.web.ears import TAP, at_rate, compared, fake_microphone, likeness, listener, recorded, state, talks, write_voice
 from tests.web.stage import Stage
-from tests.web.test_sound_page import (
-    HEARD,
-    RATE,
-    TAP,
-    compared,
-    fake_microphone,
-    likeness,
-    listener,
-    state,
-    talks,
-    voice,
-)
 
 pytestmark = pytest.mark.alone
 
-__all__ = ["voice"]
+
+@pytest.fixture(scope="module")
+def voice(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("voice") / "voice.wav"
+    write_voice(path)
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +52,7 @@ def played(stage: Stage) -> np.ndarray[Any, Any]:
     robot = stage.robots["goob"]
     assert isinstance(robot, LinuxRobot)
     pcm = b"".join(one.frames() for one in playbacks(robot.voice))
-    return Resampler(RATE, 48_000, 1).feed(np.frombuffer(pcm, "<i2")[:, None])[:, 0].astype(float)
+    return at_rate(np.frombuffer(pcm, "<i2"), 48_000)
 
 
 def test_a_robot_is_heard_and_plays_the_voice(goob: Stage, browser: Browser):
@@ -105,7 +98,7 @@ TIMES = """() => {
 @pytest.mark.thorough
 def test_mouth_to_ear_is_short_and_the_flag_is_down_afterwards(goob: Stage, browser: Browser):
     ears = Ears(goob)
-    with tab(browser, goob.robot_url("goob")) as opened, listener(goob, "pcm"):
+    with tab(browser, goob.robot_url("goob")) as opened, listener(goob.url.rstrip("/"), "pcm"):
         opened.test("listen").click()
         assert opened.until(lambda: "ms buffered · pcm" in state(opened), 20)
         opened.page.wait_for_timeout(2000)
@@ -121,7 +114,7 @@ def test_mouth_to_ear_is_short_and_the_flag_is_down_afterwards(goob: Stage, brow
 def mouth_to_ear(page: Page, packets: list[Sound]) -> list[float]:
     """Milliseconds from the capture of each half second to when it was heard."""
     rate = int(page.evaluate("pebble.sound.model.context.sampleRate"))
-    heard = np.frombuffer(base64.b64decode(page.evaluate(HEARD)), "<i2").astype(float)
+    heard = recorded(page)
     first_s = float(page.evaluate("heardAt[0]"))
     now: dict[str, float] = page.evaluate(TIMES)
     delays = []
@@ -171,8 +164,7 @@ def test_sound_through_a_slow_and_lossy_network(far: Rig):
     page.evaluate(TAP)
     far.pause(page, 8)
     rate = int(page.evaluate("pebble.sound.model.context.sampleRate"))
-    heard = np.frombuffer(base64.b64decode(page.evaluate(HEARD)), "<i2").astype(float)
-    assert compared(heard, rate, envelopes=True) > 0.9
+    assert compared(recorded(page), rate, envelopes=True) > 0.9
     page.locator("[data-test=talk]").hover()
     page.mouse.down()
     far.until(page, lambda: len(played(far.stage)) > 5 * 48_000, lambda: shown.inner_text(), 40)

@@ -35,9 +35,14 @@ export class OpusDecoder {
     const decoder = (this.decoder ??= this.open(sound.channels));
     const packets = split(sound.body);
     this.pending.push({ sound, left: packets.length, parts: [], rate: 0 });
-    for (const data of packets) {
-      decoder.decode(new EncodedAudioChunk({ type: "key", timestamp: this.at, data }));
-      this.at += 1000 * milliseconds(data);
+    try {
+      for (const data of packets) {
+        decoder.decode(new EncodedAudioChunk({ type: "key", timestamp: this.at, data }));
+        this.at += 1000 * milliseconds(data);
+      }
+    } catch (error) {
+      this.close(); // the next packet begins anew
+      throw error;
     }
   }
 
