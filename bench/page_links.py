@@ -36,10 +36,10 @@ _OFFERED_BYTES = 35_000  # of a picture: 4.2 megabits a second
 
 
 @contextmanager
-def linked(condition: Condition, *names: str, wide: bool = False) -> Iterator[Rig]:
+def linked(condition: Condition, *names: str, wide: bool = False, flags: tuple[str, ...] = ()) -> Iterator[Rig]:
     """Everything but the browser is on one side of the network, and the browser on the other. Raises PebbleError.
 
-    ``wide``: with a robot whose pictures are larger than the network carries.
+    ``wide``: with a robot whose pictures are larger than the network carries. ``flags``: further ones of the browser.
     """
     problem = obstacle()
     if problem is not None:
@@ -48,8 +48,8 @@ def linked(condition: Condition, *names: str, wide: bool = False) -> Iterator[Ri
         network = stack.enter_context(NamespaceNetwork())
         program = _script(Path(stack.enter_context(tempfile.TemporaryDirectory())), network)
         stack.enter_context(_inside(network.on_robot(())[1].removeprefix("--net=")))
-        flag = f"--unsafely-treat-insecure-origin-as-secure=http://{SERVER}:{_PORT}"  # as https would be
-        made = stack.enter_context(rig(*names, program=program, flags=(flag,), host=SERVER, port=_PORT))
+        secure = f"--unsafely-treat-insecure-origin-as-secure=http://{SERVER}:{_PORT}"  # as https would be
+        made = stack.enter_context(rig(*names, program=program, flags=(secure, *flags), host=SERVER, port=_PORT))
         if wide:
             stack.callback(WideRobot(made.stage.broker_port).close)
         network.apply(condition)

@@ -160,6 +160,7 @@ class LinuxRobot(SimulatedRobot):
         services = config["services"]
         services["mqtt_bridge"]["remote_mqtt"] = {"host": "127.0.0.1", "port": remote_port}
         services["mqtt_bridge"]["service_restart_control"] = {"command": _RESTART}
+        services["mqtt_bridge"].setdefault("media", {})["audio_receiver"] = {"command": self._loudspeaker()}
         services["serial_mcu_bridge"]["serial"]["port"] = str(self._port)
         for kind, port in self._devices.items():
             lines = services["serial_mcu_bridge"].setdefault("instances", {})
@@ -170,6 +171,15 @@ class LinuxRobot(SimulatedRobot):
             "audio": {"source": "synthetic"},
         }
         return config
+
+    @property
+    def voice(self) -> Path:
+        """Where its loudspeaker records what it plays of operators' voices; see pebble.simulation.loudspeaker."""
+        return self._folder / "voice"
+
+    def _loudspeaker(self) -> list[str]:
+        raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
+        return [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self.voice), *raw]
 
 
 class RoomRobot(LinuxRobot):

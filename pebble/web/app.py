@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from importlib.resources import files
+from typing import Any
 from urllib.parse import quote
 
 import msgspec
@@ -20,6 +21,7 @@ from starlette.websockets import WebSocket
 
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
+from pebble.fleet.roles import Session
 from pebble.web import login, robot_streams
 from pebble.web.control import CHECK_S, Control
 from pebble.web.guard import CONTENT_SECURITY_POLICY, Guard
@@ -43,7 +45,7 @@ def create_app(settings: WebSettings) -> Starlette:
         server = Server(settings, people, audit)
         state = app.state
         state.server, state.audit, state.driving, state.stops = server, audit, server.driving, server.stops
-        state.robots, state.broker, state.media = server.robots, server.broker, server.media
+        state.robots, state.broker, state.media, state.sound = server.robots, server.broker, server.media, server.sound
         await server.open()
         try:
             yield
@@ -70,6 +72,7 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
             *login.routes(),
             WebSocketRoute("/ws/control", _control),
             WebSocketRoute("/ws/media", _media),
+            WebSocketRoute("/ws/sound", _sound),
         ],
         lifespan=lifespan,
         middleware=[Middleware(Guard, settings=settings)],
@@ -152,16 +155,30 @@ async def _control(websocket: WebSocket) -> None:
 
 
 async def _media(websocket: WebSocket) -> None:
-    ref = websocket.query_params.get("ref", "")
-    if login.session_of(websocket) is None or ref not in websocket.app.state.robots.components:
+    media = websocket.app.state.media
+    await _serve(websocket, lambda ref, can, _: media.serve(websocket, ref, can & _ENCODINGS))
+
+
+async def _sound(websocket: WebSocket) -> None:
+    sound = websocket.app.state.sound
+    await _serve(websocket, lambda ref, can, session: sound.serve(websocket, ref, can, session))
+
+
+async def _serve(
+    websocket: WebSocket, serve: Callable[[str, frozenset[str], Session], Coroutine[Any, Any, None]]
+) -> None:
+    """Serve one component's pictures or sound, as long as the session is what it was."""
+    ref, session = websocket.query_params.get("ref", ""), login.session_of(websocket)
+    if session is None or ref not in websocket.app.state.robots.components:
         await websocket.close(4401)
         return
     await websocket.accept()
-    can = frozenset(re.findall(r"[a-z0-9]+", websocket.query_params.get("can", ""))) & _ENCODINGS
-    serving = asyncio.ensure_future(websocket.app.state.media.serve(websocket, ref, can))
+    can = frozenset(re.findall(r"[a-z0-9]+", websocket.query_params.get("can", "")))
+    serving = asyncio.ensure_future(serve(ref, can, session))
     try:
         while not (await asyncio.wait({serving}, timeout=CHECK_S))[0]:
-            if await asyncio.to_thread(login.session_of, websocket) is None:
+            now = await asyncio.to_thread(login.session_of, websocket)
+            if now is None or now.role != session.role:
                 return  # it was revoked
     finally:
         serving.cancel()

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import logging
 import struct
 import time
 from typing import Final
+from weakref import WeakKeyDictionary
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -15,17 +14,15 @@ from pebble.contract import CAMERA
 from pebble.contract.identity import Direction
 from pebble.web.broker import Broker
 from pebble.web.encoding_choice import BEST_FIRST
+from pebble.web.media_stream import Streams
 from pebble.web.messages import PictureView
 from pebble.web.picture_stream import PageViewer, PictureStream, rest
 from pebble.web.rescue import RescuedPicture, newest_jpeg
 from pebble.web.robots import Robots, own_topic
 
-log = logging.getLogger(__name__)
-
 PICTURE_METRIC: Final = "web/picture"
 _ANSWER: Final = struct.Struct(">IB")  # number of a frame, and what became of it
-_BAD_REQUEST: Final = 4400  # codes of closed sockets
-_GONE: Final = 1001
+_BAD_REQUEST: Final = 4400  # code of a closed socket
 _SNAPSHOT_S: Final = 0.5  # a snapshot this recent is used again
 
 
@@ -34,30 +31,19 @@ class MediaHub:
 
     def __init__(self, broker: Broker, robots: Robots) -> None:
         self._broker, self._robots = broker, robots
-        self._streams: dict[str, PictureStream] = {}
-        self._snapshots: dict[str, _Snapshot] = {}
+        self._streams = Streams(self._make)
+        self._snapshots: WeakKeyDictionary[PictureStream, _Snapshot] = WeakKeyDictionary()
         self._pinned: dict[str, str] = {}
-        self._closed = False
 
     async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
         """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
-        if self._closed or not own_topic(ref, CAMERA.topic(ref), Direction.OUTGOING):
+        if self._streams.closed or not own_topic(ref, CAMERA.topic(ref), Direction.OUTGOING):
             await websocket.close(_BAD_REQUEST, "no such component")
             return
         viewer = PageViewer(can)
-        stream = self._stream(ref)
-        stream.join(viewer)
-        tasks = {
-            asyncio.create_task(_send(websocket, viewer)),
-            asyncio.create_task(_receive(websocket, stream, viewer)),
-        }
-        try:
-            await asyncio.wait({*tasks, stream.task}, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            stream.leave(viewer)
-            await _end(tasks)
-            with contextlib.suppress(RuntimeError):  # it is closed already
-                await websocket.close(_GONE)
+        await self._streams.serve(
+            websocket, ref, viewer, lambda _: _send(websocket, viewer), lambda stream: _receive(websocket, stream, viewer)
+        )
 
     def pin(self, ref: str, encoding: str) -> None:
         """Request this encoding for all viewers; "" is automatic. One that the robot does not offer has no effect."""
@@ -76,26 +62,14 @@ class MediaHub:
         stream = self._streams.get(ref)
         if stream is None:
             return None
-        return await self._snapshots.setdefault(ref, _Snapshot()).take(stream)
+        return await self._snapshots.setdefault(stream, _Snapshot()).take(stream)
 
     async def close(self) -> None:
         """Withdraw all requests."""
-        self._closed = True
-        await asyncio.gather(*(stream.close() for stream in self._streams.values()), return_exceptions=True)
+        await self._streams.close()
 
-    def _stream(self, ref: str) -> PictureStream:
-        stream = self._streams.get(ref)
-        if stream is None:
-            stream = PictureStream(self._broker, self._robots, ref, self._pinned.get(ref, ""), self._show)
-            self._streams[ref] = stream
-            stream.task.add_done_callback(lambda task: self._forget(ref, task))
-        return stream
-
-    def _forget(self, ref: str, task: asyncio.Task[None]) -> None:
-        self._streams.pop(ref, None)
-        self._snapshots.pop(ref, None)
-        if not task.cancelled() and task.exception() is not None:
-            log.error("the pictures of %s have ended", ref, exc_info=task.exception())
+    def _make(self, ref: str) -> PictureStream:
+        return PictureStream(self._broker, self._robots, ref, self._pinned.get(ref, ""), self._show)
 
     def _show(self, ref: str, view: PictureView) -> None:
         if self._robots.capabilities(ref):
@@ -142,11 +116,3 @@ async def _receive(websocket: WebSocket, stream: PictureStream, viewer: PageView
         if message["type"] != "websocket.receive" or answer is None or len(answer) != _ANSWER.size:
             return
         stream.acknowledge(viewer, *_ANSWER.unpack(answer))
-
-
-async def _end(tasks: set[asyncio.Task[None]]) -> None:
-    for task in tasks:
-        task.cancel()
-    for result in await asyncio.gather(*tasks, return_exceptions=True):
-        if isinstance(result, Exception):
-            log.warning("a page's pictures have ended: %s", result)

@@ -282,6 +282,14 @@ class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
     again: bool
 
 
+class TalkAnswer(Struct, frozen=True, kw_only=True):
+    """On the sound socket, as text: whether the page's talk of that number lasts. One that is over never goes on."""
+
+    talk: int
+    on: bool
+    why: str = ""  # it is not, for people
+
+
 ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Series | Bye
 
 
@@ -347,6 +355,16 @@ class PictureView(Struct, frozen=True, kw_only=True):
     pinned: str
 
 
+class SoundView(Struct, frozen=True, kw_only=True):
+    """``web/sound``: the sound of a component, as it comes from it, and who talks to it."""
+
+    state: str  # "rest", "starting", "flowing", "silent" or "refused"
+    why: str
+    encoding: str
+    listeners: int
+    talker: str  # "": nobody
+
+
 class BrokerView(Struct, frozen=True, kw_only=True):
     """``web/broker`` of ref "": the server's connection to the broker."""
 
@@ -380,6 +398,7 @@ SERVER_METRICS: dict[str, type] = {
     "web/estop": EstopView,
     "web/driver": DriverView,
     "web/picture": PictureView,
+    "web/sound": SoundView,
     "web/picture-from": PictureFrom,
     "web/flags": FlagsView,
     "web/restarts": RestartsView,

@@ -37,6 +37,20 @@ _MEDIA = """## Media socket
 kind 1: a JPEG of the server's own, after `u64` epoch milliseconds of its capture, 0 if unknown |
 | page | `u32 number`, `u8 what`: 0 the frame is drawn, 1 a key frame is needed, 2 this browser cannot decode it |
 """
+_SOUND = """## Sound socket
+
+`/ws/sound?ref=REF&can=opus,pcm` carries the sound of one component, and a person's voice to it. `can` empty: this page \
+only talks. Numbers are big-endian; `talk` numbers the talks of this connection, each greater than the last.
+
+| from | message |
+|---|---|
+| server | binary: a PBAT packet as it came from the robot |
+| server | text: a TalkAnswer |
+| page | `u8 0`, `u32 count`: so many packets have been received; at most 32 are under way |
+| page | `u8 1`, `u32 talk`, `u32 number`, 640 bytes: 20 ms of the voice, 16 kHz mono s16le, numbered from 0; \
+the first one begins the talk |
+| page | `u8 2`, `u32 talk`: it ends |
+"""
 
 
 def markdown() -> str:
@@ -46,13 +60,13 @@ def markdown() -> str:
     parts += ["## From the page\n", *map(_section, get_args(messages.FromPage))]
     parts += ["## From the server\n", *map(_section, get_args(messages.ToPage))]
     parts += ["## Metrics of the server\n", *map(_section, _views())]
-    return "\n".join([*parts, _MEDIA])
+    return "\n".join([*parts, _MEDIA, _SOUND, _section(messages.TalkAnswer)])
 
 
 def declarations() -> str:
     """messages.d.ts: one interface for each struct."""
     parts = ["// Generated from pebble/web/messages.py by python -m pebble.web.messages_docs.\n"]
-    for struct in (*get_args(messages.FromPage), *get_args(messages.ToPage), messages.ShownOwner, *_views()):
+    for struct in (*get_args(messages.FromPage), *get_args(messages.ToPage), messages.ShownOwner, messages.TalkAnswer, *_views()):
         info: Any = types.type_info(struct)
         tag = [f'  op: "{info.tag}";'] if info.tag is not None else []
         fields = [f"  {one.name}{'' if one.required else '?'}: {_script(one.type)};" for one in info.fields]

@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import logging
 import struct
 import time
 from collections.abc import Callable
 from typing import Final
 
-from pebble.errors import PebbleError
-from pebble.media.rate_meter import RateMeter
 from pebble.web import rescue
 from pebble.web.broker import Broker
 from pebble.web.encoding_choice import BEST_FIRST, EncodingChoice
 from pebble.web.media_queue import NO_FRAME, Frame, ViewerQueue, assess
+from pebble.web.media_source import offered, refusal
+from pebble.web.media_stream import MediaStream
 from pebble.web.messages import PictureView
 from pebble.web.picture_header import PictureHeader, follows, read_header
-from pebble.web.picture_source import MAX_PAYLOAD, PictureSource, offered, refusal
 from pebble.web.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
 from pebble.web.robots import Robots
 
-log = logging.getLogger(__name__)
-
 Show = Callable[[str, PictureView], None]
 
-LINGER_S: Final = 5.0  # without viewers, before the request is withdrawn: a page that reloads is back by then
-_TICK_S: Final = 0.5
-_SILENT_S: Final = 2.0
-_SILENT_PERIODS: Final = 3.0
+MAX_PAYLOAD: Final = 4 << 20
 _CHANGE_S: Final = 1.0  # a new encoding begins with a key frame within this time: viewers need no help meanwhile
 _MAX_CHAIN: Final = 240  # pictures since a key frame
 _MAX_CHAIN_BYTES: Final = 8 << 20
@@ -45,46 +37,20 @@ class PageViewer:
         self.wakeup = asyncio.Event()
 
 
-class PictureStream:
-    """Requests the pictures of one robot while it has viewers, and gives them to each viewer's queue.
-
-    ``task`` ends once the request is withdrawn; until then viewers may join again.
-    """
+class PictureStream(MediaStream[PageViewer, PictureView]):
+    """Gives the pictures of one robot to each viewer's queue."""
 
     def __init__(self, broker: Broker, robots: Robots, ref: str, pinned: str, show: Show) -> None:
-        self.ref = ref
+        super().__init__(broker, robots, ref, "video", show, rest(pinned))
         self.choice = EncodingChoice()
         self.choice.pinned = pinned
-        self.viewers: set[PageViewer] = set()
-        self.refused = 0  # payloads that are no pictures, or too large
-        self.view = rest(pinned)  # as shown last
-        self._shown_at = float("-inf")
-        self._broker, self._robots, self._show = broker, robots, show
-        self._source = PictureSource(broker, ref, self.receive)
         self._rescue = RescueStream(self._on_rescued)
-        self._meter = RateMeter()
         self._last: PictureHeader | None = None  # of the newest picture, unless one is missing before it
-        self._encoding = ""  # of the newest picture
-        self._arrived_at: float | None = None
         self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
         self._chain_bytes = 0
         self._seq = 0
-        self._empty_since = time.monotonic()
-        self._why = ""
-        self._wakeup = asyncio.Event()
-        self._closing = False
-        self.task = asyncio.create_task(self._run())
 
     # -- pages
-
-    def join(self, viewer: PageViewer) -> None:
-        self.viewers.add(viewer)
-        self._wakeup.set()
-
-    def leave(self, viewer: PageViewer) -> None:
-        self.viewers.discard(viewer)
-        self._empty_since = time.monotonic()
-        self._wakeup.set()
 
     def pin(self, encoding: str) -> None:
         self.choice.pinned = encoding
@@ -111,23 +77,16 @@ class PictureStream:
         """The number of the newest frame."""
         return self._seq
 
-    async def close(self) -> None:
-        """Withdraw the request now."""
-        self._closing = True
-        self._wakeup.set()
-        await self.task
-
     # -- pictures
 
     def receive(self, payload: bytes) -> None:
-        """Give a payload of the robot to all viewers. On the event loop."""
         now = time.monotonic()
         header = read_header(payload) if len(payload) <= MAX_PAYLOAD else None
         if header is None:
             self.refused += 1
             self._last = None
             return
-        self._note(payload, header, now)
+        self._note(header.encoding, len(payload), now)
         fits = follows(self._last, header)
         self._last = header if fits else None
         self._extend_chain(payload, header, fits=fits)
@@ -136,13 +95,6 @@ class PictureStream:
             self._offer(payload, header, now)
         else:
             self._skip(now)
-
-    def _note(self, payload: bytes, header: PictureHeader, now: float) -> None:
-        starts = self._arrived_at is None or header.encoding != self._encoding
-        self._meter.add(now, len(payload))
-        self._arrived_at, self._encoding = now, header.encoding
-        if starts:
-            self._wakeup.set()
 
     def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
         grown = self._chain_bytes + len(payload)
@@ -186,46 +138,15 @@ class PictureStream:
         self._seq = (self._seq + 1) % NO_FRAME  # NO_FRAME itself is no number
         return self._seq
 
-    # -- the task: requests, key frames and what pages are shown about it
-
-    async def _run(self) -> None:
-        try:
-            while not self._over():
-                await self._step()
-        finally:
-            self._rescue.stop()
-            await self._source.withdraw()
-            self._show(self.ref, rest(self.choice.pinned))
-
-    def _over(self) -> bool:
-        """A request is not withdrawn while there is no broker: the robot would go on sending afterwards."""
-        idle = not self.viewers and time.monotonic() - self._empty_since >= LINGER_S
-        return self._closing or (idle and (self._broker.connected or not self._source.started))
-
-    async def _step(self) -> None:
-        started = time.monotonic()
-        self._report()
-        try:
-            await self._request()
-        except PebbleError as error:
-            self._why = str(error)
-        self._report()
-        await self._pause(started)
-
-    async def _pause(self, started: float) -> None:
-        """A step each half second; one that is needed earlier, a tenth of a second after the last one."""
-        await asyncio.sleep(max(0.0, started + _TICK_S / 5 - time.monotonic()))
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._wakeup.wait(), max(0.001, started + _TICK_S - time.monotonic()))
-        self._wakeup.clear()
+    # -- requests, and key frames
 
     async def _request(self) -> None:
         capabilities = self._robots.capabilities(self.ref)
-        self._why = refusal(self.ref, capabilities)
+        self._why = refusal(self.ref, capabilities, "video")
         if self._why:
             await self._source.withdraw()
             return
-        encoding = self.choice.update(offered(capabilities), self._can(), time.monotonic())
+        encoding = self.choice.update(offered(capabilities, "video"), self._can(), time.monotonic())
         if self.viewers:
             await self._source.follow(capabilities, encoding)
         await self._help_viewers()
@@ -258,47 +179,22 @@ class PictureStream:
 
     # -- what pages are shown
 
-    def _flowing(self, now: float) -> bool:
-        if self._arrived_at is None:
-            return False
-        rate = self._meter.rate(self._arrived_at)
-        return now - self._arrived_at <= max(_SILENT_S, _SILENT_PERIODS / rate if rate else 0.0)
-
-    def _report(self) -> None:
-        """Show what has changed, at most twice a second."""
-        now = time.monotonic()
-        if now - self._shown_at < _TICK_S:
-            return
-        view = self._make_view(now)
-        if view != self.view:
-            self.view, self._shown_at = view, now
-            self._show(self.ref, view)
-
-    def _make_view(self, now: float) -> PictureView:
-        state, why = self._state(now)
-        flowing = state == "flowing"
+    def _make_view(self, state: str, why: str, rate: float, kbits: float) -> PictureView:
         return PictureView(
             state=state,
             why=why,
             encoding=self._encoding,
-            per_second=round(self._meter.rate(now), 1) if flowing else 0.0,
-            kbits=float(round(self._meter.bitrate(now) / 1000)) if flowing else 0.0,
+            per_second=rate,
+            kbits=kbits,
             viewers=len(self.viewers),
             pinned=self.choice.pinned,
         )
 
-    def _state(self, now: float) -> tuple[str, str]:
-        if self._why:
-            return "refused", self._why
-        if self._flowing(now):
-            return "flowing", self._rescue_problem()
-        if not self._broker.connected:
-            return "silent", f"the server cannot reach the broker: {self._broker.problem}"
-        if self._arrived_at is None:
-            return "starting", ""
-        return "silent", f"no picture for {int(now - self._arrived_at)} s"
+    def _end(self) -> None:
+        self._rescue.stop()
+        self._show(self.ref, rest(self.choice.pinned))
 
-    def _rescue_problem(self) -> str:
+    def _problem(self) -> str:
         lacking = sum(not viewer.queue.decodes(self._encoding) for viewer in self.viewers)
         problem = rescue.unavailable(self._encoding)
         return f"{lacking} of {len(self.viewers)} browsers cannot show it: {problem}" if problem and lacking else ""

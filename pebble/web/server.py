@@ -30,6 +30,7 @@ from pebble.web.media import MediaHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
 from pebble.web.settings import WebSettings
+from pebble.web.sound import SoundHub
 from pebble.web.stops import Stops
 
 log = logging.getLogger(__name__)
@@ -58,6 +59,7 @@ class Server:
         self.broker = Broker(settings.broker)
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
         self.media = MediaHub(self.broker, self.robots)
+        self.sound = SoundHub(self.broker, self.robots, lambda ref, user: audit.write("talk", ref=ref, user=user))
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         self.drive_changed: set[str] = set()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -82,7 +84,7 @@ class Server:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self.media.close()
+        await asyncio.gather(self.media.close(), self.sound.close())
         await self.broker.close()
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import itertools
 import json
 import struct
 import sys
@@ -29,7 +30,8 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from pebble.contract.packets import Picture, PictureKind
+from pebble.contract.packets import Codec, Picture, PictureKind, Sound
+from pebble.media.speech import Speech
 from pebble.web.guard import CONTENT_SECURITY_POLICY
 from pebble.web.messages import FromPage
 from pebble.web.static_files import StaticFiles
@@ -81,6 +83,7 @@ class CannedServer:
                 Route("/api/{name}", self._post, methods=["POST"]),
                 WebSocketRoute("/ws/control", self._control),
                 WebSocketRoute("/ws/media", self._media),
+                WebSocketRoute("/ws/sound", self._sound),
             ]
         )
         config = uvicorn.Config(app, "127.0.0.1", self.port, log_level="critical", ws_per_message_deflate=False)
@@ -225,6 +228,16 @@ class CannedServer:
                 await websocket.send_bytes(struct.pack(">IB", number, 0) + packet)
                 await websocket.receive_bytes()  # drawn
                 await asyncio.sleep(PICTURE_S)
+
+    async def _sound(self, websocket: WebSocket) -> None:
+        await websocket.accept()
+        reading = asyncio.ensure_future(_until_closed(websocket))
+        with suppress(WebSocketDisconnect, RuntimeError):
+            for number in itertools.count(1):
+                piece = Speech(16_000).samples(320 * number, 320).tobytes()
+                await websocket.send_bytes(Sound(Codec.PCM16LE, 1, 16_000, 320, number, _now(), piece).pack())
+                await asyncio.sleep(0.02)
+        reading.cancel()
 
 
 def _headers() -> dict[str, str]:

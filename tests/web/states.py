@@ -42,6 +42,7 @@ def capabilities(kind: str, *, video: bool = True, drive: bool = True) -> dict[s
         "value": {
             "transport": {"kind": kind},
             "video": {"available": video, "controls": video, "encodings": ["h264", "pbvz", "pbvd", "json"]},
+            "audio": {"available": video, "controls": video, "encodings": ["pcm", "opus"]},
             "drive": {"available": drive, "controls": drive, "arbitrates": True},
             "system": {
                 "reboot": {"available": True, "controls": drive},
@@ -95,6 +96,10 @@ def flow(state: str = "flowing", why: str = "") -> dict[str, Any]:
         "viewers": 2,
         "pinned": "",
     }
+
+
+def sound(state: str = "rest", why: str = "", *, talker: str = "") -> dict[str, Any]:
+    return {"state": state, "why": why, "encoding": "pcm", "listeners": 1, "talker": talker}
 
 
 def imu(now: int) -> dict[str, Any]:
@@ -161,6 +166,7 @@ def goob(now: int) -> list[Value]:
         *robot(now, GOOB, "zenoh", 7.92),
         (GOOB, "web/picture", flow(), 0),
         (GOOB, "web/picture-from", {"source": ""}, 0),
+        (GOOB, "web/sound", sound(), 0),
         (GOOB, "sensors/imu", imu(now), 100),
         (GOOB, "touch-sensors", {"value": {"a0": 512, "a1": 498, "a2": 730}, "unit": "adc"}, 20),
         (GOOB, "media-status", media(now), 2000),
@@ -406,6 +412,10 @@ STATES: dict[str, State] = {
     "old-picture": replace(DRIVING, freezes=True),
     "no-picture": replace(
         DRIVING, pictures=False, values=changed(fleet, MINE, at(GOOB, "web/picture", flow("starting")))
+    ),
+    "listening": replace(DRIVING, values=changed(fleet, MINE, at(GOOB, "web/sound", sound("flowing", talker="bob")))),
+    "no-sound": replace(
+        DRIVING, values=changed(fleet, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here")))
     ),
     "old-page": replace(DRIVING, welcome={"version": "of another server"}),
     "plain-http": replace(DRIVING, welcome={"drives": False}),

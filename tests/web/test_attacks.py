@@ -641,3 +641,22 @@ def static(hall: Hall) -> list[str]:
     names = list(hall.served.app.state.static.files)
     assert {"fleet.html", "robot.html", "login.html", "main.js"} <= set(names)
     return names
+
+
+def test_nor_does_the_sound_socket(hall: Hall, driver: Page) -> None:
+    cookie = hall.cookie("viewer")
+    for query in ("", "?ref=", "?ref=%23", "?ref=pebble/robots/nobody", f"?ref={GOOB}/incoming"):
+        assert hall.refusal(f"/ws/sound{query}", cookie=cookie) == 403
+    path = f"/ws/sound?ref={GOOB}&can={'opus,' * 500}%00'\"<script>"
+    for data in ("text", "", b"", b"\x00" * 4, b"\x01" * 648, b"\x01" * 650, b"\x02" * 6, b"\x03" * 5, b"\x00" * 60_000):
+        assert hall.closed_after(path, cookie, data)
+    sound = hall.socket(path, cookie=cookie)
+    for number in (0, 1, 0xFFFFFFFF):
+        sound.send(b"\x00" + number.to_bytes(4, "big"))
+        sound.send(b"\x02" + number.to_bytes(4, "big"))
+    sound.close()
+    talker = hall.socket(path, cookie=cookie)
+    talker.send(b"\x01" + bytes(648))
+    assert json.loads(talker.recv(timeout=5)) == {"talk": 0, "on": False, "why": "The role viewer may not do this"}
+    talker.close()
+    assert hall.works()

@@ -144,6 +144,14 @@ def _show_card(name: str) -> Callable[[Page], None]:
     return act
 
 
+def _listen(page: Page) -> None:
+    tab_of_sound = page.locator("[data-test=tab-sound]")
+    if tab_of_sound.count():
+        tab_of_sound.click()
+    page.locator("[data-test=listen]").click()
+    page.locator("[data-test=sound-state]", has_text="buffered").wait_for()
+
+
 class Screen(NamedTuple):
     """One picture: a state of the server, and what a person does then."""
 
@@ -173,6 +181,8 @@ WHEN = {
     "silent": "goob is silent since",
     "old-picture": "The picture is ",
     "no-picture": "There is no picture yet",
+    "listening": "Listen",
+    "no-sound": "Listen",
     "old-page": "older than the server",
     "plain-http": "not encrypted",
     "tower": "pbvz 640×360",
@@ -189,6 +199,8 @@ SCREENS = [
     Screen("plots", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("plots")),
     Screen("map", "odometry", _press(".tabs button:nth-child(2)"), ("phone",), hold=_show_card("map")),
     Screen("stream-open", "own-stream", _press("[data-test=open-stream]")),
+    Screen("listening-now", "listening", _listen),
+    Screen("sound", "no-sound", _press("[data-test=tab-sound]"), ("phone",)),
     Screen("driving-now", "driving", sizes=("desktop",), hold=_drive),
     Screen("thumbnails", "fleet", _press(".check")),
     Screen("settings", "driving", _press(".me"), ("desktop",)),
@@ -199,9 +211,9 @@ SCREENS = [
     Screen("open-on-phone", "fleet", _press("[data-test=phone]")),
     Screen("left-handed", "driving", _do("pebble.settings.set('side', 'left')"), ("landscape",)),
     Screen("reset-asked", "stopped", _press(".banner-actions button")),
-    Screen("sensors", "driving", _press(".tabs button:nth-child(2)"), ("phone",)),
-    Screen("more", "driving", _press(".tabs button:nth-child(3)"), ("phone",)),
-    Screen("settings", "driving", _press(".tabs button:nth-child(3)", ".wide"), ("phone",)),
+    Screen("sensors", "driving", _press("[data-test=tab-sensors]"), ("phone",)),
+    Screen("more", "driving", _press("[data-test=tab-more]"), ("phone",)),
+    Screen("settings", "driving", _press("[data-test=tab-more]", ".wide"), ("phone",)),
     Screen("drawer", "driving", _press(".round"), ("landscape",)),
     Screen("outlets", "devices", sizes=("desktop",), hold=_at("outlets")),
     Screen("outlets", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at("outlets")),

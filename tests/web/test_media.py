@@ -17,7 +17,7 @@ from pebble.media.decode import VideoDecoder, encoding_of
 from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
 from pebble.transports import QoS
-from pebble.web import picture_stream, rescue
+from pebble.web import media_stream, rescue
 from pebble.web.media_queue import NO_FRAME
 from pebble.web.picture_header import follows, read_header
 from tests.web.picture_robot import (
@@ -48,7 +48,7 @@ def on_loop(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., Non
 
 @pytest.fixture(autouse=True)
 def _short_linger(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(picture_stream, "LINGER_S", 0.4)
+    monkeypatch.setattr(media_stream, "LINGER_S", 0.4)
 
 
 def jpeg(number: int = 0) -> bytes:

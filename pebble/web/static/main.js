@@ -61,7 +61,26 @@ function join() {
     (bitmap, info) => video.draw(bitmap, info),
     (state) => video.report(state),
   );
-  return { store, connection, route, settings, panels, video, driver, estop, commands: commands(socket, driver, estop) };
+  const services = { store, connection, route, settings, panels, video, driver, estop };
+  return { ...services, commands: commands(socket, driver, estop), sound: sound(services) };
+}
+
+/** Listening and talking, fetched with its controls, or when a key asks for it. */
+function sound(services) {
+  let held = false;
+  const use = async (act) => {
+    const { Sound } = await import("./ui/sound-model.js");
+    act((one.model ??= new Sound(services)));
+  };
+  const one = {
+    model: null,
+    talk(on) {
+      held = on;
+      use((model) => model.talk(held)).catch(console.error);
+    },
+    toggleMute: () => one.model?.toggleMute(),
+  };
+  return one;
 }
 
 /** Everything that widgets can ask for. */

@@ -13,6 +13,9 @@ import { Telemetry } from "./telemetry.js";
 /** @template T @param {Promise<T>} one of those that share a style sheet */
 const withStyle = async (part) => (await Promise.all([part, fetchStyle("devices.css")]))[0];
 
+/** Listening and talking; a desktop has them below the picture. */
+export const VOICE = async () => (await import("./sound.js")).load();
+
 /** @type {CardKind[]} */
 export const CARDS = [
   { id: "telemetry", title: "Telemetry", icon: "gauge", tab: "sensors", wants: () => true, part: async () => Telemetry },
@@ -23,6 +26,14 @@ export const CARDS = [
     tab: "more",
     wants: (offers) => offers.hasLights,
     part: async () => (await import("./lights.js")).Lights,
+  },
+  {
+    id: "voice",
+    title: "Listen and talk",
+    icon: "mic",
+    tab: "sound",
+    wants: (offers) => offers.has("audio"),
+    part: VOICE,
   },
   {
     id: "sounds",

@@ -1,6 +1,6 @@
 // One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
 
-import { CARDS, TABS } from "./cards.js";
+import { CARDS, TABS, VOICE } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
 import { CardView, Offers } from "./models.js";
@@ -39,7 +39,7 @@ function Unknown({ at }) {
 }
 
 function Desktop({ at, offers, view, video, source }) {
-  const cards = wanted(offers, view);
+  const cards = wanted(offers, view).filter(({ part }) => part !== VOICE || !video);
   const side = !offers.drives && video ? cards.shift() : null;
   return html`<div class="robot">
     <h1 class="sr">${nameOf(at)}</h1>

@@ -1,8 +1,9 @@
 // The live picture: how old it is, how it comes, and where from.
 
+import { VOICE } from "./cards.js";
 import { html, useEffect, useModel, usePage, usePart, useRef, useState, useTick, useRefs, useValue } from "./hooks.js";
 import { Offers } from "./models.js";
-import { Icon, Why } from "./parts.js";
+import { Icon, Part, Why } from "./parts.js";
 import { nameOf, span } from "./words.js";
 
 const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
@@ -77,6 +78,7 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
       </button>
       <${Extra} part="Tools" source=${source} wanted=${control.wanted} />
       ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
+      ${wide && offers.has("audio") && html`<${Part} part=${VOICE} at=${at} />`}
     </div>`}
   </section>`;
 }

@@ -1,4 +1,4 @@
-"""Requests one robot's pictures while pages watch them, and withdraws the request afterwards."""
+"""Requests one medium of one robot, its pictures or its sound, and withdraws the request afterwards."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple, cast
 
 from pebble.client.viewer import Medium, Viewer
 from pebble.contract.identity import Direction
@@ -18,8 +18,7 @@ from pebble.web.robots import own_topic
 
 log = logging.getLogger(__name__)
 
-MAX_PAYLOAD: Final = 4 << 20
-_MAX_PENDING_BYTES: Final = 16 << 20  # received, and not yet taken by the event loop
+_MAX_PENDING, _MAX_PENDING_BYTES = 2000, 16 << 20  # received, and not yet taken by the event loop
 _CAPABILITIES_S: Final = 2.0
 _TOPICS: Final = {
     "topic": Direction.OUTGOING,
@@ -28,51 +27,65 @@ _TOPICS: Final = {
 }
 
 
-def offered(capabilities: dict[str, Any]) -> tuple[str, ...]:
+class _Words(NamedTuple):
+    """How people are told of a medium."""
+
+    lacking: str
+    fixed: str
+    name: str
+
+
+_WORDS: Final[dict[Medium, _Words]] = {
+    "video": _Words("it has no camera", "its camera cannot be switched on from here", "pictures"),
+    "audio": _Words("it has no sound", "its sound cannot be switched on from here", "sound"),
+}
+
+
+def offered(capabilities: dict[str, Any], medium: Medium) -> tuple[str, ...]:
     """The encodings that may be requested; empty for robots that do not list any, whose requests name none."""
-    section = capabilities.get("video")
+    section = capabilities.get(medium)
     listed = section.get("encodings") if isinstance(section, dict) else None
     return tuple(name for name in listed if isinstance(name, str)) if isinstance(listed, list) else ()
 
 
-def refusal(ref: str, capabilities: dict[str, Any]) -> str:
-    """Why this robot's pictures are not requested; empty if they may be.
+def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
+    """Why this robot's pictures, or its sound, are not requested; empty if they may be.
 
     Capabilities come from the network: one that names topics of another component is not believed at all.
     """
     if not capabilities:
         return "it has published no capabilities yet"
-    section = capabilities.get("video")
+    section, words = capabilities.get(medium), _WORDS[medium]
     if not isinstance(section, dict) or section.get("available") is not True:
-        return "it has no camera"
+        return words.lacking
     if section.get("controls") is not True:
-        return "its camera cannot be switched on from here"
+        return words.fixed
     for key, direction in _TOPICS.items():
         if section.get(key) is not None and not own_topic(ref, section[key], direction):
-            return f"its capabilities name a topic for pictures that is not its own ({key})"
+            return f"its capabilities name a topic for {words.name} that is not its own ({key})"
     return ""
 
 
-class PictureSource:
+class MediaSource:
     """One robot's payloads, on the event loop. One task calls its coroutines."""
 
-    def __init__(self, broker: Broker, ref: str, receive: Callable[[bytes], None]) -> None:
-        self.ref = ref
+    def __init__(self, broker: Broker, ref: str, medium: Medium, receive: Callable[[bytes], None]) -> None:
+        self.ref, self.medium = ref, medium
         self.encoding: str | None = None  # as requested
         self.requested_at = float("-inf")
         self._broker, self._receive = broker, receive
         self._viewer: Viewer | None = None
         self._topics: tuple[object, ...] = ()  # that the capabilities listed at the request
-        self._pending_bytes = 0
-        self._lock = threading.Lock()  # guards _pending_bytes
+        self._pending = self._pending_bytes = 0
+        self._lock = threading.Lock()  # guards the last two
 
     @property
     def started(self) -> bool:
         return self._viewer is not None
 
     async def follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
-        """Request pictures, as these capabilities allow it; call it again and again. Raises PebbleError."""
-        topics = tuple(capabilities["video"].get(key) for key in _TOPICS)
+        """Request it, as these capabilities allow it; call it again and again. Raises PebbleError."""
+        topics = tuple(capabilities[self.medium].get(key) for key in _TOPICS)
         if self._viewer is not None and topics != self._topics:
             await self.withdraw()
         if self._viewer is None:
@@ -87,7 +100,7 @@ class PictureSource:
     async def request_keyframe(self, encoding: str) -> None:
         """Request a key frame in the present encoding; the viewer lets one pass each second."""
         if self._viewer is not None:
-            known = encoding if encoding in offered(self._viewer.capabilities) else None
+            known = encoding if encoding in offered(self._viewer.capabilities, self.medium) else None
             await asyncio.to_thread(self._viewer.request_keyframe, known)
 
     async def withdraw(self) -> None:
@@ -95,17 +108,23 @@ class PictureSource:
         viewer, self._viewer = self._viewer, None
         self.encoding, self.requested_at = None, float("-inf")
         if viewer is not None:
-            await asyncio.to_thread(_close, viewer)
+            await asyncio.to_thread(self._close, viewer)
 
     async def _request(self, encoding: str | None) -> None:
         if self._viewer is None:
             return
         self.encoding, self.requested_at = encoding, time.monotonic()
         try:
-            await asyncio.to_thread(self._viewer.request, "video", encoding)
+            await asyncio.to_thread(self._viewer.request, self.medium, encoding)
         except PebbleError:
             await self.withdraw()
             raise
+
+    def _close(self, viewer: Viewer) -> None:
+        try:
+            viewer.close()
+        except PebbleError as error:
+            log.warning("the %s of %s: %s", _WORDS[self.medium].name, self.ref, error)
 
     def _open(self) -> Viewer:
         """On a thread: it waits for the broker."""
@@ -113,7 +132,7 @@ class PictureSource:
         viewer = Viewer(transport, self.ref, self._on_payload)
         try:
             viewer.wait_for_capabilities(_CAPABILITIES_S)
-            if reason := refusal(self.ref, viewer.capabilities):
+            if reason := refusal(self.ref, viewer.capabilities, self.medium):
                 raise PebbleError(reason)
         except PebbleError:
             viewer.close()
@@ -125,8 +144,9 @@ class PictureSource:
     def _on_payload(self, _medium: Medium, payload: bytes) -> None:
         size = len(payload)
         with self._lock:
-            if self._pending_bytes + size > _MAX_PENDING_BYTES:
+            if self._pending >= _MAX_PENDING or self._pending_bytes + size > _MAX_PENDING_BYTES:
                 return  # the event loop is far behind; what is missing is noticed by the numbers
+            self._pending += 1
             self._pending_bytes += size
         try:
             self._broker.loop.call_soon_threadsafe(self._take, payload)
@@ -135,6 +155,7 @@ class PictureSource:
 
     def _take(self, payload: bytes) -> None:
         with self._lock:
+            self._pending -= 1
             self._pending_bytes -= len(payload)
         if self._viewer is not None:
             self._receive(payload)
@@ -163,9 +184,3 @@ class _OwnTopics:
         if not any(own_topic(self._ref, topic, direction) for direction in directions):
             raise TransportError(f"{topic} is no topic of {self._ref}")
 
-
-def _close(viewer: Viewer) -> None:
-    try:
-        viewer.close()
-    except PebbleError as error:
-        log.warning("the pictures of %s: %s", viewer.base, error)

@@ -1,0 +1,98 @@
+// The sound of one component: its socket, what is played of it, and what a person says to it.
+
+import { decodesOpus } from "./opus.js";
+import { Playout } from "./playout.js";
+import { Uplink } from "./uplink.js";
+
+const [RECEIVED, , END] = [0, 1, 2]; // what is sent; 1 is a piece of the voice
+const ACKNOWLEDGED = 4; // packets at a time
+const STATS_MS = 250;
+const FIRST_WAIT_MS = 250;
+const LONGEST_WAIT_MS = 4000;
+const LATE_BYTES = 10_000; // 0.3 s of the voice that could not be sent: what comes then is left out
+const ALIVE_MS = 1000; // without a word of the page, which may stand still while a key was released
+
+let ref = "";
+let can = "";
+/** @type {WebSocket|null} */
+let socket = null;
+let wait = FIRST_WAIT_MS;
+/** @type {Playout|null} */
+let playout = null;
+/** @type {Uplink|null} */
+let uplink = null;
+let received = 0; // on this connection
+let aliveAt = 0;
+
+self.onmessage = ({ data }) => {
+  aliveAt = performance.now();
+  if (data.op === "open") open(data);
+  else if (data.op === "talk") talk(data);
+  else if (data.op === "end") end();
+};
+
+/** @param {{ref: string, port: MessagePort|null, rate: number}} message ``port`` null: this page only talks */
+async function open(message) {
+  ref = message.ref;
+  if (message.port) {
+    playout = new Playout(message.port, message.rate);
+    can = (await decodesOpus()) ? "opus,pcm" : "pcm";
+    setInterval(() => self.postMessage({ stats: playout?.stats() }), STATS_MS);
+  }
+  connect();
+}
+
+function connect() {
+  const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+  const mine = new WebSocket(`${scheme}//${location.host}/ws/sound?${new URLSearchParams({ ref, can })}`);
+  mine.binaryType = "arraybuffer";
+  received = 0;
+  mine.onopen = () => self.postMessage({ connection: "open" });
+  mine.onmessage = ({ data }) => {
+    wait = FIRST_WAIT_MS;
+    if (typeof data === "string") self.postMessage({ answer: JSON.parse(data) });
+    else take(data);
+  };
+  mine.onclose = () => {
+    uplink?.close();
+    uplink = null; // it cannot go on by another connection
+    self.postMessage({ connection: "lost" });
+    setTimeout(connect, wait * (0.75 + 0.5 * Math.random()));
+    wait = Math.min(LONGEST_WAIT_MS, 2 * wait);
+  };
+  socket = mine;
+}
+
+/** @param {ArrayBuffer} payload */
+function take(payload) {
+  playout?.take(payload);
+  if (++received % ACKNOWLEDGED === 0) send(head(RECEIVED, received));
+}
+
+/** @param {{talk: number, port: MessagePort, rate: number}} message */
+function talk(message) {
+  uplink?.close();
+  uplink = new Uplink(message.port, message.rate, message.talk, (piece) => {
+    if (performance.now() - aliveAt > ALIVE_MS) end();
+    else if ((socket?.bufferedAmount ?? 0) < LATE_BYTES) send(piece);
+  });
+}
+
+function end() {
+  if (uplink) send(head(END, uplink.talk));
+  uplink?.close();
+  uplink = null;
+}
+
+/** @param {number} what @param {number} number */
+function head(what, number) {
+  const message = new DataView(new ArrayBuffer(5));
+  message.setUint8(0, what);
+  message.setUint32(1, number);
+  return message.buffer;
+}
+
+/** @param {ArrayBuffer} message */
+function send(message) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(message);
+}

@@ -1,0 +1,254 @@
+// Listening to the component that is open, and talking to it: what is under way, and why not more.
+
+import { Microphone, hasMicrophone } from "../media/microphone.js";
+import { makeSpeaker } from "../media/speaker.js";
+import { Model, Offers } from "./models.js";
+import { nameOf } from "./words.js";
+
+const WORKER = new URL("../media/sound-worker.js", import.meta.url).href;
+const STEP_MS = 200; // while a person talks: the page tells the worker that it is alive
+const KEEP_MS = 5000; // so long the robot's loudspeaker stays ready after a talk
+const OWN_MS = 1500; // so long after a talk its name is still shown by the server
+
+/** @typedef {{number: number, on: boolean}} Talk ``on``: the server takes it */
+
+/** @typedef {import("../media/playout.js").Stats} Stats */
+
+export class Sound extends Model {
+  /** @param {any} page its services */
+  constructor({ store, connection, route }) {
+    super();
+    this.store = store;
+    this.connection = connection;
+    this.route = route;
+    this.ref = ""; // of the component that the worker is connected to
+    this.listening = false;
+    this.muted = false;
+    /** @type {Talk|null} */
+    this.talking = null;
+    this.held = false; // key or button: a talk that was interrupted does not go on
+    this.problem = ""; // of the last attempt to listen or talk
+    this.open = false; // whether the worker is connected
+    /** @type {Stats|null} */
+    this.stats = null;
+    this.talks = 0;
+    this.endedAt = -Infinity; // the last talk
+    /** @type {AudioContext|null} */
+    this.context = null;
+    /** @type {GainNode|null} */
+    this.gain = null;
+    /** @type {Promise<{node: AudioNode, attach: (port: MessagePort) => void}>|null} */
+    this.speaker = null;
+    /** @type {Microphone|null} */
+    this.microphone = null;
+    /** @type {Worker|null} */
+    this.worker = null;
+    this.timer = 0;
+    route.onChange(() => route.ref !== this.ref && this.leave());
+    connection.onChange(() => !connection.isOpen && this.silence());
+    for (const name of ["blur", "pagehide"]) addEventListener(name, () => this.interrupt());
+    document.addEventListener("freeze", () => this.interrupt());
+    document.addEventListener("visibilitychange", () => document.hidden && this.interrupt());
+    document.addEventListener("contextmenu", () => this.silence());
+  }
+
+  // -- listening
+
+  /** To be called in a click: browsers start no sound by themselves. */
+  async listen() {
+    if (this.listening || this.listenReason()) return;
+    this.silence();
+    this.listening = true;
+    this.muted = false;
+    this.problem = "";
+    const { ref } = this.route;
+    const context = this.start();
+    this.adjust();
+    this.changed();
+    try {
+      this.speaker ??= makeSpeaker(context);
+      const { node, attach } = await this.speaker;
+      node.connect(/** @type {GainNode} */ (this.gain));
+      if (!this.listening || this.route.ref !== ref) return; // stopped meanwhile
+      this.silence();
+      const { port1, port2 } = new MessageChannel();
+      attach(port2);
+      this.connect(ref, port1);
+    } catch (error) {
+      this.speaker = null;
+      this.leave();
+      this.problem = `Sound cannot be played: ${/** @type {Error} */ (error).message}`;
+    }
+    this.changed();
+  }
+
+  stopListening() {
+    this.leave();
+  }
+
+  toggleMute() {
+    if (!this.listening) return;
+    this.muted = !this.muted;
+    this.adjust();
+    this.changed();
+  }
+
+  // -- talking
+
+  /** Key or button: held or released. @param {boolean} on */
+  talk(on) {
+    if (on && !this.held) {
+      this.held = true;
+      this.begin();
+    } else if (!on) {
+      this.held = false;
+      this.silence();
+    }
+  }
+
+  async begin() {
+    if (this.talkReason()) return;
+    /** @type {Talk} */
+    const talk = { number: ++this.talks, on: false };
+    this.talking = talk;
+    this.problem = "";
+    const context = this.start();
+    this.adjust();
+    if (!this.worker) this.connect(this.route.ref, null);
+    clearInterval(this.timer);
+    this.timer = setInterval(() => this.step(), STEP_MS);
+    this.changed();
+    this.microphone ??= new Microphone(context);
+    const problem = await this.microphone.open();
+    if (this.talking !== talk) this.microphone.release(); // released, perhaps to answer the browser's question
+    else if (problem) this.silence(problem);
+    else {
+      const { port1, port2 } = new MessageChannel();
+      this.microphone.attach(port2);
+      const message = { op: "talk", talk: talk.number, rate: context.sampleRate, port: port1 };
+      this.worker?.postMessage(message, [port1]);
+    }
+  }
+
+  /** A talk that lasts: its worker needs to hear of a page that is alive, and a dialog ends it. */
+  step() {
+    if (!this.talking && performance.now() - this.endedAt > KEEP_MS) {
+      clearInterval(this.timer);
+      if (!this.listening) this.leave();
+    } else if (this.talking && document.querySelector("dialog[open]")) this.silence();
+    else if (this.talking) this.worker?.postMessage({ op: "alive" });
+  }
+
+  /** The page has lost the keyboard, or is hidden: a release will not be seen. */
+  interrupt() {
+    this.held = false;
+    this.silence();
+  }
+
+  /** End the talk. @param {string} [why] if the person did not */
+  silence(why = "") {
+    if (!this.talking) return;
+    this.talking = null;
+    this.endedAt = performance.now();
+    if (why) this.problem = why;
+    this.worker?.postMessage({ op: "end" });
+    this.microphone?.release();
+    this.adjust();
+    this.changed();
+  }
+
+  // -- both
+
+  /** The page leaves this component, or has heard enough. */
+  leave() {
+    this.silence();
+    clearInterval(this.timer);
+    this.microphone?.close();
+    this.listening = false;
+    this.disconnect();
+    this.problem = "";
+    this.context?.suspend();
+    this.changed();
+  }
+
+  /** @returns {AudioContext} running as soon as the browser lets it */
+  start() {
+    if (!this.context) {
+      this.context = new AudioContext({ latencyHint: "interactive" });
+      this.gain = this.context.createGain();
+      this.gain.connect(this.context.destination);
+    }
+    this.context.resume();
+    return this.context;
+  }
+
+  /** Nothing is heard while a person talks: it would come back by the microphone. */
+  adjust() {
+    if (this.gain) this.gain.gain.value = this.muted || this.talking ? 0 : 1;
+  }
+
+  /** @param {string} ref @param {MessagePort|null} port where sound is played; null: this is only for talking */
+  connect(ref, port) {
+    this.disconnect();
+    this.ref = ref;
+    const worker = new Worker(WORKER, { type: "module" });
+    worker.onmessage = ({ data }) => worker === this.worker && this.take(data);
+    worker.postMessage({ op: "open", ref, port, rate: this.context?.sampleRate }, port ? [port] : []);
+    this.worker = worker;
+  }
+
+  disconnect() {
+    this.worker?.terminate();
+    this.worker = null;
+    this.ref = "";
+    this.open = false;
+    this.stats = null;
+  }
+
+  /** @param {any} message of the worker */
+  take({ stats, connection, answer }) {
+    if (stats) this.stats = stats;
+    if (connection) this.open = connection === "open";
+    if (connection === "lost") this.silence("The connection was lost");
+    if (answer && this.talking?.number === answer.talk) {
+      if (answer.on) this.talking.on = true;
+      else this.silence(answer.why);
+    }
+    this.changed();
+  }
+
+  // -- why not
+
+  /** @returns {string} why nothing can be heard now; "" it can */
+  listenReason() {
+    if (!this.connection.isOpen) return "No connection to the server";
+    if (this.store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
+    if (!this.offers.has("audio")) return `${nameOf(this.route.ref)} has no sound`;
+    return "AudioContext" in window ? "" : "This browser plays no sound";
+  }
+
+  /** @returns {string} why this page cannot talk now; "" it can */
+  talkReason() {
+    const why = this.listenReason();
+    if (why) return why;
+    if (!this.connection.may("drive")) return "Log in as driver to talk";
+    if (!hasMicrophone()) return "Needs https";
+    const { ref } = this.route;
+    if (this.store.get(ref, "web/liveness")?.value.online === false) return `${nameOf(ref)} is silent`;
+    const view = this.store.get(ref, "web/sound")?.value;
+    if (view?.state === "refused") return view.why;
+    return this.talker ? `${this.talker} is talking` : "";
+  }
+
+  /** @returns {string} who else talks to this component */
+  get talker() {
+    const talker = this.store.get(this.route.ref, "web/sound")?.value.talker ?? "";
+    const own = talker === this.connection.you?.user && performance.now() - this.endedAt < OWN_MS;
+    return this.talking || own ? "" : talker;
+  }
+
+  get offers() {
+    const { ref } = this.route;
+    return new Offers(ref, this.store.get(ref, "capabilities")?.value);
+  }
+}

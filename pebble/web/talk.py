@@ -1,0 +1,53 @@
+"""A person's voice on its way to a robot: one talk at a time, nothing that is old, and the robot's packets. Pure."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pebble.contract.packets import SEQUENCE_LIMIT, Codec, Sound
+
+RATE: Final = 16_000  # Hz, mono, s16le
+PIECES_PER_S: Final = 50
+SAMPLES: Final = RATE // PIECES_PER_S
+PIECE_BYTES: Final = 2 * SAMPLES
+SILENT_S: Final = 1.0  # without a piece, after which a talk is over
+LATE_S: Final = 0.3  # what a stalled connection has held back longer than that is not played
+_DRIFT_S: Final = 2e-5  # a piece: the clock of a page's microphone may be slow by a thousandth
+
+
+class Talk:
+    """One talk of one page. It never goes on after its end: the page begins another one."""
+
+    def __init__(self, number: int, now: float) -> None:
+        self.number = number  # of that page's connection
+        self._heard_at = now
+        self._least = float("inf")  # the smallest lateness of its pieces
+
+    def takes(self, piece: int, now: float) -> bool:
+        """Whether this piece, counted from 0 by the page's microphone, is in time."""
+        late = now - piece / PIECES_PER_S
+        self._least = min(self._least + _DRIFT_S, late)
+        self._heard_at = now
+        return late - self._least <= LATE_S
+
+    def is_over(self, now: float) -> bool:
+        return now - self._heard_at > SILENT_S
+
+
+class Voice:
+    """The packets of all talks to one robot, by the server's clock.
+
+    Receivers of the original discard what has a smaller number than before, so numbers must not begin anew with
+    another talk, or another server: each talk begins at the number that belongs to the time.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def begin(self, wall_s: float) -> None:
+        self._count = max(self._count, int(PIECES_PER_S * wall_s))
+
+    def packet(self, piece: bytes, wall_s: float) -> bytes:
+        self._count += 1
+        number = (self._count - 1) % (SEQUENCE_LIMIT - 1) + 1  # 0 is not used
+        return Sound(Codec.PCM16LE, 1, RATE, SAMPLES, number, int(1000 * wall_s), piece).pack()

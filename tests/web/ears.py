@@ -1,0 +1,105 @@
+"""What a page plays and says, for tests in Chromium: recorded, and compared with what should have been heard."""
+
+from __future__ import annotations
+
+import base64
+import wave
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
+
+from pebble.demo.media_assessment import best_match, envelope
+from pebble.media.pcm import Resampler
+from pebble.media.speech import PERIOD_S, Speech
+from tests.web.browser import Tab
+from tests.web.sound_robot import REF
+
+RATE = 16_000
+#: Records what the page plays; as a worklet hands it over.
+TAP = """async () => {
+  const { node } = await pebble.sound.model.speaker;
+  window.heard = [];
+  window.heardAt = []; // seconds of the sound's clock
+  node.port.onmessage = ({ data }) => heardAt.push(data.at) && heard.push(data.left);
+  node.port.postMessage({ taps: true });
+}"""
+#: Everything that was recorded, as 16 bits.
+HEARD = """() => {
+  const samples = Int16Array.from(heard.flatMap((block) => [...block]), (sample) => 32767 * sample);
+  let text = "";
+  for (const byte of new Uint8Array(samples.buffer)) text += String.fromCharCode(byte);
+  return btoa(text);
+}"""
+
+
+def speech(rate: int, seconds: float = PERIOD_S) -> npt.NDArray[np.float64]:
+    """What robots and people say in tests, at any rate."""
+    return at_rate(Speech(RATE).samples(0, int(seconds * RATE)), rate)
+
+
+def at_rate(samples: npt.NDArray[np.int16], rate: int) -> npt.NDArray[np.float64]:
+    """16 kHz, mono, at another rate."""
+    return Resampler(RATE, rate, 1).feed(samples.reshape(-1, 1))[:, 0].astype(float)
+
+
+def write_voice(path: Path) -> None:
+    """A WAV file of ``speech``."""
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(48_000)
+        file.writeframes(speech(48_000).astype("<i2").tobytes())
+
+
+def fake_microphone(voice: Path) -> tuple[str, ...]:
+    """Flags of a browser whose microphone records this file, and that lets every page use it."""
+    flags = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
+    return *flags, f"--use-file-for-fake-audio-capture={voice}"
+
+
+@contextmanager
+def listener(origin: str, can: str) -> Iterator[ClientConnection]:
+    """Another page that listens."""
+    url = f"{origin.replace('http', 'ws')}/ws/sound?ref={REF}&can={can}"
+    with connect(url, origin=Origin(origin), max_size=None) as socket:
+        yield socket
+
+
+def state(opened: Tab) -> str:
+    return str(opened.test("sound-state").inner_text())
+
+
+def likeness(opened: Tab, seconds: float, *, envelopes: bool) -> float:
+    """How well the best second and a half of what the page plays from now on agrees with what the robot said."""
+    opened.page.evaluate(TAP)
+    rate = int(opened.page.evaluate("pebble.sound.model.context.sampleRate"))
+    assert opened.until(f"heard.length * 128 > {seconds * rate}", seconds + 10)
+    return compared(recorded(opened.page), rate, envelopes=envelopes)
+
+
+def recorded(page: Any) -> npt.NDArray[np.float64]:
+    """What was played since ``TAP``, at the rate of the page's sound."""
+    return np.frombuffer(base64.b64decode(page.evaluate(HEARD)), "<i2").astype(float)
+
+
+def compared(heard: npt.NDArray[np.float64], rate: int, *, envelopes: bool = False) -> float:
+    """The highest correlation of a second and a half of ``heard`` with what is said in tests."""
+    said = speech(rate, 2 * PERIOD_S)
+    size, step = int(1.5 * rate), rate // 4
+    windows = [heard[at : at + size] for at in range(0, len(heard) - size + 1, step)]
+    if envelopes:
+        return max(best_match(envelope(one, rate), envelope(said, rate)) for one in windows)
+    return max(best_match(one, said) for one in windows)
+
+
+def talks(opened: Tab) -> bool:
+    """Hold the button until the server takes the voice."""
+    opened.test("talk").hover()
+    opened.page.mouse.down()
+    return opened.until(lambda: state(opened) == "goob plays your voice.")

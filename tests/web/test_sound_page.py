@@ -1,0 +1,157 @@
+"""Sound between a robot and a page in Chromium, through the real server and a real broker."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from pebble.transports import MqttSettings, create
+from tests.support import Broker
+from tests.web.browser import Size, Tab, chromium, tab
+from tests.web.ears import at_rate, compared, fake_microphone, likeness, listener, state, talks, write_voice
+from tests.web.served import Served
+from tests.web.sound_robot import REF, SoundRobot
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    voice = tmp_path_factory.mktemp("voice") / "voice.wav"
+    write_voice(voice)
+    with chromium(*fake_microphone(voice)) as running:
+        yield running
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[SoundRobot]:
+    transport = create("mqtt", "sound", MqttSettings(host="127.0.0.1", port=broker.port))
+    robot = SoundRobot(transport=transport.open())
+    yield robot
+    robot.close()
+
+
+@contextmanager
+def page_of(
+    browser: Browser, served: Served, size: Size = "desktop", *, script: str = "", **options: Any
+) -> Iterator[Tab]:
+    with tab(browser, f"{served.origin}/r/{REF}", size, script=script, **options) as opened:
+        if size == "phone":
+            opened.test("tab-sound").click()
+        opened.test("listen").wait_for()
+        yield opened
+
+
+def test_what_the_robot_says_is_heard(browser: Browser, served: Served, robot: SoundRobot):
+    with page_of(browser, served) as opened, listener(served.origin, "pcm"):
+        assert state(opened) == ""
+        opened.test("listen").click()
+        assert opened.until(lambda: "ms buffered · pcm" in state(opened))
+        assert likeness(opened, 3, envelopes=False) > 0.95
+        assert robot.encodings[0] in ("opus", "pcm")
+        opened.test("mute").click()
+        assert opened.until(lambda: state(opened).startswith("muted"))
+        assert opened.page.evaluate("pebble.sound.model.gain.gain.value") == 0
+        opened.test("listen").click()
+        assert opened.until(lambda: state(opened) == "")
+        assert opened.complaints() == []
+
+
+def test_opus_is_heard(browser: Browser, served: Served, robot: SoundRobot):
+    with page_of(browser, served, "phone") as opened:
+        opened.test("listen").click()
+        assert opened.until(lambda: "ms buffered · opus" in state(opened))
+        assert likeness(opened, 3, envelopes=True) > 0.9
+        assert opened.complaints() == []
+
+
+WITHOUT_WORKLET = """Object.defineProperty(BaseAudioContext.prototype, "audioWorklet", { get: () => undefined });
+Object.defineProperty(navigator, "mediaDevices", { get: () => undefined });"""
+
+
+def test_over_plain_http_sound_is_heard_and_talking_needs_https(browser: Browser, served: Served, robot: SoundRobot):
+    """As far as the page can tell; the worker still decodes Opus."""
+    with page_of(browser, served, script=WITHOUT_WORKLET) as opened:
+        assert opened.test("talk").is_disabled()
+        why = opened.test("talk").get_attribute("aria-describedby")
+        assert opened.page.locator(f"#{why}").inner_text() == "Needs https"
+        opened.test("listen").click()
+        assert opened.until(lambda: "ms buffered" in state(opened))
+        assert opened.until("pebble.sound.model.stats.received > 100")
+
+
+# -- talking
+
+
+def test_a_voice_is_heard_at_the_robot(browser: Browser, served: Served, robot: SoundRobot):
+    with page_of(browser, served) as opened:
+        opened.test("listen").click()
+        assert opened.until(lambda: "ms buffered" in state(opened))
+        assert talks(opened)
+        assert opened.page.evaluate("pebble.sound.model.gain.gain.value") == 0  # else it would come back
+        assert opened.until(lambda: len(robot.heard) > 150)
+        opened.page.mouse.up()
+        assert opened.until(lambda: "ms buffered" in state(opened))
+        heard = np.frombuffer(b"".join(packet.body for packet in robot.heard), "<i2")
+        assert compared(at_rate(heard, 48_000), 48_000) > 0.9
+        assert opened.page.evaluate("pebble.sound.model.gain.gain.value") == 1
+        assert opened.complaints() == []
+
+
+INTERRUPTIONS: dict[str, Callable[[Tab], Any]] = {
+    "released": lambda opened: opened.page.mouse.up(),
+    "blur": lambda opened: opened.blur(),
+    "hidden": lambda opened: opened.hide(),
+    "menu": lambda opened: opened.page.evaluate("document.body.dispatchEvent(new Event('contextmenu', {bubbles: true}))"),
+    "dialog": lambda opened: opened.page.evaluate(
+        "() => { const one = document.createElement('dialog'); document.body.append(one); one.show(); }"
+    ),
+    "pointer": lambda opened: opened.page.evaluate(
+        """() => document.querySelector('[data-test=talk]').dispatchEvent(new PointerEvent('lostpointercapture'))"""
+    ),
+    "frozen": lambda opened: opened.freeze(),
+    "elsewhere": lambda opened: opened.page.evaluate("pebble.route.go('')"),
+}
+
+
+@pytest.mark.parametrize("how", INTERRUPTIONS)
+def test_what_ends_a_gesture_ends_a_talk(browser: Browser, served: Served, robot: SoundRobot, how: str):
+    with page_of(browser, served) as opened:
+        assert talks(opened)
+        assert opened.until(lambda: len(robot.heard) > 5)
+        INTERRUPTIONS[how](opened)
+        assert falls_silent(opened, robot)
+
+
+def falls_silent(opened: Tab, robot: SoundRobot) -> bool:
+    """Whether soon no voice reaches the robot any more, for 0.3 s."""
+    end = time.monotonic() + 4
+    while time.monotonic() < end:
+        count = len(robot.heard)
+        time.sleep(0.3)  # not the page's wait: one that is frozen would not answer
+        if len(robot.heard) == count:
+            return True
+    return False
+
+
+def test_while_another_person_talks_the_button_says_who(browser: Browser, served: Served, robot: SoundRobot):
+    with page_of(browser, served) as first, page_of(browser, served) as second:
+        assert talks(first)
+        assert second.until(lambda: second.test("talk").is_disabled())
+        assert second.page.locator("#why-talk").inner_text() == "local is talking"
+        first.page.mouse.up()
+        assert second.until(lambda: second.test("talk").is_enabled())
+
+
+def test_listening_ends_when_the_page_leaves_the_robot(browser: Browser, served: Served, robot: SoundRobot):
+    with page_of(browser, served) as opened:
+        opened.test("listen").click()
+        assert opened.until(lambda: "ms buffered" in state(opened))
+        opened.page.evaluate("pebble.route.go('')")
+        assert opened.until("!pebble.sound.model.worker && !pebble.sound.model.listening")
+        assert opened.until(lambda: robot.encodings[-1] is None, 8)
+        assert opened.until(lambda: robot.flags[-1] is False)
