@@ -201,6 +201,12 @@ export interface ShownOwner {
   count: number;
 }
 
+export interface TalkAnswer {
+  talk: number;
+  on: boolean;
+  why?: string;
+}
+
 export interface OwnerState {
   owner: string;
   latched: boolean;
@@ -250,6 +256,14 @@ export interface PictureView {
   pinned: string;
 }
 
+export interface SoundView {
+  state: string;
+  why: string;
+  encoding: string;
+  listeners: number;
+  talker: string;
+}
+
 export interface PictureFrom {
   source: string;
 }
@@ -275,6 +289,7 @@ export interface Metrics {
   "web/estop": EstopView;
   "web/driver": DriverView;
   "web/picture": PictureView;
+  "web/sound": SoundView;
   "web/picture-from": PictureFrom;
   "web/flags": FlagsView;
   "web/restarts": RestartsView;
