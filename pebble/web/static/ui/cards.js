@@ -1,7 +1,6 @@
 // Which cards there are, in their fixed order. A new one is a line here, and a module that is fetched when it is shown.
 
 import { fetchStyle } from "./hooks.js";
-import { Telemetry } from "./telemetry.js";
 
 /**
  * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
@@ -10,7 +9,7 @@ import { Telemetry } from "./telemetry.js";
  *   part: () => Promise<any>}} CardKind
  */
 
-/** @template T @param {Promise<T>} one of those that share a style sheet */
+/** @template T @param {Promise<T>} part one of those that share a style sheet */
 const withStyle = async (part) => (await Promise.all([part, fetchStyle("devices.css")]))[0];
 
 /** Listening and talking; a desktop has them below the picture. */
@@ -18,7 +17,14 @@ export const VOICE = async () => (await import("./sound.js")).load();
 
 /** @type {CardKind[]} */
 export const CARDS = [
-  { id: "telemetry", title: "Telemetry", icon: "gauge", tab: "sensors", wants: () => true, part: async () => Telemetry },
+  {
+    id: "telemetry",
+    title: "Telemetry",
+    icon: "gauge",
+    tab: "sensors",
+    wants: () => true,
+    part: async () => (await import("./telemetry.js")).Telemetry,
+  },
   {
     id: "lights",
     title: "Lights",
