@@ -4,9 +4,9 @@ import { fetchStyle } from "./hooks.js";
 
 /**
  * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
- * component with ``at`` and ``offers``.
+ * component with ``at`` and ``offers``. ``right``: in the right one of a desktop's columns.
  * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
- *   part: () => Promise<any>}} CardKind
+ *   part: () => Promise<any>, right?: boolean}} CardKind
  */
 
 /** @template T @param {Promise<T>} part one of those that share a style sheet */
@@ -27,6 +27,7 @@ export const CARDS = [
   },
   {
     id: "lights",
+    right: true,
     title: "Lights",
     icon: "light",
     tab: "more",
@@ -43,6 +44,7 @@ export const CARDS = [
   },
   {
     id: "sounds",
+    right: true,
     title: "Sounds",
     icon: "sound",
     tab: "sound",
@@ -51,6 +53,7 @@ export const CARDS = [
   },
   {
     id: "autonomy",
+    right: true,
     title: "Autonomy",
     icon: "script",
     tab: "more",
@@ -59,6 +62,7 @@ export const CARDS = [
   },
   {
     id: "outlets",
+    right: true,
     title: "Outlets",
     icon: "plug",
     tab: "more",
@@ -99,6 +103,7 @@ export const CARDS = [
   },
   {
     id: "system",
+    right: true,
     title: "System",
     icon: "power",
     tab: "more",

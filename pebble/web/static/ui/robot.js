@@ -51,7 +51,11 @@ function Desktop({ at, offers, view, video, source }) {
         /><//>`}
         ${!video && offers.drives && html`<${NoCamera} at=${at} offers=${offers} />`}
         <div class="cards">
-          ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
+          ${columns(cards).map(
+            (column, index) => html`<div key=${index} class="column">
+              ${column.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
+            </div>`,
+          )}
         </div>
         <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
       </div>
@@ -167,6 +171,13 @@ function SettingsWords() {
 }
 
 const wanted = (offers, view) => CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id));
+
+/** Two columns, so that a card that grows moves only those below it. */
+function columns(cards) {
+  const [left, right] = [false, true].map((wanted) => cards.filter(({ right: is = false }) => is === wanted));
+  if (!right.length) right.push(...left.splice(Math.ceil(left.length / 2)));
+  return [left, right].filter((column) => column.length);
+}
 
 function CardOf({ card, at, offers, view }) {
   return html`<${Card} id=${card.id} title=${card.title} icon=${card.icon} view=${view}>
