@@ -142,7 +142,7 @@ class AutonomyOp(_FromPage, frozen=True, kw_only=True, tag="autonomy"):
 
     ref: Ref
     file: Annotated[str, Meta(max_length=200)]
-    config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}  # noqa: RUF012 - a Struct
+    config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}
 
 
 class OutletOp(_FromPage, frozen=True, kw_only=True, tag="outlet"):
