@@ -463,7 +463,12 @@ SCRIPTS = {
     "timestamp": 1.0,
 }
 CLIPS = {
-    "files": ["horn.wav", "intro.mp3", *(f"speech/number {n}.wav" for n in range(140)), "warn/siren, long and loud.wav"],
+    "files": [
+        "horn.wav",
+        "intro.mp3",
+        *(f"speech/number {n}.wav" for n in range(140)),
+        "warn/siren, long and loud.wav",
+    ],
     "controls": True,
     "timestamp": 1.0,
 }
@@ -474,7 +479,12 @@ def script(now: int, **more: Any) -> Value:
     config = {"tag_id": 5, "distance_m": 0.6, "search": True, "family": "APRILTAG_36H11"}
     parts = [{"file": "wheel-odometry", "pid": 812, "running": True}]
     status = {"running": True, "file": "apriltag-follow", "pid": 813, "dependencies": parts, "error": None}
-    return (GOOB, "autonomy-status", status | {"config": config, "timestamp": now / 1000, "controls": True} | more, 4000)
+    return (
+        GOOB,
+        "autonomy-status",
+        status | {"config": config, "timestamp": now / 1000, "controls": True} | more,
+        4000,
+    )
 
 
 def sound(**more: Any) -> Callable[[int], Value]:
@@ -502,7 +512,11 @@ STATES |= {
         changed(
             ASKED,
             MINE,
-            at(GOOB, "autonomy-status", {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"}),
+            at(
+                GOOB,
+                "autonomy-status",
+                {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"},
+            ),
             sound(error="the loudspeaker is busy (talk-back plays)"),
         ),
         LIVE,

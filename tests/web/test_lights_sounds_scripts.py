@@ -21,7 +21,16 @@ CAPABILITIES = {
 }
 CLIPS = ["horn.wav", "signals/beep.wav", *(f"speech/number {number}.wav" for number in range(300))]
 CONFIGS = [
-    {"key": "tag_id", "label": "Tag ID", "type": "int", "default": None, "arg": "", "required": True, "min": 0, "max": 34},
+    {
+        "key": "tag_id",
+        "label": "Tag ID",
+        "type": "int",
+        "default": None,
+        "arg": "",
+        "required": True,
+        "min": 0,
+        "max": 34,
+    },
     {"key": "distance", "label": "Distance (m)", "type": "float", "default": 0.6, "arg": "", "min": 0.2, "max": 3.0},
     {"key": "search", "label": "Search", "type": "bool", "default": True, "arg": ""},
     {"key": "family", "label": "Family", "type": "enum", "default": "25H9", "arg": "", "options": ["25H9", "36H11"]},
@@ -31,7 +40,15 @@ SCRIPTS = [
     {"file": "april-follow", "label": "Follow a tag", "configs": CONFIGS},
     {"file": "circle", "label": "Drive in a circle", "configs": []},
 ]
-IDLE = {"running": False, "file": None, "pid": None, "dependencies": [], "error": None, "config": None, "timestamp": 1.0}
+IDLE = {
+    "running": False,
+    "file": None,
+    "pid": None,
+    "dependencies": [],
+    "error": None,
+    "config": None,
+    "timestamp": 1.0,
+}
 PIDS = itertools.count(100)
 
 
@@ -119,7 +136,9 @@ _DRAG = """async (input) => {
 
 def test_a_dragged_colour_is_sent_now_and_then_and_at_last(opened: Tab, robot: Robot):
     opened.test("colour").evaluate(_DRAG)
-    assert opened.until(lambda: (robot.asked("lights-solid") or [{"r": 0}])[-1]["r"] == pytest.approx(250 / 255, abs=0.001), 3)
+    assert opened.until(
+        lambda: (robot.asked("lights-solid") or [{"r": 0}])[-1]["r"] == pytest.approx(250 / 255, abs=0.001), 3
+    )
     times = [at for at, name, _ in robot.received if name.endswith("/lights-solid")]
     assert len(times) <= 2 + (times[-1] - times[0]) / 0.2
 
@@ -154,7 +173,9 @@ def test_hundreds_of_clips_are_filtered_and_one_is_played(opened: Tab, robot: Ro
     assert opened.until(lambda: len(robot.asked("soundboard-command")) == 2, 3)
     assert robot.asked("soundboard-command")[1]["action"] == "stop"
     opened.test("repeat").check()
-    robot.show("soundboard-status", {"playing": False, "file": None, "error": "player exited with code 1", "timestamp": 3.0})
+    robot.show(
+        "soundboard-status", {"playing": False, "file": None, "error": "player exited with code 1", "timestamp": 3.0}
+    )
     assert opened.until(lambda: opened.test("sound-error").count() == 1, 3)
     opened.test("clip").click()
     opened.test("repeat").uncheck()
@@ -225,7 +246,10 @@ def test_what_runs_and_its_end(opened: Tab, robot: Robot):
     opened.test("effective").click()
     shown = opened.page.locator(".effective dl").inner_text().split("\n")
     assert {"0.8", "7"} <= {line.strip() for line in shown}
-    assert opened.page.locator(".dependencies").inner_text().split("\n") == ["● wheel-odometry runs", "✖ locations does not run"]
+    assert opened.page.locator(".dependencies").inner_text().split("\n") == [
+        "● wheel-odometry runs",
+        "✖ locations does not run",
+    ]
     robot.show("autonomy-status", running(overridden=True))
     assert opened.until(lambda: "waits: a person drives" in text(opened, "script-state"), 3)
     opened.test("end-script").click()
@@ -296,8 +320,21 @@ LONG = "long " * 5000
 @pytest.mark.parametrize("metric", ["soundboard-files", "soundboard-status", "autonomy-files", "autonomy-status"])
 def test_a_robot_may_report_anything(opened: Tab, robot: Robot, metric: str):
     texts = [
-        {"files": [MARKUP, LONG[:2000], {"file": MARKUP, "label": LONG, "configs": [{"key": MARKUP, "label": MARKUP}]}]},
-        {"running": True, "playing": True, "file": LONG, "error": MARKUP, "config": {MARKUP: DEEP}, "dependencies": [DEEP, {}]},
+        {
+            "files": [
+                MARKUP,
+                LONG[:2000],
+                {"file": MARKUP, "label": LONG, "configs": [{"key": MARKUP, "label": MARKUP}]},
+            ]
+        },
+        {
+            "running": True,
+            "playing": True,
+            "file": LONG,
+            "error": MARKUP,
+            "config": {MARKUP: DEEP},
+            "dependencies": [DEEP, {}],
+        },
         {"running": True, "playing": True, "file": DEEP, "error": DEEP, "config": DEEP, "dependencies": LONG},
     ]
     for value in [*ODD, *texts]:

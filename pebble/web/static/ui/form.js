@@ -60,6 +60,7 @@ const common = ({ id, field, wrong }) => ({
   "aria-required": field.required && field.default === null ? "true" : undefined,
 });
 
+/** @param {any} props */
 function TextInput({ text = "", onText, ...props }) {
   return html`<input
     type="text"
@@ -72,7 +73,10 @@ function TextInput({ text = "", onText, ...props }) {
   />`;
 }
 
-/** While its text is no number yet, as a lone sign, browsers report it as empty: it must stay as it was typed. */
+/**
+ * While its text is no number yet, as a lone sign, browsers report it as empty: it must stay as it was typed.
+ * @param {any} props
+ */
 function NumberInput({ text = "", onText, ...props }) {
   const { min, max, step, type, default: usual } = props.field;
   const input = (event) => onText(event.currentTarget.validity.badInput ? UNREADABLE : event.currentTarget.value);
@@ -89,6 +93,7 @@ function NumberInput({ text = "", onText, ...props }) {
   />`;
 }
 
+/** @param {any} props */
 function Switch({ text, onText, ...props }) {
   const usual = props.field.default;
   const on = (text ?? usual) === "true";
@@ -102,6 +107,7 @@ function Switch({ text, onText, ...props }) {
   </label>`;
 }
 
+/** @param {any} props */
 function Choice({ text, onText, ...props }) {
   const { options, default: usual, required, type } = props.field;
   const listed = usual !== null && options.includes(usual);

@@ -15,7 +15,7 @@ const FIRST = { colour: "#ff8800", period: 2, mode: "", steady: "off" };
 /** Calls the newest of what it is given, at most once in ``stepMs``. */
 export class Pacer {
   /** @param {number} stepMs @param {() => number} [clock] @param {(fn: () => void, ms: number) => unknown} [later] */
-  constructor(stepMs, clock = () => performance.now(), later = setTimeout) {
+  constructor(stepMs, clock = () => performance.now(), later = (fn, ms) => setTimeout(fn, ms)) {
     this.stepMs = stepMs;
     this.clock = clock;
     this.later = later;
