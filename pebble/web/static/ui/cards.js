@@ -10,7 +10,7 @@ import { Telemetry } from "./telemetry.js";
  *   part: () => Promise<any>}} CardKind
  */
 
-/** @template T @param {Promise<T>} one of those that share a style sheet */
+/** @template T @param {Promise<T>} part one of those that share a style sheet */
 const withStyle = async (part) => (await Promise.all([part, fetchStyle("devices.css")]))[0];
 
 /** @type {CardKind[]} */
