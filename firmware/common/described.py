@@ -30,7 +30,7 @@ _PONG = const(0x32)
 
 
 class Described:
-    """``manifest`` is the payload of DESCRIBE, whose first ``hello`` bytes are those of HELLO; ``ring`` holds a frame of it.
+    """``manifest`` is the payload of DESCRIBE, whose first ``hello`` bytes are those of HELLO; its frame fits ``ring``.
 
     Call ``receive`` at the beginning of each turn, ``port.send`` at its end. ``now`` wraps after 2**30 ms.
     """

@@ -77,7 +77,8 @@ def outlets(
     link: _Link = None,
     count: Annotated[int, typer.Option("--outlets", "-n", min=1, max=4, help="How many.")] = 4,
     unreachable: Annotated[
-        list[str] | None, typer.Option(help="An outlet without its relay: o4. May be given several times.", metavar="oN")
+        list[str] | None,
+        typer.Option(help="An outlet without its relay: o4. May be given several times.", metavar="oN"),
     ] = None,
     trace: Annotated[Path | None, typer.Option(help="Append each change of a relay to this file.")] = None,
 ) -> int:

@@ -132,7 +132,15 @@ class LinuxRobot(SimulatedRobot):
         self.mcu = self._start_motors()
         self.mcu.wait_until(self._port.exists, _MCU_START_S, ending)
         for kind, port in self._devices.items():
-            options = ["--kind", kind, "--link", str(port), "--trace", str(self._trace_of(kind)), *_OPTIONS.get(kind, ())]
+            options = [
+                "--kind",
+                kind,
+                "--link",
+                str(port),
+                "--trace",
+                str(self._trace_of(kind)),
+                *_OPTIONS.get(kind, ()),
+            ]
             command = [sys.executable, "-m", "pebble.simulation.mcu", *options]
             self.devices.append(Program(f"{self.name}'s {kind}", command, self._folder / f"{kind}.log"))
         for device, port in zip(self.devices, self._devices.values(), strict=True):

@@ -233,10 +233,11 @@ class Robots:
             return
         self.receive_as(address.identity.base, address.metric, message, now)
 
-    def receive_as(
-        self, ref: str, metric: str, message: Message, now: float, channel: Channel | None = None
-    ) -> None:
-        """Take a message as the metric that it carries, whatever its topic is called; ``channel``: not the contract's."""
+    def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: Channel | None = None) -> None:
+        """Take a message as the metric that it carries, whatever its topic is called.
+
+        ``channel``: how it is read, if the contract does not have it.
+        """
         component = self.components.get(ref) or self._add(ref, retained=message.retain)
         channel = channel or _channel(metric)
         if component is None or channel is None:

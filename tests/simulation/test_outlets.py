@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -29,15 +30,17 @@ class Host:
         os.write(self._port, wire.frame(kind, payload, interface, sequence=7))
 
     def received(self, kind: int) -> list[wire.Received]:
-        try:
+        with suppress(BlockingIOError):
             self._received += os.read(self._port, 65536)
-        except BlockingIOError:
-            pass
         whole = self._received[: self._received.rfind(b"\0") + 1]
         return [one for one in map(wire.received, filter(None, whole.split(b"\0"))) if one.kind == kind]
 
     def close(self) -> None:
         os.close(self._port)
+
+
+def relays(trace: Path) -> list[str]:
+    return [entry.line for entry in read_trace(trace) if entry.event == "relay"]
 
 
 @pytest.fixture
@@ -51,8 +54,7 @@ def test_a_command_on_the_line_switches_a_relay_and_the_trace_has_it(station: Pt
     host.send(wire.CMD, b"\1", interface=3)
     assert until(lambda: host.received(wire.ACK))
     host.send(wire.CMD, b"\0", interface=3)
-    relays = lambda: [entry.line for entry in read_trace(tmp_path / "trace.jsonl") if entry.event == "relay"]
-    assert until(lambda: relays() == ["o2 on", "o2 off"])
+    assert until(lambda: relays(tmp_path / "trace.jsonl") == ["o2 on", "o2 off"])
     host.close()
 
 

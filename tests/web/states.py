@@ -198,7 +198,9 @@ def fleet(now: int) -> list[Value]:
     ]
 
 
-def outlet(name: str, *, on: bool = False, bound: bool = True, reachable: bool = True, label: str = "") -> dict[str, Any]:
+def outlet(
+    name: str, *, on: bool = False, bound: bool = True, reachable: bool = True, label: str = ""
+) -> dict[str, Any]:
     """What a station reports of one outlet, as its robot publishes it."""
     value = {"bound": bound, "reachable": reachable, "on": on}
     return sample("hs105-sta", f"{name}_state", value, profile="outlet.switch.v1") | ({"label": label} if label else {})
@@ -218,7 +220,9 @@ def described(mcu: wire.M) -> Any:
 LAMP_MCU = wire.LAMP.but(
     interfaces=(
         *wire.LAMP.interfaces,
-        wire.I(5, "arm", wire.IN, wire.KIND_COMMAND, (wire.F("angle", wire.I16, 0.1, 0.0, "deg"), wire.F("k", wire.F32))),
+        wire.I(
+            5, "arm", wire.IN, wire.KIND_COMMAND, (wire.F("angle", wire.I16, 0.1, 0.0, "deg"), wire.F("k", wire.F32))
+        ),
     )
 )
 

@@ -142,12 +142,23 @@ HOSTILE: dict[str, Any] = {
     "number": 7,
     "deep": {"interfaces": [nested(28)], "model": nested(28)},
     "wrong": {"interfaces": [None, 7, {"name": 1}, {"name": "a", "dir": "out", "encoding": {"fields": [None, 7]}}]},
-    "script": {"model": SCRIPT, "interfaces": [{"name": SCRIPT, "dir": "out", "encoding": {"fields": [{"name": SCRIPT}]}}]},
-    "twice": {"interfaces": [{"name": "x", "dir": "out", "encoding": {"fields": [{"name": "f", "type": "u8"}] * 2}}] * 2},
-    "names": {"interfaces": [{"name": "x", "dir": "in", "encoding": {"fields": [{"name": "__proto__", "type": "u8"}]}}]},
+    "script": {
+        "model": SCRIPT,
+        "interfaces": [{"name": SCRIPT, "dir": "out", "encoding": {"fields": [{"name": SCRIPT}]}}],
+    },
+    "twice": {
+        "interfaces": [{"name": "x", "dir": "out", "encoding": {"fields": [{"name": "f", "type": "u8"}] * 2}}] * 2
+    },
+    "names": {
+        "interfaces": [{"name": "x", "dir": "in", "encoding": {"fields": [{"name": "__proto__", "type": "u8"}]}}]
+    },
     "huge": {
         "interfaces": [
-            {"name": f"i{n}", "dir": ("in", "out")[n % 2], "encoding": {"fields": [{"name": "y" * 60, "type": "f32"}] * 9}}
+            {
+                "name": f"i{n}",
+                "dir": ("in", "out")[n % 2],
+                "encoding": {"fields": [{"name": "y" * 60, "type": "f32"}] * 9},
+            }
             for n in range(60)
         ]
     },
@@ -159,7 +170,9 @@ def test_hostile_manifests_reports_and_capabilities_do_no_harm(server: CannedSer
     odd = [
         at(GOOB, f"mcu/{SCRIPT.replace('/', '')} {name}/describe", manifest) for name, manifest in HOSTILE.items()
     ]  # fmt: skip
-    odd += [at(GOOB, f"outlets/odd{n}/status", value) for n, value in enumerate([7, "x", [], {}, {"value": []}, nested(30)])]
+    odd += [
+        at(GOOB, f"outlets/odd{n}/status", value) for n, value in enumerate([7, "x", [], {}, {"value": []}, nested(30)])
+    ]
     odd += [at(GOOB, "mcu/lamp-1/lamp", [1]), at(GOOB, "mcu/lamp-1/glow", {"value": {"lux": {"a": nested(25)}}})]
     server.show(with_values(*odd))
     with tab(browser, server.url + server.state.path) as opened:

@@ -11,7 +11,7 @@ import pytest
 from pebble.transports import Message
 from pebble.web.robots import MAX_ALIASES, Interest, Robots
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.support import until
+from tests.support import Broker, until
 from tests.web.served import Page, RecordingRobot, Served
 from tests.web.states import described, outlet, sample
 
@@ -20,10 +20,9 @@ DESCRIBE = "mcu/lamp-1/describe"
 
 
 @pytest.fixture
-def robot(served: Served) -> Iterator[RecordingRobot]:
-    made = RecordingRobot(served.broker_port, BASE)
-    yield made
-    made.close()
+def robot(broker: Broker) -> Iterator[RecordingRobot]:
+    with RecordingRobot(broker.port, BASE) as made:
+        yield made
 
 
 @pytest.fixture

@@ -48,7 +48,8 @@ def _at(card: str, *selectors: str) -> Callable[[Page], None]:
         for selector in selectors:
             page.locator(f'[data-card="{card}"] {selector}').first.click()
         page.evaluate(
-            "(card) => scrollBy(0, document.querySelector(`[data-card='${card}']`).getBoundingClientRect().top - 90)", card
+            "(card) => scrollBy(0, document.querySelector(`[data-card='${card}']`).getBoundingClientRect().top - 90)",
+            card,
         )
 
     return act

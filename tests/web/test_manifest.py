@@ -72,7 +72,10 @@ HOSTILE = [
 
 @pytest.mark.parametrize("payload", HOSTILE)
 def test_a_manifest_of_any_shape_is_read_without_an_exception(payload: Any) -> None:
-    run("[readManifest(v[0])?.interfaces.map((one) => [unsendable(one), command(one, new Map()), range, step])]", payload)
+    run(
+        "[readManifest(v[0])?.interfaces.map((one) => [unsendable(one), command(one, new Map()), range, step])]",
+        payload,
+    )
 
 
 def test_what_is_too_much_is_counted() -> None:
@@ -194,7 +197,9 @@ def test_outlets_are_those_that_are_listed_and_those_that_report() -> None:
     listed = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
     assert outlets(listed, "outlets/o1/status", "outlets/o9/status") == {"o1": False, "o2": True, "o9": False}
     assert outlets(None, "outlets/o1/status", "outlets/o1/other", "outlets/x") == {"o1": True}
-    assert outlets({"value": {"outlets": {"available": True, "outlets": [1, None, {}, {"name": 7}, {"name": ""}]}}}) == {}
+    assert (
+        outlets({"value": {"outlets": {"available": True, "outlets": [1, None, {}, {"name": 7}, {"name": ""}]}}}) == {}
+    )
 
 
 @pytest.mark.parametrize(
