@@ -95,7 +95,7 @@ class OpenComponents:
     def update(self, ref: str) -> None:
         """Its capabilities, or the pages that have it open, may have changed."""
         wanted = self._filters(ref) if ref in self._pages else {}
-        if ref not in self._following and list(wanted) != list(self._subscriptions.get(ref, ())):
+        if ref not in self._following and set(wanted) != set(self._subscriptions.get(ref, ())):
             self._following.add(ref)
             self._spawn(self._follow(ref))
 
@@ -121,7 +121,7 @@ class OpenComponents:
                     self._subscriptions.pop(ref)
                     return
                 await asyncio.sleep(_STEP_S)
-                if list(self._filters(ref) if ref in self._pages else {}) == list(wanted):
+                if set(self._filters(ref) if ref in self._pages else {}) == set(wanted):
                     return
         finally:
             self._following.discard(ref)

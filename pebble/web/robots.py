@@ -353,6 +353,8 @@ class Robots:
             return
         arrived = time.time() - (time.monotonic() - now)
         component.heartbeat(payload.t, now, arrived, online=payload.online is not False)
+        if payload.online is False and component.sent_online is not False:
+            self._refresh(component, now)  # it may be back before the next round
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)

@@ -308,5 +308,5 @@ def test_without_a_login_a_page_says_who_it_is(served, robot) -> None:
 
 
 def test_with_a_login_the_name_of_the_user_counts(broker, tmp_path: Path) -> None:
-    with Hall(broker.port, tmp_path) as hall, hall.page("driver", name="Alice") as page:
+    with Hall(broker.port, tmp_path) as hall, Page(hall.served, cookie=hall.cookie("driver"), name="Alice") as page:
         assert page.welcome["user"] == "driver"

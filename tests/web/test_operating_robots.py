@@ -77,16 +77,18 @@ def test_what_a_service_logs_is_on_the_page_and_can_be_filtered(at_goob: Console
 
 
 def test_a_flag_is_retained_at_the_broker(at_goob: Console, robots: Stage, wire: Wire) -> None:
-    at_goob.test("flag-mqtt-audio").check()
     topic = "goob/incoming/flags/mqtt-audio"
+    flag = lambda: at_goob.state("web/flags")["mqtt_audio"]
+    at_goob.test("flag-mqtt-audio").check()
     assert at_goob.tab.until(lambda: wire.last(topic) == {"value": True}, 3)
     later = Wire(robots)
     assert at_goob.tab.until(lambda: later.last(topic) == {"value": True}, 3)
     later.close()
     wire.publish(topic, {"value": False}, retain=True)  # another operator
+    assert at_goob.tab.until(lambda: flag() is False, 3), (flag(), wire.all(topic))
     assert at_goob.tab.until(lambda: not at_goob.test("flag-mqtt-audio").is_checked(), 3)
     wire.publish(topic, None, retain=True)
-    assert at_goob.tab.until(lambda: at_goob.state("web/flags")["mqtt_audio"] is None, 3)
+    assert at_goob.tab.until(lambda: flag() is None, 3)
 
 
 def child(robots: Stage, name: str) -> int:
@@ -114,7 +116,7 @@ def test_the_service_that_keeps_restarting_is_found(at_goob: Console, robots: St
     assert at_goob.tab.until(lambda: at_goob.test("log-service").input_value() == SERVICE, 2)
     at_goob.test("log-service").select_option("")
     at_goob.test("bell").click()
-    notice = at_goob.page.locator(".notice.service")
+    notice = at_goob.page.locator(".notice-service")
     assert notice.count() == 1
     assert re.search(rf"goob service {SERVICE} .* \(signal 9\) 2×", notice.inner_text()), notice.inner_text()
     at_goob.page.keyboard.press("Escape")

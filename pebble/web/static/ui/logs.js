@@ -1,15 +1,16 @@
 // The log lines of a robot's services as they come, filtered.
 
 import { LEVELS } from "../core/logs.js";
-import { html, useEffect, useModel, usePage, useRef, useState } from "./hooks.js";
+import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "./hooks.js";
 import { logViewOf } from "./log-view.js";
 import { Why } from "./parts.js";
 import { styled } from "./styled.js";
-import { clockTime } from "./words.js";
+import { clockTime, inner, isObject } from "./words.js";
 
 const SIGNS = { DEBUG: "·", INFO: "○", WARNING: "▲", ERROR: "✖", CRITICAL: "✖" };
 const END_PX = 24; // so near to the end the newest line is in sight
 const SAID_MS = 3000;
+const SERVICES = 64; // to choose from
 
 export const Logs = styled("system.css", LogsBody);
 
@@ -34,15 +35,17 @@ function LogsBody({ at, view: cards }) {
   }, [cards?.wanted]);
   const lines = view.book.filtered(view.filter);
   return html`<div class="logs" ref=${card}>
-    <${Tools} view=${view} lines=${lines} />
+    <${Tools} at=${at} view=${view} lines=${lines} />
     <${Lines} view=${view} lines=${lines} />
     <${Foot} view=${view} lines=${lines} />
   </div>`;
 }
 
-function Tools({ view, lines }) {
+function Tools({ at, view, lines }) {
   const { filter } = view;
-  const services = [...new Set([...view.book.services, filter.service])].filter(Boolean).sort();
+  const listed = inner(useValue(at, "status"))?.services;
+  const known = isObject(listed) ? Object.keys(listed).slice(0, SERVICES) : [];
+  const services = [...new Set([...known, ...view.book.services, filter.service])].filter(Boolean).sort();
   const on = (name) => (event) => view.choose({ [name]: event.currentTarget.value });
   return html`<div class="log-tools">
     <select

@@ -182,7 +182,7 @@ function NoticeListBody({ onGo }) {
 
 function Row({ one, isNew, onGo }) {
   const { ref, kind, text, at, since, count } = one;
-  return html`<li class=${`notice ${kind} ${isNew ? "new" : ""}`} onClick=${onGo}>
+  return html`<li class=${`notice notice-${kind} ${isNew ? "notice-new" : ""}`} onClick=${onGo}>
     <${RouteLink} to=${ref} className="notice-link">
       <i aria-hidden="true">${SIGNS[kind]}</i>
       <span class="notice-text">

@@ -219,8 +219,11 @@ function Flag({ at, name, title, meaning, value, known }) {
   const { commands, connection } = usePage();
   useModel(connection);
   const [asked, ask] = useState(/** @type {{on: boolean, at: number} | null} */ (null));
-  const pending = asked && asked.on !== (value ?? null) ? asked : null;
-  useTick(pending ? 500 : 0);
+  useEffect(() => {
+    if (asked?.on === value) ask(null);
+  }, [asked, value]);
+  useTick(asked ? 500 : 0);
+  const pending = asked && performance.now() - asked.at < ECHO_MS ? asked : null;
   const why = flagReason(connection, known);
   const change = (event) => {
     const on = event.currentTarget.checked;
@@ -240,7 +243,7 @@ function Flag({ at, name, title, meaning, value, known }) {
         onChange=${change}
       /><span>${title}</span></label
     >
-    <span class="flag-state" role="status">${flagWords(pending, value)}</span>
+    <span class="flag-state" role="status">${flagWords(asked, pending, value)}</span>
     <${Why} id=${`${id}-why`}>${why || meaning}<//>
   </div>`;
 }
@@ -251,9 +254,8 @@ function flagReason(connection, known) {
   return known ? "" : "Not received yet";
 }
 
-function flagWords(pending, value) {
+function flagWords(asked, pending, value) {
   const now = value === true ? "on" : value === false ? "off" : "never set";
-  if (!pending) return now;
-  if (performance.now() - pending.at < ECHO_MS) return `asked: ${pending.on ? "on" : "off"}…`;
-  return `✖ not confirmed: ${now}`;
+  if (pending) return `asked: ${pending.on ? "on" : "off"}…`;
+  return asked && asked.on !== value ? `✖ not confirmed: ${now}` : now;
 }
