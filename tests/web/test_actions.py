@@ -1,4 +1,4 @@
-"""Keys and buttons besides driving, a gamepad of one's own, and screens that only watch; asserted at robot and broker."""
+"""Keys and buttons besides driving, mappings of gamepads, and screens that only watch; asserted at robot and broker."""
 
 from __future__ import annotations
 
@@ -256,7 +256,7 @@ def test_the_wizard_learns_a_gamepad_without_moving_anything(at_benjr: Console) 
 
 @contextmanager
 def _watching(browser: Browser, url: str) -> Iterator[Tab]:
-    with tab(browser, f"{url}?watch", script="window.__pads = []; navigator.getGamepads = () => window.__pads;") as opened:
+    with tab(browser, f"{url}?watch") as opened:
         assert opened.until("!!window.pebble?.connection.you && document.documentElement.hasAttribute('data-watch')")
         yield opened
 
@@ -268,7 +268,7 @@ def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser) ->
         opened.page.evaluate(
             "() => { for (const one of document.querySelectorAll('main button, .banners button')) one.click() }"
         )
-        opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.setFlag(pebble.driver.ref, 'a', true) }")
+        opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.act(pebble.driver.ref, 'reboot') }")
         opened.page.keyboard.press("Control+Space")
         assert opened.until(lambda: bool(canned.sent("estop")), 2)
         assert {message["op"] for message in canned.received} <= {"hello", "watch", "stop", "estop"}

@@ -126,7 +126,7 @@ export class Settings extends Model {
 
   /** @param {"theme" | "thumbnails" | "sort" | "side" | "hints"} name @param {any} value */
   set(name, value) {
-    this[name] = value;
+    Object.assign(this, { [name]: value });
     write(name, value);
     this.apply();
     this.changed();
