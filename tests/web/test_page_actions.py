@@ -150,7 +150,8 @@ const rest = pad([0, 0, 0, 0]);
 
 
 def mapping(steps: str) -> Any:
-    return run("inputs.js", "Inputs, USUAL, validMapping", _MAPPING + steps)
+    imports = f"const {{ validMapping }} = await import({json.dumps((CORE / 'pad-mapping.js').as_uri())});"
+    return run("inputs.js", "Inputs, USUAL", imports + _MAPPING + steps)
 
 
 def test_a_mapping_has_the_axes_and_their_directions() -> None:
@@ -203,7 +204,7 @@ def test_no_mapping_has_the_buttons_of_the_emergency_stop() -> None:
 # -- learning a gamepad
 
 _LEARNING = """
-const inputs = await import("%s");
+const { validMapping } = await import("%s");
 const pad = (axes, ...pressed) =>
   ({ axes, buttons: Array.from({ length: 16 }, (_, i) => ({ pressed: pressed.includes(i) })) });
 const rest = [0.02, -0.03, 1, 0];
@@ -217,12 +218,12 @@ const press = (...buttons) => buttons.forEach((button) => take(pad(rest, button)
 
 
 def learning(steps: str) -> Any:
-    return run("pad-learning.js", "Learning, STEPS", _LEARNING % (CORE / "inputs.js").as_uri() + steps)
+    return run("pad-learning.js", "Learning, STEPS", _LEARNING % (CORE / "pad-mapping.js").as_uri() + steps)
 
 
 def test_a_gamepad_is_learned_from_what_is_moved() -> None:
     steps = "forward(); right(); press(2, 3, 4, 5); while (learning.step) learning.skip();"
-    made = learning(f"{steps} result = learning.mapping(); result.valid = inputs.validMapping(result);")
+    made = learning(f"{steps} result = learning.mapping(); result.valid = validMapping(result);")
     valid = made.pop("valid")
     assert made == valid
     assert made["z"] == {"axis": 3, "invert": False}
