@@ -295,7 +295,7 @@ def test_it_stops_robots_and_never_drives(browser: Browser, stage: Stage, wire: 
         assert opened.until("window.pebble.store.get(pebble.driver.ref, 'web/liveness')?.value.online === true")
         before = len(wire.all("benjr/incoming/drive-values"))
         opened.page.keyboard.press("KeyW", delay=200)
-        assert opened.page.evaluate("pebble.store.get(pebble.driver.ref, 'web/driver')?.value.by") == ""
+        assert not opened.page.evaluate("pebble.store.get(pebble.driver.ref, 'web/driver')?.value.you")
         assert len(wire.all("benjr/incoming/drive-values")) == before
         opened.test("stop-one").click()
         assert opened.until(lambda: wire.latched("benjr"), 2)
