@@ -7,7 +7,7 @@ import { Estop } from "./core/estop.js";
 import { Store } from "./core/store.js";
 import { App, PARTS } from "./ui/app.js";
 import { Page, fetchPart, isHere } from "./ui/hooks.js";
-import { Connection, Panels, Route, Settings } from "./ui/models.js";
+import { Connection, Panels, Route, Settings, WATCHES, read } from "./ui/models.js";
 import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
 
@@ -26,7 +26,7 @@ function join() {
   const socket = new ControlSocket({
     store,
     version,
-    maySend: (op) => !route.watching || WATCHING.includes(op),
+    maySend: (op) => !WATCHES || WATCHING.includes(op),
     onOpen: () => driver.opened(),
     onLost: () => driver.lost(),
     onChange: () => connection.changed(),
@@ -54,7 +54,7 @@ function join() {
   connection.socket = socket;
   estop.onChange = () => connection.changed();
   driver.onControlLost = (by) => connection.show(by ? `${by} took over` : "Your control has ended: take it again");
-  driver.mappingOf = (id) => settings.mappingOf(id);
+  if (read("pads", null)) driver.mappingOf = () => null; // until ui/more.js is here
   driver.loading = () => !isHere(PARTS.robot);
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
   video.pictures = new Pictures(
@@ -94,12 +94,6 @@ function commands(socket, driver, estop) {
     reset: (ref, owners) => estop.reset(ref, owners),
     take: (over) => driver.take(over),
     release: () => driver.release(),
-    /** Whether this screen only watches; then it drives nothing any more. */
-    watchOnly(on) {
-      const mine = on ? store.refs().filter((ref) => store.get(ref, "web/driver")?.value.you) : [];
-      for (const ref of mine) socket.send({ op: "lease", ref, take: false });
-      route.watch(on);
-    },
     askSeries: (ref) => socket.send({ op: "watch", ref, series: true }),
     setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
     setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
@@ -141,8 +135,7 @@ fetchMore();
 
 /** What keys, gamepad and wall screens do besides; as often as it takes. */
 function fetchMore() {
-  const retry = () => setTimeout(fetchMore, REST_MS);
-  import("./ui/more.js").then((more) => more.install(page), retry);
+  import("./ui/more.js").then(({ install }) => install(page), () => setTimeout(fetchMore, REST_MS));
 }
 
 Object.assign(window, { pebble: page }); // for tests, and for people who look into it

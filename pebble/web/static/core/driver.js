@@ -30,7 +30,7 @@ export class Driver {
     this.onAction = () => {};
     /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
     this.actions = null;
-    /** @type {(id: string) => import("./inputs.js").Mapping} of a gamepad */
+    /** @type {(id: string) => import("./inputs.js").Mapping | null} of a gamepad; null: it is not known yet */
     this.mappingOf = () => USUAL;
     this.mine = false;
     this.padName = "";
@@ -275,14 +275,14 @@ export class Driver {
     this.padName = pad?.id ?? "";
     const mapping = this.mappingOf(this.padName);
     const focused = document.hasFocus() ? pad : null;
-    this.inputs.padSample(focused, performance.now(), mapping);
+    this.inputs.padSample(mapping && focused, performance.now(), mapping);
     this.actions?.padSample(focused, mapping);
     const pressed = (index) => pad?.buttons[index]?.pressed === true;
     if (focused && PAD_ESTOP.every(pressed)) {
       if (!this.padLatched) this.latch("gamepad");
       this.padLatched = this.padStopped = true;
     } else {
-      const stop = pressed(mapping.buttons.stop);
+      const stop = pressed(mapping?.buttons.stop);
       if (stop && !this.padStopped) this.space();
       this.padStopped = stop;
       this.padLatched = false;

@@ -11,7 +11,6 @@ export const DRIVE_KEYS = new Set([...LEFT, ...RIGHT, ...FORWARD, ...BACK, ...UP
 const DEAD_ZONE = 0.1;
 const FROZEN_MS = 3000; // a deflected gamepad whose time stands still may be gone
 export const PAD_ESTOP = [8, 9]; // buttons that no mapping has
-export const MOST = 32; // axes, and buttons
 
 /** @typedef {{speed: number, turn: number, balance: number}} Sliders speed and turn 0..1, balance -1..1 */
 /** @typedef {{id: string, axes: readonly number[], buttons: readonly {pressed: boolean}[], timestamp: number}} Pad */
@@ -29,18 +28,6 @@ export const USUAL = {
   deadZone: DEAD_ZONE,
   buttons: { stop: 0, auxiliary: 1 },
 };
-
-const isIndex = (value) => Number.isInteger(value) && value >= -1 && value < MOST;
-
-/** @param {any} value that was stored, perhaps by another version @returns {Mapping} the usual one for what is none */
-export function validMapping(value) {
-  const axis = (one) => ({ axis: one?.axis, invert: one?.invert === true });
-  const [x, z, deadZone] = [axis(value?.x), axis(value?.z), Number(value?.deadZone)];
-  const valid = isIndex(x.axis) && isIndex(z.axis) && x.axis !== z.axis && deadZone >= 0.02 && deadZone < 0.6;
-  if (!valid) return USUAL;
-  const kept = Object.entries(value.buttons ?? {}).filter(([, at]) => isIndex(at) && !PAD_ESTOP.includes(at));
-  return { x, z, deadZone, buttons: { ...USUAL.buttons, ...Object.fromEntries(kept.slice(0, MOST)) } };
-}
 
 export class Inputs {
   constructor() {

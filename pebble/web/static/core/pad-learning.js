@@ -1,7 +1,8 @@
 /** Learns which axis and button of a gamepad does what, from what is moved when the page asks for it. Pure. */
 
 import { ACTIONS, PAD_ACTIONS } from "./actions.js";
-import { MOST, PAD_ESTOP } from "./inputs.js";
+import { PAD_ESTOP } from "./inputs.js";
+import { MOST } from "./pad-mapping.js";
 
 const MOVED = 0.6; // an axis that was pushed on purpose
 const STILL = 0.25; // one that was let go

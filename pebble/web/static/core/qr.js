@@ -2,7 +2,7 @@
 
 export const MOST_BYTES = 106;
 
-/** Of each version: blocks, and the data and correction codewords of a block. */
+/** @type {[number, number, number][]} of each version: blocks, and the data and correction codewords of a block */
 const VERSIONS = [
   [1, 16, 10],
   [1, 28, 16],

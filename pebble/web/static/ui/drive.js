@@ -1,6 +1,6 @@
 // Driving: who may, why not, the stick, and how fast.
 
-import { html, useCalm, useEffect, useModel, usePage, useValue } from "./hooks.js";
+import { html, useCalm, useModel, usePage, useValue } from "./hooks.js";
 import { Card, HoldButton, Icon, Part } from "./parts.js";
 import { Stick } from "./stick.js";
 import { driverName, nameOf } from "./words.js";
@@ -15,12 +15,18 @@ export function DriveCard({ at }) {
   <//>`;
 }
 
-const keyHints = async () => (await import("./key-hints.js")).KeyHints;
+const MORE = {
+  keyHints: async () => (await import("./key-hints.js")).KeyHints,
+  settings: async () => (await import("./drive-settings.js")).DriveSettings,
+};
 
 function Hints() {
   const { hints } = useModel(usePage().settings);
-  return hints ? html`<div style=${{ minHeight: "126px" }}><${Part} part=${keyHints} /></div>` : null;
+  return hints ? html`<div style=${{ minHeight: "88px" }}><${Part} part=${MORE.keyHints} /></div>` : null;
 }
+
+/** How the inputs are scaled, and the extra axis; fetched later. */
+export const DriveSettings = () => html`<${Part} part=${MORE.settings} />`;
 
 /** Why it cannot be driven now, and what can be done about it; or that it can. */
 export function WhyLine({ at }) {
@@ -90,7 +96,7 @@ export function DrivePad() {
   </div>`;
 }
 
-function set(driver, name) {
+export function set(driver, name) {
   return (event) => {
     driver.sliders[name] = Number(event.currentTarget.value) / 100;
     driver.changed();
@@ -104,25 +110,7 @@ export function Speed() {
   return html`<${Slider} name="Speed" value=${speed} min=${5} text=${text} onInput=${set(driver, "speed")} />`;
 }
 
-/** How the inputs are scaled, and the extra axis. */
-export function DriveSettings() {
-  const { driver } = usePage();
-  const { turn, balance } = useModel(driver).sliders;
-  const part = `${Math.round(100 * turn)} %`;
-  const side = balance === 0 ? "centred" : `${Math.round(100 * Math.abs(balance))} % ${balance > 0 ? "right" : "left"}`;
-  return html`<div class="sliders">
-    <${Slider} name="Turn" value=${turn} min=${5} text=${part} onInput=${set(driver, "turn")} />
-    <${Slider} name="Balance" value=${balance} min=${-50} max=${50} text=${side} onInput=${set(driver, "balance")} />
-    <div class="aux">
-      <span>Extra axis <kbd>Q</kbd> <kbd>E</kbd></span>
-      <${AuxButton} driver=${driver} value=${1} label="Extra axis up">+<//>
-      <${AuxButton} driver=${driver} value=${-1} label="Extra axis down">−<//>
-    </div>
-    <p class="pad-name"><${Icon} name="pad" />${driver.padName || "no gamepad: press one of its buttons"}</p>
-  </div>`;
-}
-
-function Slider({ name, value, min, max = 100, text, onInput }) {
+export function Slider({ name, value, min, max = 100, text, onInput }) {
   return html`<label class="slider">
     <span>${name}</span>
     <input
@@ -137,27 +125,4 @@ function Slider({ name, value, min, max = 100, text, onInput }) {
     />
     <output>${text}</output>
   </label>`;
-}
-
-function AuxButton({ driver, value, label, children }) {
-  const reason = driver.reason();
-  const end = () => driver.hold(`aux ${value}`, 0);
-  useEffect(() => end, []);
-  return html`<button
-    type="button"
-    data-test=${`aux${value > 0 ? "+" : "-"}`}
-    aria-label=${label}
-    disabled=${Boolean(reason) && !driver.gestureActive}
-    aria-describedby=${reason ? "why-drive" : undefined}
-    onPointerDown=${(event) => {
-      event.currentTarget.setPointerCapture(event.pointerId);
-      driver.hold(`aux ${value}`, value, event.timeStamp);
-    }}
-    onPointerUp=${end}
-    onPointerCancel=${end}
-    onLostPointerCapture=${end}
-    onContextMenu=${(event) => event.preventDefault()}
-  >
-    ${children}
-  </button>`;
 }

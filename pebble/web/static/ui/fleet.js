@@ -2,7 +2,7 @@
 
 import { RouteLink, Liveness } from "./header.js";
 import { html, useEffect, useMetric, useModel, useNodes, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
-import { Offers } from "./models.js";
+import { Offers, Route, WATCHES } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import {
   battery,
@@ -83,8 +83,7 @@ function sorted(store, refs, by) {
 }
 
 function FleetTools({ filter, onFilter }) {
-  const { commands, panels, route, settings } = usePage();
-  useModel(route);
+  const { panels, settings } = usePage();
   return html`<div class="fleet-tools">
     <input
       type="search"
@@ -113,14 +112,7 @@ function FleetTools({ filter, onFilter }) {
         onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
       /><span>Thumbnails</span></label
     >
-    <label class="check"
-      ><input
-        type="checkbox"
-        data-test="watch"
-        checked=${route.watching}
-        onChange=${(event) => commands.watchOnly(event.currentTarget.checked)}
-      /><span>Only watch</span></label
-    >
+    <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}>${WATCHES ? "More than watch" : "Only watch"}</a>
     <button type="button" data-test="phone" onClick=${() => panels.show("phone")}>
       <${Icon} name="phone" />Open on a phone
     </button>
@@ -147,9 +139,8 @@ export const iconOf = (ref) => ICONS[typeOf(ref)] ?? "thing";
 const TRANSPORTS = { mqtt: "MQTT", zenoh: "Zenoh", mcu: "MCU" };
 
 function FleetCard({ at }) {
-  const { commands, settings, connection, route } = usePage();
+  const { commands, settings, connection } = usePage();
   useModel(settings);
-  useModel(route);
   useModel(connection, (one) => one.state);
   const offers = new Offers(at, useValue(at, "capabilities"));
   const estop = useValue(at, "web/estop");
@@ -169,7 +160,7 @@ function FleetCard({ at }) {
       </div>
       <${Liveness} at=${at} />
     </div>
-    ${(settings.thumbnails || route.watching) && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
+    ${(settings.thumbnails || WATCHES) && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
       <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} />

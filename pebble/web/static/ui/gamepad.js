@@ -1,9 +1,10 @@
 // What the gamepad shows, and the wizard that learns what its axes and buttons do. It moves no robot: a panel is open.
 
 import { PAD_ACTIONS, buttonName, buttonOf } from "../core/actions.js";
-import { MOST } from "../core/inputs.js";
 import { Learning, STEPS } from "../core/pad-learning.js";
+import { MOST } from "../core/pad-mapping.js";
 import { html, useEffect, useModel, usePage, useState, useTick } from "./hooks.js";
+import { pads } from "./pads.js";
 import { Panel } from "./panel.js";
 import { Why } from "./parts.js";
 
@@ -30,18 +31,18 @@ function tryButtons({ actions }, tried) {
 }
 
 function Wizard({ pad }) {
-  const { driver, settings } = usePage();
+  const { driver } = usePage();
   const [learning, learn] = useState(/** @type {Learning | null} */ (null));
-  useModel(settings);
+  useModel(pads);
   useEffect(() => {
     if (!learning) return;
     learning.take(pad);
     if (learning.step) return;
-    settings.setMapping(pad.id, learning.mapping());
+    pads.set(pad.id, learning.mapping());
     driver.interrupt(); // what is held now meant something else before
     learn(null);
   });
-  const own = settings.pads.has(pad.id);
+  const own = pads.mappings.has(pad.id);
   return html`<div class="panel-text">
     <p><b>${pad.id}</b> <span class="dim">${own ? "set up in this browser" : "with the usual layout"}</span></p>
     <${Live} pad=${pad} />
@@ -86,10 +87,10 @@ function Question({ learning, onCancel }) {
 }
 
 function Summary({ pad, own, onLearn }) {
-  const { driver, settings } = usePage();
-  const mapping = settings.mappingOf(pad.id);
+  const { driver } = usePage();
+  const mapping = pads.mappingOf(pad.id);
   const set = (changed) => {
-    settings.setMapping(pad.id, changed);
+    pads.set(pad.id, changed);
     driver.interrupt();
   };
   const few = pad.axes.length < 2;

@@ -1,6 +1,7 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
 import { Boundary, html, useMetric, useModel, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
+import { Route } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
 
@@ -62,13 +63,13 @@ const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble
 
 /** Follow a link to a component, or the fleet, without loading the page again. */
 export function RouteLink({ to, className, label, children }) {
-  const route = useModel(usePage().route);
+  const { route } = usePage();
   const go = (event) => {
     if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
     event.preventDefault();
     route.go(to);
   };
-  return html`<a class=${className} href=${route.to(to)} aria-label=${label} onClick=${go}>${children}</a>`;
+  return html`<a class=${className} href=${Route.path(to)} aria-label=${label} onClick=${go}>${children}</a>`;
 }
 
 const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: all robots"

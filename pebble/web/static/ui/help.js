@@ -3,6 +3,7 @@
 import { ACTIONS, buttonName, buttonOf } from "../core/actions.js";
 import { html, useModel, usePage } from "./hooks.js";
 import { useKeyNames } from "./keyboard.js";
+import { pads } from "./pads.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
 
@@ -28,11 +29,11 @@ export function HelpPanel({ onClose }) {
 }
 
 function Bindings() {
-  const { driver, settings } = usePage();
+  const { driver } = usePage();
   useModel(driver);
-  useModel(settings);
+  useModel(pads);
   const name = useKeyNames();
-  const mapping = settings.mappingOf(driver.padName);
+  const mapping = pads.mappingOf(driver.padName);
   const standard = driver.pad?.mapping === "standard";
   return html`<section class="panel-text" aria-label="Keys, gamepad and touch">
     <ul class="bindings">

@@ -1,9 +1,9 @@
 // What the page knows besides the store: its connection, its address, its settings, and the picture.
 
-import { USUAL, validMapping } from "../core/inputs.js";
 import { inner, isObject } from "./words.js";
 
-const PADS = 16; // gamepads that are remembered
+/** Whether this screen only watches: nothing but stops is sent. It is in the address, so it outlives everything. */
+export const WATCHES = new URLSearchParams(location.search).has("watch");
 
 /** Something that widgets follow. */
 export class Model {
@@ -22,8 +22,6 @@ export class Model {
     for (const fn of [...this.followers]) fn();
   }
 }
-
-const isWatching = () => new URLSearchParams(location.search).has("watch");
 
 /** The state of the control socket, and what the server last refused. */
 export class Connection extends Model {
@@ -61,7 +59,7 @@ export class Connection extends Model {
   }
 
   may(right) {
-    return this.isOpen && !isWatching() && (this.you?.rights ?? []).includes(right);
+    return this.isOpen && !WATCHES && (this.you?.rights ?? []).includes(right);
   }
 
   /** Show a text for a few seconds. @param {string} text */
@@ -89,28 +87,15 @@ export class Route extends Model {
     }
   }
 
-  /** Whether this screen only watches: nothing but stops is sent. It is in the address, so it outlives everything. */
-  get watching() {
-    return isWatching();
-  }
-
-  static path(ref) {
-    return ref ? `/r/${ref.split("/").map(encodeURIComponent).join("/")}` : "/";
-  }
-
-  /** @param {string} ref @returns {string} the address of a screen, which only watches if this one does */
-  to(ref, watching = this.watching) {
-    return Route.path(ref) + (watching ? "?watch" : "");
-  }
-
-  watch(watching) {
-    history.replaceState(null, "", this.to(this.ref, watching));
-    this.changed();
+  /** @param {string} ref @returns {string} the address of its screen, which only watches if this one does */
+  static path(ref, watches = WATCHES) {
+    const path = ref ? `/r/${ref.split("/").map(encodeURIComponent).join("/")}` : "/";
+    return watches ? `${path}?watch` : path;
   }
 
   go(ref) {
     if (ref === this.ref) return;
-    history.pushState(null, "", this.to(ref));
+    history.pushState(null, "", Route.path(ref));
     scrollTo(0, 0);
     this.changed();
   }
@@ -124,17 +109,15 @@ export class Settings extends Model {
     this.thumbnails = read("thumbnails", false) === true;
     this.sort = read("sort", "name");
     this.name = read("name", "");
-    this.side = read("side", "right") === "left" ? "left" : "right"; // of the stick, on a phone
-    this.hints = read("hints", true) !== false; // which keys drive
+    this.side = read("side", "right"); // of the stick, on a phone
+    this.hints = read("hints", true); // which keys drive
     this.forgotten = new Set(list(read("forgotten", [])));
-    const pads = Object.entries(read("pads", {})).slice(0, PADS);
-    this.pads = new Map(pads.map(([id, mapping]) => [id, validMapping(mapping)]));
     this.apply();
   }
 
   /** @param {"theme" | "thumbnails" | "sort" | "name" | "side" | "hints"} name @param {any} value */
   set(name, value) {
-    this[name] = value;
+    Object.assign(this, { [name]: value });
     write(name, value);
     this.apply();
     this.changed();
@@ -145,19 +128,6 @@ export class Settings extends Model {
     if (this.theme === "light" || this.theme === "dark") root.dataset.theme = this.theme;
     else delete root.dataset.theme;
     root.dataset.side = this.side;
-  }
-
-  /** @param {string} id of a gamepad @returns {import("../core/inputs.js").Mapping} */
-  mappingOf(id) {
-    return this.pads.get(id) ?? USUAL;
-  }
-
-  /** @param {string} id of a gamepad @param {import("../core/inputs.js").Mapping | null} mapping null: the usual one */
-  setMapping(id, mapping) {
-    this.pads.delete(id);
-    if (mapping) this.pads.set(id, mapping);
-    write("pads", Object.fromEntries([...this.pads].slice(-PADS)));
-    this.changed();
   }
 
   forget(ref, forgotten = true) {

@@ -3,6 +3,8 @@
 import { Actions } from "../core/actions.js";
 import { Awake } from "../core/awake.js";
 import { fetchStyle } from "./hooks.js";
+import { WATCHES } from "./models.js";
+import { pads } from "./pads.js";
 
 const WATCHING = ["help", "mute"]; // what can be asked of a screen that only watches
 const STEP = 0.1; // of the speed, for each press
@@ -19,6 +21,8 @@ export function install(page) {
     (id, phase) => driver.onAction(id, phase),
     () => driver.ref !== "",
   );
+  page.pads = pads;
+  driver.mappingOf = (id) => pads.mappingOf(id);
   fetchStyle("panels.css").catch(() => {}); // the panels fetch it again
   new Wall(page).start();
 }
@@ -33,7 +37,7 @@ class Doer {
   act(id, phase) {
     const { page } = this;
     const { ref } = page.driver;
-    if (phase === "down" && page.route.watching && !WATCHING.includes(id)) return undefined;
+    if (phase === "down" && WATCHES && !WATCHING.includes(id)) return undefined;
     switch (id) {
       case "help":
         return page.panels.toggle("help");
@@ -75,19 +79,16 @@ class Wall {
   }
 
   start() {
-    const { route } = this.page;
-    const mark = () => document.documentElement.toggleAttribute("data-watch", route.watching);
-    route.onChange(mark);
-    mark();
+    document.documentElement.toggleAttribute("data-watch", WATCHES);
     setInterval(() => this.check(), CHECK_MS);
     document.addEventListener("visibilitychange", () => this.check());
   }
 
   check() {
-    const { connection, driver, route, store } = this.page;
+    const { connection, driver, store } = this.page;
     const drives = connection.isOpen && store.get(driver.ref, "web/driver")?.value.you === true;
-    this.awake.want(route.watching || drives);
-    if (route.watching) this.recover(connection);
+    this.awake.want(WATCHES || drives);
+    if (WATCHES) this.recover(connection);
   }
 
   /** Load the page again when it is older than the server, or the server has ended its session. */

@@ -16,6 +16,9 @@ export function Panel({ id, title, onClose, className = "", children }) {
       before?.focus?.();
     };
   }, []);
+  useEffect(() => {
+    if (document.activeElement === document.body) element.current.focus(); // what had it is gone
+  });
   return html`<dialog
     open
     class=${`panel ${className}`}

@@ -19,7 +19,7 @@ export function PhonePanel({ onClose }) {
 export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost|.*\.localhost)$/.test(host);
 
 function Code({ at }) {
-  const whole = location.origin + Route.path(at);
+  const whole = location.origin + Route.path(at, false);
   const grid = qrCode(whole);
   const address = grid ? whole : location.origin;
   return html`<div class="panel-text">
