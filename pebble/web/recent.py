@@ -1,4 +1,4 @@
-"""What components sent in the last minutes of what pages plot, for pages that open a plot later. Pure: time is passed in.
+"""What components sent in the last minutes of what pages plot, for pages that open a plot later. Pure.
 
 Values are thinned to a rate; what is too old, too long or too much is left out.
 """

@@ -52,7 +52,9 @@ class State:
     path: str = "/"
     values: Callable[[int], list[Value]] = field(default=lambda _now: [])
     repeated: dict[str, float] = field(default_factory=dict)  # metrics that arrive again and again: seconds between
-    series: Callable[[], dict[tuple[str, str], list[Any]]] = field(default=dict)  # points from before, as in messages.Series
+    series: Callable[[], dict[tuple[str, str], list[Any]]] = field(
+        default=dict
+    )  # points from before, as in messages.Series
     frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
     welcome: dict[str, Any] = field(default_factory=dict)  # instead of the usual one's fields
     pictures: bool = True  # whether cameras send any
@@ -122,7 +124,9 @@ class CannedServer:
 
     async def _stream(self, _request: Request) -> Response:
         """A page that a robot may show in a frame."""
-        return HTMLResponse("<body style='background: #2a6; color: #fff'>The robot's own stream<script>self.ran = 1</script>")
+        return HTMLResponse(
+            "<body style='background: #2a6; color: #fff'>The robot's own stream<script>self.ran = 1</script>"
+        )
 
     def _filled(self, text: str) -> str:
         return text.replace("{port}", str(self.port))

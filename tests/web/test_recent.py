@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from typing import Any
 
@@ -82,7 +83,7 @@ def test_each_metric_fits_into_one_message_evenly() -> None:
     assert len(text) < MESSAGE_BYTES + 500
     numbers = [json.loads(bytes(value))["n"] for _, value in points]
     assert numbers[-1] == 599
-    steps = {b - a for a, b in zip(numbers, numbers[1:], strict=False)}
+    steps = {b - a for a, b in itertools.pairwise(numbers)}
     assert len(steps) == 1
     assert len(numbers) > 40
 
@@ -93,7 +94,7 @@ def test_all_of_them_are_bounded_in_bytes() -> None:
     for number in range(200):
         for metric in LIMITS:
             recent.open(f"a/b/{number}")
-            for at in range(0, 120):
+            for at in range(120):
                 recent.receive(f"a/b/{number}", metric, value, float(at))
     assert recent.bytes <= module.MAX_BYTES
     held = sum(len(bytes(one)) for ring in recent._rings.values() for _, one in ring.points)

@@ -11,6 +11,7 @@ import subprocess
 from collections.abc import Iterator
 
 import httpx
+import msgspec
 import pytest
 
 from pebble.web.guard import CONTENT_SECURITY_POLICY
@@ -117,7 +118,7 @@ def test_the_page_refuses_the_same() -> None:
     assert found["shown"][: len(GOOD)] == list(GOOD)
     assert set(found["shown"][len(GOOD) :]) <= set(addresses[-3:])
     assert found["own"] == []
-    assert found["secure"] == [url for url in GOOD if url.startswith("https")]
+    assert [one for one in found["secure"] if one in GOOD] == [url for url in GOOD if url.startswith("https")]
     assert found["reported"] == ["a", "a", "a", "", "", "", "", "", ""]
 
 
@@ -137,7 +138,7 @@ def report(served: Served, robot: RecordingRobot, url: object, key: str = "webrt
     """Publish it, and wait until the server has it."""
     robot.publish("status", {"t": 1, "value": {key: url}}, retain=True)
     robots = served.app.state.robots
-    assert until(lambda: json.dumps(url).encode() in bytes(robots.value(robot.base, "status") or b"").replace(b" ", b""))
+    assert until(lambda: msgspec.json.encode(url) in bytes(robots.value(robot.base, "status") or b""))
 
 
 @pytest.mark.parametrize("key", ["webrtc_url", "webrtcUrl", "url"])

@@ -43,7 +43,9 @@ def server() -> Iterator[CannedServer]:
 
 
 @contextmanager
-def showing(server: CannedServer, browser: Browser, state: State, size: Any = "desktop", **options: Any) -> Iterator[Tab]:
+def showing(
+    server: CannedServer, browser: Browser, state: State, size: Any = "desktop", **options: Any
+) -> Iterator[Tab]:
     server.show(state)
     with tab(browser, server.url + state.path, size, **options) as opened:
         assert opened.until("!!window.pebble?.connection.you")
@@ -119,8 +121,9 @@ def test_the_newest_values_are_text(sensors: Tab) -> None:
     assert [" ".join(text.split()) for text in texts] == ["battery 7.92 V"]
     names = [text.split()[0] for text in sensors.test("plot-touch").locator("li").all_inner_texts()]
     assert names == ["a0", "a1", "a2"]
-    dashes = "[...document.querySelectorAll('[data-test=plot-touch] svg')].map((one) => getComputedStyle(one).strokeDasharray)"
-    assert len(set(sensors.page.evaluate(dashes))) == 3
+    swatches = sensors.test("plot-touch").locator("svg")
+    dashes = swatches.evaluate_all("(all) => all.map((one) => getComputedStyle(one).strokeDasharray)")
+    assert len(set(dashes)) == 3
 
 
 def test_only_what_is_seen_is_drawn_and_not_often(sensors: Tab) -> None:
@@ -171,15 +174,27 @@ def test_a_plot_is_added_remembered_and_removed(server: CannedServer, browser: B
 
 
 def test_uplot_is_fetched_with_the_plots_only(server: CannedServer, browser: Browser) -> None:
-    fetched = "performance.getEntriesByType('resource').map((one) => one.name).filter((one) => /uPlot/.test(one)).length"
+    fetched = (
+        "performance.getEntriesByType('resource').map((one) => one.name).filter((one) => /uPlot/.test(one)).length"
+    )
     with showing(server, browser, replace(SENSORS, path="/")) as opened:
         opened.page.locator("[data-test^=card-]").first.wait_for()
         assert opened.page.evaluate(fetched) == 0
 
 
-NASTY: list[Any] = [None, 7, "x" * 5000, [], {"value": {"a" * 5000: 1}}, {"value": {"x_mm": "1", "y_mm": []}},
-                    {"value": {str(n): n for n in range(500)}}, {"shapes": 7, "labels": {}}, {"shapes": [[[1e300, None]] * 900] * 900},
-                    {"value": {"orientation_deg": {"roll": "<img src=x>", "pitch": None}}}]  # fmt: skip
+SET = "([metric, value]) => pebble.store.set(pebble.route.ref, metric, value)"
+NASTY: list[Any] = [
+    None,
+    7,
+    "x" * 5000,
+    [],
+    {"value": {"a" * 5000: 1}},
+    {"value": {"x_mm": "1", "y_mm": []}},
+    {"value": {str(number): number for number in range(500)}},
+    {"shapes": 7, "labels": {}},
+    {"shapes": [[[1e300, None]] * 900] * 900},
+    {"value": {"orientation_deg": {"roll": "<img src=x>", "pitch": None}}},
+]
 
 
 @pytest.mark.parametrize("metric", ["sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level"])
@@ -187,7 +202,9 @@ def test_no_payload_breaks_a_card(server: CannedServer, browser: Browser, metric
     with showing(server, browser, SENSORS) as opened:
         opened.test("plot-battery").wait_for()
         for payload in NASTY:
-            opened.page.evaluate("([metric, value]) => pebble.store.set(pebble.route.ref, metric, value)", [metric, payload])
+            opened.page.evaluate(
+                "([metric, value]) => pebble.store.set(pebble.route.ref, metric, value)", [metric, payload]
+            )
             opened.page.wait_for_timeout(120)
         see(opened, "map")
         assert opened.page.locator(".failed").count() == 0
@@ -362,8 +379,7 @@ def test_in_full_screen_too_where_stop_and_the_reason_remain(server: CannedServe
 def test_overlays_vanish_half_a_second_after_the_last(server: CannedServer, browser: Browser) -> None:
     with showing(server, browser, replace(OVERLAYS, repeated={"web/liveness": 1.0})) as opened:
         assert opened.until("!!document.querySelector('[data-test=overlays-canvas]')")
-        publish = "(value) => pebble.store.set(pebble.route.ref, 'video-overlays', value)"
-        opened.page.evaluate(publish, {"shapes": [[[0.2, 0.2], [0.8, 0.8]]]})
+        opened.page.evaluate(SET, ["video-overlays", {"shapes": [[[0.2, 0.2], [0.8, 0.8]]]}])
         inked = """() => { const one = document.querySelector("[data-test=overlays-canvas]");
           return one.getContext("2d").getImageData(0, 0, one.width, one.height).data.some((value) => value > 0); }"""
         assert opened.until(inked, 1)
@@ -440,10 +456,17 @@ def test_an_address_that_is_newer_than_the_page_needs_a_reload(server: CannedSer
 
 @pytest.mark.parametrize(
     "address",
-    ["javascript:parent.ran = 1", "data:text/html,x", "http://user:secret@localhost/", "http://127.0.0.1:{port}/stream"],
+    [
+        "javascript:parent.ran = 1",
+        "data:text/html,x",
+        "http://user:secret@localhost/",
+        "http://127.0.0.1:{port}/stream",
+    ],
 )
 def test_what_may_not_be_shown_is_not(server: CannedServer, browser: Browser, address: str) -> None:
-    state = replace(OWN, values=changed(fleet, MINE, with_stream(address)), frames=f"{STREAM} http://127.0.0.1:{{port}}")
+    state = replace(
+        OWN, values=changed(fleet, MINE, with_stream(address)), frames=f"{STREAM} http://127.0.0.1:{{port}}"
+    )
     with showing(server, browser, state) as opened:
         assert opened.test("open-stream").is_disabled()
         assert opened.page.locator("#why-stream").inner_text()
@@ -453,7 +476,10 @@ def test_what_may_not_be_shown_is_not(server: CannedServer, browser: Browser, ad
 def test_another_component_whose_picture_is_shown_offers_its_stream(server: CannedServer, browser: Browser) -> None:
     tower = "pebble/towers/tower-1"
     values = changed(
-        fleet, MINE, at(GOOB, "web/picture-from", {"source": tower}), at(tower, "status", {"value": {"url": f"{STREAM}/stream"}})
+        fleet,
+        MINE,
+        at(GOOB, "web/picture-from", {"source": tower}),
+        at(tower, "status", {"value": {"url": f"{STREAM}/stream"}}),
     )
     with showing(server, browser, replace(OWN, values=values)) as opened:
         opened.test("open-stream").click()

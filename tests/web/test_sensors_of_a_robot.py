@@ -87,7 +87,9 @@ def test_a_plot_has_the_values_that_the_broker_carried(
     shown = [row[field[-1]] for row in rows(goob, metric)]
     carried = [value if metric == "charging-level" else value[field[-1]] for value in sensors.all(metric)]
     assert set(shown) <= set(carried)
-    assert goob.tab.until(lambda: f"{carried[-1]:.2f}" in goob.test("plot-battery").inner_text() or metric != "charging-level")
+    assert goob.tab.until(
+        lambda: f"{carried[-1]:.2f}" in goob.test("plot-battery").inner_text() or metric != "charging-level"
+    )
 
 
 def test_what_was_sent_before_a_reload_is_there_after_it(goob: Console) -> None:

@@ -74,7 +74,9 @@ export function choices(metric, payload) {
     groups.set(group, [...(groups.get(group) ?? []), name]);
   }
   const together = [...groups].filter(([group, fields]) => group && fields.length > 1 && fields.length <= MOST_LINES);
-  return [...together, ...names.map((name) => [name, [name]])].slice(0, MOST_CHOICES).map(([name, fields]) => ({
+  /** @type {[string, string[]][]} */
+  const alone = names.map((name) => [name, [name]]);
+  return [...together, ...alone].slice(0, MOST_CHOICES).map(([name, fields]) => ({
     id: `${metric} ${name}`,
     title: name === "value" ? metric : `${metric} ${name}`,
     metric,

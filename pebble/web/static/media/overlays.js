@@ -110,6 +110,7 @@ const EDGE = "rgb(0 0 0 / 75%)";
  * canvas per pixel of the page
  */
 export function drawOverlays(context, overlays, area, scale) {
+  /** @returns {Point} */
   const place = ([x, y]) => [area.x + x * area.width, area.y + y * area.height];
   context.lineJoin = "round";
   for (const shape of overlays.shapes) {

@@ -162,6 +162,7 @@ class View {
     Object.assign(canvas, { width: Math.round(width * pixels), height: Math.round(height * pixels) });
     const context = canvas.getContext("2d");
     context.scale(pixels, pixels);
+    /** @returns {[number, number]} */
     const place = (pose) => [width / 2 + (pose.x - x) * this.scale, height / 2 - (pose.y - y) * this.scale];
     this.drawGrid(context, { width, height, x, y, line, edge, dim });
     context.lineWidth = 2.5;

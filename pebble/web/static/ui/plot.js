@@ -1,9 +1,12 @@
 // Draws the lines of one plot with uPlot, a few times a second and only while they are seen.
 
-import uPlot from "../vendor/uPlot.mjs";
+import made from "../vendor/uPlot.mjs";
 import { spread } from "../core/plot-choices.js";
 import { html, useEffect, usePage, useRef } from "./hooks.js";
 import { clockTime } from "./words.js";
+
+/** @type {any} it has no types here */
+const uPlot = made;
 
 const STEP_MS = 100; // at most ten times a second
 const CALM_MS = 1000; // where people ask for less motion, and where a pixel is longer than that
