@@ -164,12 +164,12 @@ class Page:
 
     async def speak(self, talk: int, pieces: int, *, until_refused: bool = True) -> bytes:
         """Say so much in real time; returns what was said."""
-        speech, said = Speech(RATE), b""
+        speech, said, began = Speech(RATE), b"", time.monotonic()
         for number in range(pieces):
             pcm = speech.samples(PIECE * number, PIECE).tobytes()
             self.say(talk, number, pcm)
             said += pcm
-            await asyncio.sleep(PIECE / RATE)
+            await asyncio.sleep(max(0.0, began + (number + 1) * PIECE / RATE - time.monotonic()))
             if until_refused and any(one["talk"] == talk and not one["on"] for one in self.talks):
                 break
         return said

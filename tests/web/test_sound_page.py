@@ -106,7 +106,9 @@ INTERRUPTIONS: dict[str, Callable[[Tab], Any]] = {
     "released": lambda opened: opened.page.mouse.up(),
     "blur": lambda opened: opened.blur(),
     "hidden": lambda opened: opened.hide(),
-    "menu": lambda opened: opened.page.evaluate("document.body.dispatchEvent(new Event('contextmenu', {bubbles: true}))"),
+    "menu": lambda opened: opened.page.evaluate(
+        "document.body.dispatchEvent(new Event('contextmenu', {bubbles: true}))"
+    ),
     "dialog": lambda opened: opened.page.evaluate(
         "() => { const one = document.createElement('dialog'); document.body.append(one); one.show(); }"
     ),

@@ -22,7 +22,18 @@ from pebble.simulation.loudspeaker import playbacks
 from pebble.transports import Message, MqttSettings, create
 from tests.support import until
 from tests.web.browser import chromium, tab
-from tests.web.ears import TAP, at_rate, compared, fake_microphone, likeness, listener, recorded, state, talks, write_voice
+from tests.web.ears import (
+    TAP,
+    at_rate,
+    compared,
+    fake_microphone,
+    likeness,
+    listener,
+    recorded,
+    state,
+    talks,
+    write_voice,
+)
 from tests.web.stage import Stage
 
 pytestmark = pytest.mark.alone

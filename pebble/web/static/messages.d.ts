@@ -189,6 +189,12 @@ export interface ShownOwner {
   count: number;
 }
 
+export interface TalkAnswer {
+  talk: number;
+  on: boolean;
+  why?: string;
+}
+
 export interface OwnerState {
   owner: string;
   latched: boolean;
@@ -238,6 +244,14 @@ export interface PictureView {
   pinned: string;
 }
 
+export interface SoundView {
+  state: string;
+  why: string;
+  encoding: string;
+  listeners: number;
+  talker: string;
+}
+
 export interface PictureFrom {
   source: string;
 }
@@ -259,6 +273,7 @@ export interface Metrics {
   "web/estop": EstopView;
   "web/driver": DriverView;
   "web/picture": PictureView;
+  "web/sound": SoundView;
   "web/picture-from": PictureFrom;
   "web/flags": FlagsView;
   "web/broker": BrokerView;
