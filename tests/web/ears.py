@@ -1,4 +1,4 @@
-"""What a page plays, and its microphone, for tests in Chromium: recorded, and compared with the speech that was sent."""
+"""What a page plays, and its microphone, in Chromium: recorded, and compared with the speech that was sent."""
 
 from __future__ import annotations
 
