@@ -42,7 +42,11 @@ class MediaHub:
             return
         viewer = PageViewer(can)
         await self._streams.serve(
-            websocket, ref, viewer, lambda _: _send(websocket, viewer), lambda stream: _receive(websocket, stream, viewer)
+            websocket,
+            ref,
+            viewer,
+            lambda _: _send(websocket, viewer),
+            lambda stream: _receive(websocket, stream, viewer),
         )
 
     def pin(self, ref: str, encoding: str) -> None:

@@ -183,4 +183,3 @@ class _OwnTopics:
     def _check(self, topic: str, directions: tuple[Direction, ...]) -> None:
         if not any(own_topic(self._ref, topic, direction) for direction in directions):
             raise TransportError(f"{topic} is no topic of {self._ref}")
-

@@ -39,8 +39,8 @@ kind 1: a JPEG of the server's own, after `u64` epoch milliseconds of its captur
 """
 _SOUND = """## Sound socket
 
-`/ws/sound?ref=REF&can=opus,pcm` carries the sound of one component, and a person's voice to it. `can` empty: this page \
-only talks. Numbers are big-endian; `talk` numbers the talks of this connection, each greater than the last.
+`/ws/sound?ref=REF&can=opus,pcm` carries the sound of one component, and a person's voice to it. `can` empty: this \
+page only talks. Numbers are big-endian; `talk` numbers the talks of this connection, each greater than the last.
 
 | from | message |
 |---|---|
@@ -66,7 +66,13 @@ def markdown() -> str:
 def declarations() -> str:
     """messages.d.ts: one interface for each struct."""
     parts = ["// Generated from pebble/web/messages.py by python -m pebble.web.messages_docs.\n"]
-    for struct in (*get_args(messages.FromPage), *get_args(messages.ToPage), messages.ShownOwner, messages.TalkAnswer, *_views()):
+    for struct in (
+        *get_args(messages.FromPage),
+        *get_args(messages.ToPage),
+        messages.ShownOwner,
+        messages.TalkAnswer,
+        *_views(),
+    ):
         info: Any = types.type_info(struct)
         tag = [f'  op: "{info.tag}";'] if info.tag is not None else []
         fields = [f"  {one.name}{'' if one.required else '?'}: {_script(one.type)};" for one in info.fields]

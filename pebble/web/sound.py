@@ -116,7 +116,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
     # -- talking
 
-    def hear(self, page: SoundPage, talk: int, piece: int, sound: bytes) -> None:
+    def receive_voice(self, page: SoundPage, talk: int, piece: int, sound: bytes) -> None:
         """Take 20 ms of a page's voice. The first piece of a talk begins it, if nothing speaks against it."""
         now = time.monotonic()
         if talk <= page.over:
@@ -156,7 +156,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return refusal(self.ref, self._robots.capabilities(self.ref), "audio")
 
     def _release(self, now: float) -> None:
-        """End a talk of which nothing is heard any more."""
+        """End a talk of which nothing comes any more."""
         if self._talk is not None and self._talker is not None and self._talk.is_over(now):
             self._talker.answer(self._talk.number, on=False, why=f"No sound came for {SILENT_S:g} s")
             self._end_talk(self._talker)
@@ -275,7 +275,7 @@ async def _receive(websocket: WebSocket, stream: SoundStream, page: SoundPage) -
         what, size = data[0], len(data)
         if what == _VOICE and size == _PIECE.size + PIECE_BYTES:
             _, talk, piece = _PIECE.unpack_from(data)
-            stream.hear(page, talk, piece, data[_PIECE.size :])
+            stream.receive_voice(page, talk, piece, data[_PIECE.size :])
         elif what == _RECEIVED and size == _HEAD.size:
             page.queue.acknowledge(_HEAD.unpack(data)[1])
             page.wakeup.set()

@@ -20,18 +20,18 @@ class Talk:
 
     def __init__(self, number: int, now: float) -> None:
         self.number = number  # of that page's connection
-        self._heard_at = now
+        self._received_at = now
         self._least = float("inf")  # the smallest lateness of its pieces
 
     def takes(self, piece: int, now: float) -> bool:
         """Whether this piece, counted from 0 by the page's microphone, is in time."""
         late = now - piece / PIECES_PER_S
         self._least = min(self._least + _DRIFT_S, late)
-        self._heard_at = now
+        self._received_at = now
         return late - self._least <= LATE_S
 
     def is_over(self, now: float) -> bool:
-        return now - self._heard_at > SILENT_S
+        return now - self._received_at > SILENT_S
 
 
 class Voice:

@@ -1,4 +1,4 @@
-"""What a page plays and says, for tests in Chromium: recorded, and compared with what should have been heard."""
+"""What a page plays, and its microphone, in Chromium: recorded, and compared with the speech that was sent."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ RATE = 16_000
 #: Records what the page plays; as a worklet hands it over.
 TAP = """async () => {
   const { node } = await pebble.sound.model.speaker;
-  window.heard = [];
-  window.heardAt = []; // seconds of the sound's clock
-  node.port.onmessage = ({ data }) => heardAt.push(data.at) && heard.push(data.left);
+  window.recorded = [];
+  window.recordedAt = []; // seconds of the sound's clock
+  node.port.onmessage = ({ data }) => recordedAt.push(data.at) && recorded.push(data.left);
   node.port.postMessage({ taps: true });
 }"""
 #: Everything that was recorded, as 16 bits.
-HEARD = """() => {
-  const samples = Int16Array.from(heard.flatMap((block) => [...block]), (sample) => 32767 * sample);
+RECORDED = """() => {
+  const samples = Int16Array.from(recorded.flatMap((block) => [...block]), (sample) => 32767 * sample);
   let text = "";
   for (const byte of new Uint8Array(samples.buffer)) text += String.fromCharCode(byte);
   return btoa(text);
@@ -39,7 +39,7 @@ HEARD = """() => {
 
 
 def speech(rate: int, seconds: float = PERIOD_S) -> npt.NDArray[np.float64]:
-    """What robots and people say in tests, at any rate."""
+    """The speech of robots and people in tests, at any rate."""
     return at_rate(Speech(RATE).samples(0, int(seconds * RATE)), rate)
 
 
@@ -76,26 +76,26 @@ def state(opened: Tab) -> str:
 
 
 def likeness(opened: Tab, seconds: float, *, envelopes: bool) -> float:
-    """How well the best second and a half of what the page plays from now on agrees with what the robot said."""
+    """How well the best second and a half of what the page plays from now on agrees with the robot's speech."""
     opened.page.evaluate(TAP)
     rate = int(opened.page.evaluate("pebble.sound.model.context.sampleRate"))
-    assert opened.until(f"heard.length * 128 > {seconds * rate}", seconds + 10)
+    assert opened.until(f"recorded.length * 128 > {seconds * rate}", seconds + 10)
     return compared(recorded(opened.page), rate, envelopes=envelopes)
 
 
 def recorded(page: Any) -> npt.NDArray[np.float64]:
     """What was played since ``TAP``, at the rate of the page's sound."""
-    return np.frombuffer(base64.b64decode(page.evaluate(HEARD)), "<i2").astype(float)
+    return np.frombuffer(base64.b64decode(page.evaluate(RECORDED)), "<i2").astype(float)
 
 
-def compared(heard: npt.NDArray[np.float64], rate: int, *, envelopes: bool = False) -> float:
-    """The highest correlation of a second and a half of ``heard`` with what is said in tests."""
-    said = speech(rate, 2 * PERIOD_S)
+def compared(played: npt.NDArray[np.float64], rate: int, *, envelopes: bool = False) -> float:
+    """The highest correlation of a second and a half of ``played`` with the speech."""
+    original = speech(rate, 2 * PERIOD_S)
     size, step = int(1.5 * rate), rate // 4
-    windows = [heard[at : at + size] for at in range(0, len(heard) - size + 1, step)]
+    windows = [played[at : at + size] for at in range(0, len(played) - size + 1, step)]
     if envelopes:
-        return max(best_match(envelope(one, rate), envelope(said, rate)) for one in windows)
-    return max(best_match(one, said) for one in windows)
+        return max(best_match(envelope(one, rate), envelope(original, rate)) for one in windows)
+    return max(best_match(one, original) for one in windows)
 
 
 def talks(opened: Tab) -> bool:

@@ -47,7 +47,7 @@ def capabilities(audio: dict[str, Any]) -> bytes:
 
 
 class SoundRobot:
-    """Says what ``Speech`` says, as requested: while the flag is up and a request is active."""
+    """Speaks as requested: while the flag is up and a request is active."""
 
     def __init__(self, audio: dict[str, Any] = AUDIO, transport: Transport | None = None) -> None:
         """``transport``: one that is open; without it on a network of its own, ``hub``."""
@@ -55,7 +55,7 @@ class SoundRobot:
         self.transport = transport or MemoryTransport("robot", self.hub).open()
         self.published: list[Message] = []  # by others, to the robot
         self.sent: list[bytes] = []
-        self.heard: list[Sound] = []
+        self.voice: list[Sound] = []
         self.mute = False
         self._default = audio.get("encoding", "pcm")
         self._encoding = self._default
@@ -97,7 +97,7 @@ class SoundRobot:
             self._requested = request["enabled"]
             self._encoding = request.get("encoding") or self._default
         elif message.topic == UPLINK:
-            self.heard.append(Sound.unpack(message.payload))
+            self.voice.append(Sound.unpack(message.payload))
 
     def _speak(self) -> None:
         speech, encoder, due, first = Speech(RATE), None, time.monotonic(), 0
@@ -156,23 +156,23 @@ class Page:
     def acknowledge(self, count: int) -> None:
         self.send(struct.pack(">BI", 0, count))
 
-    def say(self, talk: int, number: int, pcm: bytes) -> None:
+    def send_piece(self, talk: int, number: int, pcm: bytes) -> None:
         self.send(struct.pack(">BII", 1, talk, number) + pcm)
 
     def end(self, talk: int) -> None:
         self.send(struct.pack(">BI", 2, talk))
 
     async def speak(self, talk: int, pieces: int, *, until_refused: bool = True) -> bytes:
-        """Say so much in real time; returns what was said."""
-        speech, said = Speech(RATE), b""
+        """Speak so long in real time; returns the samples."""
+        speech, sent, began = Speech(RATE), b"", time.monotonic()
         for number in range(pieces):
             pcm = speech.samples(PIECE * number, PIECE).tobytes()
-            self.say(talk, number, pcm)
-            said += pcm
-            await asyncio.sleep(PIECE / RATE)
+            self.send_piece(talk, number, pcm)
+            sent += pcm
+            await asyncio.sleep(max(0.0, began + (number + 1) * PIECE / RATE - time.monotonic()))
             if until_refused and any(one["talk"] == talk and not one["on"] for one in self.talks):
                 break
-        return said
+        return sent
 
 
 class Server:

@@ -419,7 +419,10 @@ STATES: dict[str, State] = {
     ),
     "listening": replace(DRIVING, values=changed(fleet, MINE, at(GOOB, "web/sound", sound("flowing", talker="bob")))),
     "no-sound": replace(
-        DRIVING, values=changed(fleet, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here")))
+        DRIVING,
+        values=changed(
+            fleet, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here"))
+        ),
     ),
     "old-page": replace(DRIVING, welcome={"version": "of another server"}),
     "plain-http": replace(DRIVING, welcome={"drives": False}),

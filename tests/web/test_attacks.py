@@ -648,7 +648,17 @@ def test_nor_does_the_sound_socket(hall: Hall, driver: Page) -> None:
     for query in ("", "?ref=", "?ref=%23", "?ref=pebble/robots/nobody", f"?ref={GOOB}/incoming"):
         assert hall.refusal(f"/ws/sound{query}", cookie=cookie) == 403
     path = f"/ws/sound?ref={GOOB}&can={'opus,' * 500}%00'\"<script>"
-    for data in ("text", "", b"", b"\x00" * 4, b"\x01" * 648, b"\x01" * 650, b"\x02" * 6, b"\x03" * 5, b"\x00" * 60_000):
+    for data in (
+        "text",
+        "",
+        b"",
+        b"\x00" * 4,
+        b"\x01" * 648,
+        b"\x01" * 650,
+        b"\x02" * 6,
+        b"\x03" * 5,
+        b"\x00" * 60_000,
+    ):
         assert hall.closed_after(path, cookie, data)
     sound = hall.socket(path, cookie=cookie)
     for number in (0, 1, 0xFFFFFFFF):

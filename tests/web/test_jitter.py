@@ -67,9 +67,7 @@ def node(imports: dict[str, str], steps: str, given: Any, folder: Path) -> Any:
         'writeFileSync("made.json", JSON.stringify(made));',
     ]
     (folder / "steps.mjs").write_text("\n".join(lines))
-    done = subprocess.run(
-        ["node", "steps.mjs"], cwd=folder, capture_output=True, text=True, check=False, timeout=60
-    )
+    done = subprocess.run(["node", "steps.mjs"], cwd=folder, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0, done.stderr
     return json.loads((folder / "made.json").read_text())
 
@@ -128,7 +126,7 @@ def arrivals(randoms: random.Random) -> list[Arrival]:
     return sorted(found, key=lambda one: one[0])
 
 
-@pytest.mark.parametrize("seeds", [range(12), pytest.param(range(12, 200), marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("seeds", [range(6), pytest.param(range(6, 200), marks=pytest.mark.thorough)])
 def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range, tmp_path: Path) -> None:
     cases = []
     for seed in seeds:
@@ -183,14 +181,17 @@ def test_the_same_packets_are_refused(tmp_path: Path) -> None:
     for _ in range(600):
         packet = bytearray(randoms.choice(whole))
         for _ in range(randoms.randrange(1, 4)):
-            packet[randoms.randrange(0, min(len(packet), 30))] = randoms.choice([0, 1, 2, 9, 255, randoms.randrange(256)])
+            packet[randoms.randrange(0, min(len(packet), 30))] = randoms.choice(
+                [0, 1, 2, 9, 255, randoms.randrange(256)]
+            )
         packets.append(bytes(packet[: randoms.choice([len(packet), randoms.randrange(len(packet))])]))
     expected = [_described(packet) for packet in packets]
     assert 0.05 < sum(one is None for one in expected) / len(expected) < 0.95
     steps = """
 const made = input.map((packet) => {
   try {
-    const { encoding, rate, channels, frames, sequence, capturedMs } = unpack(new Uint8Array(Buffer.from(packet, "hex")));
+    const sound = unpack(new Uint8Array(Buffer.from(packet, "hex")));
+    const { encoding, rate, channels, frames, sequence, capturedMs } = sound;
     return [encoding, rate, channels, frames, sequence, capturedMs];
   } catch { return null; }
 });

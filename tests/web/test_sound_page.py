@@ -46,7 +46,7 @@ def page_of(
         yield opened
 
 
-def test_what_the_robot_says_is_heard(browser: Browser, served: Served, robot: SoundRobot):
+def test_the_robots_sound_is_played(browser: Browser, served: Served, robot: SoundRobot):
     with page_of(browser, served) as opened, listener(served.origin, "pcm"):
         assert state(opened) == ""
         opened.test("listen").click()
@@ -61,7 +61,7 @@ def test_what_the_robot_says_is_heard(browser: Browser, served: Served, robot: S
         assert opened.complaints() == []
 
 
-def test_opus_is_heard(browser: Browser, served: Served, robot: SoundRobot):
+def test_opus_is_played(browser: Browser, served: Served, robot: SoundRobot):
     with page_of(browser, served, "phone") as opened:
         opened.test("listen").click()
         assert opened.until(lambda: "ms buffered · opus" in state(opened))
@@ -73,7 +73,7 @@ WITHOUT_WORKLET = """Object.defineProperty(BaseAudioContext.prototype, "audioWor
 Object.defineProperty(navigator, "mediaDevices", { get: () => undefined });"""
 
 
-def test_over_plain_http_sound_is_heard_and_talking_needs_https(browser: Browser, served: Served, robot: SoundRobot):
+def test_over_plain_http_sound_is_played_and_talking_needs_https(browser: Browser, served: Served, robot: SoundRobot):
     """As far as the page can tell; the worker still decodes Opus."""
     with page_of(browser, served, script=WITHOUT_WORKLET) as opened:
         assert opened.test("talk").is_disabled()
@@ -87,17 +87,17 @@ def test_over_plain_http_sound_is_heard_and_talking_needs_https(browser: Browser
 # -- talking
 
 
-def test_a_voice_is_heard_at_the_robot(browser: Browser, served: Served, robot: SoundRobot):
+def test_a_voice_reaches_the_robot(browser: Browser, served: Served, robot: SoundRobot):
     with page_of(browser, served) as opened:
         opened.test("listen").click()
         assert opened.until(lambda: "ms buffered" in state(opened))
         assert talks(opened)
         assert opened.page.evaluate("pebble.sound.model.gain.gain.value") == 0  # else it would come back
-        assert opened.until(lambda: len(robot.heard) > 150)
+        assert opened.until(lambda: len(robot.voice) > 150)
         opened.page.mouse.up()
         assert opened.until(lambda: "ms buffered" in state(opened))
-        heard = np.frombuffer(b"".join(packet.body for packet in robot.heard), "<i2")
-        assert compared(at_rate(heard, 48_000), 48_000) > 0.9
+        voice = np.frombuffer(b"".join(packet.body for packet in robot.voice), "<i2")
+        assert compared(at_rate(voice, 48_000), 48_000) > 0.9
         assert opened.page.evaluate("pebble.sound.model.gain.gain.value") == 1
         assert opened.complaints() == []
 
@@ -106,7 +106,9 @@ INTERRUPTIONS: dict[str, Callable[[Tab], Any]] = {
     "released": lambda opened: opened.page.mouse.up(),
     "blur": lambda opened: opened.blur(),
     "hidden": lambda opened: opened.hide(),
-    "menu": lambda opened: opened.page.evaluate("document.body.dispatchEvent(new Event('contextmenu', {bubbles: true}))"),
+    "menu": lambda opened: opened.page.evaluate(
+        "document.body.dispatchEvent(new Event('contextmenu', {bubbles: true}))"
+    ),
     "dialog": lambda opened: opened.page.evaluate(
         "() => { const one = document.createElement('dialog'); document.body.append(one); one.show(); }"
     ),
@@ -122,7 +124,7 @@ INTERRUPTIONS: dict[str, Callable[[Tab], Any]] = {
 def test_what_ends_a_gesture_ends_a_talk(browser: Browser, served: Served, robot: SoundRobot, how: str):
     with page_of(browser, served) as opened:
         assert talks(opened)
-        assert opened.until(lambda: len(robot.heard) > 5)
+        assert opened.until(lambda: len(robot.voice) > 5)
         INTERRUPTIONS[how](opened)
         assert falls_silent(opened, robot)
 
@@ -131,14 +133,14 @@ def falls_silent(opened: Tab, robot: SoundRobot) -> bool:
     """Whether soon no voice reaches the robot any more, for 0.3 s."""
     end = time.monotonic() + 4
     while time.monotonic() < end:
-        count = len(robot.heard)
+        count = len(robot.voice)
         time.sleep(0.3)  # not the page's wait: one that is frozen would not answer
-        if len(robot.heard) == count:
+        if len(robot.voice) == count:
             return True
     return False
 
 
-def test_while_another_person_talks_the_button_says_who(browser: Browser, served: Served, robot: SoundRobot):
+def test_while_another_person_talks_the_button_shows_who(browser: Browser, served: Served, robot: SoundRobot):
     with page_of(browser, served) as first, page_of(browser, served) as second:
         assert talks(first)
         assert second.until(lambda: second.test("talk").is_disabled())

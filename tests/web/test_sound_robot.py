@@ -22,7 +22,18 @@ from pebble.simulation.loudspeaker import playbacks
 from pebble.transports import Message, MqttSettings, create
 from tests.support import until
 from tests.web.browser import chromium, tab
-from tests.web.ears import TAP, at_rate, compared, fake_microphone, likeness, listener, recorded, state, talks, write_voice
+from tests.web.ears import (
+    TAP,
+    at_rate,
+    compared,
+    fake_microphone,
+    likeness,
+    listener,
+    recorded,
+    state,
+    talks,
+    write_voice,
+)
 from tests.web.stage import Stage
 
 pytestmark = pytest.mark.alone
@@ -55,7 +66,7 @@ def played(stage: Stage) -> np.ndarray[Any, Any]:
     return at_rate(np.frombuffer(pcm, "<i2"), 48_000)
 
 
-def test_a_robot_is_heard_and_plays_the_voice(goob: Stage, browser: Browser):
+def test_a_page_plays_the_robots_sound_and_the_robot_the_voice(goob: Stage, browser: Browser):
     with tab(browser, goob.robot_url("goob")) as opened:
         opened.test("listen").click()
         assert opened.until(lambda: "ms buffered · opus" in state(opened), 20)
@@ -114,18 +125,18 @@ def test_mouth_to_ear_is_short_and_the_flag_is_down_afterwards(goob: Stage, brow
 def mouth_to_ear(page: Page, packets: list[Sound]) -> list[float]:
     """Milliseconds from the capture of each half second to when it was heard."""
     rate = int(page.evaluate("pebble.sound.model.context.sampleRate"))
-    heard = recorded(page)
-    first_s = float(page.evaluate("heardAt[0]"))
+    whole = recorded(page)
+    first_s = float(page.evaluate("recordedAt[0]"))
     now: dict[str, float] = page.evaluate(TIMES)
     delays = []
     for index in range(0, len(packets) - 25, 25):
-        part = packets[index : index + 25]
-        pcm = np.frombuffer(b"".join(one.body for one in part), "<i2")[:, None]
-        said = Resampler(part[0].rate, rate, 1).feed(pcm)[:, 0].astype(float)
-        place, found = position(said, heard)
+        some = packets[index : index + 25]
+        pcm = np.frombuffer(b"".join(one.body for one in some), "<i2")[:, None]
+        part = Resampler(some[0].rate, rate, 1).feed(pcm)[:, 0].astype(float)
+        place, found = position(part, whole)
         if found > 0.95:
             at = now["at"] + 1000 * (first_s + place / rate - now["contextTime"])
-            delays.append(at - part[0].captured_ms)
+            delays.append(at - some[0].captured_ms)
     assert len(delays) > 3
     return delays
 
