@@ -173,7 +173,7 @@ class OpenComponents:
                 self._show_flags(ref, FlagsView())
 
     def _filters(self, ref: str) -> dict[str, _Carried]:
-        """Every channel's own topic, its flags, topics that capabilities and manifests name, and overlays of its picture."""
+        """Every channel's own topic, flags, what capabilities and manifests name, and overlays of its picture."""
         filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
         for (section, key), channel in _NAMED.items():
             self._add(filters, ref, section, key, channel)
