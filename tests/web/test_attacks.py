@@ -229,6 +229,7 @@ def ops(ref: str) -> dict[str, dict[str, Any]]:
         "hello": {"version": "x"},
         "echo": {"n": 0, "t": 0},
         "watch": {"ref": ref},
+        "read-logs": {"ref": ref, "on": True},
         "lease": {"ref": ref, "take": True, "over": True},
         "drive": {"ref": ref, "g": 1, "t": now_ms(), "z": 0.5},
         "stop": {"ref": ref},
@@ -248,7 +249,7 @@ def ops(ref: str) -> dict[str, dict[str, Any]]:
 
 
 #: What a viewer may send: it moves nothing and changes nothing for others, but a stop.
-FOR_VIEWERS = {"hello", "echo", "watch", "stop", "estop", "estop-end"}
+FOR_VIEWERS = {"hello", "echo", "watch", "read-logs", "stop", "estop", "estop-end"}
 #: What stops a robot, and is sent to it for that.
 STOPPING = {"stop", "estop", "estop-end"}
 
