@@ -279,38 +279,39 @@ def test_what_was_filled_in_has_the_types_of_json():
     assert filled(ALL, texts) == (expected, {})
 
 
-@pytest.mark.parametrize(
-    ("key", "text", "mistake"),
-    [
-        ("tag", "", "required"),
-        ("laps", "0", "at least 1"),
-        ("laps", "10", "at most 9"),
-        ("laps", "2.5", "must be a whole number"),
-        ("laps", "?", "must be a number"),
-        ("laps", " ", "must be a number"),
-        ("laps", "two", "must be a number"),
-        ("tag", "1e15", "must be a whole number"),
-        ("power", "1e999", "must be a number"),
-        ("power", "NaN", "must be a number"),
-        ("power", "Infinity", "must be a number"),
-        ("power", "0.05", "at least 0.1"),
-        ("name", "-x", "must not begin with -"),
-        ("name", "x" * 257, "at most 256 characters"),
-        ("name", "a\tb", "must have no control characters"),
-        ("name", "a\u00a0b", "must have no control characters"),
-        ("family", "C", "choose one of the list"),
-        ("search", "maybe", "choose one of the list"),
-    ],
-)
-def test_mistakes(key: str, text: str, mistake: str):
-    config, mistakes = filled(ALL, {"tag": "1"} | {key: text})
-    assert mistakes == {key: mistake}
-    assert key not in config
+MISTAKES = [
+    ("tag", "", "required"),
+    ("laps", "0", "at least 1"),
+    ("laps", "10", "at most 9"),
+    ("laps", "2.5", "must be a whole number"),
+    ("laps", "?", "must be a number"),
+    ("laps", " ", "must be a number"),
+    ("laps", "two", "must be a number"),
+    ("tag", "1e15", "must be a whole number"),
+    ("power", "1e999", "must be a number"),
+    ("power", "NaN", "must be a number"),
+    ("power", "Infinity", "must be a number"),
+    ("power", "0.05", "at least 0.1"),
+    ("name", "-x", "must not begin with -"),
+    ("name", "x" * 257, "at most 256 characters"),
+    ("name", "a\tb", "must have no control characters"),
+    ("name", "a\u00a0b", "must have no control characters"),
+    ("family", "C", "choose one of the list"),
+    ("search", "maybe", "choose one of the list"),
+]
 
 
-@pytest.mark.parametrize("text", ["naïve café", "日本", "a b", "3-4", "{}"])
-def test_texts_that_robots_accept(text: str):
-    assert filled(ALL, {"name": text, "tag": "1"}) == ({"name": text, "tag": 1}, {})
+def test_mistakes():
+    found = filled_all(ALL, [{"tag": "1"} | {key: text} for key, text, _ in MISTAKES])
+    for (key, text, mistake), (config, mistakes) in zip(MISTAKES, found, strict=True):
+        assert mistakes == {key: mistake}, (key, text)
+        assert key not in config
+
+
+def test_texts_that_robots_accept():
+    texts = ["naïve café", "日本", "a b", "3-4", "{}"]
+    found = filled_all(ALL, [{"name": text, "tag": "1"} for text in texts])
+    assert found == [[{"name": text, "tag": 1}, {}] for text in texts]
 
 
 SETTINGS = [
@@ -405,19 +406,20 @@ def test_a_form_with_mistakes_is_not_sent():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("field", "expected"),
-    [
-        (entry("a", "int", min=1, max=9, default=3), "a whole number, 1 to 9, default 3"),
-        (entry("a", "float", min=0.5), "at least 0.5"),
-        (entry("a", "float", max=2, default=1.5), "at most 2, default 1.5"),
-        (entry("a", "bool", default=False), "default off"),
-        (entry("a"), ""),
-    ],
-)
-def test_hints(field: dict[str, Any], expected: str):
-    files = {"files": [{"file": "x", "configs": [field]}]}
-    assert forms(f"result = hint(scripts({json.dumps(files)})[0].fields[0]);") == expected
+HINTS = [
+    (entry("a", "int", min=1, max=9, default=3), "a whole number, 1 to 9, default 3"),
+    (entry("a", "float", min=0.5), "at least 0.5"),
+    (entry("a", "float", max=2, default=1.5), "at most 2, default 1.5"),
+    (entry("a", "bool", default=False), "default off"),
+    (entry("a"), ""),
+]
+
+
+def test_hints():
+    configs = [field | {"key": f"k{number}"} for number, (field, _) in enumerate(HINTS)]
+    files = {"files": [{"file": "x", "configs": configs}]}
+    found = forms(f"result = scripts({json.dumps(files)})[0].fields.map(hint);")
+    assert found == [expected for _, expected in HINTS]
 
 
 _STORED = """
