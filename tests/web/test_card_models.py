@@ -388,7 +388,7 @@ def test_without_a_list_there_are_no_scripts(payload: Any):
     assert forms(f"result = scripts({json.dumps(payload)});") is None
 
 
-def test_scripts_of_the_same_label_are_told_apart():
+def test_scripts_of_the_same_label_have_their_folder_beside_it():
     files = {
         "files": [{"file": "a", "label": "Follow"}, {"file": "b", "label": "Follow"}, {"file": "c", "label": "Go"}]
     }

@@ -247,7 +247,7 @@ def refusals(page: Page, expected: int = 1) -> list[str]:
     return [one["why"] for one in page.refused]
 
 
-def test_nothing_is_asked_of_what_nobody_has_seen(page: Page, robot: RecordingRobot):
+def test_nothing_is_asked_of_an_unknown_component(page: Page, robot: RecordingRobot):
     for number, (fields, *_) in enumerate(PUBLISHED):
         ask(page, "pebble/robots/unheard", **fields)
         assert refusals(page, number + 1)[-1] == "unknown component"
