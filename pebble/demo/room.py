@@ -52,7 +52,7 @@ def write_clip(folder: Path) -> bytes:
 
 def _sound(seconds: float, *tones: float) -> bytes:
     phases = 2 * np.pi * np.outer(tones, np.arange(round(seconds * _RATE)) / _RATE)
-    return (np.sin(phases).sum(axis=0) * 8000).astype("<i2").tobytes()
+    return bytes((np.sin(phases).sum(axis=0) * 8000).astype("<i2"))
 
 
 def _write(path: Path, samples: bytes) -> None:
