@@ -68,7 +68,7 @@ const drag = (ms, value) => {
 """
 
 
-def test_a_dragged_colour_is_sent_five_times_a_second_and_the_last_one_always():
+def test_a_dragged_colour_is_sent_five_times_a_second_and_the_last_one_always() -> None:
     calls = lights(_PACER + "for (let i = 0; i < 100; i++) drag(10, i); drag(1000); result = calls;")
     times = [at for at, _ in calls]
     assert min(later - at for at, later in itertools.pairwise(times)) >= 200
@@ -77,7 +77,7 @@ def test_a_dragged_colour_is_sent_five_times_a_second_and_the_last_one_always():
     assert calls[-1][1] == 99
 
 
-def test_single_choices_are_sent_at_once():
+def test_single_choices_are_sent_at_once() -> None:
     assert lights(_PACER + "drag(0, 1); drag(200, 2); drag(500, 3); result = [calls, timers.length];") == [
         [[1000, 1], [1200, 2], [1700, 3]], 0,
     ]  # fmt: skip
@@ -95,17 +95,17 @@ def test_single_choices_are_sent_at_once():
         ('{ colour: "red" }', {"r": 1, "g": 0.533, "b": 0}),
     ],
 )
-def test_what_is_asked_of_lights(change: str, expected: dict[str, float]):
+def test_what_is_asked_of_lights(change: str, expected: dict[str, float]) -> None:
     assert lights(f"lightsOf(ref).ask(page, {change}); result = sent;") == [expected]
 
 
-def test_lights_that_only_flash_are_off_in_black():
+def test_lights_that_only_flash_are_off_in_black() -> None:
     steps = "values[ref].capabilities.value.lights = { solid: false, flash: true };"
     assert lights(f'{steps} lightsOf(ref).ask(page, {{ mode: "off" }}); result = sent;') == [BLACK | {"period": 2}]
 
 
 @pytest.mark.parametrize(("before", "after"), [("solid", "solid"), ("off", "off")])
-def test_a_flash_ends_in_what_was_before(before: str, after: str):
+def test_a_flash_ends_in_what_was_before(before: str, after: str) -> None:
     steps = f"""
     const one = lightsOf(ref);
     one.ask(page, {{ mode: "{before}" }});
@@ -127,7 +127,7 @@ def test_a_flash_ends_in_what_was_before(before: str, after: str):
         ("delete values[ref]", "goob has no lights that flash"),
     ],
 )
-def test_why_lights_do_not_flash(change: str, why: str):
+def test_why_lights_do_not_flash(change: str, why: str) -> None:
     assert lights(f"{change}; result = [toggleFlash(page, ref), sent];") == [why, []]
 
 
@@ -142,7 +142,7 @@ def test_why_lights_do_not_flash(change: str, why: str):
         ({}, [False, False]),
     ],
 )
-def test_what_lights_can_do(section: dict[str, Any], expected: list[bool]):
+def test_what_lights_can_do(section: dict[str, Any], expected: list[bool]) -> None:
     steps = f"const can = supported({{ value: {{ lights: {json.dumps(section)} }} }}); result = [can.solid, can.flash];"
     assert lights(steps) == expected
 
@@ -150,7 +150,7 @@ def test_what_lights_can_do(section: dict[str, Any], expected: list[bool]):
 @pytest.mark.parametrize(
     "stored", ["null", "7", '"x"', "[]", '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}']
 )
-def test_lights_ignore_what_they_cannot_have_remembered(stored: str):
+def test_lights_ignore_what_they_cannot_have_remembered(stored: str) -> None:
     steps = f"""
     globalThis.localStorage = {{ getItem: () => {json.dumps(stored)}, setItem() {{}} }};
     const {{ colour, period, mode, steady }} = new Lights("other");
@@ -165,7 +165,7 @@ def sounds(steps: str) -> Any:
     return run("../ui/sounds-model.js", "clips, grouped, play, playing, repeatLast, soundsOf", _PAGE + steps)
 
 
-def test_the_last_sound_is_repeated_as_it_was_played():
+def test_the_last_sound_is_repeated_as_it_was_played() -> None:
     steps = """
     result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
       repeatLast(page, "pebble/robots/fred"), sent];"""
@@ -173,7 +173,7 @@ def test_the_last_sound_is_repeated_as_it_was_played():
     assert sounds(steps) == ["Play one sound first", "", "", "Play one sound first", [played, played]]
 
 
-def test_what_cannot_be_played_is_not_repeated():
+def test_what_cannot_be_played_is_not_repeated() -> None:
     steps = """
     result = [play(page, ref, "x".repeat(1001), false), repeatLast(page, ref)];
     values[ref].capabilities.value.soundboard.controls = false;
@@ -195,7 +195,7 @@ FILES = ["horn.wav", "Bell.wav", "animals/Cat.wav", "animals/dog.wav", "animals/
         ("", 2, [["", FILES[:2]]], 3),
     ],
 )
-def test_clips_are_grouped_by_folder_and_bounded(words: str, most: int, folders: list[Any], more: int):
+def test_clips_are_grouped_by_folder_and_bounded(words: str, most: int, folders: list[Any], more: int) -> None:
     found = sounds(f"result = grouped({json.dumps(FILES)}, {json.dumps(words)}, {most});")
     assert found == {"folders": folders, "more": more}
 
@@ -211,7 +211,7 @@ def test_clips_are_grouped_by_folder_and_bounded(words: str, most: int, folders:
         (7, None),
     ],
 )
-def test_only_names_are_clips(payload: Any, expected: Any):
+def test_only_names_are_clips(payload: Any, expected: Any) -> None:
     assert sounds(f"result = clips({json.dumps(payload)});") == expected
 
 
@@ -225,7 +225,7 @@ def test_only_names_are_clips(payload: Any, expected: Any):
         (None, ["", ""]),
     ],
 )
-def test_what_plays(payload: Any, expected: list[str]):
+def test_what_plays(payload: Any, expected: list[str]) -> None:
     assert sounds(f"const {{ file, error }} = playing({json.dumps(payload)}); result = [file, error];") == expected
 
 
@@ -269,48 +269,49 @@ ALL = [
 ]
 
 
-def test_what_was_not_filled_in_is_not_sent():
+def test_what_was_not_filled_in_is_not_sent() -> None:
     assert filled(ALL, {"tag": "7"}) == ({"tag": 7}, {})
 
 
-def test_what_was_filled_in_has_the_types_of_json():
+def test_what_was_filled_in_has_the_types_of_json() -> None:
     texts = {"name": "fred", "laps": "4", "power": "0.25", "search": "false", "family": "B", "tag": "0", "foreign": "x"}
     expected = {"name": "fred", "laps": 4, "power": 0.25, "search": False, "family": "B", "tag": 0}
     assert filled(ALL, texts) == (expected, {})
 
 
-@pytest.mark.parametrize(
-    ("key", "text", "mistake"),
-    [
-        ("tag", "", "required"),
-        ("laps", "0", "at least 1"),
-        ("laps", "10", "at most 9"),
-        ("laps", "2.5", "must be a whole number"),
-        ("laps", "?", "must be a number"),
-        ("laps", " ", "must be a number"),
-        ("laps", "two", "must be a number"),
-        ("tag", "1e15", "must be a whole number"),
-        ("power", "1e999", "must be a number"),
-        ("power", "NaN", "must be a number"),
-        ("power", "Infinity", "must be a number"),
-        ("power", "0.05", "at least 0.1"),
-        ("name", "-x", "must not begin with -"),
-        ("name", "x" * 257, "at most 256 characters"),
-        ("name", "a\tb", "must have no control characters"),
-        ("name", "a\u00a0b", "must have no control characters"),
-        ("family", "C", "choose one of the list"),
-        ("search", "maybe", "choose one of the list"),
-    ],
-)
-def test_mistakes(key: str, text: str, mistake: str):
-    config, mistakes = filled(ALL, {"tag": "1"} | {key: text})
-    assert mistakes == {key: mistake}
-    assert key not in config
+MISTAKES = [
+    ("tag", "", "required"),
+    ("laps", "0", "at least 1"),
+    ("laps", "10", "at most 9"),
+    ("laps", "2.5", "must be a whole number"),
+    ("laps", "?", "must be a number"),
+    ("laps", " ", "must be a number"),
+    ("laps", "two", "must be a number"),
+    ("tag", "1e15", "must be a whole number"),
+    ("power", "1e999", "must be a number"),
+    ("power", "NaN", "must be a number"),
+    ("power", "Infinity", "must be a number"),
+    ("power", "0.05", "at least 0.1"),
+    ("name", "-x", "must not begin with -"),
+    ("name", "x" * 257, "at most 256 characters"),
+    ("name", "a\tb", "must have no control characters"),
+    ("name", "a\u00a0b", "must have no control characters"),
+    ("family", "C", "choose one of the list"),
+    ("search", "maybe", "choose one of the list"),
+]
 
 
-@pytest.mark.parametrize("text", ["naïve café", "日本", "a b", "3-4", "{}"])
-def test_texts_that_robots_accept(text: str):
-    assert filled(ALL, {"name": text, "tag": "1"}) == ({"name": text, "tag": 1}, {})
+def test_mistakes() -> None:
+    found = filled_all(ALL, [{"tag": "1"} | {key: text} for key, text, _ in MISTAKES])
+    for (key, text, mistake), (config, mistakes) in zip(MISTAKES, found, strict=True):
+        assert mistakes == {key: mistake}, (key, text)
+        assert key not in config
+
+
+def test_texts_that_robots_accept() -> None:
+    texts = ["naïve café", "日本", "a b", "3-4", "{}"]
+    found = filled_all(ALL, [{"name": text, "tag": "1"} for text in texts])
+    assert found == [[{"name": text, "tag": 1}, {}] for text in texts]
 
 
 SETTINGS = [
@@ -349,15 +350,15 @@ def robot_accepts(values: dict[str, Any]) -> bool:
     return True
 
 
-def test_the_form_and_the_robot_accept_the_same():
+def test_the_form_and_the_robot_accept_the_same() -> None:
     cases = [(setting.key, text) for setting in SETTINGS for text in TEXTS]
     found = filled_all([setting.entry() for setting in SETTINGS], [{key: text} for key, text in cases])
     for (key, text), (config, mistakes) in zip(cases, found, strict=True):
         assert robot_accepts(config or {key: text}) is not bool(mistakes), (key, text)
 
 
-def test_a_robot_may_list_anything():
-    odd = [
+def test_a_robot_may_list_anything() -> None:
+    odd: list[Any] = [
         7, None, [], {"key": 1}, {"key": ""}, {"key": "x" * 101}, {"key": "a"},
         entry("a", "colour", default={"x": 1}, min="0"),
         entry("b", "int", default="3", min="0", max=None, step=-1, required="yes"), entry("c", "enum", options="abc"),
@@ -383,11 +384,11 @@ def test_a_robot_may_list_anything():
 
 
 @pytest.mark.parametrize("payload", [None, 7, [], {}, {"files": None}, {"value": 3}])
-def test_without_a_list_there_are_no_scripts(payload: Any):
+def test_without_a_list_there_are_no_scripts(payload: Any) -> None:
     assert forms(f"result = scripts({json.dumps(payload)});") is None
 
 
-def test_scripts_of_the_same_label_are_told_apart():
+def test_scripts_of_the_same_label_have_their_folder_beside_it() -> None:
     files = {
         "files": [{"file": "a", "label": "Follow"}, {"file": "b", "label": "Follow"}, {"file": "c", "label": "Go"}]
     }
@@ -395,7 +396,7 @@ def test_scripts_of_the_same_label_are_told_apart():
     assert [one["label"] for one in found] == ["Follow (a)", "Follow (b)", "Go"]
 
 
-def test_a_form_with_mistakes_is_not_sent():
+def test_a_form_with_mistakes_is_not_sent() -> None:
     steps = """
     const reasons = (mistakes, config = {}) => whyNotSent({ config, mistakes: new Map(mistakes) });
     const long = Object.fromEntries([...Array(64).keys()].map((n) => [`k${n}`, "x".repeat(256)]));
@@ -405,19 +406,20 @@ def test_a_form_with_mistakes_is_not_sent():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("field", "expected"),
-    [
-        (entry("a", "int", min=1, max=9, default=3), "a whole number, 1 to 9, default 3"),
-        (entry("a", "float", min=0.5), "at least 0.5"),
-        (entry("a", "float", max=2, default=1.5), "at most 2, default 1.5"),
-        (entry("a", "bool", default=False), "default off"),
-        (entry("a"), ""),
-    ],
-)
-def test_hints(field: dict[str, Any], expected: str):
-    files = {"files": [{"file": "x", "configs": [field]}]}
-    assert forms(f"result = hint(scripts({json.dumps(files)})[0].fields[0]);") == expected
+HINTS = [
+    (entry("a", "int", min=1, max=9, default=3), "a whole number, 1 to 9, default 3"),
+    (entry("a", "float", min=0.5), "at least 0.5"),
+    (entry("a", "float", max=2, default=1.5), "at most 2, default 1.5"),
+    (entry("a", "bool", default=False), "default off"),
+    (entry("a"), ""),
+]
+
+
+def test_hints() -> None:
+    configs = [field | {"key": f"k{number}"} for number, (field, _) in enumerate(HINTS)]
+    files = {"files": [{"file": "x", "configs": configs}]}
+    found = forms(f"result = scripts({json.dumps(files)})[0].fields.map(hint);")
+    assert found == [expected for _, expected in HINTS]
 
 
 _STORED = """
@@ -428,7 +430,7 @@ const texts = (map) => Object.fromEntries(map);
 """
 
 
-def test_forms_are_remembered_by_robot_and_script():
+def test_forms_are_remembered_by_robot_and_script() -> None:
     steps = """
     remember("goob", "a", new Map([["x", "1"]]));
     remember("goob", "b", new Map([["x", "2"], ["y", "?"]]));
@@ -438,7 +440,7 @@ def test_forms_are_remembered_by_robot_and_script():
     assert forms(_STORED + steps) == [{"x": "1"}, {"x": "2"}, {}, "b", "a", ""]
 
 
-def test_the_memory_of_forms_is_bounded():
+def test_the_memory_of_forms_is_bounded() -> None:
     steps = """
     for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
     const many = JSON.parse(stored.get("pebble forms")).length;
@@ -448,7 +450,7 @@ def test_the_memory_of_forms_is_bounded():
 
 
 @pytest.mark.parametrize("stored", ["{", "7", '{"a":1}', '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'])
-def test_a_memory_of_something_else_is_none(stored: str):
+def test_a_memory_of_something_else_is_none(stored: str) -> None:
     steps = f"{_STORED} stored.set('pebble forms', {json.dumps(stored)});"
     assert forms(f"{steps} result = [texts(remembered('goob', 'a')), lastScript('goob')];") == [{}, ""]
 
@@ -472,13 +474,13 @@ def autonomy(steps: str) -> Any:
         {"running": True, "file": [], "dependencies": {"a": 1}, "config": [1]},
     ],
 )
-def test_a_status_may_be_anything(payload: Any):
+def test_a_status_may_be_anything(payload: Any) -> None:
     status = autonomy(f"result = statusOf({json.dumps(payload)});")
     assert status["running"] is (isinstance(payload, dict) and payload["running"] is True)
     assert (status["dependencies"], status["config"], status["error"]) == ([], [], "")
 
 
-def test_a_status_of_a_robot():
+def test_a_status_of_a_robot() -> None:
     payload = {
         "running": True, "file": "follow", "pid": 7, "overridden": True, "error": None, "config": {"tag_id": 5},
         "dependencies": [{"file": "wheel-odometry", "pid": 8, "running": True}, {"file": 3, "running": 1}, "x"],
@@ -490,7 +492,7 @@ def test_a_status_of_a_robot():
     }  # fmt: skip
 
 
-def test_since_when_a_script_runs():
+def test_since_when_a_script_runs() -> None:
     steps = """
     const since = new Since();
     const see = (status, at) => { since.update(statusOf(status), at); return [since.at, since.isExact]; };
@@ -521,6 +523,6 @@ def test_since_when_a_script_runs():
         ('values[ref]["web/driver"] = { by: "bob", you: false, idle_s: 0.1 }; drive.arbitrates = false', ""),
     ],
 )
-def test_why_no_script_can_be_started(change: str, why: str):
+def test_why_no_script_can_be_started(change: str, why: str) -> None:
     steps = f"const {{ drive }} = values[ref].capabilities.value; {change}; result = whyNotStarted(page, ref);"
     assert autonomy(steps) == why

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Locator
 
+from tests.support import Broker
 from tests.web.browser import Tab, tab
 from tests.web.served import RecordingRobot, Served
 
@@ -40,7 +42,7 @@ SCRIPTS = [
     {"file": "april-follow", "label": "Follow a tag", "configs": CONFIGS},
     {"file": "circle", "label": "Drive in a circle", "configs": []},
 ]
-IDLE = {
+IDLE: dict[str, Any] = {
     "running": False,
     "file": None,
     "pid": None,
@@ -68,7 +70,7 @@ class Robot(RecordingRobot):
 
 
 @pytest.fixture(scope="module")
-def robot(broker) -> Iterator[Robot]:
+def robot(broker: Broker) -> Iterator[Robot]:
     with Robot(broker.port, BASE, capabilities=CAPABILITIES) as one:
         yield one
 
@@ -107,7 +109,7 @@ def why(control: Locator) -> str:
 # -- lights
 
 
-def test_lights_solid_flashing_and_off(opened: Tab, robot: Robot):
+def test_lights_solid_flashing_and_off(opened: Tab, robot: Robot) -> None:
     opened.test("colour-blue").click()
     assert opened.until(lambda: robot.asked("lights-solid") == [{"b": 1.0, "g": 0.0, "r": 0.0}], 3)
     opened.test("lights-period").fill("0.5")
@@ -134,7 +136,7 @@ _DRAG = """async (input) => {
 }"""
 
 
-def test_a_dragged_colour_is_sent_now_and_then_and_at_last(opened: Tab, robot: Robot):
+def test_a_dragged_colour_is_sent_now_and_then_and_at_last(opened: Tab, robot: Robot) -> None:
     opened.test("colour").evaluate(_DRAG)
     assert opened.until(
         lambda: (robot.asked("lights-solid") or [{"r": 0}])[-1]["r"] == pytest.approx(250 / 255, abs=0.001), 3
@@ -143,7 +145,9 @@ def test_a_dragged_colour_is_sent_now_and_then_and_at_last(opened: Tab, robot: R
     assert len(times) <= 2 + (times[-1] - times[0]) / 0.2
 
 
-def test_a_browser_remembers_what_it_asked_of_lights(opened: Tab, browser: Browser, served: Served, robot: Robot):
+def test_a_browser_remembers_what_it_asked_of_lights(
+    opened: Tab, browser: Browser, served: Served, robot: Robot
+) -> None:
     opened.test("colour-green").click()
     opened.test("lights-flash").click()
     assert opened.until(lambda: robot.asked("lights-flash"), 3)
@@ -157,7 +161,7 @@ def test_a_browser_remembers_what_it_asked_of_lights(opened: Tab, browser: Brows
 # -- sounds
 
 
-def test_hundreds_of_clips_are_filtered_and_one_is_played(opened: Tab, robot: Robot):
+def test_hundreds_of_clips_are_filtered_and_one_is_played(opened: Tab, robot: Robot) -> None:
     assert opened.test("clip").count() == 60
     assert text(opened, "more-clips") == "… 242 more: use the filter."
     assert why(opened.test("repeat-last")) == "Play one sound first"
@@ -190,7 +194,7 @@ def test_hundreds_of_clips_are_filtered_and_one_is_played(opened: Tab, robot: Ro
 # -- scripts
 
 
-def test_a_form_is_sent_when_it_has_no_mistakes(opened: Tab, robot: Robot):
+def test_a_form_is_sent_when_it_has_no_mistakes(opened: Tab, robot: Robot) -> None:
     opened.test("script").select_option("Follow a tag")
     start = opened.test("start-script")
     assert why(start) == "The form has 1 mistake"
@@ -221,7 +225,7 @@ def test_a_form_is_sent_when_it_has_no_mistakes(opened: Tab, robot: Robot):
     assert robot.asked("autonomy-command")[1]["config"] == {"tag_id": 7, "distance": 0.8, "name": "other"}
 
 
-def test_a_form_is_remembered_for_its_robot_and_script(opened: Tab, robot: Robot, served: Served):
+def test_a_form_is_remembered_for_its_robot_and_script(opened: Tab, robot: Robot, served: Served) -> None:
     opened.test("script").select_option("Follow a tag")
     opened.test("set-tag_id").fill("9")
     opened.test("script").select_option("Drive in a circle")
@@ -238,7 +242,7 @@ def test_a_form_is_remembered_for_its_robot_and_script(opened: Tab, robot: Robot
     page.close()
 
 
-def test_what_runs_and_its_end(opened: Tab, robot: Robot):
+def test_what_runs_and_its_end(opened: Tab, robot: Robot) -> None:
     parts = [{"file": "wheel-odometry", "pid": 5, "running": True}, {"file": "locations", "pid": 6, "running": False}]
     robot.show("autonomy-status", running(dependencies=parts))
     assert opened.until(lambda: "april-follow runs, since " in text(opened, "script-state"), 3)
@@ -278,7 +282,7 @@ def moves(robot: Robot) -> bool:
     return any(one["z"] for one in robot.asked("drive-values"))
 
 
-def test_a_person_has_to_stop_the_script_and_to_press_again(driver: Tab, robot: Robot):
+def test_a_person_has_to_stop_the_script_and_to_press_again(driver: Tab, robot: Robot) -> None:
     robot.show("autonomy-status", running())
     driver.test("stop-script").wait_for()
     assert text(driver, "stop-script") == "Stop april-follow"
@@ -295,7 +299,7 @@ def test_a_person_has_to_stop_the_script_and_to_press_again(driver: Tab, robot: 
     assert driver.until(lambda: moves(robot), 3)
 
 
-def test_no_script_starts_while_a_person_drives(driver: Tab, robot: Robot):
+def test_no_script_starts_while_a_person_drives(driver: Tab, robot: Robot) -> None:
     driver.test("script").select_option("Drive in a circle")
     driver.page.evaluate("document.activeElement.blur()")
     assert driver.until(driver.test("start-script").is_enabled, 2)
@@ -318,7 +322,7 @@ LONG = "long " * 5000
 
 
 @pytest.mark.parametrize("metric", ["soundboard-files", "soundboard-status", "autonomy-files", "autonomy-status"])
-def test_a_robot_may_report_anything(opened: Tab, robot: Robot, metric: str):
+def test_a_robot_may_report_anything(opened: Tab, robot: Robot, metric: str) -> None:
     texts = [
         {
             "files": [
@@ -339,7 +343,7 @@ def test_a_robot_may_report_anything(opened: Tab, robot: Robot, metric: str):
     ]
     for value in [*ODD, *texts]:
         robot.show(metric, value)
-        assert opened.until(lambda value=value: _has(opened, metric, value), 3), value
+        assert opened.until(partial(_has, opened, metric, value), 3), value
         opened.page.wait_for_timeout(60)  # it is drawn
         assert opened.page.locator(".failed, img").count() == 0
     assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth")

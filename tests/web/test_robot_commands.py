@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.robots import Robots
-from tests.support import until
+from tests.support import Broker, until
 from tests.web.attacker import Hall
 from tests.web.served import Page, RecordingRobot, Served, now_ms
 
@@ -109,14 +110,14 @@ def published(asked: Any, capabilities: dict[str, Any]) -> Message:
 
 
 @pytest.mark.parametrize(("fields", "metric", "value", "retain"), PUBLISHED)
-def test_what_is_published(fields: dict[str, Any], metric: str, value: Any, retain: bool):
+def test_what_is_published(fields: dict[str, Any], metric: str, value: Any, retain: bool) -> None:
     message = published(op(**fields), {})
     assert (message.topic, json.loads(message.payload)) == (f"{BASE}/incoming/{metric}", value)
     assert (message.qos, message.retain) == (QoS.DELIVERED, retain)
 
 
 @pytest.mark.parametrize(("fields", "metric"), [(fields, metric) for fields, metric, _, _ in PUBLISHED])
-def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str, Any], metric: str):
+def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str, Any], metric: str) -> None:
     section, key = NAMED.get(metric, ("outlets", "command_topic"))
     own = f"{BASE}/incoming/other"
     usual = f"{BASE}/incoming/{metric}"
@@ -136,7 +137,7 @@ def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str,
 
 
 @pytest.mark.parametrize("fields", [fields for fields, _, _, _ in PUBLISHED], ids=str)
-def test_which_right_is_needed(fields: dict[str, Any]):
+def test_which_right_is_needed(fields: dict[str, Any]) -> None:
     right = robot_commands.right(op(**fields))
     assert right == ("system" if fields["tag"] == "action" else "drive")
     assert [role.value for role in Role if right in rights(role)] == (
@@ -144,10 +145,12 @@ def test_which_right_is_needed(fields: dict[str, Any]):
     )
 
 
-START = {"tag": "autonomy", "file": "follow"}
-SOLID, FLASH = {"tag": "lights", "r": 1}, {"tag": "lights", "r": 1, "period": 1}
-HORN = {"tag": "soundboard", "file": "horn.wav"}
-OUTLET = {"tag": "outlet", "outlet": "o1", "on": True}
+Fields = dict[str, Any]
+START: Fields = {"tag": "autonomy", "file": "follow"}
+SOLID: Fields = {"tag": "lights", "r": 1}
+FLASH: Fields = {"tag": "lights", "r": 1, "period": 1}
+HORN: Fields = {"tag": "soundboard", "file": "horn.wav"}
+OUTLET: Fields = {"tag": "outlet", "outlet": "o1", "on": True}
 
 
 @pytest.mark.parametrize(
@@ -173,7 +176,7 @@ OUTLET = {"tag": "outlet", "outlet": "o1", "on": True}
         (OUTLET, {"outlets": {"controls": False, "outlets": {"o1": False}}}, ""),
     ],
 )  # fmt: skip
-def test_what_capabilities_rule_out(fields: dict[str, Any], capabilities: dict[str, Any], refused: str):
+def test_what_capabilities_rule_out(fields: dict[str, Any], capabilities: dict[str, Any], refused: str) -> None:
     asked = op(**fields)
     why = "" if robot_commands.ends(asked) else robot_commands.refusal(asked, capabilities)
     assert why == (refused and f"goob takes no {refused} commands")
@@ -183,7 +186,7 @@ def test_what_capabilities_rule_out(fields: dict[str, Any], capabilities: dict[s
 
 
 @pytest.fixture
-def robot(broker) -> Iterator[RecordingRobot]:
+def robot(broker: Broker) -> Iterator[RecordingRobot]:
     with RecordingRobot(broker.port, f"pebble/robots/asked{next(NUMBERS)}") as one:
         yield one
 
@@ -207,7 +210,7 @@ def ask(page: Page, ref: str, tag: str, **fields: Any) -> None:
     page.send(tag, ref=ref, **fields)
 
 
-def test_every_command_reaches_the_robot_in_its_order(page: Page, robot: RecordingRobot):
+def test_every_command_reaches_the_robot_in_its_order(page: Page, robot: RecordingRobot) -> None:
     for fields, *_ in PUBLISHED:
         ask(page, robot.base, **fields)
     assert until(lambda: len(asked_of(robot)) == len(PUBLISHED), 5), asked_of(robot)
@@ -215,7 +218,7 @@ def test_every_command_reaches_the_robot_in_its_order(page: Page, robot: Recordi
     assert page.refused == []
 
 
-def test_the_broker_remembers_flags_and_nothing_else(broker, page: Page, robot: RecordingRobot):
+def test_the_broker_remembers_flags_and_nothing_else(broker: Broker, page: Page, robot: RecordingRobot) -> None:
     for fields, *_ in PUBLISHED:
         ask(page, robot.base, **fields)
     assert until(lambda: len(asked_of(robot)) == len(PUBLISHED), 5)
@@ -226,7 +229,9 @@ def test_the_broker_remembers_flags_and_nothing_else(broker, page: Page, robot: 
     assert {one.topic.rpartition("/")[2] for one in retained} == {"remote-mirror", "mqtt-audio", "mqtt-video"}
 
 
-def test_what_was_asked_is_in_the_audit_but_no_lights_and_sounds(served: Served, page: Page, robot: RecordingRobot):
+def test_what_was_asked_is_in_the_audit_but_no_lights_and_sounds(
+    served: Served, page: Page, robot: RecordingRobot
+) -> None:
     for fields, *_ in PUBLISHED:
         ask(page, robot.base, **fields)
 
@@ -247,7 +252,7 @@ def refusals(page: Page, expected: int = 1) -> list[str]:
     return [one["why"] for one in page.refused]
 
 
-def test_nothing_is_asked_of_what_nobody_has_seen(page: Page, robot: RecordingRobot):
+def test_nothing_is_asked_of_an_unknown_component(page: Page, robot: RecordingRobot) -> None:
     for number, (fields, *_) in enumerate(PUBLISHED):
         ask(page, "pebble/robots/unheard", **fields)
         assert refusals(page, number + 1)[-1] == "unknown component"
@@ -257,7 +262,7 @@ def test_nothing_is_asked_of_what_nobody_has_seen(page: Page, robot: RecordingRo
     assert asked_of(robot) == []
 
 
-def test_a_silent_robot_is_asked_nothing_but_to_end_and_its_flags(page: Page, robot: RecordingRobot):
+def test_a_silent_robot_is_asked_nothing_but_to_end_and_its_flags(page: Page, robot: RecordingRobot) -> None:
     robot.silent()
     assert until(lambda: page.value(robot.base, "web/liveness", "online") is False, 4)
     for fields, *_ in PUBLISHED:
@@ -269,7 +274,7 @@ def test_a_silent_robot_is_asked_nothing_but_to_end_and_its_flags(page: Page, ro
     assert set(refusals(page, len(PUBLISHED) - 5)) == {f"{robot.base.rpartition('/')[2]} is silent"}
 
 
-def test_a_robot_whose_script_service_takes_no_commands(broker, served: Served):
+def test_a_robot_whose_script_service_takes_no_commands(broker: Broker, served: Served) -> None:
     base = f"pebble/robots/asked{next(NUMBERS)}"
     capabilities = {"autonomy": {"available": True, "controls": False}, "lights": {"solid": True, "flash": False}}
     with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, served.page() as page:
@@ -287,7 +292,7 @@ def test_a_robot_whose_script_service_takes_no_commands(broker, served: Served):
         ]
 
 
-def test_a_robot_cannot_have_others_asked(broker, served: Served, robot: RecordingRobot):
+def test_a_robot_cannot_have_others_asked(broker: Broker, served: Served, robot: RecordingRobot) -> None:
     base = f"pebble/robots/asked{next(NUMBERS)}"
     foreign = f"{robot.base}/incoming/autonomy-command"
     capabilities: dict[str, Any] = {}
@@ -304,7 +309,9 @@ def test_a_robot_cannot_have_others_asked(broker, served: Served, robot: Recordi
         assert robot.received == []
 
 
-def test_clips_and_scripts_on_topics_that_the_robot_names(broker, served: Served, robot: RecordingRobot):
+def test_clips_and_scripts_on_topics_that_the_robot_names(
+    broker: Broker, served: Served, robot: RecordingRobot
+) -> None:
     base = f"pebble/robots/asked{next(NUMBERS)}"
     own = f"{base}/outgoing/renamed"
     named = {"soundboard": {"files_topic": f"{own}/clips", "status_topic": f"{robot.base}/outgoing/soundboard-status"}}
@@ -316,19 +323,19 @@ def test_clips_and_scripts_on_topics_that_the_robot_names(broker, served: Served
         values = {"clips": "soundboard-files", "scripts": "autonomy-files", "script": "autonomy-status"}
         for topic, metric in values.items():
             one.publish(f"renamed/{topic}", {"of": topic}, retain=True)
-            assert until(lambda metric=metric: page.value(base, metric), 3), metric
+            assert until(partial(page.value, base, metric), 3), metric
             assert page.value(base, metric) == {"of": topic}
         assert page.value(base, "soundboard-status") is None
 
 
-def test_a_long_list_of_clips_is_passed_on(page: Page, robot: RecordingRobot):
+def test_a_long_list_of_clips_is_passed_on(page: Page, robot: RecordingRobot) -> None:
     files = [f"speech/number {number}, spoken by a person.wav" for number in range(6000)]  # 256 KiB of names
     page.send("watch", ref=robot.base)
     robot.publish("soundboard-files", {"files": files, "timestamp": 1.0}, retain=True)
     assert until(lambda: page.value(robot.base, "soundboard-files", "files") == files, 5)
 
 
-def test_a_stopped_robot_starts_no_script_but_may_end_one(page: Page, robot: RecordingRobot):
+def test_a_stopped_robot_starts_no_script_but_may_end_one(page: Page, robot: RecordingRobot) -> None:
     page.send("estop", ref=robot.base, stop="00000000000000a1")
     assert until(lambda: page.value(robot.base, "web/estop", "latched") is True)
     before = len(asked_of(robot))
@@ -341,7 +348,9 @@ def test_a_stopped_robot_starts_no_script_but_may_end_one(page: Page, robot: Rec
 
 
 @pytest.mark.parametrize("arbitrates", [True, False])
-def test_a_script_starts_beside_a_person_only_where_it_gives_way(broker, served: Served, arbitrates: bool):
+def test_a_script_starts_beside_a_person_only_where_it_gives_way(
+    broker: Broker, served: Served, arbitrates: bool
+) -> None:
     base = f"pebble/robots/asked{next(NUMBERS)}"
     capabilities = {"drive": {"available": True, "controls": True, "arbitrates": arbitrates}}
     with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, served.page() as page:
@@ -376,7 +385,9 @@ def test_a_script_starts_beside_a_person_only_where_it_gives_way(broker, served:
     ],
     ids=lambda fields: str(fields)[:60],
 )
-def test_what_is_beyond_the_limits_ends_the_connection(served: Served, robot: RecordingRobot, fields: dict[str, Any]):
+def test_what_is_beyond_the_limits_ends_the_connection(
+    served: Served, robot: RecordingRobot, fields: dict[str, Any]
+) -> None:
     with served.page() as page:
         assert page.knows(robot.base)
         ask(page, robot.base, **fields)
@@ -384,7 +395,7 @@ def test_what_is_beyond_the_limits_ends_the_connection(served: Served, robot: Re
         assert asked_of(robot) == []
 
 
-def test_the_broker_is_down(broker, page: Page, robot: RecordingRobot):
+def test_the_broker_is_down(broker: Broker, page: Page, robot: RecordingRobot) -> None:
     broker.freeze()
     ask(page, robot.base, **SOLID)  # accepted, and never acknowledged
     assert until(lambda: page.value("", "web/broker", "problem"), 5)
@@ -393,7 +404,7 @@ def test_the_broker_is_down(broker, page: Page, robot: RecordingRobot):
     broker.thaw()
 
 
-def test_who_may_what(broker, tmp_path: Path):
+def test_who_may_what(broker: Broker, tmp_path: Path) -> None:
     with (
         Hall(broker.port, tmp_path) as hall,
         RecordingRobot(broker.port, f"pebble/robots/asked{next(NUMBERS)}") as robot,

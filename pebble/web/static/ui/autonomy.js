@@ -149,7 +149,7 @@ function StartButton({ at, page, entry, why, note, config, file, children }) {
   };
   return html`<button
       type="button"
-      class="primary"
+      class=${why ? "" : "primary"}
       data-test="start-script"
       disabled=${Boolean(why)}
       aria-describedby=${why || note ? "why-start" : undefined}
