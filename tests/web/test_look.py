@@ -41,16 +41,14 @@ def _press(*selectors: str) -> Callable[[Page], None]:
     return act
 
 
-def _at(card: str, *selectors: str) -> Callable[[Page], None]:
-    """Show this card below the header, once these were pressed in it."""
+def _at(place: str, *pressed: str) -> Callable[[Page], None]:
+    """Show this place below the header, once these were pressed."""
 
     def act(page: Page) -> None:
-        for selector in selectors:
-            page.locator(f'[data-card="{card}"] {selector}').first.click()
-        page.evaluate(
-            "(card) => scrollBy(0, document.querySelector(`[data-card='${card}']`).getBoundingClientRect().top - 90)",
-            card,
-        )
+        for selector in pressed:
+            page.locator(selector).first.click()
+        top = "(place) => document.querySelector(place).getBoundingClientRect().top"
+        page.evaluate("(top) => scrollBy(0, top - 90)", page.evaluate(top, place))
 
     return act
 
@@ -94,6 +92,8 @@ WHEN = {
     "tower": "pbvz 640×360",
     "other-camera": "seen from tower-1",
 }
+_OUTLETS, _VALUES = (f'[data-card="{card}"]' for card in ("outlets", "values"))
+_LAMP, _LUX = '[data-test="mcu-lamp-1"]', '[data-test="reading-lux"]'
 SCREENS = [
     *(
         Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
@@ -107,14 +107,12 @@ SCREENS = [
     Screen("more", "driving", _press(".tabs button:nth-child(3)"), ("phone",)),
     Screen("settings", "driving", _press(".tabs button:nth-child(3)", ".wide"), ("phone",)),
     Screen("drawer", "driving", _press(".round"), ("landscape",)),
-    Screen("outlets", "devices", sizes=("desktop",), hold=_at("outlets")),
-    Screen("outlets", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at("outlets")),
-    Screen("outlets-viewer", "devices-viewer", _press(".tabs button:nth-child(3)"), ("phone",), _at("outlets")),
-    Screen("mcus", "devices", sizes=("desktop",), hold=_at("mcus", '[data-test="reading-lux"]')),
-    Screen(
-        "mcus", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at("mcus", '[data-test="reading-lux"]')
-    ),
-    Screen("values", "devices", sizes=("desktop",), hold=_at("values", "summary")),
+    Screen("outlets", "devices", sizes=("desktop",), hold=_at(_OUTLETS)),
+    Screen("outlets", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at(_OUTLETS)),
+    Screen("outlets-viewer", "devices-viewer", _press(".tabs button:nth-child(3)"), ("phone",), _at(_OUTLETS)),
+    Screen("mcus", "devices", sizes=("desktop",), hold=_at(_LAMP, _LUX)),
+    Screen("mcus", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at(_LAMP, _LUX)),
+    Screen("values", "devices", sizes=("desktop",), hold=_at(_VALUES, f"{_VALUES} summary")),
     Screen("small", "driving", sizes=("small",)),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
