@@ -41,16 +41,14 @@ def _press(*selectors: str) -> Callable[[Page], None]:
     return act
 
 
-def _at(card: str, *selectors: str) -> Callable[[Page], None]:
-    """Show this card below the header, once these were pressed in it."""
+def _at(place: str, *pressed: str) -> Callable[[Page], None]:
+    """Show this place below the header, once these were pressed."""
 
     def act(page: Page) -> None:
-        for selector in selectors:
-            page.locator(f'[data-card="{card}"] {selector}').first.click()
-        page.evaluate(
-            "(card) => scrollBy(0, document.querySelector(`[data-card='${card}']`).getBoundingClientRect().top - 90)",
-            card,
-        )
+        for selector in pressed:
+            page.locator(selector).first.click()
+        top = "(place) => document.querySelector(place).getBoundingClientRect().top"
+        page.evaluate("(top) => scrollBy(0, top - 90)", page.evaluate(top, place))
 
     return act
 
@@ -190,6 +188,8 @@ WHEN = {
     "other-camera": "seen from tower-1",
     "script-drives": "Stop apriltag-follow",
 }
+_OUTLETS, _VALUES = (f'[data-card="{card}"]' for card in ("outlets", "values"))
+_LAMP, _LUX = '[data-test="mcu-lamp-1"]', '[data-test="reading-lux"]'
 SCREENS = [
     *(
         Screen(name, name, sizes=ALL if name in ("driving", "taken", "stopped", "lost") else ("desktop", "phone"))
@@ -216,14 +216,12 @@ SCREENS = [
     Screen("more", "driving", _press("[data-test=tab-more]"), ("phone",)),
     Screen("settings", "driving", _press("[data-test=tab-more]", ".wide"), ("phone",)),
     Screen("drawer", "driving", _press(".round"), ("landscape",)),
-    Screen("outlets", "devices", sizes=("desktop",), hold=_at("outlets")),
-    Screen("outlets", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at("outlets")),
-    Screen("outlets-viewer", "devices-viewer", _press(".tabs button:nth-child(3)"), ("phone",), _at("outlets")),
-    Screen("mcus", "devices", sizes=("desktop",), hold=_at("mcus", '[data-test="reading-lux"]')),
-    Screen(
-        "mcus", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at("mcus", '[data-test="reading-lux"]')
-    ),
-    Screen("values", "devices", sizes=("desktop",), hold=_at("values", "summary")),
+    Screen("outlets", "devices", sizes=("desktop",), hold=_at(_OUTLETS)),
+    Screen("outlets", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at(_OUTLETS)),
+    Screen("outlets-viewer", "devices-viewer", _press(".tabs button:nth-child(3)"), ("phone",), _at(_OUTLETS)),
+    Screen("mcus", "devices", sizes=("desktop",), hold=_at(_LAMP, _LUX)),
+    Screen("mcus", "devices", _press(".tabs button:nth-child(3)"), ("phone",), _at(_LAMP, _LUX)),
+    Screen("values", "devices", sizes=("desktop",), hold=_at(_VALUES, f"{_VALUES} summary")),
     Screen("small", "driving", sizes=("small",)),
     Screen("lights", "asked", _press('[data-test="colour-blue"]'), ("desktop",), _at_card("lights")),
     Screen("sounds", "asked-busy", sizes=("desktop",), hold=_at_card("sounds")),

@@ -59,8 +59,8 @@ function Readings({ at, uid, one }) {
   const since = entry ? `${roughly(age)} ago` : one.isPrivate ? "stays on the robot" : "nothing received yet";
   return html`<div class="mcu-out" data-test=${`mcu-out-${one.name}`}>
     <h4>
-      ${one.label} ${one.profile && html`<small>${one.profile}</small>`}
-      <small class=${late ? "late" : ""}>${[rate, since].filter(Boolean).join(" · ")}</small>
+      ${one.label}${" "}
+      <small class=${late ? "late" : ""}>${[one.profile, rate, since].filter(Boolean).join(" · ")}</small>
     </h4>
     <ul>
       ${one.fields.map((field) => {
