@@ -61,11 +61,11 @@ def _trouble(page: Page) -> None:
           const set = (name, metric, value) => pebble.store.set(`pebble/robots/${name}`, metric, value);
           const later = () => new Promise((resolve) => setTimeout(resolve, 150));
           for (let i = 0; i < 3; i++) {
-            set("fred", "web/liveness", { online: i % 2 === 1, silent_s: 0, latency_ms: 1, whole_seconds: false });
+            set("minilamp", "web/liveness", { online: i % 2 === 1, silent_s: 0, latency_ms: 1, whole_seconds: false });
             await later();
           }
-          const estop = pebble.store.get("pebble/robots/minilamp", "web/estop").value;
-          set("minilamp", "web/estop", { ...estop, latched: true, by: "eve on phone" });
+          const estop = pebble.store.get("pebble/robots/fred", "web/estop").value;
+          set("fred", "web/estop", { ...estop, latched: true, by: "eve on phone" });
           const imu = { state: "failed", restarts: 5, last_exit: "exit code 1" };
           set("goob", "status", { value: { services: { autonomy_manager: imu } } });
           set("goob", "charging-level", { value: 12, unit: "%" });
@@ -246,9 +246,11 @@ SCREENS = [
     ),
     Screen("system-ask", "operating", _press("[data-test=service-restart]"), ("desktop",)),
     Screen("system-ask", "operating", _press("[data-test=tab-more]", "[data-test=service-restart]"), ("phone",)),
-    Screen("notices", "fleet", _trouble_and_press("[data-test=bell]"), ("desktop",)),
-    Screen("notices", "fleet", _trouble_and_press(".me"), ("phone",)),
-    Screen("limits", "fleet", _trouble_and_press("[data-test=bell]", "[data-test=limits]"), ("desktop",)),
+    Screen("notices", "driving", _trouble_and_press("[data-test=bell]"), ("desktop",)),
+    Screen("notices", "driving", _trouble_and_press(".tabs button:nth-child(3)", ".wide"), ("phone",)),
+    Screen("fleet-notices", "fleet", sizes=("desktop",), hold=_trouble_and_press("[data-test=bell]")),
+    Screen("fleet-notices", "fleet", sizes=("phone",), hold=_trouble_and_press(".me")),
+    Screen("limits", "driving", _trouble_and_press("[data-test=bell]", "[data-test=limits]"), ("desktop",)),
     Screen("bell", "driving", _trouble, ("desktop", "phone")),
     Screen("own-name", "operating", _press(".me"), ("desktop",)),
 ]

@@ -150,7 +150,7 @@ def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
     assert flags()["mqtt_video"] is True
 
 
-def test_a_flag_is_read_where_the_capabilities_say_but_only_of_the_robot_itself(served, broker) -> None:
+def test_a_flag_is_read_where_the_capabilities_name_it_but_only_of_the_robot_itself(served, broker) -> None:
     base = f"pebble/robots/rig{next(NAMES)}"
     named = {
         "video": {"available": True, "flag_topic": f"{base}/incoming/flags/eye"},
@@ -291,7 +291,7 @@ def test_a_component_that_is_opened_while_it_is_being_closed_is_received(monkeyp
 # -- names
 
 
-def test_without_a_login_a_page_says_who_it_is(served, robot) -> None:
+def test_without_a_login_a_page_gives_its_own_name(served, robot) -> None:
     with Reader(served, name="Alice \u202e", device="phone") as alice, Reader(served) as other:
         assert alice.welcome["user"] == "Alice ?"
         assert other.welcome["user"] == "local"

@@ -81,6 +81,7 @@ def test_a_flag_is_retained_at_the_broker(at_goob: Console, robots: Stage, wire:
     flag = lambda: at_goob.state("web/flags")["mqtt_audio"]
     at_goob.test("flag-mqtt-audio").check()
     assert at_goob.tab.until(lambda: wire.last(topic) == {"value": True}, 3)
+    assert at_goob.tab.until(lambda: flag() is True, 3), (flag(), wire.all(topic))
     later = Wire(robots)
     assert at_goob.tab.until(lambda: later.last(topic) == {"value": True}, 3)
     later.close()

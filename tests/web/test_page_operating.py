@@ -115,7 +115,7 @@ def test_programs_that_start_anew_are_seen_without_a_gap_of_the_heartbeat() -> N
     assert outcome("see(2, { boots: 'base b2' });") == ["asked 0", "its programs have started anew 2"]
 
 
-def test_nothing_is_said_not_to_have_happened_before_30_s() -> None:
+def test_only_after_30_s_nothing_has_happened() -> None:
     assert outcome("see(29, {});") == ["asked 0", "waiting…"]
     assert outcome("see(30, {});") == ["asked 0", "nothing changed for 30 s: the robot may not have done it"]
     assert outcome("see(30, {}); result = outcome.isOver(now);") is False
@@ -245,7 +245,7 @@ def test_a_voltage_is_low_only_below_a_limit_of_the_user() -> None:
     assert notices(steps + "notices.clear(); level(6.5, { ...low, charging: true });") == []
 
 
-def test_per_cent_are_low_below_20_unless_the_user_says_otherwise() -> None:
+def test_per_cent_are_low_below_20_unless_the_user_has_another_limit() -> None:
     assert notices("level(19.5, { unit: '%' });") == ["a has a low battery: 19.5 %, below 20"]
     assert notices("level(15, { unit: '%', limit: 10 });") == []
 

@@ -47,7 +47,7 @@ function Service({ at, view, name, one, times }) {
     <i aria-hidden="true">${Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
     <span class="services-name">${name.replaceAll("_", " ")}</span>
     <span class="services-state">${state}</span>
-    <button type="button" class="quiet" aria-label=${`Log lines of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
+    <button type="button" class="quiet" aria-label=${`Logs of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
       Logs
     </button>
     ${words && html`<span class="services-more">${words}</span>`}

@@ -218,9 +218,10 @@ function Flags({ at, offers }) {
 function Flag({ at, name, title, meaning, value, known }) {
   const { commands, connection } = usePage();
   useModel(connection);
-  const [asked, ask] = useState(/** @type {{on: boolean, at: number} | null} */ (null));
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number, was: any} | null} */ (null));
   useEffect(() => {
-    if (asked?.on === value) ask(null);
+    // another operator's change may arrive in place of the echo
+    if (asked && (value === asked.on || value !== asked.was)) ask(null);
   }, [asked, value]);
   useTick(asked ? 500 : 0);
   const pending = asked && performance.now() - asked.at < ECHO_MS ? asked : null;
@@ -228,7 +229,7 @@ function Flag({ at, name, title, meaning, value, known }) {
   const change = (event) => {
     const on = event.currentTarget.checked;
     commands.setFlag(at, name, on);
-    ask({ on, at: performance.now() });
+    ask({ on, at: performance.now(), was: value });
   };
   const id = `flag-${name}`;
   return html`<div class="flag">
