@@ -123,8 +123,6 @@ def test_keys_call_what_they_are_for_and_end_no_gesture(at_benjr: Console) -> No
     "interruption",
     [
         "dispatchEvent(new Event('blur'))",
-        "document.dispatchEvent(new Event('freeze'))",
-        "document.dispatchEvent(new Event('contextmenu'))",
         "pebble.panels.show('settings')",
         "pebble.route.go('')",
     ],
