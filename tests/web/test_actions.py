@@ -75,11 +75,15 @@ def _calls(robot: Console) -> Any:
 # -- keys
 
 
+def _has_speed(robot: Console, speed: float) -> bool:
+    return robot.tab.until(lambda: robot.speeds == pytest.approx((speed, speed), abs=0.01), 1)
+
+
 def test_plus_and_minus_change_the_speed_of_the_wheels_while_they_turn(at_benjr: Console) -> None:
     assert at_benjr.drive()
     for key, speed in [("+", 0.7), ("+", 0.8), ("-", 0.7), ("-", 0.6)]:
         at_benjr.page.keyboard.press(key)
-        assert at_benjr.tab.until(lambda speed=speed: at_benjr.speeds == pytest.approx((speed, speed), abs=0.01), 1)
+        assert _has_speed(at_benjr, speed)
     at_benjr.let_go()
     assert at_benjr.rests()
 
@@ -119,8 +123,6 @@ def test_keys_call_what_they_are_for_and_end_no_gesture(at_benjr: Console) -> No
     "interruption",
     [
         "dispatchEvent(new Event('blur'))",
-        "document.dispatchEvent(new Event('freeze'))",
-        "document.dispatchEvent(new Event('contextmenu'))",
         "pebble.panels.show('settings')",
         "pebble.route.go('')",
     ],
@@ -216,6 +218,10 @@ def test_the_buttons_of_a_mapping_stop_and_the_emergency_stop_is_always_there(
     robot.take()
 
 
+def _asks(robot: Console, text: str, expected: bool) -> bool:
+    return robot.tab.until(lambda: (text in robot.test("pad-ask").inner_text()) is expected, 2)
+
+
 def test_the_wizard_learns_a_gamepad_without_moving_anything(at_benjr: Console) -> None:
     robot, began = at_benjr, time.monotonic_ns()
     robot.pads(_pad())
@@ -227,9 +233,9 @@ def test_the_wizard_learns_a_gamepad_without_moving_anything(at_benjr: Console) 
         ("stick to the right", _pad(0, -1, 0, 0)),
         ("Stop for now", _pad(pressed=(3,))),
     ]:
-        assert robot.tab.until(lambda asked=asked: asked in robot.test("pad-ask").inner_text(), 2)
+        assert _asks(robot, asked, True)
         robot.pads(shown)
-        assert robot.tab.until(lambda asked=asked: asked not in robot.test("pad-ask").inner_text(), 2)
+        assert _asks(robot, asked, False)
         robot.pads(_pad())
     while robot.test("pad-skip").count():
         assert robot.tab.until(lambda: robot.test("pad-ask").inner_text() != "Let go", 2)

@@ -209,7 +209,7 @@ SCREENS = [
     Screen("gamepad", "driving", _do(_PAD)),
     Screen("gamepad-asks", "driving", _do(_PAD, "[data-test=pad-learn]")),
     Screen("no-gamepad", "driving", _do("pebble.panels.show('gamepad')"), ("desktop",)),
-    Screen("open-on-phone", "fleet", _press("[data-test=phone]")),
+    Screen("open-on-phone", "fleet", _do("pebble.panels.show('phone')")),
     Screen("left-handed", "driving", _do("pebble.settings.set('side', 'left')"), ("landscape",)),
     Screen("reset-asked", "stopped", _press(".banner-actions button")),
     Screen("sensors", "driving", _press("[data-test=tab-sensors]"), ("phone",)),

@@ -31,8 +31,9 @@ def canned() -> Iterator[CannedServer]:
 
 def _read(opened: Tab) -> str:
     """What the code says, as it is shown."""
-    picture = opened.page.locator(".qr").screenshot()
-    text, _, _ = cv2.QRCodeDetector().detectAndDecode(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR))
+    picture = cv2.imdecode(np.frombuffer(opened.page.locator(".qr").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    text, _, _ = cv2.QRCodeDetector().detectAndDecode(picture)
     return str(text)
 
 

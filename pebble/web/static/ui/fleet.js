@@ -104,16 +104,17 @@ function FleetTools({ filter, onFilter }) {
         ${Object.entries(SORTS).map(([value, text]) => html`<option key=${value} value=${value}>${text}</option>`)}
       </select></label
     >
-    <label class="check"
+    ${!WATCHES &&
+    html`<label class="check"
       ><input
         type="checkbox"
         data-test="thumbnails"
         checked=${settings.thumbnails}
         onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
       /><span>Thumbnails</span></label
-    >
-    <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}>${WATCHES ? "More than watch" : "Only watch"}</a>
-    <button type="button" data-test="phone" onClick=${() => panels.show("phone")}>
+    >`}
+    <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}>${WATCHES ? "Show all controls" : "Only watch"}</a>
+    <button type="button" class="to-phone" data-test="phone" onClick=${() => panels.show("phone")}>
       <${Icon} name="phone" />Open on a phone
     </button>
   </div>`;

@@ -96,6 +96,24 @@ function Summary({ pad, own, onLearn }) {
   const few = pad.axes.length < 2;
   const percent = Math.round(100 * mapping.deadZone);
   return html`<p data-test="pad-result">${asked(driver.inputs.pad)}</p>
+    <p class="dim">
+      Let go of everything before you begin. While this panel is open nothing moves; the buttons that stop, stop.
+    </p>
+    ${few && html`<${Why} id="why-pad">It has no stick: ${pad.axes.length} axes<//>`}
+    <div class="choices">
+      <button
+        type="button"
+        class="primary"
+        data-test="pad-learn"
+        disabled=${few}
+        aria-describedby=${few ? "why-pad" : undefined}
+        onClick=${onLearn}
+      >
+        Set it up
+      </button>
+      ${own &&
+      html`<button type="button" data-test="pad-forget" onClick=${() => set(null)}>Usual layout</button>`}
+    </div>
     <label class="slider"
       ><span>Dead zone</span>
       <input
@@ -125,25 +143,7 @@ function Summary({ pad, own, onLearn }) {
         <dt>STOP</dt>
         <dd>buttons 9 and 10 together, always</dd>
       </div>
-    </dl>
-    ${few && html`<${Why} id="why-pad">It has no stick: ${pad.axes.length} axes<//>`}
-    <div class="choices">
-      <button
-        type="button"
-        class="primary"
-        data-test="pad-learn"
-        disabled=${few}
-        aria-describedby=${few ? "why-pad" : undefined}
-        onClick=${onLearn}
-      >
-        Set it up
-      </button>
-      ${own &&
-      html`<button type="button" data-test="pad-forget" onClick=${() => set(null)}>Usual layout</button>`}
-    </div>
-    <p class="dim">
-      Let go of everything before you begin. While this panel is open nothing moves; the buttons that stop, stop.
-    </p>`;
+    </dl>`;
 }
 
 const axisWords = ({ axis, invert }) => `axis ${axis + 1}${invert ? ", reversed" : ""}`;

@@ -11,7 +11,7 @@ const THEMES = { auto: "as the system", light: "light", dark: "dark" };
 const SIDES = { left: "on the left", right: "on the right" };
 const RIGHTS = { drive: "drive", reset: "reset stops", system: "restart and update robots", people: "manage users" };
 const MORE = [
-  { name: "help", icon: "help", text: "Keys, gamepad, and how stopping works" },
+  { name: "help", icon: "help", text: "Keys, and how stopping works" },
   { name: "gamepad", icon: "pad", text: "Set up a gamepad" },
   { name: "phone", icon: "phone", text: "Open on a phone" },
 ];
