@@ -54,9 +54,7 @@ class State:
     pictures: bool = True  # whether cameras send any
     freezes: bool = False  # pictures end a moment after the first
     silent: bool = False  # the server answers nothing any more once everything is shown
-    series: Callable[[], dict[tuple[str, str], list[Any]]] = field(
-        default=dict
-    )  # points from before, as in messages.Series
+    series: Callable[[], dict[tuple[str, str], list[Any]]] = dict  # points of messages.Series, by component and metric
     frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
