@@ -52,15 +52,13 @@ class State:
     path: str = "/"
     values: Callable[[int], list[Value]] = field(default=lambda _now: [])
     repeated: dict[str, float] = field(default_factory=dict)  # metrics that arrive again and again: seconds between
-    series: Callable[[], dict[tuple[str, str], list[Any]]] = field(
-        default=dict
-    )  # points from before, as in messages.Series
-    frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
     welcome: dict[str, Any] = field(default_factory=dict)  # instead of the usual one's fields
     pictures: bool = True  # whether cameras send any
     freezes: bool = False  # pictures end a moment after the first
     silent: bool = False  # the server answers nothing any more once everything is shown
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
+    series: Callable[[], dict[tuple[str, str], list[Any]]] = dict  # points of messages.Series, by component and metric
+    frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
 class CannedServer:

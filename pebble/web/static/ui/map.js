@@ -34,6 +34,7 @@ function Trail({ at }) {
   const canvas = useRef(null);
   const view = useRef(/** @type {View | null} */ (null));
   useEffect(() => {
+    if (!canvas.current) return undefined; // it was closed before it was shown
     const own = (view.current = new View(canvas.current, series));
     return () => own.close();
   }, [series]);

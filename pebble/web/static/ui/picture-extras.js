@@ -55,13 +55,14 @@ function Overlays({ source }) {
   const { store, video } = usePage();
   const canvas = useRef(null);
   useEffect(() => {
-    const element = canvas.current; // it is null before this effect ends
+    const own = canvas.current;
+    if (!own) return undefined; // it was closed before it was shown
     const newest = new NewestOverlays();
     let timer = 0;
     const draw = () => {
       clearTimeout(timer);
       const overlays = newest.current(store.clock());
-      paint(element, video.canvas, overlays);
+      paint(own, video.canvas, overlays);
       if (overlays.shapes.length || overlays.labels.length) timer = setTimeout(draw, STALE_MS / 5);
     };
     const take = () => {

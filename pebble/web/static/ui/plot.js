@@ -39,19 +39,18 @@ export function Lines({ series, fields, shownMs, least, paused }) {
   const stopped = useRef(paused);
   stopped.current = paused;
   useEffect(() => {
-    const element = /** @type {HTMLElement} */ (place.current);
+    const element = /** @type {HTMLElement | null} */ (place.current);
+    if (!element) return undefined; // it was closed before it was shown
     const view = new View(element, fields, least);
     const calm = matchMedia("(prefers-reduced-motion: reduce)");
     let seen = true;
     let drawnAt = -Infinity;
-    let version = -1;
     const draw = () => {
       const now = store.clock();
       const pixelMs = shownMs / Math.max(1, view.width);
       const step = calm.matches ? CALM_MS : Math.min(CALM_MS, pixelMs);
-      if (!seen || stopped.current || (now - drawnAt < step && version >= 0)) return;
+      if (!seen || view.recoloured() || stopped.current || now - drawnAt < step) return;
       drawnAt = now;
-      version = series.version;
       view.draw(series.columns(fields, now - shownMs, now), now - shownMs, now, store.offset);
     };
     const sizes = new ResizeObserver(() => view.resize(element.clientWidth));
@@ -88,6 +87,8 @@ class View {
       grid: { stroke: colour("--line"), width: 1 },
       ticks: { stroke: colour("--line"), width: 1, size: 4 },
     };
+    this.style = style;
+    this.theme = "";
     this.range = [0, 1];
     this.width = Math.max(80, element.clientWidth);
     this.plot = new uPlot(
@@ -116,6 +117,15 @@ class View {
   draw([times, ...values], from, to, offset) {
     this.range = [(from + offset) / 1000, (to + offset) / 1000];
     this.plot.setData([times.map((at) => (at + offset) / 1000), ...values]);
+  }
+
+  /** Draw again, if the theme is another one. */
+  recoloured() {
+    const theme = this.style.getPropertyValue("--fg");
+    if (theme === this.theme) return false;
+    if (this.theme) this.plot.redraw(false);
+    this.theme = theme;
+    return true;
   }
 
   resize(width) {
