@@ -362,7 +362,7 @@ class SoundView(Struct, frozen=True, kw_only=True):
     why: str
     encoding: str
     listeners: int
-    talker: str  # "": nobody
+    talker: str  # "": there is none
 
 
 class BrokerView(Struct, frozen=True, kw_only=True):

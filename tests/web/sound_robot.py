@@ -193,11 +193,11 @@ class Server:
 
         self.robots.set_server_metric = record  # type: ignore[method-assign]
         loop = self.broker.loop
-        self.broker.transport.subscribe(
-            CAPABILITIES,
-            lambda message: loop.call_soon_threadsafe(self.robots.receive, message, time.monotonic()),
-            direct=True,
-        )
+
+        def learn(message: Message) -> None:
+            loop.call_soon_threadsafe(self.robots.receive, message, time.monotonic())
+
+        self.broker.transport.subscribe(CAPABILITIES, learn, direct=True)
 
     def open(
         self, page: Page, can: frozenset[str] = BOTH, *, user: str = "alice", role: Role = Role.DRIVER, ref: str = REF

@@ -180,8 +180,6 @@ WHEN = {
     "silent": "goob is silent since",
     "old-picture": "The picture is ",
     "no-picture": "There is no picture yet",
-    "listening": "Listen",
-    "no-sound": "Listen",
     "old-page": "older than the server",
     "plain-http": "not encrypted",
     "tower": "pbvz 640×360",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Coroutine
-from functools import wraps
+from functools import partial, wraps
 from itertools import pairwise
 from typing import Any
 
@@ -97,7 +97,7 @@ async def test_one_listener_without_opus_is_enough_for_pcm() -> None:
         await until(lambda: robot.encodings == ["opus", "pcm", "opus"])
 
 
-def test_the_best_encoding_that_all_listeners_play():
+def test_the_best_encoding_that_all_listeners_play() -> None:
     both, pcm = frozenset({"opus", "pcm"}), frozenset({"pcm"})
     assert best(("pcm", "opus"), [both, both]) == "opus"
     assert best(("pcm", "opus"), [both, pcm]) == "pcm"
@@ -155,7 +155,7 @@ async def test_sound_is_requested_again_while_none_comes() -> None:
         await until(lambda: server.view.state == "flowing")
 
 
-def test_the_queue_of_a_slow_page_is_bounded_and_its_oldest_is_dropped():
+def test_the_queue_of_a_slow_page_is_bounded_and_its_oldest_is_dropped() -> None:
     queue = SoundQueue()
     packets = [bytes([number]) * 100 for number in range(200)]
     for packet in packets:
@@ -316,8 +316,12 @@ async def test_the_voice_goes_to_the_robots_own_topic_only() -> None:
         robot = SoundRobot({**AUDIO, "uplink_topic": named})
         async with serving(robot) as server:
             await server.open(Page(), NOTHING).speak(1, 3)
-            await until(lambda robot=robot, topic=topic: topic in {one.topic for one in robot.published})
+            await until(partial(_was_published, robot, topic))
             assert all(one.topic.startswith(f"{REF}/incoming/") for one in robot.published)
+
+
+def _was_published(robot: SoundRobot, topic: str) -> bool:
+    return topic in {one.topic for one in list(robot.published)}
 
 
 @on_loop
@@ -333,7 +337,7 @@ async def test_capabilities_that_change_end_the_request() -> None:
         await until(lambda: robot.flags == [True, False])
 
 
-def test_what_a_stalled_connection_held_back_is_not_played():
+def test_what_a_stalled_connection_held_back_is_not_played() -> None:
     talk = Talk(1, 0.0)
     assert all(talk.takes(number, 10 + number / PIECES_PER_S) for number in range(100))
     stalled = 10 + 100 / PIECES_PER_S + 1.0
@@ -344,12 +348,12 @@ def test_what_a_stalled_connection_held_back_is_not_played():
     assert talk.is_over(10 + 200 / PIECES_PER_S + SILENT_S + 0.1)
 
 
-def test_a_microphone_whose_clock_is_slow_works_for_an_hour():
+def test_a_microphone_whose_clock_is_slow_works_for_an_hour() -> None:
     talk = Talk(1, 0.0)
     assert all(talk.takes(number, number / PIECES_PER_S * 1.0005) for number in range(3600 * PIECES_PER_S))
 
 
-def test_the_numbers_of_packets_only_grow_also_of_another_server():
+def test_the_numbers_of_packets_only_grow_also_of_another_server() -> None:
     piece, numbers = bytes(PIECE_BYTES), []
     for server in range(3):
         voice = Voice()
@@ -360,7 +364,7 @@ def test_the_numbers_of_packets_only_grow_also_of_another_server():
     assert all(a < b for a, b in pairwise(numbers))
 
 
-def test_after_the_last_number_comes_1():
+def test_after_the_last_number_comes_1() -> None:
     voice = Voice()
     voice._count = 0xFFFF_FFFE
     numbers = [Sound.unpack(voice.packet(bytes(PIECE_BYTES), 1.0)).sequence for _ in range(3)]

@@ -23,11 +23,12 @@ from pebble.transports import Message, MqttSettings, create
 from tests.support import until
 from tests.web.browser import chromium, tab
 from tests.web.ears import (
+    PLAIN_MICROPHONE,
     TAP,
     at_rate,
     compared,
     fake_microphone,
-    likeness,
+    is_played,
     listener,
     recorded,
     state,
@@ -66,16 +67,16 @@ def played(stage: Stage) -> np.ndarray[Any, Any]:
     return at_rate(np.frombuffer(pcm, "<i2"), 48_000)
 
 
-def test_a_page_plays_the_robots_sound_and_the_robot_the_voice(goob: Stage, browser: Browser):
-    with tab(browser, goob.robot_url("goob")) as opened:
+def test_a_page_plays_the_robots_sound_and_the_robot_the_voice(goob: Stage, browser: Browser) -> None:
+    with tab(browser, goob.robot_url("goob"), script=PLAIN_MICROPHONE) as opened:
         opened.test("listen").click()
         assert opened.until(lambda: "ms buffered · opus" in state(opened), 20)
-        assert likeness(opened, 2, envelopes=True) > 0.9
+        assert is_played(opened, 0.9, envelopes=True)
         assert talks(opened)
-        assert opened.until(lambda: len(played(goob)) > 3 * 48_000, 20)
+        assert opened.until(lambda: len(played(goob)) > 2 * 48_000, 20)
+        assert opened.until(lambda: compared(played(goob), 48_000) > 0.9, 20)
         opened.page.mouse.up()
-        assert compared(played(goob), 48_000) > 0.9
-        assert opened.complaints() == []
+        assert opened.errors + opened.violations == []
 
 
 class Ears:
@@ -107,14 +108,15 @@ TIMES = """() => {
 
 
 @pytest.mark.thorough
-def test_mouth_to_ear_is_short_and_the_flag_is_down_afterwards(goob: Stage, browser: Browser):
+def test_mouth_to_ear_is_short_and_the_flag_is_down_afterwards(goob: Stage, browser: Browser) -> None:
     ears = Ears(goob)
     with tab(browser, goob.robot_url("goob")) as opened, listener(goob.url.rstrip("/"), "pcm"):
         opened.test("listen").click()
         assert opened.until(lambda: "ms buffered · pcm" in state(opened), 20)
         opened.page.wait_for_timeout(2000)
+        assert is_played(opened, 0.95, envelopes=False)
         ears.packets.clear()
-        assert likeness(opened, 6, envelopes=False) > 0.95
+        opened.page.wait_for_timeout(4000)
         delays = mouth_to_ear(opened.page, ears.packets)
         assert statistics.median(delays) <= 150, delays
         opened.test("listen").click()
@@ -164,7 +166,7 @@ def far(voice: Path) -> Iterator[Rig]:
 
 
 @pytest.mark.thorough
-def test_sound_through_a_slow_and_lossy_network(far: Rig):
+def test_sound_through_a_slow_and_lossy_network(far: Rig) -> None:
     page = far.page("goob")
     far.until(page, lambda: page.locator("[data-test=listen]:enabled").count(), "no page", 30)
     page.locator("[data-test=video]").click()  # pictures would need all of it
@@ -176,6 +178,7 @@ def test_sound_through_a_slow_and_lossy_network(far: Rig):
     far.pause(page, 8)
     rate = int(page.evaluate("pebble.sound.model.context.sampleRate"))
     assert compared(recorded(page), rate, envelopes=True) > 0.9
+    page.evaluate(f"() => {{ {PLAIN_MICROPHONE} }}")
     page.locator("[data-test=talk]").hover()
     page.mouse.down()
     far.until(page, lambda: len(played(far.stage)) > 5 * 48_000, lambda: shown.inner_text(), 40)

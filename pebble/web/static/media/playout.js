@@ -6,7 +6,9 @@ import { Resampler } from "./resampler.js";
 import { pcmOf, unpack } from "./sound-packet.js";
 
 const TARGET_MS = 40; // in the jitter buffer, and more if packets come unevenly
-const LEAD_S = 0.03; // at the loudspeaker: what the worker and its messages may be late
+const LEAD_S = 0.03; // at the loudspeaker: what the worker and its messages may be late; more on a slow machine
+const LEAD_STEP_S = 0.01;
+const LONGEST_LEAD_S = 0.12;
 const SLACK_S = 0.01;
 const LONGEST_TICK_S = 0.1; // the loudspeaker has stopped if it says nothing for so long
 
@@ -24,6 +26,7 @@ export class Playout {
     );
     this.played = this.removed = this.pushed = 0; // samples of each channel; played: with silence
     this.tickedAt = performance.now();
+    this.lead = LEAD_S;
     this.received = this.refused = 0;
     this.encoding = "";
     this.format = "";
@@ -68,12 +71,19 @@ export class Playout {
     this.played = played;
     this.removed = removed;
     this.tickedAt = performance.now();
-    while (this.pushed - this.removed < (LEAD_S + SLACK_S) * this.rate) {
+    while (this.pushed - this.removed < (this.lead + SLACK_S) * this.rate) {
+      const { playing } = this.buffer;
       const chunk = this.buffer.take(this.now());
       if (!chunk) return;
-      if (this.pushed === this.removed) this.push(new Float32Array(Math.round(LEAD_S * this.rate)));
+      if (this.pushed === this.removed) this.begin(playing);
       this.push(...this.planes(chunk));
     }
+  }
+
+  /** Nothing waits at the loudspeaker. @param {boolean} late because this worker was late */
+  begin(late) {
+    if (late) this.lead = Math.min(LONGEST_LEAD_S, this.lead + LEAD_STEP_S);
+    this.push(new Float32Array(Math.round(this.lead * this.rate)));
   }
 
   /** @param {Float32Array} left @param {Float32Array} [right] */

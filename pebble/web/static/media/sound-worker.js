@@ -10,7 +10,7 @@ const STATS_MS = 250;
 const FIRST_WAIT_MS = 250;
 const LONGEST_WAIT_MS = 4000;
 const LATE_BYTES = 10_000; // 0.3 s of the voice that could not be sent: what comes then is left out
-const ALIVE_MS = 1000; // without a word of the page, which may stand still while a key was released
+const ALIVE_MS = 1000; // without a message of the page, which may stand still while a key was released
 
 let ref = "";
 let can = "";

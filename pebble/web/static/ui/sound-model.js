@@ -130,7 +130,7 @@ export class Sound extends Model {
     }
   }
 
-  /** A talk that lasts: its worker needs to hear of a page that is alive, and a dialog ends it. */
+  /** While a talk lasts: its worker ends it unless the page shows that it runs; a dialog ends it, too. */
   step() {
     if (!this.talking && performance.now() - this.endedAt > KEEP_MS) {
       clearInterval(this.timer);
@@ -159,7 +159,7 @@ export class Sound extends Model {
 
   // -- both
 
-  /** The page leaves this component, or has heard enough. */
+  /** The page leaves this component, or stops listening. */
   leave() {
     this.silence();
     clearInterval(this.timer);
