@@ -46,8 +46,8 @@ class Described:
         self._manifest, self._hello = manifest, hello
         self._others = 0  # sequence number: a gap shows lost frames
         self._lost = 0  # frames for which there was no room
-        self._asked = False  # for a DESCRIBE
-        self._notify(_HELLO, manifest[:hello])
+        self.asked = False  # for a DESCRIBE, which has not been sent yet
+        self.notify(manifest[:hello], _HELLO)
 
     def receive(self) -> None:
         """Read and answer what the host has sent."""
@@ -55,11 +55,10 @@ class Described:
         if not self.out.used:  # the host reads
             if self._lost:
                 lost, self._lost = self._lost, 0
-                self.log(b"frames_lost=%d" % lost)
-            elif self._asked:
-                self._asked = False
-                self._notify(_DESCRIBE, self._manifest)
-                self.described()
+                self.notify(b"frames_lost=%d" % lost)
+            elif self.asked:
+                self.asked = False
+                self.notify(self._manifest, _DESCRIBE)
         for _ in range(_AT_ONCE):
             byte = self.port.read()
             if byte < 0:
@@ -67,15 +66,9 @@ class Described:
             if self.decoder.take(byte):
                 self._answer()
 
-    def described(self) -> None:
-        """The host knows the manifest from now on: what is sent on change only must be sent now."""
-
     def command(self) -> bytes:
         """Obey the command in ``decoder``. Returns why not; empty: it is obeyed."""
         return b"unknown_interface"
-
-    def log(self, data: bytes) -> None:
-        self._notify(_LOG, data)
 
     def send(self, kind: int, interface: int, sequence: int, data: bytes | bytearray) -> bool:
         """False: there was no room for the frame."""
@@ -86,15 +79,15 @@ class Described:
     def _answer(self) -> None:
         frame, kind = self.decoder, self.decoder.kind
         if kind == _DESCRIBE_REQ:
-            self._notify(_HELLO, self._manifest[: self._hello])
-            self._asked = True
+            self.notify(self._manifest[: self._hello], _HELLO)
+            self.asked = True
         elif kind == _PING:
             self.send(_PONG, 0, frame.sequence, b"")
         elif kind == _CMD:
             why = self.command()
             self.send(_NACK if why else _ACK, frame.interface, frame.sequence, why)
 
-    def _notify(self, kind: int, data: bytes) -> None:
-        """Send a frame that belongs to no interface."""
+    def notify(self, data: bytes, kind: int = _LOG) -> None:
+        """Send a frame that belongs to no interface: a line for the host's log."""
         self._others += 1
         self.send(kind, 0, self._others, data)

@@ -83,20 +83,16 @@ class Decoder:
     """Decodes the host's bytes. After a byte that completes a valid frame, the attributes hold its parts."""
 
     def __init__(self) -> None:
-        self.kind = self.interface = self.sequence = 0
-        self._buffer = bytearray(_LIMIT)
-        self._length = self._size = 0
-
-    def payload(self) -> bytes:
-        """Return the payload of the newest frame; the next byte may overwrite it."""
-        return bytes(self._buffer[_HEADER_SIZE : self._size])
+        self.kind = self.interface = self.sequence = self.size = 0
+        self.buffer = bytearray(_LIMIT)  # the payload is from 13 to ``size``, until the next byte
+        self._length = 0
 
     def take(self, byte: int) -> bool:
         """Whether ``byte`` completes a valid frame of at most 160 bytes and of our version."""
         length = self._length
         if byte:
             if length < _LIMIT:
-                self._buffer[length] = byte
+                self.buffer[length] = byte
             self._length += length <= _LIMIT  # one more than fits: too long
             return False
         self._length = 0
@@ -104,7 +100,7 @@ class Decoder:
 
     def _unstuff(self, size: int) -> int:
         """Decode in place; returns the decoded length, 0 if a run exceeds the frame."""
-        buffer = self._buffer
+        buffer = self.buffer
         source = target = 0
         while source < size:
             code = buffer[source]
@@ -123,11 +119,11 @@ class Decoder:
 
     def _parse(self, size: int) -> bool:
         """Check and parse a decoded frame; ``size`` is that of all before the CRC."""
-        buffer = self._buffer
+        buffer = self.buffer
         if size < _HEADER_SIZE or buffer[0] != _VERSION:
             return False
         if crc16(buffer, size) != buffer[size] | buffer[size + 1] << 8:
             return False
-        self._size = size
+        self.size = size
         _, self.kind, _, self.interface, self.sequence, _ = struct.unpack_from(_HEADER, buffer, 0)
         return True

@@ -30,7 +30,7 @@ class Robot(Described):
 
     def __init__(self) -> None:
         super().__init__(MANIFEST, _HELLO_SIZE, _RING)
-        self.imu = Imu(Mpu6050(pins), self.log)
+        self.imu = Imu(Mpu6050(pins), self.notify)
         self._grid = Grid(_SAMPLE_MS, self.now)
         self._until_state = _STATE_EVERY
         self._payload = bytearray(18)

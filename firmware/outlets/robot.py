@@ -11,6 +11,7 @@ from outlets.manifest import HELLO_SIZE, manifest
 _CHECK_MS = const(20)
 _RING = const(768)  # bytes for the host; a DESCRIBE of four outlets has 724
 
+_HEADER_SIZE = const(13)
 _STATE = const(0x11)
 _BOUND = const(1)  # bits of a state
 _REACHABLE = const(2)
@@ -30,10 +31,13 @@ class Robot(Described):
         self._payload = bytearray(3)
         self._states = 0  # sequence number
         self._grid = Grid(_CHECK_MS, self.now)
-        self.described()
+        self._forget()
 
     def step(self) -> None:
+        asked = self.asked
         self.receive()
+        if asked and not self.asked:
+            self._forget()  # a host that knows the manifest now needs all states
         if self._grid.due(self.now):
             self._report()
         self.port.send()
@@ -42,12 +46,13 @@ class Robot(Described):
         for relay in self._relays:
             relay.value(0)
 
-    def described(self) -> None:
+    def _forget(self) -> None:
         for index in range(len(self._reported)):
             self._reported[index] = _UNSENT
 
     def command(self) -> bytes:
-        interface, data = self.decoder.interface, self.decoder.payload()
+        frame = self.decoder
+        interface, data = frame.interface, bytes(frame.buffer[_HEADER_SIZE : frame.size])
         index = interface // 2
         if not interface & 1 or index >= len(self._relays):
             return b"unknown_interface"
