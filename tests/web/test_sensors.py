@@ -36,6 +36,11 @@ CanvasRenderingContext2D.prototype.fillText = function (...text) {
 """
 
 
+def thorough(*values: Any) -> Any:
+    """A case that runs in make thorough only."""
+    return pytest.param(*values, marks=pytest.mark.thorough)
+
+
 @pytest.fixture(scope="module")
 def server() -> Iterator[CannedServer]:
     with serving() as canned:
@@ -173,6 +178,7 @@ def test_a_plot_is_added_remembered_and_removed(server: CannedServer, browser: B
         assert opened.complaints() == []
 
 
+@pytest.mark.thorough
 def test_uplot_is_fetched_with_the_plots_only(server: CannedServer, browser: Browser) -> None:
     fetched = (
         "performance.getEntriesByType('resource').map((one) => one.name).filter((one) => /uPlot/.test(one)).length"
@@ -197,7 +203,9 @@ NASTY: list[Any] = [
 ]
 
 
-@pytest.mark.parametrize("metric", ["sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level"])
+@pytest.mark.parametrize(
+    "metric", ["sensors/imu", *map(thorough, ("wheel-odometry", "video-overlays", "status", "charging-level"))]
+)
 def test_no_payload_breaks_a_card(server: CannedServer, browser: Browser, metric: str) -> None:
     with showing(server, browser, SENSORS) as opened:
         opened.test("plot-battery").wait_for()
@@ -267,6 +275,7 @@ def test_the_map_is_moved_zoomed_and_centred(sensors: Tab) -> None:
     assert sensors.until(lambda: trail(sensors)["middle"] > 30)
 
 
+@pytest.mark.thorough
 def test_one_finger_scrolls_the_page_and_two_zoom_the_map(server: CannedServer, browser: Browser) -> None:
     with showing(server, browser, SENSORS, "phone") as opened:
         opened.test("tab-sensors").click()
@@ -347,11 +356,11 @@ OVERLAYS = STATES["overlays"]
 @pytest.mark.parametrize(
     ("size", "options"),
     [
-        ("desktop", {"viewport": {"width": 1280, "height": 800}}),
+        thorough("desktop", {"viewport": {"width": 1280, "height": 800}}),
         ("desktop", {"viewport": {"width": 1100, "height": 560}}),  # bars on both sides of the picture
-        ("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
+        thorough("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
         ("phone", {}),
-        ("landscape", {}),
+        thorough("landscape", {}),
     ],
 )
 def test_what_is_drawn_over_a_picture_is_where_it_belongs(
@@ -388,6 +397,7 @@ def test_overlays_vanish_half_a_second_after_the_last(server: CannedServer, brow
         assert time.monotonic() - began < 1.5
 
 
+@pytest.mark.thorough
 def test_overlays_are_switched_off_and_stay_so(server: CannedServer, browser: Browser) -> None:
     with showing(server, browser, OVERLAYS) as opened:
         opened.test("overlays").click()
@@ -457,9 +467,9 @@ def test_an_address_that_is_newer_than_the_page_needs_a_reload(server: CannedSer
 @pytest.mark.parametrize(
     "address",
     [
-        "javascript:parent.ran = 1",
-        "data:text/html,x",
-        "http://user:secret@localhost/",
+        thorough("javascript:parent.ran = 1"),
+        thorough("data:text/html,x"),
+        thorough("http://user:secret@localhost/"),
         "http://127.0.0.1:{port}/stream",
     ],
 )
@@ -473,6 +483,7 @@ def test_what_may_not_be_shown_is_not(server: CannedServer, browser: Browser, ad
         assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0
 
 
+@pytest.mark.thorough
 def test_another_component_whose_picture_is_shown_offers_its_stream(server: CannedServer, browser: Browser) -> None:
     tower = "pebble/towers/tower-1"
     values = changed(
