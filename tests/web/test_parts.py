@@ -12,7 +12,7 @@ from tests.web.canned import CannedServer, serving
 from tests.web.states import STATES
 
 SCREEN = "**/ui/robot.js"
-LATER = "fleet", "cards", "telemetry", "values", "drive", "stick", "video", "settings"
+LATER = "fleet", "cards", "drive", "stick", "video", "settings"
 HERE = r"performance.getEntriesByType('resource').map((one) => one.name.match(/(\w+).js$/)?.[1])"
 
 
