@@ -85,6 +85,16 @@ export function useTick(ms) {
   }, [ms]);
 }
 
+/** Draw again once, ``ms`` after this time; Infinity: never. @param {number} ms */
+export function useLater(ms) {
+  const redraw = useRedraw();
+  useEffect(() => {
+    if (!Number.isFinite(ms)) return undefined;
+    const timer = setTimeout(redraw, ms);
+    return () => clearTimeout(timer);
+  });
+}
+
 /**
  * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before. ``draw`` may
  * use nothing but its argument.
