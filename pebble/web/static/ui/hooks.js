@@ -85,12 +85,14 @@ export function useTick(ms) {
   }, [ms]);
 }
 
-/** Draw again once, ``ms`` after this time; Infinity: never. @param {number} ms */
+const LONGEST_MS = 60_000; // a timer of more than 24 days would end at once
+
+/** Draw again once, after ``ms`` or a minute; Infinity: never. @param {number} ms */
 export function useLater(ms) {
   const redraw = useRedraw();
   useEffect(() => {
     if (!Number.isFinite(ms)) return undefined;
-    const timer = setTimeout(redraw, ms);
+    const timer = setTimeout(redraw, Math.min(ms, LONGEST_MS));
     return () => clearTimeout(timer);
   });
 }
