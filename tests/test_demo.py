@@ -81,6 +81,7 @@ def temporary() -> Iterator[Path]:
     """A short path: the robots' unix sockets are below it, and their paths are limited to 108 bytes."""
     with tempfile.TemporaryDirectory(prefix="pebble-", dir="/tmp") as folder:
         yield Path(folder)
+        assert until(lambda: not any(folder in _command(pid) for pid in _pids()))  # of a demo that was killed
 
 
 @pytest.fixture

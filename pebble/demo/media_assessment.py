@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-RATE_TOLERANCE = 0.05  # of the camera's rate, by its counter
-DELIVERED_TOLERANCE = 0.15  # of the promised rate: the check is short and the machine busy
+TOLERANCE = 0.15  # of the camera's rate and of the promised one: the check is short and the machine busy
 LEGIBLE = 0.9  # share of the pictures whose counter must be readable
 PCM_CORRELATION = 0.95  # of the samples
 OPUS_CORRELATION = 0.9  # of the envelopes: Opus preserves the sound, not the waveform
@@ -61,7 +60,7 @@ def assess_pictures(
         wrong.append(f"{encoding}: the counter of {len(shown) - len(legible)} of {len(shown)} pictures is illegible")
     if any(later <= earlier for earlier, later in pairwise(counters)):
         wrong.append(f"{encoding}: the frame counter fell back")
-    if abs(advance - camera_fps) > RATE_TOLERANCE * camera_fps:
+    if abs(advance - camera_fps) > TOLERANCE * camera_fps:
         wrong.append(f"{encoding}: the frame counter advances by {advance:.1f} a second instead of {camera_fps:g}")
     delivered = assess_rate(robot, encoding, [one.captured_s for one in shown], fps)
     return MediaResult(robot, encoding, f"{delivered.measured}, counter {advance:.2f}/s", (*wrong, *delivered.wrong))
@@ -74,7 +73,7 @@ def assess_rate(robot: str, encoding: str, captured_s: Sequence[float], fps: flo
     seconds = captured_s[-1] - captured_s[0]
     delivered = (len(captured_s) - 1) / seconds if seconds > 0 else 0.0
     wrong = f"{encoding}: {delivered:.1f} pictures a second instead of {fps:g}"
-    right = abs(delivered - fps) <= DELIVERED_TOLERANCE * fps
+    right = abs(delivered - fps) <= TOLERANCE * fps
     return MediaResult(robot, encoding, f"{delivered:.1f} fps", () if right else (wrong,))
 
 

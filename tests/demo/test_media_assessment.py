@@ -21,6 +21,10 @@ def test_pictures_as_promised() -> None:
     assert result.measured == "10.0 fps, counter 15.00/s"
 
 
+def test_a_camera_that_catches_up_after_a_stall_of_the_machine() -> None:
+    assert assess_pictures("goob", "json", shown(camera=16.8), 15, 10).wrong == ()
+
+
 @pytest.mark.parametrize(
     ("pictures", "complaint"),
     [

@@ -85,6 +85,18 @@ export function useTick(ms) {
   }, [ms]);
 }
 
+const LONGEST_MS = 60_000; // a timer of more than 24 days would end at once
+
+/** Draw again once, after ``ms`` or a minute; Infinity: never. @param {number} ms */
+export function useLater(ms) {
+  const redraw = useRedraw();
+  useEffect(() => {
+    if (!Number.isFinite(ms)) return undefined;
+    const timer = setTimeout(redraw, Math.min(ms, LONGEST_MS));
+    return () => clearTimeout(timer);
+  });
+}
+
 /**
  * Draw each item again only when it changes by itself: Preact passes over a node that it has drawn before. ``draw`` may
  * use nothing but its argument.

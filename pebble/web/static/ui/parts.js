@@ -1,10 +1,11 @@
 // Small parts of many widgets.
 
-import { html, useEffect, usePart, useRef, useState, useTick } from "./hooks.js";
+import { html, useEffect, useLater, usePart, useRef, useState, useTick } from "./hooks.js";
 import { roughly } from "./words.js";
 
 const ICONS = new URL("../icons.svg", import.meta.url).href;
 const GONE_MS = 10_000;
+const LATE_MS = 250; // beyond two periods
 
 /** @param {{name: string}} props */
 export const Icon = ({ name }) => html`<svg class="icon" aria-hidden="true"><use href=${`${ICONS}#${name}`} /></svg>`;
@@ -96,13 +97,15 @@ export const Why = ({ id, children }) => html`<span class="why" id=${id}>${child
  * @param {{entry?: import("../core/store.js").Value, online?: boolean, children: any}} props
  */
 export function Live({ entry, online = true, children }) {
-  useTick(1000);
+  const { age = 0, period = 0 } = entry ?? {};
+  const lateAt = period > 0 ? 2 * period + LATE_MS : Infinity;
+  const late = age > lateAt;
+  useTick(!online || late ? 1000 : 0); // its age is shown
+  useLater(online && !late ? lateAt - age + 1 : Infinity);
   if (!entry) return html`<span class="dim">–</span>`;
-  const { age, period } = entry;
   if (!online || (period > 0 && age > Math.max(GONE_MS, 3 * period))) {
     return html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
   }
-  const late = period > 0 && age > 2 * period + 250;
   return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 

@@ -1,0 +1,31 @@
+"""A value on the page ages by itself: on the fleet's screen nothing else draws it again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from playwright.sync_api import Browser
+
+from tests.web.browser import tab
+from tests.web.canned import serving
+from tests.web.states import GOOB, STATES
+
+SEND = """async ([ref, count]) => {
+  for (let i = 0; i < count; i++) {
+    pebble.store.set(ref, "charging-level", { value: 7, unit: "v" });
+    await new Promise((resolve) => setTimeout(resolve, 60));
+  }
+}"""
+
+
+def test_a_value_that_stops_becomes_late_and_the_next_one_is_fresh(browser: Browser) -> None:
+    state = replace(STATES["fleet"], repeated={})
+    with serving(state) as server, tab(browser, server.url + state.path) as opened:
+        level = opened.test("card-goob").get_by_text("7.00 V")
+        opened.test("card-goob").wait_for()
+        opened.page.evaluate(SEND, [GOOB, 6])
+        assert opened.until(lambda: level.inner_text() == "7.00 V 0 s old", 3), level.inner_text()
+        assert opened.until(lambda: level.inner_text() == "7.00 V 2 s old", 4), level.inner_text()
+        opened.page.evaluate(SEND, [GOOB, 1])
+        assert opened.until(lambda: level.inner_text() == "7.00 V", 1), level.inner_text()
+        assert opened.until(lambda: level.inner_text() == "7.00 V 0 s old", 3), level.inner_text()
