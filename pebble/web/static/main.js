@@ -32,7 +32,7 @@ function join() {
     onChange: () => connection.changed(),
     name: () => String(settings.name).slice(0, 32),
     onLogs: (message) => connection.onLogs?.(message),
-    onDone: (message) => answered(message),
+    onDone: (message) => connection.answered(message),
     onSeries: (message) => store.set(message.ref, `web/series/${message.metric}`, message),
     onBye: (message) => {
       connection.bye = message.again ? null : message;
@@ -40,15 +40,10 @@ function join() {
     },
     onRefused: (message) => {
       driver.refused(message);
-      connection.refusal = message;
-      answered(message);
+      connection.answered(message);
       if (message.cmd !== "drive") connection.show(`Not done: ${message.why}`);
     },
   });
-  const answered = (message) => {
-    connection.answer = message;
-    connection.changed();
-  };
   const estop = new Estop(socket);
   const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
   connection.socket = socket;

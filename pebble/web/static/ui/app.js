@@ -2,7 +2,7 @@
 
 import { Banners } from "./banner.js";
 import { Header } from "./header.js";
-import { Boundary, html, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
+import { Boundary, html, styled, useEffect, useMedia, useModel, usePage, useState } from "./hooks.js";
 import { Part } from "./parts.js";
 import { nameOf } from "./words.js";
 
@@ -10,7 +10,7 @@ import { nameOf } from "./words.js";
 export const PARTS = {
   fleet: async () => (await import("./fleet.js")).Fleet,
   robot: async () => (await import("./robot.js")).Robot,
-  panels: async () => (await import("./panels.js")).fetched(),
+  panels: styled(async () => (await import("./panels.js")).Panels, "panels.css", "notices.css"),
 };
 
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */

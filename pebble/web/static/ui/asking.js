@@ -27,16 +27,16 @@ export function useWhyNot(at, what) {
   return "";
 }
 
-const lastRefusal = (connection) => connection.refusal;
+const answersOf = (connection) => connection.answers;
 
 /**
  * Why the server has not passed on what was asked; "" it has, as far as is known.
- * @param {string} at @param {string} cmd "outlet" @param {{refusal: unknown} | null} asked ``refusal``: the last one then
+ * @param {string} at @param {string} cmd "outlet" @param {{answer: unknown} | null} asked ``answer``: the last one then
  * @returns {string}
  */
 export function useRefusal(at, cmd, asked) {
   const { connection } = usePage();
-  const { refusal } = useModel(connection, lastRefusal);
-  const isNew = asked !== null && refusal !== null && refusal !== asked.refusal;
-  return isNew && refusal.cmd === cmd && refusal.ref === at ? refusal.why : "";
+  useModel(connection, answersOf);
+  const answer = connection.answerTo(cmd, at);
+  return asked !== null && answer !== asked.answer && answer?.op === "refused" ? answer.why : "";
 }

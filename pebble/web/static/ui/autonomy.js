@@ -5,14 +5,13 @@ import { filled, lastScript, remember, remembered, scripts, whyNotSent } from ".
 import { Form } from "./form.js";
 import { html, useMetric, useState, useTick, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
-import { styled } from "./styled.js";
 import { useReasons, whyNotEnd } from "./why-not.js";
 import { clockTime, nameOf, plain } from "./words.js";
 import { useMemo } from "../vendor/hooks.mjs";
 
 const ASKED_MS = 10_000; // so long the page says that it has asked
 
-export const Autonomy = styled("commands.css", ({ at }) => {
+export function Autonomy({ at }) {
   const page = useReasons(at);
   useValue(at, "web/estop");
   useValue(at, "web/driver");
@@ -42,7 +41,7 @@ export const Autonomy = styled("commands.css", ({ at }) => {
       </label>
       <${Starter} key=${`${chosen} ${Boolean(script)}`} ...${parts} script=${script} />`}
   </div>`;
-});
+}
 
 /** What runs, and the end of it. */
 function Running({ at, page, entry, status, script }) {

@@ -1,6 +1,6 @@
 // Which cards there are, in their fixed order. A new one is a line here, and a module that is fetched when it is shown.
 
-import { fetchStyle } from "./hooks.js";
+import { styled } from "./hooks.js";
 
 /**
  * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
@@ -9,11 +9,8 @@ import { fetchStyle } from "./hooks.js";
  *   part: () => Promise<any>, right?: boolean}} CardKind
  */
 
-/** @template T @param {Promise<T>} part one of those that share a style sheet */
-const withStyle = async (part) => (await Promise.all([part, fetchStyle("devices.css")]))[0];
-
 /** Listening and talking; a desktop has them below the picture. */
-export const VOICE = async () => (await import("./sound.js")).load();
+export const VOICE = styled(async () => (await import("./sound.js")).SoundControls, "sound.css");
 
 /** @type {CardKind[]} */
 export const CARDS = [
@@ -32,7 +29,7 @@ export const CARDS = [
     icon: "light",
     tab: "more",
     wants: (offers) => offers.hasLights,
-    part: async () => (await import("./lights.js")).Lights,
+    part: styled(async () => (await import("./lights.js")).Lights, "commands.css"),
   },
   {
     id: "voice",
@@ -49,7 +46,7 @@ export const CARDS = [
     icon: "sound",
     tab: "sound",
     wants: (offers) => offers.has("soundboard"),
-    part: async () => (await import("./sounds.js")).Sounds,
+    part: styled(async () => (await import("./sounds.js")).Sounds, "commands.css"),
   },
   {
     id: "autonomy",
@@ -58,7 +55,7 @@ export const CARDS = [
     icon: "script",
     tab: "more",
     wants: (offers) => offers.has("autonomy"),
-    part: async () => (await import("./autonomy.js")).Autonomy,
+    part: styled(async () => (await import("./autonomy.js")).Autonomy, "commands.css"),
   },
   {
     id: "outlets",
@@ -67,7 +64,7 @@ export const CARDS = [
     icon: "plug",
     tab: "more",
     wants: (offers) => offers.section("outlets").available === true || offers.received("outlets/"),
-    part: async () => (await withStyle(import("./outlets.js"))).Outlets,
+    part: styled(async () => (await import("./outlets.js")).Outlets, "devices.css"),
   },
   {
     id: "map",
@@ -75,7 +72,7 @@ export const CARDS = [
     icon: "map",
     tab: "sensors",
     wants: (offers) => offers.received("wheel-odometry") || offers.received("localization-pose"),
-    part: async () => (await import("./map.js")).Odometry,
+    part: styled(async () => (await import("./map.js")).Odometry, "map.css"),
   },
   {
     id: "plots",
@@ -83,7 +80,7 @@ export const CARDS = [
     icon: "plot",
     tab: "sensors",
     wants: () => true,
-    part: async () => (await import("./plots.js")).Plots,
+    part: styled(async () => (await import("./plots.js")).Plots, "plots.css", "vendor/uPlot.css"),
   },
   {
     id: "mcus",
@@ -91,7 +88,7 @@ export const CARDS = [
     icon: "chip",
     tab: "more",
     wants: (offers) => offers.metrics.some((metric) => metric.endsWith("/describe")),
-    part: async () => (await withStyle(import("./mcus.js"))).Mcus,
+    part: styled(async () => (await import("./mcus.js")).Mcus, "devices.css"),
   },
   {
     id: "logs",
@@ -99,7 +96,7 @@ export const CARDS = [
     icon: "list",
     tab: "more",
     wants: (offers) => offers.isRobot,
-    part: async () => (await import("./logs.js")).Logs,
+    part: styled(async () => (await import("./logs.js")).Logs, "system.css"),
   },
   {
     id: "system",
@@ -108,7 +105,7 @@ export const CARDS = [
     icon: "power",
     tab: "more",
     wants: (offers) => offers.has("system"),
-    part: async () => (await import("./system.js")).System,
+    part: styled(async () => (await import("./system.js")).System, "system.css"),
   },
   {
     id: "values",
@@ -116,7 +113,7 @@ export const CARDS = [
     icon: "list",
     tab: "more",
     wants: () => true,
-    part: async () => (await withStyle(import("./values.js"))).Values,
+    part: styled(async () => (await import("./values.js")).Values, "devices.css"),
   },
 ];
 

@@ -1,6 +1,6 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
-import { Boundary, html, useMetric, useModel, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
+import { Boundary, html, styled, useMetric, useModel, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
 import { Route } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
@@ -154,7 +154,7 @@ function ConnectionState() {
   return html`<span class=${`chip plain ${socket.roundTripMs > 300 ? "late" : ""}`}>connected${round}</span>`;
 }
 
-const BELL = async () => (await import("./notices.js")).Bell;
+const BELL = styled(async () => (await import("./notices.js")).Bell, "notices.css");
 
 /** Fetched later. Where there is little room only their number is shown, with the settings. */
 function Notices(props) {

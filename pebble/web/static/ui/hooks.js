@@ -196,12 +196,18 @@ export class Boundary extends Component {
   }
 }
 
+/**
+ * Fetches a part of the page together with its style sheets, beside app.css; for usePart() and Part.
+ * @param {() => Promise<any>} fetch @param {...string} sheets "cards.css" @returns {() => Promise<any>}
+ */
+export const styled =
+  (fetch, ...sheets) =>
+  async () =>
+    (await Promise.all([fetch(), ...sheets.map(fetchStyle)]))[0];
+
 const sheets = new Map(); // promises, by name
 
-/**
- * A style sheet of a part of the page, beside app.css; to be awaited before the part is drawn.
- * @param {string} name "cards.css" @returns {Promise<void>}
- */
+/** @param {string} name @returns {Promise<void>} */
 export function fetchStyle(name) {
   if (!sheets.has(name)) {
     const link = document.createElement("link");

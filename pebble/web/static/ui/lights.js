@@ -3,7 +3,6 @@
 import { html, useModel } from "./hooks.js";
 import { LONGEST_S, SHORTEST_S, lightsOf, toggleFlash, whyNotLights } from "./lights-model.js";
 import { Why } from "./parts.js";
-import { styled } from "./styled.js";
 import { useReasons } from "./why-not.js";
 import { nameOf } from "./words.js";
 
@@ -18,7 +17,7 @@ const COLOURS = {
   white: "#ffffff",
 };
 
-export const Lights = styled("commands.css", ({ at }) => {
+export function Lights({ at }) {
   const page = useReasons(at);
   const lights = useModel(lightsOf(at));
   const noSolid = whyNotLights(page, at, "solid");
@@ -67,7 +66,7 @@ export const Lights = styled("commands.css", ({ at }) => {
     ${why && html`<${Why} id="why-lights">${why}<//>`}
     <p class="dim" data-test="lights-asked">${asked(lights)} ${nameOf(at)} does not report its lights.</p>
   </div>`;
-});
+}
 
 function ModeButton({ lights, mode, why, onPress, children }) {
   return html`<button

@@ -4,7 +4,6 @@ import { LEVELS } from "../core/logs.js";
 import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "./hooks.js";
 import { logViewOf } from "./log-view.js";
 import { Why } from "./parts.js";
-import { styled } from "./styled.js";
 import { clockTime, inner, isObject } from "./words.js";
 
 const SIGNS = { DEBUG: "·", INFO: "○", WARNING: "▲", ERROR: "✖", CRITICAL: "✖" };
@@ -12,9 +11,7 @@ const END_PX = 24; // so near to the end the newest line is in sight
 const SAID_MS = 3000;
 const SERVICES = 64; // to choose from
 
-export const Logs = styled("system.css", LogsBody);
-
-function LogsBody({ at, view: cards }) {
+export function Logs({ at, view: cards }) {
   const { commands, connection } = usePage();
   const view = useModel(logViewOf(at));
   const { you } = useModel(connection, (one) => one.you);

@@ -1,7 +1,7 @@
 // Where a component was and is, by its odometry: a trail over a grid.
 
 import { differs, pieces, poseOf } from "../core/trail.js";
-import { fetchStyle, html, useEffect, useMetrics, usePage, usePart, useRef, useState, useTick } from "./hooks.js";
+import { html, useEffect, useMetrics, usePage, useRef, useState, useTick } from "./hooks.js";
 import { recorderOf } from "./recorder.js";
 import { number } from "./words.js";
 
@@ -13,18 +13,7 @@ const ZOOM = { start: 120, least: 2, most: 1200 }; // pixels per metre
 const GRIDS = [0.5, 1, 5, 10, 50, 100, 500]; // metres
 const GRID_PIXELS = 24; // lines are not nearer
 
-const STYLE = async () => {
-  await fetchStyle("map.css");
-  return Trail;
-};
-
 export function Odometry({ at }) {
-  const { body, failed } = usePart(STYLE);
-  if (failed) return html`<p class="failed" role="alert">The style of the map could not be fetched.</p>`;
-  return body ? html`<${body} at=${at} />` : html`<p class="dim">Loading…</p>`;
-}
-
-function Trail({ at }) {
   const page = usePage();
   const metrics = useMetrics(at);
   const sources = Object.keys(SOURCES).filter((one) => metrics.includes(one));

@@ -97,7 +97,7 @@ function Reading({ field, value, gone, history }) {
 function Form({ at, uid, one, id, whyNot }) {
   const { commands, connection } = usePage();
   const [entered, enter] = useState(/** @type {Map<string, string | boolean>} */ (new Map()));
-  const [asked, ask] = useState(/** @type {{at: number, refusal: unknown} | null} */ (null));
+  const [asked, ask] = useState(/** @type {{at: number, answer: unknown} | null} */ (null));
   const refused = useRefusal(at, "mcu", asked);
   const names = isLevel(uid) && isLevel(one.name);
   const own = unsendable(one) || (names ? "" : "its name cannot be part of a topic");
@@ -106,8 +106,8 @@ function Form({ at, uid, one, id, whyNot }) {
   const send = (event) => {
     event.preventDefault();
     if (why) return;
-    const { refusal } = connection;
-    if (commands.commandMcu(at, uid, one.name, value)) ask({ at: Date.now(), refusal });
+    const answer = connection.answerTo("mcu", at);
+    if (commands.commandMcu(at, uid, one.name, value)) ask({ at: Date.now(), answer });
   };
   const change = (name, what) => enter(new Map(entered).set(name, what));
   return html`<form class="mcu-in" data-test=${`mcu-in-${one.name}`} noValidate onSubmit=${send}>

@@ -23,19 +23,17 @@ export class Model {
   }
 }
 
-/** The state of the control socket, and what the server last refused. */
+/** The state of the control socket, and what the server answered. */
 export class Connection extends Model {
   constructor(version) {
     super();
     this.version = version;
     this.socket = null; // set by main.js
     this.bye = null;
-    /** @type {{cmd: string, ref: string, why: string} | null} */
-    this.refusal = null; // the last one
     /** @type {{text: string, at: number} | null} */
     this.notice = null;
-    /** @type {any} what the server last did or refused to do, of what this page asked */
-    this.answer = null;
+    /** @type {Map<string, {op: "done" | "refused", why?: string}>} what last came of a command, by command and component */
+    this.answers = new Map();
     /** @type {((message: any) => void) | null} */
     this.onLogs = null;
     this.unread = 0; // notices
@@ -60,6 +58,17 @@ export class Connection extends Model {
 
   may(right) {
     return this.isOpen && !WATCHES && (this.you?.rights ?? []).includes(right);
+  }
+
+  /** @param {{op: any, cmd: string, ref: string, why?: string}} message what the server did or refused to do */
+  answered(message) {
+    this.answers = new Map(this.answers).set(`${message.cmd} ${message.ref}`, message);
+    this.changed();
+  }
+
+  /** @param {string} cmd @param {string} ref */
+  answerTo(cmd, ref) {
+    return this.answers.get(`${cmd} ${ref}`);
   }
 
   /** Show a text for a few seconds. @param {string} text */

@@ -23,7 +23,7 @@ export function install(page) {
   );
   page.pads = pads;
   driver.mappingOf = (id) => pads.mappingOf(id);
-  fetchStyle("panels.css").catch(() => {}); // the panels fetch it again
+  fetchStyle("panels.css").catch(() => {}); // key hints and wall screens; the panels fetch it again
   new Wall(page).start();
 }
 

@@ -6,7 +6,6 @@ import { html, useCalm, useEffect, useModel, usePage, useRefs, useState, useValu
 import { Model, read, write } from "./models.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
-import { styled } from "./styled.js";
 import { battery, inner, isObject, nameOf, shortTime } from "./words.js";
 
 const LIMITS = "battery limits"; // by component, in the unit that it reports
@@ -120,10 +119,8 @@ function useNotices() {
   return useModel(models.get(page));
 }
 
-export const Bell = styled("notices.css", BellBody);
-
 /** ``wide``: there is room for a button; else the list is with the settings. ``panel``: the settings are open. */
-function BellBody({ wide, panel, onPanel }) {
+export function Bell({ wide, panel, onPanel }) {
   const { notices } = useNotices();
   const { unread } = notices;
   const [open, show] = useState(false);
@@ -149,7 +146,7 @@ function BellBody({ wide, panel, onPanel }) {
     ${wide &&
     open &&
     html`<${Panel} id="notices" title="Notices" onClose=${() => show(false)}>
-      <${NoticeListBody} onGo=${() => show(false)} />
+      <${NoticeList} onGo=${() => show(false)} />
     <//>`}`;
 }
 
@@ -161,9 +158,7 @@ function Announcement({ newest }) {
   return html`<span class="sr" role="status" data-test="announcement">${text}</span>`;
 }
 
-export const NoticeList = styled("notices.css", NoticeListBody);
-
-function NoticeListBody({ onGo }) {
+export function NoticeList({ onGo }) {
   const model = useNotices();
   const { list } = model.notices;
   const [unread] = useState(() => new Set(list.filter((one) => one.unread).map((one) => one.key)));

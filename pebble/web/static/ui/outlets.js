@@ -58,7 +58,7 @@ function Outlet({ at, id, name, controls, whyNot }) {
   const payload = useMetric(at, `outlets/${name}/status`)?.value;
   const online = useValue(at, "web/liveness")?.online !== false;
   const report = isObject(inner(payload)) ? inner(payload) : {};
-  const [asked, ask] = useState(/** @type {{on: boolean, at: number, refusal: unknown} | null} */ (null));
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number, answer: unknown} | null} */ (null));
   const refused = useRefusal(at, "outlet", asked);
   const waits = asked !== null && report.on !== asked.on && !refused;
   useEffect(() => {
@@ -70,8 +70,8 @@ function Outlet({ at, id, name, controls, whyNot }) {
   const words = report.on === true ? "on" : report.on === false ? "off" : "unknown";
   const press = () => {
     const on = !(waits && !late ? asked.on : report.on === true);
-    const { refusal } = connection;
-    if (commands.switchOutlet(at, name, on)) ask({ on, at: performance.now(), refusal });
+    const answer = connection.answerTo("outlet", at);
+    if (commands.switchOutlet(at, name, on)) ask({ on, at: performance.now(), answer });
   };
   const why = [whyNot && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
   return html`<li class="outlet">

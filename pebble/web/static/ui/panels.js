@@ -2,14 +2,11 @@
 
 import { GamepadPanel } from "./gamepad.js";
 import { HelpPanel } from "./help.js";
-import { fetchStyle, html } from "./hooks.js";
+import { html } from "./hooks.js";
 import { PhonePanel } from "./phone.js";
 import { SettingsPanel } from "./settings.js";
 
 const PANELS = { settings: SettingsPanel, help: HelpPanel, gamepad: GamepadPanel, phone: PhonePanel };
 
-/** @returns {Promise<any>} what draws the panel that is shown */
-export async function fetched() {
-  await fetchStyle("panels.css");
-  return ({ shown, onClose }) => html`<${PANELS[shown]} key=${shown} onClose=${onClose} />`;
-}
+/** The panel that is shown. */
+export const Panels = ({ shown, onClose }) => html`<${PANELS[shown]} key=${shown} onClose=${onClose} />`;

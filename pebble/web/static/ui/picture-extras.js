@@ -1,19 +1,13 @@
 // What belongs to a picture besides it: what robots draw over it, snapshots, and the robot's own stream.
 
 import { MIXED, refusal, reported } from "../core/stream.js";
-import { fetchStyle, html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "./hooks.js";
+import { html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "./hooks.js";
 import { Model, read, write } from "./models.js";
 import { Icon, Why } from "./parts.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../media/overlays.js";
 import { nameOf } from "./words.js";
 
 const OVERLAYS = "video-overlays";
-
-/** The parts that are drawn, once their style is here. */
-export async function extras() {
-  await fetchStyle("picture.css");
-  return { Layer, Tools };
-}
 
 /** Whether overlays are drawn over the pictures of a component; remembered in this browser. */
 class Switches extends Model {
@@ -30,7 +24,7 @@ class Switches extends Model {
 const switches = new Switches();
 
 /** What lies over the picture of ``source``. */
-function Layer({ source }) {
+export function Layer({ source }) {
   const { video, driver } = usePage();
   useModel(video);
   useModel(switches);
@@ -95,7 +89,7 @@ function paint(canvas, picture, overlays) {
 }
 
 /** Buttons below the picture of ``source``. ``wanted``: whether pictures are. */
-function Tools({ source, wanted }) {
+export function Tools({ source, wanted }) {
   const { connection, store, video } = usePage();
   useModel(video);
   useModel(switches);

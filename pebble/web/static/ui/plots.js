@@ -2,33 +2,26 @@
 
 import { numbers } from "../core/series.js";
 import { MOST_ADDED, USUAL, choices, fieldsOf, limitsOf, nameOfLine, restored } from "../core/plot-choices.js";
-import { fetchStyle, html, useMetrics, usePage, usePart, useState, useTick } from "./hooks.js";
+import { html, useMetrics, usePage, useState, useTick } from "./hooks.js";
 import { read, write } from "./models.js";
 import { Icon, Why } from "./parts.js";
+import { Lines } from "./plot.js";
 import { recorderOf } from "./recorder.js";
 import { isObject, number, plain } from "./words.js";
 
 const WORDS_MS = 500; // between two changes of the numbers
 const MOST_METRICS = 60; // in the list
 
-const DRAWN = async () => {
-  const [, , module] = await Promise.all([fetchStyle("plots.css"), fetchStyle("vendor/uPlot.css"), import("./plot.js")]);
-  return module.Lines;
-};
-
 export function Plots({ at }) {
   const metrics = useMetrics(at);
   const [paused, pause] = useState(false);
   const [added, setAdded] = useState(() => restored(read(`plots ${at}`, [])));
-  const { body: Lines, failed } = usePart(DRAWN);
   const change = (plots) => {
     write(`plots ${at}`, plots);
     setAdded(plots);
   };
-  if (failed) return html`<p class="failed" role="alert">What draws plots could not be fetched.</p>`;
-  if (!Lines) return html`<p class="dim">Loading…</p>`;
   const usual = USUAL.filter(({ metric }) => metrics.includes(metric));
-  const parts = { at, Lines, paused };
+  const parts = { at, paused };
   return html`<div class="plots">
     ${!usual.length && !added.length && html`<p class="dim">Nothing that could be plotted was received yet.</p>`}
     ${usual.map((plot) => html`<${Figure} key=${plot.id} plot=${plot} ...${parts} />`)}
@@ -49,7 +42,7 @@ export function Plots({ at }) {
   </div>`;
 }
 
-function Figure({ at, plot, Lines, paused, onRemove }) {
+function Figure({ at, plot, paused, onRemove }) {
   const page = usePage();
   const limits = limitsOf(plot.metric);
   const series = recorderOf(page, at).follow("numbers", plot.metric, numbers, limits);

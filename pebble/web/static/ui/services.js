@@ -2,16 +2,13 @@
 
 import { html, usePage, useTick, useValue } from "./hooks.js";
 import { logViewOf } from "./log-view.js";
-import { styled } from "./styled.js";
 import { inner, isObject, plain, roughly } from "./words.js";
 
 const MOST = 64;
 const RECENT_MS = 600_000;
 const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
 
-export const Services = styled("system.css", ServicesBody);
-
-function ServicesBody({ at, view }) {
+export function Services({ at, view }) {
   const services = inner(useValue(at, "status"))?.services;
   const times = useValue(at, "web/restarts")?.times ?? {};
   useTick(5000);

@@ -4,7 +4,6 @@ import { html, useModel, usePage } from "./hooks.js";
 import { NoticeList } from "./notices.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
-import { styled } from "./styled.js";
 import { nameOf } from "./words.js";
 
 const THEMES = { auto: "as the system", light: "light", dark: "dark" };
@@ -16,9 +15,7 @@ const MORE = [
   { name: "phone", icon: "phone", text: "Open on a phone" },
 ];
 
-export const SettingsPanel = styled("notices.css", SettingsBody);
-
-function SettingsBody({ onClose }) {
+export function SettingsPanel({ onClose }) {
   const { settings, driver, panels } = usePage();
   useModel(settings);
   useModel(driver);

@@ -1,17 +1,11 @@
 // Listen to a component, and talk to it: in the bar below its picture, or in a card.
 
-import { fetchStyle, html, useCalm, useEffect, useModel, usePage, useValue } from "./hooks.js";
+import { html, useCalm, useEffect, useModel, usePage, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
 import { Sound } from "./sound-model.js";
 import { nameOf } from "./words.js";
 
-/** @returns {Promise<any>} what draws it, once its style is here */
-export async function load() {
-  await fetchStyle("sound.css");
-  return SoundControls;
-}
-
-function SoundControls({ at }) {
+export function SoundControls({ at }) {
   const page = usePage();
   /** @type {Sound} */
   const sound = (page.sound.model ??= new Sound(page));

@@ -3,14 +3,13 @@
 import { html, useModel, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
 import { clips, grouped, play, playing, repeatLast, soundsOf } from "./sounds-model.js";
-import { styled } from "./styled.js";
 import { useReasons, whyNot, whyNotEnd } from "./why-not.js";
 import { nameOf, plain } from "./words.js";
 import { useMemo } from "../vendor/hooks.mjs";
 
 const MOST = 60; // clips that are listed at a time
 
-export const Sounds = styled("commands.css", ({ at }) => {
+export function Sounds({ at }) {
   const page = useReasons(at);
   const sounds = useModel(soundsOf(at));
   const why = whyNot(page, at, "soundboard");
@@ -40,7 +39,7 @@ export const Sounds = styled("commands.css", ({ at }) => {
     ${whyNotAgain && html`<${Why} id="why-again">${whyNotAgain}<//>`}
     <${Clips} at=${at} page=${page} sounds=${sounds} why=${why} />
   </div>`;
-});
+}
 
 function NowPlaying({ at, page }) {
   const { file, error } = playing(useValue(at, "soundboard-status"));

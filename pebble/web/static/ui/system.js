@@ -6,7 +6,6 @@ import { logViewOf } from "./log-view.js";
 import { Model } from "./models.js";
 import { Panel } from "./panel.js";
 import { HoldButton, Icon, Why } from "./parts.js";
-import { styled } from "./styled.js";
 import { clockTime, driverName, nameOf, plain } from "./words.js";
 
 /** @typedef {import("../core/outcome.js").Action} Action */
@@ -36,9 +35,7 @@ const ACTIONS = {
   },
 };
 
-export const System = styled("system.css", SystemBody);
-
-function SystemBody({ at, offers, view }) {
+export function System({ at, offers, view }) {
   const { connection } = usePage();
   useModel(connection);
   const [asked, ask] = useState(/** @type {Action | ""} */ (""));
@@ -120,7 +117,7 @@ class Watch extends Model {
     this.page = page;
     this.ref = ref;
     this.outcome = new Outcome(action, page.store.now(), boots(page.store, ref));
-    this.answer = page.connection.answer; // the last one before
+    this.answer = page.connection.answerTo("action", ref); // the last one before
     const see = () => this.see();
     this.ends = [
       page.store.subscribe(ref, "web/liveness", see),
@@ -132,11 +129,8 @@ class Watch extends Model {
 
   see() {
     const { store, connection } = this.page;
-    const { answer } = connection;
-    if (answer !== this.answer && answer?.cmd === "action" && answer.ref === this.ref) {
-      this.answer = answer;
-      if (answer.op === "refused") this.outcome.refused = String(answer.why);
-    }
+    const answer = connection.answerTo("action", this.ref);
+    if (answer !== this.answer && answer?.op === "refused") this.outcome.refused = String(answer.why);
     const entry = store.get(this.ref, "web/liveness");
     const silent = entry?.value.silent_s;
     this.outcome.see(

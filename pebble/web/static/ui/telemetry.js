@@ -1,10 +1,10 @@
 // What the component reports of itself, in words and numbers.
 
-import { html, useMetric, useModel, usePage, useTick, useValue } from "./hooks.js";
+import { html, styled, useMetric, useModel, usePage, useTick, useValue } from "./hooks.js";
 import { Live, Part } from "./parts.js";
 import { battery, charging, inner, isObject, number, plain, roughly, span } from "./words.js";
 
-const SERVICES = async () => (await import("./services.js")).Services;
+const SERVICES = styled(async () => (await import("./services.js")).Services, "system.css");
 
 export function Telemetry({ at, view }) {
   const { connection } = usePage();

@@ -1,14 +1,26 @@
 // The live picture: how old it is, how it comes, and where from.
 
 import { VOICE } from "./cards.js";
-import { html, useEffect, useModel, usePage, usePart, useRef, useState, useTick, useRefs, useValue } from "./hooks.js";
+import {
+  html,
+  styled,
+  useEffect,
+  useModel,
+  usePage,
+  usePart,
+  useRef,
+  useRefs,
+  useState,
+  useTick,
+  useValue,
+} from "./hooks.js";
 import { Offers } from "./models.js";
 import { Icon, Part, Why } from "./parts.js";
 import { nameOf, span } from "./words.js";
 
 const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
 
-const EXTRAS = async () => (await import("./picture-extras.js")).extras();
+const EXTRAS = styled(() => import("./picture-extras.js"), "picture.css");
 
 /** What belongs to a picture besides it, as soon as it was fetched. @param {any} props */
 function Extra({ part, ...props }) {
