@@ -35,6 +35,11 @@ class CompletedStop:
     is_free: bool  # after the reset
     ended: float
 
+    @property
+    def began(self) -> float:
+        """The driving before it."""
+        return self.pressed - _BEFORE_S
+
 
 @dataclass(frozen=True, slots=True)
 class StopResult:

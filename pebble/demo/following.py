@@ -34,6 +34,10 @@ class CompletedFollow:
     ended: float  # the script, by a stop command
     clip: str
 
+    @property
+    def began(self) -> float:
+        return self.started
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:

@@ -17,15 +17,17 @@ from pebble.contract.encodings import ALL_VIDEO
 from pebble.demo import emergency, following, takeover
 from pebble.demo.broker import BrokerKind, best_kind
 from pebble.demo.emergency import CompletedStop
-from pebble.demo.following import CompletedFollow, FollowResult
+from pebble.demo.following import CompletedFollow
+from pebble.demo.machine import Machine
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
 from pebble.demo.operator import Operator
 from pebble.demo.page import PageServer
+from pebble.demo.results import Result, Results
 from pebble.demo.steps import ROUND_S, SCRIPT, CompletedStep, assess
 from pebble.demo.testbed import ROBOTS, Testbed
-from pebble.demo.view import Result, View, show_media_results, show_results
+from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT
@@ -35,13 +37,13 @@ _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _POLL_S = 0.1
 _REPORTED_S = 0.3  # an MCU reports ten times a second: the end of a step is reported a little later
-_SLOW_S = 15.0  # how much longer the first round may take: a script drives as fast as its machine permits
+_SLOW_S = 60.0  # how much longer an overloaded machine may take for the first round, and to repeat steps of it
 
 
 class _Observed(NamedTuple):
     """The results of the steps and of the media, all other problems, and the names of robots that people drove."""
 
-    results: list[Result]
+    results: Results
     media: list[MediaResult]
     problems: list[str]
     left_alone: set[str]
@@ -50,7 +52,8 @@ class _Observed(NamedTuple):
 def run(seconds: float | None = None, *, broker: BrokerKind | None = None, console: Console | None = None) -> int:
     """Run the demo until Ctrl-C, or for ``seconds`` of driving; 0 if every robot moved and stopped as commanded.
 
-    With ``seconds`` at least one whole round of the script must have been driven. ``broker`` selects
+    With ``seconds`` at least one whole round of the script must have been driven, and steps that went wrong while the
+    machine was overloaded are repeated; pictures that such a machine lost are shown, but no failure. ``broker`` selects
     a kind instead of the best one available. Every process ends with the demo; its folder of logs stays only after a
     failure. Raises PebbleError if the demo cannot be set up.
     """
@@ -62,14 +65,14 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
         results, media, problems, left_alone = _run_demo(testbed, kind, seconds, ending, console)
         with_media = [robot.name for robot in testbed.robots if robot.has_media]
         if seconds is not None:
-            problems += _steps_not_done(testbed, results, left_alone)
+            problems += _steps_not_done(testbed, results.all(), left_alone)
         if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
             problems += _encodings_not_checked(with_media, media)
-        problems += [f"{result.robot}, {result.step}: {wrong}" for result in results for wrong in result.wrong]
+        problems += results.problems()
         problems += [f"{result.robot}: {wrong}" for result in media for wrong in result.wrong]
         testbed.keep = bool(problems)
         show_media_results(console, with_media, media)
-        show_results(console, ROBOTS, results, problems)
+        show_results(console, ROBOTS, results.all(), problems)
         if left_alone:
             console.print(f"Left to people at the page, and not judged meanwhile: {', '.join(sorted(left_alone))}.")
         if problems:
@@ -92,17 +95,19 @@ def _run_demo(
     testbed.start_robots()
     operator = Operator(testbed.remote_port)
     operator.connect()
-    media_check = MediaCheck(testbed.remote_port, [robot.name for robot in testbed.robots if robot.has_counter])
+    counting = [robot.name for robot in testbed.robots if robot.has_counter]
+    machine = Machine()
+    media_check = MediaCheck(testbed.remote_port, counting, machine.overloaded)
     try:
         with View(console, operator, media_check, testbed.robots, ending, url) as view:
             if not _discovered(operator, view, ending):
                 problems = [] if ending.is_set() else [*_not_ready(operator), *testbed.unexpected_exits()]
-                return _Observed([], [], problems, set())
+                return _Observed(Results(), [], problems, set())
             for_visitors = bool(url) and seconds is None
             operator.begin(f"the robots are yours: {url}" if for_visitors else "")
             filmed = [seen for seen in operator.discovery.all_robots() if seen.offers("video")]
             media_check.begin(filmed, once=for_visitors)
-            results = _watch(testbed, operator, view, math.inf if seconds is None else seconds, ending)
+            results = _watch(testbed, operator, view, machine, math.inf if seconds is None else seconds, ending)
         problems = testbed.unexpected_exits()
         if not ending.is_set():  # a demo that is ended early may not have received everything
             problems += _without_imu(testbed, operator)
@@ -157,36 +162,35 @@ def _without_imu(testbed: Testbed, operator: Operator) -> list[str]:
     return [f"{name}: its inertial sensor published nothing" for name in wanted if name not in received]
 
 
-def _watch(testbed: Testbed, operator: Operator, view: View, seconds: float, ending: threading.Event) -> list[Result]:
+def _watch(
+    testbed: Testbed, operator: Operator, view: View, machine: Machine, seconds: float, ending: threading.Event
+) -> Results:
     """Drive for ``seconds``, or until the first round is complete; assess each step once its traces are."""
-    results: dict[tuple[str, str], Result] = {}
+    results = Results()
     end = time.monotonic() + seconds
     while not ending.wait(_POLL_S) and not testbed.unexpected_exits():
-        if time.monotonic() > end + (0.0 if operator.rounds else _SLOW_S):
+        now = time.monotonic()
+        complete = operator.rounds and not results.doubtful
+        if now > end + (0.0 if complete else _SLOW_S):
             break
+        machine.sample()
         view.update()
-        _assess_completed(testbed, operator, results, time.monotonic() - _REPORTED_S)
+        _assess_completed(testbed, operator, machine, results, now - _REPORTED_S)
+        operator.again = frozenset(step for _, step in results.doubtful)
     operator.end()
     time.sleep(_REPORTED_S)
-    _assess_completed(testbed, operator, results, math.inf)
-    return list(results.values())
+    _assess_completed(testbed, operator, machine, results, math.inf)
+    return results
 
 
-def _assess_completed(
-    testbed: Testbed, operator: Operator, results: dict[tuple[str, str], Result], until: float
-) -> None:
+def _assess_completed(testbed: Testbed, operator: Operator, machine: Machine, results: Results, until: float) -> None:
     while operator.completed and operator.completed[0].ended < until:
-        retain_worst(results, _assess(testbed, operator, operator.completed.popleft()))
-
-
-def retain_worst(results: dict[tuple[str, str], Result], result: Result) -> None:
-    """Add a result by its robot and step; of several rounds the worst one stays, however long the demo runs."""
-
-    def badness(one: Result) -> tuple[int, float]:
-        return len(one.wrong), 0.0 if isinstance(one, FollowResult) else one.stop_s
-
-    key = (result.robot, result.step)
-    results[key] = max((results.get(key, result), result), key=badness)
+        completed = operator.completed.popleft()
+        overloaded = machine.overloaded(completed.began, completed.ended)
+        result = _assess(testbed, operator, completed)
+        results.add(result, overloaded)
+        if result.wrong and overloaded:
+            operator.show(f"REPEATS: {result.step}, {result.robot}: {result.wrong[0]}, while {overloaded}")
 
 
 def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop | CompletedFollow) -> Result:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
 import numpy as np
@@ -113,11 +113,18 @@ def _follows(before: ReceivedSound, one: ReceivedSound) -> bool:
 class MediaCheck:
     """Requests one encoding after another, on its own threads and connection; ``results`` collects the assessments.
 
-    The pictures of the robots ``counting`` have a counter in them.
+    The pictures of the robots ``counting`` have a counter in them. ``overloaded(began, ended)`` says whether the
+    machine could not keep up between these times (monotonic), and why.
     """
 
-    def __init__(self, port: int, counting: Collection[str], name: str = "pebble-demo-viewer") -> None:
-        self._counting = counting
+    def __init__(
+        self,
+        port: int,
+        counting: Collection[str],
+        overloaded: Callable[[float, float], str],
+        name: str = "pebble-demo-viewer",
+    ) -> None:
+        self._counting, self._overloaded = counting, overloaded
         self.recorders: dict[str, MediaRecorder] = {}
         self.results: deque[MediaResult] = deque(maxlen=_RESULTS)
         self.rounds = 0
@@ -161,9 +168,11 @@ class MediaCheck:
                 if self._wait(_SWITCH_S):
                     return
                 self._discard(medium, encoding)
+                began = time.monotonic()
                 if self._wait(seconds - _SWITCH_S):
                     return
-                self.results.extend(self._assess(medium, name, encoding) for name in self.recorders)
+                overloaded = self._overloaded(began, time.monotonic())
+                self.results.extend(self._assess(medium, name, encoding).on(overloaded) for name in self.recorders)
             self.rounds += medium == "video"
             if self._once:
                 return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,13 +29,25 @@ class ShownPicture:
 
 @dataclass(frozen=True, slots=True)
 class MediaResult:
-    """One encoding of one robot's video or audio: what was measured, and its defects (empty: none)."""
+    """One encoding of one robot's video or audio: what was measured, and its defects (empty: none).
+
+    ``few`` are those of a machine that cannot keep up: less arrived than should. They are no defects if it was
+    ``overloaded``, which says by what.
+    """
 
     robot: str
     encoding: str
     measured: str
     wrong: tuple[str, ...]
+    few: tuple[str, ...] = ()
     judged: bool = True
+    overloaded: str = ""
+
+    def on(self, overloaded: str) -> MediaResult:
+        """The final judgement: ``overloaded`` says why the machine could not keep up; empty: it could."""
+        if overloaded and self.few:
+            return replace(self, few=(), overloaded=overloaded)
+        return replace(self, wrong=(*self.wrong, *self.few), few=())
 
 
 def watched(robot: str, encoding: str) -> MediaResult:
@@ -49,9 +61,9 @@ def assess_pictures(
     """Requires that the counter advances at the camera's rate, never falls back, and that ``fps`` pictures arrive."""
     legible = [(one.captured_s, one.counter) for one in shown if one.counter is not None]
     if len(legible) < _FEWEST:
-        return MediaResult(
-            robot, encoding, f"{len(shown)} pictures", (f"{encoding}: only {len(legible)} legible pictures",)
-        )
+        problem = (f"{encoding}: only {len(legible)} legible pictures",)
+        too_few = len(shown) < _FEWEST
+        return MediaResult(robot, encoding, f"{len(shown)} pictures", () if too_few else problem, problem[:too_few])
     counters = [counter for _, counter in legible]
     seconds = legible[-1][0] - legible[0][0]
     advance = (counters[-1] - counters[0]) / seconds if seconds > 0 else 0.0
@@ -63,24 +75,26 @@ def assess_pictures(
     if abs(advance - camera_fps) > TOLERANCE * camera_fps:
         wrong.append(f"{encoding}: the frame counter advances by {advance:.1f} a second instead of {camera_fps:g}")
     delivered = assess_rate(robot, encoding, [one.captured_s for one in shown], fps)
-    return MediaResult(robot, encoding, f"{delivered.measured}, counter {advance:.2f}/s", (*wrong, *delivered.wrong))
+    measured = f"{delivered.measured}, counter {advance:.2f}/s"
+    return MediaResult(robot, encoding, measured, (*wrong, *delivered.wrong), delivered.few)
 
 
 def assess_rate(robot: str, encoding: str, captured_s: Sequence[float], fps: float) -> MediaResult:
     """Requires that ``fps`` pictures arrive, by the times of their capture."""
     if len(captured_s) < _FEWEST:
-        return MediaResult(robot, encoding, f"{len(captured_s)} pictures", (f"{encoding}: too few pictures came",))
+        return MediaResult(robot, encoding, f"{len(captured_s)} pictures", (), (f"{encoding}: too few pictures came",))
     seconds = captured_s[-1] - captured_s[0]
     delivered = (len(captured_s) - 1) / seconds if seconds > 0 else 0.0
-    wrong = f"{encoding}: {delivered:.1f} pictures a second instead of {fps:g}"
-    right = abs(delivered - fps) <= TOLERANCE * fps
-    return MediaResult(robot, encoding, f"{delivered:.1f} fps", () if right else (wrong,))
+    problem = (f"{encoding}: {delivered:.1f} pictures a second instead of {fps:g}",)
+    few, many = delivered < fps * (1 - TOLERANCE), delivered > fps * (1 + TOLERANCE)
+    return MediaResult(robot, encoding, f"{delivered:.1f} fps", problem[:many], problem[:few])
 
 
 def assess_sound(robot: str, encoding: str, received: Samples, made: Samples, rate: int) -> MediaResult:
     """Requires that ``received`` occurs in the longer ``made``; both are mono samples, ``rate`` per second."""
     if len(received) < rate:
-        return MediaResult(robot, encoding, f"{len(received) / rate:.1f} s", (f"{encoding}: too little sound came",))
+        problem = f"{encoding}: too little sound came without a gap"
+        return MediaResult(robot, encoding, f"{len(received) / rate:.1f} s", (), (problem,))
     if encoding == "pcm":
         likeness, needed, what = best_match(received, made), PCM_CORRELATION, "samples"
     else:

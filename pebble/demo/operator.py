@@ -15,6 +15,7 @@ from pebble.contract import DRIVE, LIGHTS_FLASH, LIGHTS_SOLID, codec
 from pebble.contract.payloads import Drive, LightsFlash
 from pebble.demo.emergency import NAME as EMERGENCY_STOP
 from pebble.demo.emergency import CompletedStop, EmergencyStop
+from pebble.demo.following import NAME as BY_ITSELF
 from pebble.demo.following import CompletedFollow
 from pebble.demo.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
 from pebble.demo.takeover import TakeOver
@@ -31,12 +32,14 @@ class Operator:
     """Drives on its own thread and connection.
 
     ``activity`` and ``events`` (monotonic seconds and a line) are for display; ``completed`` collects finished steps,
-    and ``left_alone`` the names of robots of which people had the control meanwhile.
+    and ``left_alone`` the names of robots of which people had the control meanwhile. The emergency stop and the script
+    belong to the first round; ``again`` names those that later rounds repeat.
     """
 
     def __init__(self, port: int, name: str = "pebble-demo-operator") -> None:
         self.discovery, self.visitors = Discovery(), Visitors()
         self.left_alone: set[str] = set()
+        self.again: frozenset[str] = frozenset()
         self.rounds = 0
         self.commands: dict[str, tuple[Drive, float]] = {}  # by base topic: the last one sent, and when (monotonic)
         self.events: deque[tuple[float, str]] = deque(maxlen=_EVENTS)
@@ -57,6 +60,10 @@ class Operator:
         """Are that many robots online, with a drive topic?"""
         now = time.monotonic()
         return sum(robot.ready(now) for robot in self.discovery.all_robots()) >= wanted
+
+    def show(self, event: str) -> None:
+        """Add a line to the events."""
+        self.events.append((time.monotonic(), f"operator {event}"))
 
     @property
     def activity(self) -> str:
@@ -108,9 +115,10 @@ class Operator:
                 if self._stopping.is_set():
                     break
             else:
-                if not self.rounds:
-                    self._stop_once(robots)
-                    self._take_over_once(robots)
+                if not self.rounds or EMERGENCY_STOP in self.again:
+                    self._stop_all(robots)
+                if not self.rounds or BY_ITSELF in self.again:
+                    self._take_over(robots)
                 self.rounds += 1
         if not self._stopping.is_set():
             self._doing = self._yours
@@ -142,7 +150,7 @@ class Operator:
             CompletedStep(robot.name, step, began, released, ended) for robot in robots if self._mine(robot)
         )
 
-    def _stop_once(self, robots: list[DiscoveredRobot]) -> None:
+    def _stop_all(self, robots: list[DiscoveredRobot]) -> None:
         """Stop all robots, try to drive them, and reset them."""
         robots = self._begin(EMERGENCY_STOP, robots)
         emergency = EmergencyStop(
@@ -154,7 +162,7 @@ class Operator:
         mine = {robot.name for robot in robots if self._mine(robot)}
         self.completed.extend(one for one in completed if one.robot in mine)
 
-    def _take_over_once(self, robots: list[DiscoveredRobot]) -> None:
+    def _take_over(self, robots: list[DiscoveredRobot]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
         for robot in self._begin("scripts", [robot for robot in robots if robot.offers("autonomy")]):
             if not self._stopping.is_set():
@@ -169,7 +177,7 @@ class Operator:
 
     def _note(self, what: str, text: str) -> None:
         self._doing = f"{what}: {text}"
-        self.events.append((time.monotonic(), f"operator {what}: {text}"))
+        self.show(f"{what}: {text}")
 
     def _send(self, drive: Drive, robots: list[DiscoveredRobot]) -> None:
         payload = codec.encode(DRIVE, drive)

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from types import TracebackType
-from typing import Self, TypeAlias, TypeVar
+from typing import Self, TypeVar
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -21,6 +21,7 @@ from pebble.demo.following import FollowResult
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
 from pebble.demo.operator import Operator
+from pebble.demo.results import Result
 from pebble.demo.steps import StepResult
 from pebble.demo.testbed import SimulatedRobot
 
@@ -30,7 +31,6 @@ _COLUMN_EDGE = 3  # a line, and a space on each side
 _LABEL_WIDTH = 20  # the first column, with its edges
 
 T = TypeVar("T")
-Result: TypeAlias = StepResult | StopResult | FollowResult
 
 
 class View:
@@ -168,15 +168,17 @@ def show_media_results(console: Console, robots: Sequence[str], results: Sequenc
             table.add_row(encoding, *(_media_cell(cell) for cell in cells))
     if results:
         console.print(table)
+    if slow := [result.overloaded for result in results if result.overloaded]:
+        console.print(f"slow: this machine was overloaded and could not keep up: {slow[-1]}.", soft_wrap=True)
 
 
 def _media_cell(results: Sequence[MediaResult]) -> str:
     if not results:
         return "not done"
-    worst = max(results, key=lambda result: (len(result.wrong), result.judged))
+    worst = max(results, key=lambda result: (len(result.wrong), result.judged, bool(result.overloaded)))
     if not worst.judged:
         return worst.measured
-    return f"{'FAILED' if worst.wrong else 'ok'}  {worst.measured}"
+    return f"{'FAILED' if worst.wrong else 'slow' if worst.overloaded else 'ok'}  {worst.measured}"
 
 
 def _cell(step: str, name: str, results: Sequence[StepResult | StopResult]) -> str:

@@ -37,7 +37,18 @@ def test_a_camera_that_catches_up_after_a_stall_of_the_machine() -> None:
     ],
 )
 def test_pictures_that_are_not(pictures: list[ShownPicture], complaint: str) -> None:
-    assert any(complaint in wrong for wrong in assess_pictures("goob", "json", pictures, 15, 10).wrong)
+    assert any(complaint in wrong for wrong in assess_pictures("goob", "json", pictures, 15, 10).on("").wrong)
+
+
+def test_an_overloaded_machine_excuses_too_few_pictures_but_no_wrong_ones() -> None:
+    busy = "0% were idle"
+    few = assess_pictures("goob", "json", shown(fps=6.5), 15, 10).on(busy)
+    assert (few.wrong, few.overloaded) == ((), busy)
+    many = assess_pictures("goob", "json", shown(fps=14), 15, 10).on(busy)
+    assert "14.0 pictures a second instead of 10" in many.wrong[0]
+    assert many.overloaded == ""
+    both = assess_pictures("goob", "json", shown(fps=6.5, camera=10), 15, 10).on(busy)
+    assert ["advances by" in wrong for wrong in both.wrong] == [True]
 
 
 @pytest.mark.parametrize(
@@ -45,7 +56,7 @@ def test_pictures_that_are_not(pictures: list[ShownPicture], complaint: str) -> 
     [(41, 10.0, ()), (41, 6.5, ("json: 6.5 pictures a second",)), (3, 10, ("json: too few",))],
 )
 def test_pictures_without_a_counter(count: int, fps: float, wrong: tuple[str, ...]) -> None:
-    result = assess_rate("goob", "json", [one.captured_s for one in shown(count, fps)], 10)
+    result = assess_rate("goob", "json", [one.captured_s for one in shown(count, fps)], 10).on("")
     assert [one.startswith(start) for one, start in zip(result.wrong, wrong, strict=True)] == [True] * len(wrong)
 
 
@@ -64,7 +75,7 @@ def test_other_sound_and_too_little_of_it() -> None:
     noise = np.random.default_rng(1).normal(0, 3000, 3 * RATE)
     assert "correlate by" in assess_sound("goob", "pcm", noise, made, RATE).wrong[0]
     assert "correlate by" in assess_sound("goob", "opus", noise, made, RATE).wrong[0]
-    assert "too little" in assess_sound("goob", "pcm", made[:100], made, RATE).wrong[0]
+    assert "too little" in assess_sound("goob", "pcm", made[:100], made, RATE).few[0]
 
 
 def test_samples_out_of_place_are_noticed() -> None:

@@ -100,7 +100,7 @@ def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(robo
     assert until(lambda: "goob" not in operator.activity)
     assert until(lambda: robot.driven_since(taken + 0.1), START_S)
     assert operator.left_alone == {"goob"}
-    assert [one for one in operator.completed if one.ended > taken > one.began] == []  # type: ignore[union-attr]
+    assert [one for one in operator.completed if one.ended > taken > one.began] == []
 
 
 def test_a_persons_stop_is_left_to_the_person(robot: Robot, operator: Operator) -> None:

@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from typing import Any
 
 import pytest
 
-from tests.support import ROOT
-
-CORE = ROOT / "pebble" / "web" / "static" / "core"
-
-
-@pytest.fixture(autouse=True)
-def _node() -> None:
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
+from tests.web.in_node import evaluate
 
 
 def run(module: str, names: str, steps: str) -> Any:
-    """The value of ``result`` after ``steps``."""
-    program = f"import {{ {names} }} from {json.dumps((CORE / module).as_uri())};\nlet result;\n{steps}\n"
-    command = ["node", "--input-type=module", "-e", f"{program}\nconsole.log(JSON.stringify(result));"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return evaluate({f"core/{module}": names}, steps)
 
 
 # -- gestures: what is sent is listed as [gesture, z, final]

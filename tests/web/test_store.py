@@ -2,45 +2,27 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 from typing import Any
 
-import pytest
+from tests.web.in_node import evaluate
 
-from tests.support import ROOT
-
-STORE = ROOT / "pebble" / "web" / "static" / "core" / "store.js"
-_PROGRAM = """
-import {{ Store }} from {module};
+_SETUP = """
 let now = 1000;
 const waiting = [];
 const store = new Store(() => now, (fn) => waiting.push(fn));
 const frame = () => waiting.splice(0).forEach((fn) => fn());
 const calls = [];
-{steps}
 """
-
-
-@pytest.fixture(autouse=True)
-def _node() -> None:
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
 
 
 def run(steps: str) -> Any:
     """The value of ``result`` after ``steps``, with ``store``, ``now``, ``frame`` and ``calls``."""
-    program = _PROGRAM.format(module=json.dumps(STORE.as_uri()), steps=steps)
-    command = ["node", "--input-type=module", "-e", f"{program}\nconsole.log(JSON.stringify(result));"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return evaluate({"core/store.js": "Store"}, _SETUP + steps)
 
 
 def test_a_value_ages_from_its_age_at_the_server() -> None:
     assert run(
-        'store.set("a", "m", 7, 400); now += 100; const v = store.get("a", "m"); var result = [v.value, v.age];'
+        'store.set("a", "m", 7, 400); now += 100; const v = store.get("a", "m"); result = [v.value, v.age];'
     ) == [
         7,
         500,
@@ -53,14 +35,14 @@ def test_subscribers_of_a_metric_are_called_once_for_many_changes() -> None:
     store.subscribe("b", "m", () => calls.push("b"));
     store.set("a", "m", 1); store.set("a", "m", 2); store.set("a", "n", 1); frame();
     const first = [...calls]; store.set("a", "m", 3); frame();
-    var result = [first, calls];"""
+    result = [first, calls];"""
     assert run(steps) == [["m"], ["m", "m"]]
 
 
 def test_a_subscription_ends() -> None:
     steps = """
     const end = store.subscribe("a", "m", () => calls.push("m"));
-    end(); store.set("a", "m", 1); frame(); var result = calls;"""
+    end(); store.set("a", "m", 1); frame(); result = calls;"""
     assert run(steps) == []
 
 
@@ -72,7 +54,7 @@ def test_components_and_new_metrics_are_noticed() -> None:
     store.set("a", "m", 2); frame();
     store.set("a", "n", 2); frame();
     store.remove("a"); frame();
-    var result = calls;"""
+    result = calls;"""
     assert run(steps) == ["a", "m", "m n", "", ""]
 
 
@@ -82,7 +64,7 @@ def test_the_period_is_the_usual_time_between_updates() -> None:
     for (const wait of [0, 200, 210, 190, 5000, 200]) {
       now += wait; store.set("a", "m", 1); periods.push(store.get("a", "m").period);
     }
-    var result = periods;"""
+    result = periods;"""
     assert run(steps) == [0, 0, 0, 200, 210, 200]
 
 
@@ -90,7 +72,7 @@ def test_late_messages_do_not_set_the_clock_back() -> None:
     steps = """
     store.sync(50_000, 20); const prompt = store.now();
     now += 500; store.sync(50_500 - 300, 20); const late = store.now();
-    var result = [prompt, late];"""
+    result = [prompt, late];"""
     assert run(steps) == [50_010, 50_510]
 
 
@@ -98,5 +80,5 @@ def test_a_clock_that_was_set_is_followed() -> None:
     steps = """
     store.sync(50_000, 0);
     for (let i = 0; i < 60; i++) { now += 500; store.sync(20_000 + now, 0); }
-    var result = store.now() - now;"""
+    result = store.now() - now;"""
     assert run(steps) == 20_000
