@@ -44,7 +44,7 @@ def evaluate(imports: dict[str, str], steps: str, given: Any = None) -> Any:
     node = _evaluator()
     assert node.stdin is not None
     assert node.stdout is not None
-    node.stdin.write(json.dumps("\n".join(lines)) + "\n")
+    node.stdin.write(json.dumps({"source": "\n".join(lines), "given": given}) + "\n")
     node.stdin.flush()
     if not select.select([node.stdout], [], [], _TIMEOUT_S)[0]:
         node.kill()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import shutil
 from typing import Any
 
 import pytest
@@ -13,12 +12,6 @@ from pebble.services.autonomy_manager.forms import Setting, SettingError, effect
 from tests.web.test_page_core import run
 
 BASE = "pebble/robots/goob"
-
-
-@pytest.fixture(autouse=True)
-def _node() -> None:
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
 
 
 #: The services of a page before one robot; ``sent`` is what it asks for.

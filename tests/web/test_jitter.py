@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import random
-import shutil
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,16 +14,15 @@ from pebble.media.jitter import JitterBuffer
 from pebble.media.pcm import Resampler
 from pebble.media.sound import make_sound_encoder, unpack
 from pebble.media.speech import Speech
-from tests.support import ROOT
+from tests.web.in_node import evaluate
 
-MEDIA = ROOT / "pebble" / "web" / "static" / "media"
 EPOCH_MS = 1_700_000_000_000
 COUNTERS = ("packets", "duplicates", "late", "lost", "overflow", "skipped", "underruns", "jumps", "restarts")
 
 Arrival = tuple[float, bytes]
 
 _PLAY = """
-const made = input.map(({ options, arrivals }) => {
+result = given.map(({ options, arrivals }) => {
   const buffer = new JitterBuffer(options);
   const chunks = [];
   let refused = 0;
@@ -52,24 +47,6 @@ const made = input.map(({ options, arrivals }) => {
   return { chunks, counters: { ...buffer.counters, refused } };
 });
 """
-
-
-def node(imports: dict[str, str], steps: str, given: Any, folder: Path) -> Any:
-    """The value of ``made`` after ``steps``, which read ``input``."""
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
-    lines = [f"import {{ {names} }} from {json.dumps((MEDIA / module).as_uri())};" for module, names in imports.items()]
-    (folder / "input.json").write_text(json.dumps(given))
-    lines += [
-        'import { readFileSync, writeFileSync } from "node:fs";',
-        'const input = JSON.parse(readFileSync("input.json"));',
-        steps,
-        'writeFileSync("made.json", JSON.stringify(made));',
-    ]
-    (folder / "steps.mjs").write_text("\n".join(lines))
-    done = subprocess.run(["node", "steps.mjs"], cwd=folder, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 0, done.stderr
-    return json.loads((folder / "made.json").read_text())
 
 
 def play(options: dict[str, int], arrivals: list[Arrival]) -> dict[str, Any]:
@@ -127,7 +104,7 @@ def arrivals(randoms: random.Random) -> list[Arrival]:
 
 
 @pytest.mark.parametrize("seeds", [range(6), pytest.param(range(6, 200), marks=pytest.mark.thorough)])
-def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range, tmp_path: Path) -> None:
+def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range) -> None:
     cases = []
     for seed in seeds:
         randoms = random.Random(seed)
@@ -140,7 +117,8 @@ def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range
     given = [
         {"options": options, "arrivals": [[at, payload.hex()] for at, payload in coming]} for options, coming in cases
     ]
-    made = node({"jitter.js": "JitterBuffer", "sound-packet.js": "pcmOf, unpack"}, _PLAY, given, tmp_path)
+    modules = {"media/jitter.js": "JitterBuffer", "media/sound-packet.js": "pcmOf, unpack"}
+    made = evaluate(modules, _PLAY, given)
     for (options, coming), one in zip(cases, made, strict=True):
         expected = play(options, coming)
         assert one["chunks"] == expected["chunks"]
@@ -157,21 +135,21 @@ def test_the_cases_have_everything_in_them() -> None:
 
 
 @pytest.mark.parametrize(("rate", "rate_out"), [(16000, 48000), (16000, 44100), (48000, 16000), (44100, 16000)])
-def test_the_resampler_makes_the_same_samples(rate: int, rate_out: int, tmp_path: Path) -> None:
+def test_the_resampler_makes_the_same_samples(rate: int, rate_out: int) -> None:
     speech = Speech(rate).samples(0, rate // 2)
     pieces = np.array_split(speech, 23)
     resampler = Resampler(rate, rate_out, 1)
     expected = np.concatenate([resampler.feed(piece) for piece in pieces])[:, 0]
     steps = f"""
 const resampler = new Resampler({rate}, {rate_out});
-const made = input.flatMap((piece) => [...resampler.feed(Float32Array.from(piece))]);
+result = given.flatMap((piece) => [...resampler.feed(Float32Array.from(piece))]);
 """
-    made = node({"resampler.js": "Resampler"}, steps, [piece[:, 0].tolist() for piece in pieces], tmp_path)
+    made = evaluate({"media/resampler.js": "Resampler"}, steps, [piece[:, 0].tolist() for piece in pieces])
     assert len(made) == len(expected)
     assert np.abs(np.array(made) - expected).max() <= 1
 
 
-def test_the_same_packets_are_refused(tmp_path: Path) -> None:
+def test_the_same_packets_are_refused() -> None:
     randoms = random.Random(7)
     whole = []
     for name in ("pcm", "opus"):
@@ -188,7 +166,7 @@ def test_the_same_packets_are_refused(tmp_path: Path) -> None:
     expected = [_described(packet) for packet in packets]
     assert 0.05 < sum(one is None for one in expected) / len(expected) < 0.95
     steps = """
-const made = input.map((packet) => {
+result = given.map((packet) => {
   try {
     const sound = unpack(new Uint8Array(Buffer.from(packet, "hex")));
     const { encoding, rate, channels, frames, sequence, capturedMs } = sound;
@@ -196,7 +174,7 @@ const made = input.map((packet) => {
   } catch { return null; }
 });
 """
-    made = node({"sound-packet.js": "unpack"}, steps, [packet.hex() for packet in packets], tmp_path)
+    made = evaluate({"media/sound-packet.js": "unpack"}, steps, [packet.hex() for packet in packets])
     assert [one and [*one[:5], float(one[5])] for one in made] == expected  # JavaScript's numbers are floats
 
 

@@ -2,43 +2,26 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 from typing import Any
 
 import pytest
 
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.support import ROOT
+from tests.web.in_node import evaluate
 from tests.web.states import LAMP_MCU, described
 
-UI = ROOT / "pebble" / "web" / "static" / "ui"
-
-
-@pytest.fixture(autouse=True)
-def _node() -> None:
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
+_MODULES = {
+    "ui/manifest.js": "readManifest, command, unsendable, range, step, fieldOf",
+    "ui/lines.js": "Lines",
+    "ui/outlets.js": "outletsOf, obstacle",
+    "ui/models.js": "Offers",
+    "ui/spark.js": "remember, series",
+}
 
 
 def run(expression: str, *values: Any) -> Any:
     """What ``expression`` makes of ``v``, the ``values``."""
-    names = {
-        "manifest": "readManifest, command, unsendable, range, step, fieldOf",
-        "lines": "Lines",
-        "outlets": "outletsOf, obstacle",
-        "models": "Offers",
-        "spark": "remember, series",
-    }
-    imports = [f"import {{ {what} }} from {json.dumps((UI / f'{file}.js').as_uri())};" for file, what in names.items()]
-    program = "\n".join(
-        [*imports, f"const v = JSON.parse(process.argv[1]);\nconsole.log(JSON.stringify({expression}));"]
-    )
-    command = ["node", "--input-type=module", "-e", program, "--", json.dumps(values)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return evaluate(_MODULES, f"const v = given; result = {expression};", list(values))
 
 
 def test_a_manifest_is_read() -> None:

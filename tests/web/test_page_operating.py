@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from typing import Any
 
 import pytest
 
 from tests.web.test_page_core import run
-
-
-@pytest.fixture(autouse=True)
-def _node() -> None:
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
-
 
 # -- log lines
 

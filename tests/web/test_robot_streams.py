@@ -5,9 +5,6 @@ What the server allows is in the policy of the page; the page checks each addres
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 from collections.abc import Iterator
 
 import httpx
@@ -16,10 +13,10 @@ import pytest
 
 from pebble.web.guard import CONTENT_SECURITY_POLICY
 from pebble.web.robot_streams import MAX_ORIGINS, origin
-from tests.support import ROOT, Broker, until
+from tests.support import Broker, until
+from tests.web.in_node import evaluate
 from tests.web.served import RecordingRobot, Served
 
-STREAM = ROOT / "pebble" / "web" / "static" / "core" / "stream.js"
 HOST = "pebble.local"
 
 GOOD = {
@@ -95,26 +92,21 @@ def test_what_is_no_text_is_no_origin(value: object) -> None:
 
 
 def test_the_page_refuses_the_same() -> None:
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
     addresses = [*GOOD, *BAD, "http://0x7f.1:8889/", "http://2130706433/", "http://127.1/"]
-    program = f"""
-    import {{ refusal, reported }} from {json.dumps(STREAM.as_uri())};
-    const page = {{ protocol: "http:", hostname: {json.dumps(HOST)} }};
-    const own = {{ protocol: "http:", hostname: "127.0.0.1" }};
-    const secure = {{ protocol: "https:", hostname: {json.dumps(HOST)} }};
-    const addresses = {json.dumps(addresses)};
-    const status = [{{ value: {{ webrtc_url: "a" }} }}, {{ value: {{ webrtcUrl: "a" }} }}, {{ value: {{ url: "a" }} }},
-      {{ value: {{ url: 7 }} }}, {{ value: null }}, {{ value: [] }}, null, 7, undefined];
-    console.log(JSON.stringify({{
+    steps = """
+    const { addresses, host } = given;
+    const page = { protocol: "http:", hostname: host };
+    const own = { protocol: "http:", hostname: "127.0.0.1" };
+    const secure = { protocol: "https:", hostname: host };
+    const status = [{ value: { webrtc_url: "a" } }, { value: { webrtcUrl: "a" } }, { value: { url: "a" } },
+      { value: { url: 7 } }, { value: null }, { value: [] }, null, 7, undefined];
+    result = {
       shown: addresses.filter((one) => !refusal(one, page)),
       own: addresses.slice(-3).filter((one) => !refusal(one, own)),
       secure: addresses.filter((one) => !refusal(one, secure)),
       reported: status.map(reported),
-    }}));"""
-    done = subprocess.run(["node", "--input-type=module", "-e", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    };"""
+    found = evaluate({"core/stream.js": "refusal, reported"}, steps, {"addresses": addresses, "host": HOST})
     assert found["shown"][: len(GOOD)] == list(GOOD)
     assert set(found["shown"][len(GOOD) :]) <= set(addresses[-3:])
     assert found["own"] == []

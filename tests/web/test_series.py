@@ -2,42 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 from typing import Any
 
 import pytest
 
-from tests.support import ROOT
+from tests.web.in_node import evaluate
 
-STATIC = ROOT / "pebble" / "web" / "static"
-
-
-@pytest.fixture(autouse=True)
-def _node() -> None:
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
-
-
-def run(steps: str) -> Any:
-    """The value of ``result`` after ``steps``."""
-    imports = [f'import * as {name} from "{(STATIC / path).as_uri()}";' for name, path in MODULES.items()]
-    program = "\n".join([*imports, _PREPARED, steps, "console.log(JSON.stringify(result));"])
-    done = subprocess.run(
-        ["node", "--input-type=module", "-e", program], capture_output=True, text=True, check=False, timeout=30
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-MODULES = {"core": "core/series.js", "plots": "core/plot-choices.js", "trail": "core/trail.js"}
+_MODULES = {"core/series.js": "* as core", "core/plot-choices.js": "* as plots", "core/trail.js": "* as trail"}
 _PREPARED = """
-let result;
 const series = (more = {}) => new core.Series(core.numbers, { spanMs: 120_000, most: 1000, ...more });
 const shown = (one) => one.times.map((at, index) => [at, one.rows[index].value]);
 const one = series();
 """
+
+
+def run(steps: str) -> Any:
+    return evaluate(_MODULES, _PREPARED + steps)
 
 
 # -- series

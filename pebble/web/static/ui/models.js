@@ -3,7 +3,7 @@
 import { inner, isObject } from "./words.js";
 
 /** Whether this screen only watches: nothing but stops is sent. It is in the address, so it outlives everything. */
-export const WATCHES = new URLSearchParams(location.search).has("watch");
+export const WATCHES = new URLSearchParams(globalThis.location?.search).has("watch");
 
 /** Something that widgets follow. */
 export class Model {
