@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection
+.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection test-robots test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -29,15 +29,32 @@ demo: .venv/.ready-demo
 # Folders whose tests take longest come first: else the last of them run while the other processors have nothing to do.
 TESTS := $(VENV) tools/run_tests.py --dist loadscope --no-loadscope-reorder
 LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
+# What checks no times: it uses what whole robots leave of the processors.
+COMPUTING := tests/config tests/contract tests/media tests/motion tests/perception tests/robot/test_lockstep.py \
+	$(addprefix tests/bench/test_,compare.py plots.py ratios.py report.py results.py) \
+	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py types.py vm.py) \
+	$(addprefix tests/web/test_,driving_lockstep.py page_core.py page_sources.py store.py types.py)
+# Files with tests of whole robots, to collect no others; those that take longest come first.
+ROBOTS = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' \
+	tests/services tests/robot/test_faults.py tests | grep --invert-match tests/test_demo.py | awk '!seen[$$0]++')
 
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
-	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" tests/web tests/services tests/commands tests
-	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines"
-	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" --ignore=tests/test_demo.py tests/services tests/robot/test_faults.py tests
+	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) \
+		tests/web tests/services tests/commands tests
+	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines; beside them what only computes"
+	@$(MAKE) --no-print-directory --jobs=2 test-robots test-computing
 	@echo "pebble: the demo, whose robots need all processors"
 	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
+
+test-robots:
+	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" $(ROBOTS)
+
+test-computing:
+	@nice -n 19 $(TESTS) --numprocesses 2 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \
+		{ cat .venv/computing.log; exit 1; }
+	@echo "pebble: what only computes: $$(tail -n 1 .venv/computing.log)"
 
 thorough:
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
