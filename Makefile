@@ -42,7 +42,7 @@ test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
 	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) \
-		tests/web tests/services tests/commands tests
+		$(addprefix tests/,web transports services commands scripts script robot launcher) tests
 	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines; beside them what only computes"
 	@$(MAKE) --no-print-directory --jobs=2 test-robots test-computing
 	@echo "pebble: the demo, whose robots need all processors"

@@ -102,7 +102,7 @@ def test_what_fails_twice_fails(tmp_path: Path) -> None:
 
 
 def test_many_failures_are_no_coincidence(tmp_path: Path) -> None:
-    code, output = run_tests(tmp_path, FLAKY.replace('["a/b [c]", "d e"]', "list('abcd')"))
+    code, output = run_tests(tmp_path, FLAKY.replace('["a/b [c]", "d e"]', "list('abcdefghijk')"))
     assert (code, "once more" in output) == (1, False)
 
 

@@ -176,7 +176,6 @@ def _watch(
         machine.sample()
         view.update()
         _assess_completed(testbed, operator, machine, results, now - _REPORTED_S)
-        operator.again = frozenset(step for _, step in results.doubtful)
     operator.end()
     time.sleep(_REPORTED_S)
     _assess_completed(testbed, operator, machine, results, math.inf)
@@ -185,12 +184,14 @@ def _watch(
 
 def _assess_completed(testbed: Testbed, operator: Operator, machine: Machine, results: Results, until: float) -> None:
     while operator.completed and operator.completed[0].ended < until:
-        completed = operator.completed.popleft()
+        completed = operator.completed[0]
         overloaded = machine.overloaded(completed.began, completed.ended)
         result = _assess(testbed, operator, completed)
         results.add(result, overloaded)
         if result.wrong and overloaded:
             operator.show(f"REPEATS: {result.step}, {result.robot}: {result.wrong[0]}, while {overloaded}")
+        operator.again = frozenset(step for _, step in results.doubtful)
+        operator.completed.popleft()
 
 
 def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop | CompletedFollow) -> Result:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
@@ -26,6 +27,9 @@ STOP = Drive()
 NAME = "the demo's operator"
 _COMPLETED = 1000  # finished steps that wait to be assessed
 _EVENTS = 100  # that wait to be shown
+_MOST_TIMES = 3  # for the emergency stop and for the script
+_ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machine
+_BACK_OFF, _BACK_OFF_S = Drive(z=-0.5), 1.0
 
 
 class Operator:
@@ -33,7 +37,8 @@ class Operator:
 
     ``activity`` and ``events`` (monotonic seconds and a line) are for display; ``completed`` collects finished steps,
     and ``left_alone`` the names of robots of which people had the control meanwhile. The emergency stop and the script
-    belong to the first round; ``again`` names those that later rounds repeat.
+    belong to the first round; while ``again`` has their names, they are repeated at once. Whoever assesses what was
+    completed removes it only then.
     """
 
     def __init__(self, port: int, name: str = "pebble-demo-operator") -> None:
@@ -115,15 +120,24 @@ class Operator:
                 if self._stopping.is_set():
                     break
             else:
-                if not self.rounds or EMERGENCY_STOP in self.again:
-                    self._stop_all(robots)
-                if not self.rounds or BY_ITSELF in self.again:
-                    self._take_over(robots)
+                if not self.rounds:
+                    self._until_right(EMERGENCY_STOP, lambda: self._stop_all(robots))
+                    self._until_right(BY_ITSELF, lambda: self._take_over(robots))
                 self.rounds += 1
         if not self._stopping.is_set():
             self._doing = self._yours
             self._stopping.wait()
         self._send(STOP, self._begin("disconnecting", robots))
+
+    def _until_right(self, name: str, act: Callable[[], None]) -> None:
+        for _ in range(_MOST_TIMES):
+            act()
+            end = time.monotonic() + _ASSESSED_S
+            while self.completed and time.monotonic() < end:
+                if self._stopping.wait(COMMAND_PERIOD_S):
+                    return
+            if name not in self.again:
+                return
 
     def _begin(self, step: str, robots: list[DiscoveredRobot]) -> list[DiscoveredRobot]:
         """The robots that take part in the next step."""
@@ -165,11 +179,20 @@ class Operator:
     def _take_over(self, robots: list[DiscoveredRobot]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
         for robot in self._begin("scripts", [robot for robot in robots if robot.offers("autonomy")]):
+            if BY_ITSELF in self.again:
+                self._back_off(robot)
             if not self._stopping.is_set():
                 drive = partial(self._send, robots=[robot])
                 wait = partial(self._wait_with, robot)
                 completed = TakeOver(self._transport, robot, drive, wait, self._note).perform()
                 self.completed.extend([completed] if completed else [])
+
+    def _back_off(self, robot: DiscoveredRobot) -> None:
+        """Away from the tag before which it arrived, so that there is a way to drive."""
+        end = time.monotonic() + _BACK_OFF_S
+        while time.monotonic() < end and not self._wait_with(robot, COMMAND_PERIOD_S):
+            self._send(_BACK_OFF, [robot])
+        self._send(STOP, [robot])
 
     def _wait_with(self, robot: DiscoveredRobot, seconds: float) -> bool:
         """True if the demo ends, or a person has taken this robot."""

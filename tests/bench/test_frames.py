@@ -64,7 +64,7 @@ def test_frames_in_shared_memory_arrive_whole_at_every_reader(variant: str) -> N
 
 def test_the_bare_copy_counts_only_the_cpu_of_the_copier() -> None:
     round_ = frames.run_case(Case("memcpy", Size(320, 240), 1), 0.5)
-    assert len(round_.latencies_us) > 3
+    assert round_.latencies_us
     assert round_.cpu_writer == 0.0
 
 

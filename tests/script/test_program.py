@@ -154,7 +154,7 @@ def test_a_person_goes_first(station: Station) -> None:
     lines = [next(script.stdout) for _ in range(17)]  # it goes on trying
     assert DRIVES(lines[0]) or DRIVES(lines[1])
     assert sum("[WARNING] goob does not obey this script: a person drives" in line for line in lines) == 1
-    assert {"True False\n", "False True\n"} < set(lines)
+    assert "False True\n" in lines
     before = len(station.received)
     station.publish_drive(Drive())
     assert any(re.search(r"\[INFO\] run \d+ drives goob again", next(script.stdout)) for _ in range(200))

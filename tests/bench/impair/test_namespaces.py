@@ -26,7 +26,7 @@ def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Pat
         before = network.traffic()
         network.apply(Condition("5%", Shape(loss=0.05, delay_ms=delay_ms)))
         talk.send_datagrams(_SENT)
-        assert until(lambda: talk.received_datagrams() + network.traffic().dropped_up >= _SENT)
+        assert until(lambda: talk.received_datagrams() + network.traffic().dropped_up >= _SENT, 30)
         traffic = network.traffic()
         dropped = traffic.dropped_up - before.dropped_up
         assert dropped in _BAND

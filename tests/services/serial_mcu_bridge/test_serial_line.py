@@ -81,7 +81,7 @@ def test_the_stop_is_sent_at_open_and_again_after_boot(mcu: PtyMcu, connect: Con
     assert until(host.is_ready)
     assert until(lambda: mcu.trace.lines() == [STOPPED] * 2)
     first, second = (entry.ns for entry in mcu.trace.entries() if entry.event == "line")
-    assert second - first >= 0.49e9
+    assert second - first >= 0.4e9  # the first one may be read late
     host.line.close()
     assert host.states == [LineState.BOOTING, LineState.READY, LineState.CLOSED]
 
