@@ -12,7 +12,7 @@ from pebble.contract import Channel, codec
 from pebble.contract import payloads as p
 from pebble.transports import Message, QoS
 from pebble.web import messages as m
-from pebble.web.robots import section_of
+from pebble.web.robots import FLAGS, section_of
 
 #: The topic of a channel of one component: its section and key of the capabilities, and the channel's own.
 TopicOf = Callable[[str, str, str, Channel], str]
@@ -28,11 +28,7 @@ class _Command(NamedTuple):
 
 
 _ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
-_FLAGS = {
-    "remote-mirror": (c.REMOTE_MIRROR, ""),
-    "mqtt-audio": (c.MQTT_AUDIO, "audio"),
-    "mqtt-video": (c.MQTT_VIDEO, "video"),
-}
+_FLAGS = {flag.metric.removeprefix("flags/"): (flag, section) for section, flag in FLAGS.items()}
 
 
 def right(op: m.RobotOp) -> str:
@@ -43,7 +39,9 @@ def right(op: m.RobotOp) -> str:
 def ends(op: m.RobotOp) -> bool:
     """Whether it ends something: then it is passed on whatever the component is and reports."""
     match op:
-        case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False):
+        case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False) | m.OutletOp(on=False):
+            return True
+        case m.LightsOp(r=0, g=0, b=0):
             return True
     return False
 
