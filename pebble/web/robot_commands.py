@@ -51,6 +51,8 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     command = _command(op)
     offered = section_of(capabilities, command.section) if command.section else {}
     kind = command.key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
+    if isinstance(op, m.ActionOp):
+        offered = next(filter(None, (section_of(capabilities, section) for section in _sections(op))), {})
     if isinstance(op, m.OutletOp):
         outlets = section_of(capabilities, "outlets").get("outlets")
         named = [one for one in outlets if isinstance(one, dict)] if isinstance(outlets, list) else []
@@ -75,12 +77,16 @@ def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:
 
 
 def _action_topic(op: m.ActionOp, channel: Channel, topic_of: TopicOf) -> str:
-    """The first that the capabilities name in one of the spellings that the original page understands."""
+    """The first that the capabilities name."""
     usual = channel.topic(op.ref)
-    names = (op.name.replace("-", "_"), op.name)
-    sections = [f"system.{name}" for name in names] + list(names)
-    topics = (topic_of(op.ref, section, key, channel) for section in sections for key in ("flag_topic", "topic"))
+    topics = (topic_of(op.ref, section, key, channel) for section in _sections(op) for key in ("flag_topic", "topic"))
     return next((topic for topic in topics if topic != usual), usual)
+
+
+def _sections(op: m.ActionOp) -> list[str]:
+    """Of the capabilities, in all spellings that the original page understands."""
+    names = (op.name.replace("-", "_"), op.name)
+    return [f"system.{name}" for name in names] + list(names)
 
 
 def _command(op: m.RobotOp) -> _Command:

@@ -333,7 +333,7 @@ def test_one_topic_that_cannot_be_received_holds_back_no_other(
     asyncio.run(work())
 
 
-def test_of_what_is_no_component_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_component_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_components, "_KEEP_S", 0)
     monkeypatch.setattr(open_components, "_STEP_S", 0)
     base = "pebble/robots/made-up"
