@@ -391,7 +391,7 @@ def test_the_name_of_a_page_without_a_login_counts_for_its_voice_and_for_a_stop_
     url = f"ws://127.0.0.1:{served.port}/ws/sound?ref={base}&name=Alice&device=phone"
     with RecordingRobot(broker.port, base, capabilities={"audio": audio}), Reader(served) as page:
         assert page.knows(base)
-        with connect(url, origin=served.origin) as sound:  # type: ignore[arg-type]
+        with connect(url, origin=served.origin) as sound:
             sound.send(struct.pack(">BII", 1, 1, 0) + bytes(640))
             assert json.loads(sound.recv(timeout=3)) == {"talk": 1, "on": True, "why": ""}
             assert until(lambda: page.value(base, "web/sound", "talker") == "Alice")
