@@ -37,7 +37,10 @@ class Snapshot:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run until a signal, or with ``--control`` until standard input ends."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.outlets is not None and options.kind != "outlets":
+        parser.error(f"--outlets: {options.kind} has none, only --kind outlets")
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # also in later threads; sigtimedwait below receives them
     try:
         return _run(options)

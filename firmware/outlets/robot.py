@@ -20,7 +20,7 @@ _UNSENT = const(255)  # instead of a state
 
 
 class Robot(Described):
-    """Its outlets are off after a reset, and stay as they are while the host is silent."""
+    """Its outlets are off after a reset and without a supply, and stay as they are while the host is silent."""
 
     def __init__(self, count: int) -> None:
         super().__init__(manifest(count), HELLO_SIZE, _RING)
@@ -58,22 +58,24 @@ class Robot(Described):
             return b"unknown_interface"
         if data != b"\0" and data != b"\1":
             return b"bad_payload"
-        if not self._supplies[index].value():
+        if data[0] and not self._supplies[index].value():
             return b"command_failed"
         self._relays[index].value(data[0])
         return b""
 
     def _report(self) -> None:
-        """Send the states that have changed; those for which there is no room are sent later."""
+        """Send the states that have changed; those for which there is no room are sent later, and are not lost."""
         for index in range(len(self._relays)):
             state = _BOUND
             if self._supplies[index].value():
                 state |= _REACHABLE | (_ON if self._relays[index].value() else 0)
+            else:
+                self._relays[index].value(0)  # it must not come on by itself when the supply is back
             if state != self._reported[index]:
                 for bit in range(3):
                     self._payload[bit] = state >> bit & 1
-                self._states += 1
-                if self.send(_STATE, 2 * index + 2, self._states, self._payload):
+                if self.out.send(_STATE, 2 * index + 2, self._states + 1, self.now, self._payload):
+                    self._states += 1
                     self._reported[index] = state
 
 

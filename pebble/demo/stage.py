@@ -13,7 +13,7 @@ from pebble.demo.broker import BrokerKind
 from pebble.demo.operator import Operator
 from pebble.demo.page import PageServer
 from pebble.demo.programs import Program, end_all
-from pebble.demo.testbed import ROBOTS, LinuxRobot, SimulatedRobot, Testbed
+from pebble.demo.testbed import ROBOTS, SimulatedRobot, Testbed
 from pebble.errors import PebbleError
 from pebble.simulation.trace import Entry
 
@@ -160,8 +160,7 @@ class Stage:
 
     def relays(self, name: str) -> list[str]:
         """Every change of its outlets' relays, oldest first: "o1 on"."""
-        robot = self.robots[name]
-        return [entry.line for entry in robot.relays()] if isinstance(robot, LinuxRobot) else []
+        return [entry.line for entry in self.robots[name].relays()]
 
     def lines(self, name: str) -> list[Entry]:
         """What its MCU received, oldest first."""

@@ -90,6 +90,10 @@ class SimulatedRobot(ABC):
         self._entries.extend(msgspec.json.decode(line, type=Entry) for line in complete.splitlines())
         return list(self._entries)
 
+    def relays(self) -> list[Entry]:
+        """The changes of its outlets' relays, oldest first; most robots have none."""
+        return []
+
     def outcome(self, at: float) -> Outcome:
         """What came of a script that ended at ``at``; only a robot with scripts knows."""
         raise NotImplementedError
@@ -149,8 +153,9 @@ class LinuxRobot(SimulatedRobot):
         self.launcher = Program(self.name, command, self._folder / "robot.log")
 
     def relays(self) -> list[Entry]:
-        """The changes of its outlets' relays, oldest first."""
-        return [entry for entry in read_trace(self._trace_of(OUTLETS)) if entry.event == "relay"]
+        """As its station's trace has them."""
+        trace = self._trace_of(OUTLETS)
+        return [entry for entry in read_trace(trace) if entry.event == "relay"] if OUTLETS in self._devices else []
 
     def _start_motors(self) -> Program:
         return self._start_mcu("pebble.simulation.mcu", "--link", str(self._port))

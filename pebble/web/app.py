@@ -161,7 +161,9 @@ async def _media(websocket: WebSocket) -> None:
 
 async def _sound(websocket: WebSocket) -> None:
     sound = websocket.app.state.sound
-    await _serve(websocket, lambda ref, can, session: sound.serve(websocket, ref, can, session))
+    device = login.printable(websocket.query_params.get("device", ""))
+    address = "" if websocket.client is None else websocket.client.host
+    await _serve(websocket, lambda ref, can, session: sound.serve(websocket, ref, can, session, device, address))
 
 
 async def _serve(

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from pebble.client.driver_lease import ANSWER_S
+from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 from pebble.web.arrived import Arrived, Handler
 
@@ -58,8 +59,12 @@ class Broker:
         self._watchers.append(watcher)
 
     def publish(self, topic: str, payload: bytes, *, retain: bool = False, qos: QoS = QoS.DELIVERED) -> bool:
-        """Publish now, ahead of streams; False if it was refused because there is no connection."""
-        return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
+        """Publish now, ahead of streams; False if there is no connection, or no topic may be called so."""
+        try:
+            return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
+        except TransportError as error:  # parts of topics come from robots and pages: what else is due must go on
+            log.warning("not published: %s", error)
+            return False
 
     async def subscribe(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import logging
 import secrets
 import time
@@ -20,6 +19,7 @@ from pebble.fleet.roles import Session, rights
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.driving import Tab
+from pebble.web.login import named, printable
 from pebble.web.pace import Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
 from pebble.web.robots import Interest
@@ -62,6 +62,7 @@ class Control:
         self._why_not = ""  # why this page may not drive at all
         self._reads_logs = False
         self._logs_sent = "", 0  # the origin and number of the last line
+        self._logs_due = False  # whether the page has received the part before
         self._series: deque[str] = deque()  # metrics of the watched component whose past is still to be sent
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
@@ -86,10 +87,12 @@ class Control:
         except (WebSocketDisconnect, RuntimeError):
             pass  # the page has gone
         finally:
-            self._end()
-            if sender is not None:
-                sender.cancel()
-                await asyncio.gather(sender, return_exceptions=True)
+            try:
+                self._end()
+            finally:
+                if sender is not None:
+                    sender.cancel()
+                    await asyncio.gather(sender, return_exceptions=True)
 
     # -- begin and end
 
@@ -97,10 +100,10 @@ class Control:
         if not isinstance(hello, m.Hello):
             raise Leave("the first message must be hello", again=True)
         server, settings = self._server, self._server.settings
-        self._tab.device = _printable(hello.device)
-        if not settings.login and (name := _printable(hello.name).strip()):
-            self._session = dataclasses.replace(self._session, user=name)
-            self._tab.user = name
+        self._tab.device = printable(hello.device)
+        if not settings.login:
+            self._session = named(self._session, hello.name)
+            self._tab.user = self._session.user
         self._drives = settings.plain_http_drive or self._is_secure()
         version = self._websocket.app.state.version
         if not self._drives:
@@ -128,9 +131,11 @@ class Control:
 
     def _end(self) -> None:
         self._server.robots.leave(self._interest)
-        self._server.publish(self._server.driving.closed(self._tab, clock()))
-        if self._interest.watched:
-            self._server.unwatch(self._interest.watched)
+        try:
+            self._server.publish(self._server.driving.closed(self._tab, clock()))
+        finally:
+            if self._interest.watched:
+                self._server.unwatch(self._interest.watched)
 
     async def _leave(self, reason: Leave) -> None:
         self._end_leases()
@@ -171,6 +176,7 @@ class Control:
         match op:
             case m.Echo():
                 self._tab.clock.echo(op.n, op.t, clock())
+                self._logs_due = True
                 self._post_series()
             case m.DriveOp():
                 self._drive(op)
@@ -275,7 +281,7 @@ class Control:
 
     def _read_logs(self, op: m.ReadLogs) -> None:
         if op.ref == self._interest.watched:
-            self._reads_logs, self._logs_sent = op.on, (op.origin, op.after)
+            self._reads_logs, self._logs_sent, self._logs_due = op.on, (op.origin, op.after), True
 
     def _lease(self, op: m.Lease) -> None:
         server = self._server
@@ -353,16 +359,15 @@ class Control:
         await self._send_logs()
 
     async def _send_logs(self) -> None:
-        """A part of them: what is left is sent the next time, and echoes in between."""
+        """One part at each echo, as _post_series."""
         ref = self._interest.watched
-        lines = self._server.robots.logs.get(ref) if self._reads_logs else None
+        lines = self._server.robots.logs.get(ref) if self._reads_logs and self._logs_due else None
         if lines is None:
             return
         origin, number = self._logs_sent
         run = lines.after(number if origin == lines.origin else 0)
         if run is not None:
-            self._logs_sent = lines.origin, run.first + len(run.lines) - 1
-            self._wake.set()
+            self._logs_sent, self._logs_due = (lines.origin, run.first + len(run.lines) - 1), False
             await self._websocket.send_text(
                 encode(m.Logs(ref=ref, origin=lines.origin, first=run.first, lines=run.lines))
             )
@@ -398,7 +403,3 @@ def _tag(op: m.FromPage) -> str:
 def _detail(op: m.RobotOp) -> str:
     fields = msgspec.to_builtins(op)
     return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in ("op", "ref"))[:200]
-
-
-def _printable(text: str) -> str:
-    return "".join(char if " " <= char <= "~" else "?" for char in text[:32])

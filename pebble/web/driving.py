@@ -98,8 +98,8 @@ class Driving:
         if not over and (who := self._active(ref, now)):
             return Outcome([], f"{who} is driving")
         commands = [] if lease is None else self._end_lease(ref, now)
-        tab.over = max(tab.over, -1 if tab.live is None else tab.live)  # inputs that are held now move nothing
-        tab.live = None
+        if tab.live is not None:  # it moves another robot: inputs that are held now move neither
+            commands += self._end_gesture(tab, tab.live, now)
         self._announced.pop(ref, None)
         self.leases[ref] = Lease(tab, epoch_ms, now)
         self.changed.add(ref)
@@ -165,7 +165,7 @@ class Driving:
         if (announced := self.elsewhere(ref, now)) is not None:
             return announced.by
         lease = self.leases.get(ref)
-        return lease.tab.user if lease is not None and lease.tab.live_ref == ref else ""
+        return "" if lease is None or lease.tab.live is None or lease.tab.live_ref != ref else lease.tab.user
 
     # -- commands
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pebble.config import Config, Mqtt
 from pebble.config.web import WebInterface
-from pebble.errors import ConfigError
+from pebble.errors import ConfigError, PebbleError
 from pebble.fleet.people import People
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.web.settings import WebSettings
@@ -55,7 +55,11 @@ def settings_or_all_problems(config: Config) -> WebSettings:
     try:
         return settings_of(config)
     except ConfigError as error:
-        raise ConfigError([*error.problems, *_without_user(config)]) from None
+        try:
+            more = _without_user(config)
+        except PebbleError as other:
+            more = [str(other)]
+        raise ConfigError([*error.problems, *more]) from None
 
 
 def _without_user(config: Config) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import html
 import socket
 from concurrent.futures import ThreadPoolExecutor
@@ -65,13 +66,24 @@ def routes() -> list[Route]:
 
 
 def session_of(connection: HTTPConnection) -> Session | None:
-    """The session of a request, read from the database each time; LOCAL where there is no login."""
+    """The session of a request, read from the database each time; where there is no login, LOCAL with its ``name``."""
     settings: WebSettings = connection.app.state.settings
     if not settings.login:
-        return LOCAL
+        return named(LOCAL, connection.query_params.get("name", ""))
     token = connection.cookies.get(_cookie(settings))
     session: Session | None = connection.app.state.people.session(token) if token else None
     return session
+
+
+def named(session: Session, name: str) -> Session:
+    """With the name that a person goes by; "" changes nothing. Only for where there is no login."""
+    user = printable(name).strip()
+    return dataclasses.replace(session, user=user) if user else session
+
+
+def printable(text: str) -> str:
+    """What a page says of itself, as others may be shown it."""
+    return "".join(char if " " <= char <= "~" else "?" for char in text[:32])
 
 
 def _cookie(settings: WebSettings) -> str:

@@ -10,20 +10,20 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, cast
 
 from pebble.client.viewer import Medium, Viewer
-from pebble.contract.identity import Direction
+from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, CAPABILITIES, INCOMING, VIDEO_CONTROL, Channel
 from pebble.errors import PebbleError, TransportError
 from pebble.transports import Handler, QoS, Subscription, Transport
 from pebble.web.broker import Broker
-from pebble.web.robots import own_topic
+from pebble.web.robots import FLAGS, names
 
 log = logging.getLogger(__name__)
 
 _MAX_PENDING, _MAX_PENDING_BYTES = 2000, 16 << 20  # received, and not yet taken by the event loop
 _CAPABILITIES_S: Final = 2.0
-_TOPICS: Final = {
-    "topic": Direction.OUTGOING,
-    "command_topic": Direction.INCOMING,
-    "flag_topic": Direction.INCOMING,
+#: The channels whose topics capabilities may name, by its key in the medium's section.
+_NAMED: Final[dict[Medium, dict[str, Channel]]] = {
+    "video": {"topic": CAMERA, "command_topic": VIDEO_CONTROL, "flag_topic": FLAGS["video"]},
+    "audio": {"topic": AUDIO, "command_topic": AUDIO_CONTROL, "flag_topic": FLAGS["audio"]},
 }
 
 
@@ -51,7 +51,7 @@ def offered(capabilities: dict[str, Any], medium: Medium) -> tuple[str, ...]:
 def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
     """Why this robot's pictures, or its sound, are not requested; empty if they may be.
 
-    Capabilities come from the network: one that names topics of another component is not believed at all.
+    Capabilities come from the network: one that names topics of another component, or channel, is not believed at all.
     """
     if not capabilities:
         return "it has published no capabilities yet"
@@ -60,8 +60,8 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
         return words.lacking
     if section.get("controls") is not True:
         return words.fixed
-    for key, direction in _TOPICS.items():
-        if section.get(key) is not None and not own_topic(ref, section[key], direction):
+    for key, channel in _NAMED[medium].items():
+        if section.get(key) is not None and not names(ref, section[key], channel):
             return f"its capabilities name a topic for {words.name} that is not its own ({key})"
     return ""
 
@@ -85,7 +85,7 @@ class MediaSource:
 
     async def follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
         """Request it, as these capabilities allow it; call it again and again. Raises PebbleError."""
-        topics = tuple(capabilities[self.medium].get(key) for key in _TOPICS)
+        topics = tuple(capabilities[self.medium].get(key) for key in _NAMED[self.medium])
         if self._viewer is not None and topics != self._topics:
             await self.withdraw()
         if self._viewer is None:
@@ -128,7 +128,7 @@ class MediaSource:
 
     def _open(self) -> Viewer:
         """On a thread: it waits for the broker."""
-        transport = cast(Transport, _OwnTopics(self._broker.transport, self.ref))
+        transport = cast(Transport, _OwnTopics(self._broker.transport, self.ref, self.medium))
         viewer = Viewer(transport, self.ref, self._on_payload)
         try:
             viewer.wait_for_capabilities(_CAPABILITIES_S)
@@ -162,24 +162,25 @@ class MediaSource:
 
 
 class _OwnTopics:
-    """The part of a transport that a Viewer uses, limited to the topics of one component.
+    """The part of a transport that a Viewer uses, limited to the topics of one component's medium.
 
     A robot's capabilities may change between being checked and being used.
     """
 
-    def __init__(self, transport: Transport, ref: str) -> None:
+    def __init__(self, transport: Transport, ref: str, medium: Medium) -> None:
         self._transport, self._ref = transport, ref
+        self._channels = (CAPABILITIES, *_NAMED[medium].values())
 
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False) -> bool:
-        self._check(topic, (Direction.INCOMING,))
+        self._check(topic, *(channel for channel in self._channels if channel.direction == INCOMING))
         return self._transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
 
     def subscribe(
         self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, echo: bool = True, direct: bool = False
     ) -> Subscription:
-        self._check(filter_, tuple(Direction))
+        self._check(filter_, *self._channels)
         return self._transport.subscribe(filter_, handler, qos=qos, echo=echo, direct=direct)
 
-    def _check(self, topic: str, directions: tuple[Direction, ...]) -> None:
-        if not any(own_topic(self._ref, topic, direction) for direction in directions):
-            raise TransportError(f"{topic} is no topic of {self._ref}")
+    def _check(self, topic: str, *channels: Channel) -> None:
+        if not any(names(self._ref, topic, channel) for channel in channels):
+            raise TransportError(f"{topic} is no topic of {self._ref} for this")

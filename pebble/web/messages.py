@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from msgspec import Meta, Struct
 
+from pebble.contract.identity import LEVEL
+
 MAX_OP_BYTES = 16 * 1024  # of one message of a page
 
 Ref = Annotated[str, Meta(max_length=200)]
@@ -19,7 +21,7 @@ Axis = Annotated[float, Meta(ge=-1, le=1)]
 Stamp = Annotated[float, Meta(ge=0, le=1e13)]
 Number = Annotated[int, Meta(ge=0, le=1 << 31)]
 Share = Annotated[float, Meta(ge=0, le=1)]
-Level = Annotated[str, Meta(pattern=r"^[^/+#\x00]{1,64}$", max_length=64)]  # one level of a topic
+Level = Annotated[str, Meta(pattern=LEVEL, max_length=64)]  # one level of a topic
 
 
 class _FromPage(Struct, frozen=True, kw_only=True, tag_field="op"):

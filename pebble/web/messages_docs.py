@@ -39,8 +39,9 @@ kind 1: a JPEG of the server's own, after `u64` epoch milliseconds of its captur
 """
 _SOUND = """## Sound socket
 
-`/ws/sound?ref=REF&can=opus,pcm` carries the sound of one component, and a person's voice to it. `can` empty: this \
-page only talks. Numbers are big-endian; `talk` numbers the talks of this connection, each greater than the last.
+`/ws/sound?ref=REF&can=opus,pcm&name=NAME&device=DEVICE` carries the sound of one component, and a person's voice to \
+it. `can` empty: this page only talks. `name` and `device` are those of `hello`. Numbers are big-endian; `talk` \
+numbers the talks of this connection, each greater than the last.
 
 | from | message |
 |---|---|

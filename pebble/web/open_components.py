@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -16,9 +17,6 @@ from pebble.contract import (
     CHARGING_STATUS,
     IMU,
     LOGS,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
-    REMOTE_MIRROR,
     SOUNDBOARD_FILES,
     SOUNDBOARD_STATUS,
     TOUCH_SENSORS,
@@ -30,12 +28,14 @@ from pebble.contract import (
 )
 from pebble.contract.identity import Direction
 from pebble.contract.payloads import AnyObject
-from pebble.errors import PayloadError
+from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, Subscription
 from pebble.web.broker import Broker
 from pebble.web.log_lines import LogLines
 from pebble.web.messages import FlagsView
-from pebble.web.robots import WATCHED, Robots, own_topic, section_of
+from pebble.web.robots import FLAGS, WATCHED, Robots, names, section_of
+
+log = logging.getLogger(__name__)
 
 _KEEP_S = 5.0  # so long they are still received after the last page has closed the component
 _FLAGS_METRIC = "web/flags"
@@ -56,13 +56,8 @@ _NAMED: dict[tuple[str, str], Channel] = {
     ("autonomy", "files_topic"): AUTONOMY_FILES,
     ("autonomy", "status_topic"): AUTONOMY_STATUS,
 }
-#: By section of the capabilities that may name its topic, each flag and its field of FlagsView.
-_FLAGS: dict[str, tuple[Channel, str]] = {
-    "": (REMOTE_MIRROR, "remote_mirror"),
-    "audio": (MQTT_AUDIO, "mqtt_audio"),
-    "video": (MQTT_VIDEO, "mqtt_video"),
-}
-_FLAG_FIELDS = dict(_FLAGS.values())
+#: Fields of FlagsView.
+_FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for flag in FLAGS.values()}
 
 
 class OpenComponents:
@@ -94,13 +89,15 @@ class OpenComponents:
 
     def update(self, ref: str) -> None:
         """Its capabilities, or the pages that have it open, may have changed."""
-        wanted = self._filters(ref) if ref in self._pages else {}
-        if ref not in self._following and set(wanted) != set(self._subscriptions.get(ref, ())):
+        wanted = set(self._filters(ref)) if ref in self._pages else None
+        received = set(self._subscriptions[ref]) if ref in self._subscriptions else None
+        if ref not in self._following and wanted != received:
             self._following.add(ref)
             self._spawn(self._follow(ref))
 
     async def _follow(self, ref: str) -> None:
         """Subscribe and unsubscribe until what is received is what is wanted."""
+        failed: set[str] = set()  # they are tried again, but logged once
         try:
             done = self._subscriptions.setdefault(ref, {})
             while True:
@@ -110,21 +107,33 @@ class OpenComponents:
                 for filter_ in [filter_ for filter_ in done if filter_ not in wanted]:
                     await self._broker.unsubscribe(done.pop(filter_))
                 for filter_ in [filter_ for filter_ in wanted if filter_ not in done]:
-                    done[filter_] = await self._subscribe(ref, filter_)
+                    try:
+                        done[filter_] = await self._subscribe(ref, filter_)
+                    except PebbleError as error:
+                        if filter_ not in failed:
+                            failed.add(filter_)
+                            log.warning("%s is not received: %s", filter_, error)
                 if not wanted:
                     if ref in self._pages:  # opened again meanwhile
                         continue
-                    self._robots.logs.pop(ref, None)
-                    self._flags.pop(ref, None)
-                    self._robots.remove_server_metric(ref, _FLAGS_METRIC)
-                    self._robots.recent.close(ref)
-                    self._subscriptions.pop(ref)
+                    self._forget(ref)
                     return
                 await asyncio.sleep(_STEP_S)
-                if set(self._filters(ref) if ref in self._pages else {}) == set(wanted):
+                if ref in self._pages and set(self._filters(ref)) == set(done):
                     return
         finally:
             self._following.discard(ref)
+
+    def _forget(self, ref: str) -> None:
+        """Nothing is received of it any more. Pages may open what is no component at all."""
+        self._subscriptions.pop(ref, None)
+        self._wanted.pop(ref, None)
+        self._flags.pop(ref, None)
+        self._robots.logs.pop(ref, None)
+        self._robots.remove_server_metric(ref, _FLAGS_METRIC)
+        self._robots.recent.close(ref)
+        if ref not in self._robots.components:
+            self._robots.forget(ref)
 
     async def _subscribe(self, ref: str, filter_: str) -> Subscription:
         receiver = self._receiver(ref, filter_)
@@ -180,7 +189,7 @@ class OpenComponents:
         for metric in self._robots.aliases(ref):
             alias = Channel(metric=metric, kind=Kind.STREAM, payload=AnyObject)
             filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", (ref, alias))
-        for section, (flag, _) in _FLAGS.items():
+        for section, flag in FLAGS.items():
             filters[self._robots.topic(ref, section, "flag_topic", flag)] = (ref, flag)
         source = self._robots.sources.get(ref, ref)
         filters.setdefault(VIDEO_OVERLAYS.filter(source), None)
@@ -188,7 +197,7 @@ class OpenComponents:
         return filters
 
     def _add(self, filters: dict[str, _Carried], ref: str, section: str, key: str, channel: Channel) -> None:
-        """The topic that the capabilities name, if it is the component's own."""
+        """The topic that the capabilities name, if they may."""
         topic = section_of(self._robots.capabilities(ref), section).get(key)
-        if own_topic(ref, topic, Direction.OUTGOING) and topic != channel.topic(ref):
+        if names(ref, topic, channel) and topic != channel.topic(ref):
             filters.setdefault(str(topic), (ref, channel))

@@ -12,7 +12,7 @@ from pebble.contract import Channel, codec
 from pebble.contract import payloads as p
 from pebble.transports import Message, QoS
 from pebble.web import messages as m
-from pebble.web.robots import section_of
+from pebble.web.robots import FLAGS, section_of
 
 #: The topic of a channel of one component: its section and key of the capabilities, and the channel's own.
 TopicOf = Callable[[str, str, str, Channel], str]
@@ -28,11 +28,7 @@ class _Command(NamedTuple):
 
 
 _ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
-_FLAGS = {
-    "remote-mirror": (c.REMOTE_MIRROR, ""),
-    "mqtt-audio": (c.MQTT_AUDIO, "audio"),
-    "mqtt-video": (c.MQTT_VIDEO, "video"),
-}
+_FLAGS = {flag.metric.removeprefix("flags/"): (flag, section) for section, flag in FLAGS.items()}
 
 
 def right(op: m.RobotOp) -> str:
@@ -43,7 +39,9 @@ def right(op: m.RobotOp) -> str:
 def ends(op: m.RobotOp) -> bool:
     """Whether it ends something: then it is passed on whatever the component is and reports."""
     match op:
-        case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False):
+        case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False) | m.OutletOp(on=False):
+            return True
+        case m.LightsOp(r=0, g=0, b=0):
             return True
     return False
 
@@ -53,6 +51,8 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     command = _command(op)
     offered = section_of(capabilities, command.section) if command.section else {}
     kind = command.key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
+    if isinstance(op, m.ActionOp):
+        offered = next(filter(None, (section_of(capabilities, section) for section in _sections(op))), {})
     if isinstance(op, m.OutletOp):
         outlets = section_of(capabilities, "outlets").get("outlets")
         named = [one for one in outlets if isinstance(one, dict)] if isinstance(outlets, list) else []
@@ -77,12 +77,16 @@ def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:
 
 
 def _action_topic(op: m.ActionOp, channel: Channel, topic_of: TopicOf) -> str:
-    """The first that the capabilities name in one of the spellings that the original page understands."""
+    """The first that the capabilities name."""
     usual = channel.topic(op.ref)
-    names = (op.name.replace("-", "_"), op.name)
-    sections = [f"system.{name}" for name in names] + list(names)
-    topics = (topic_of(op.ref, section, key, channel) for section in sections for key in ("flag_topic", "topic"))
+    topics = (topic_of(op.ref, section, key, channel) for section in _sections(op) for key in ("flag_topic", "topic"))
     return next((topic for topic in topics if topic != usual), usual)
+
+
+def _sections(op: m.ActionOp) -> list[str]:
+    """Of the capabilities, in all spellings that the original page understands."""
+    names = (op.name.replace("-", "_"), op.name)
+    return [f"system.{name}" for name in names] + list(names)
 
 
 def _command(op: m.RobotOp) -> _Command:

@@ -25,7 +25,10 @@ from pebble.contract import (
     LOGS,
     MCU_DESCRIBE,
     MEDIA_STATUS,
+    MQTT_AUDIO,
+    MQTT_VIDEO,
     ONLINE,
+    REMOTE_MIRROR,
     SOUNDBOARD_FILES,
     STATUS,
     VIDEO_OVERLAYS,
@@ -36,9 +39,10 @@ from pebble.contract import (
     is_reserved,
 )
 from pebble.contract.identity import LEVEL, Direction, parse_topic
-from pebble.errors import PayloadError
+from pebble.errors import PayloadError, TransportError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
+from pebble.transports.topics import check_topic
 from pebble.web import messages as m
 from pebble.web.log_lines import LogLines
 from pebble.web.recent import Recent
@@ -67,6 +71,8 @@ WATCHED = tuple(
     and channel not in SYNONYMS
     and channel.kind is not Kind.EVENT
 )
+#: Flags, by the section of the capabilities whose ``flag_topic`` may name another topic for it.
+FLAGS = {"": REMOTE_MIRROR, "audio": MQTT_AUDIO, "video": MQTT_VIDEO}
 
 
 _is_level = re.compile(LEVEL).search
@@ -159,9 +165,9 @@ class Robots:
         return {} if component is None else component.capabilities
 
     def topic(self, ref: str, section: str, key: str, channel: Channel) -> str:
-        """The topic that the capabilities name, if it is the component's own; else the channel's."""
+        """The topic that the capabilities name, if they may; else the channel's own."""
         topic = str(section_of(self.capabilities(ref), section).get(key))
-        return topic if own_topic(ref, topic, channel.direction) else channel.topic(ref)
+        return topic if names(ref, topic, channel) else channel.topic(ref)
 
     def aliases(self, ref: str) -> list[str]:
         """The metrics, none of the contract's, under which its microcontrollers say that they publish."""
@@ -251,11 +257,10 @@ class Robots:
             self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
-        """Remove a component; it comes back with its next message."""
+        """Remove a component, also one that was never there; it comes back with its next message."""
         component = self.components.pop(ref, None)
-        if component is None:
-            return
-        self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
+        if component is not None:
+            self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
         self.recent.forget(ref)
         for key in [key for key in self._server if key[0] == ref]:
             del self._server[key]
@@ -385,12 +390,19 @@ def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
 
 def own_topic(ref: str, topic: object, direction: str) -> bool:
     """Whether this is a topic of ``ref`` in that direction. Capabilities may name others; they are not used."""
-    return (
-        isinstance(topic, str)
-        and topic.startswith(f"{ref}/{direction}/")
-        and parse_topic(topic) is not None
-        and not set(topic) & {"+", "#", "\0"}
-    )
+    if not isinstance(topic, str) or not topic.startswith(f"{ref}/{direction}/") or parse_topic(topic) is None:
+        return False
+    try:
+        return check_topic(topic) == topic
+    except TransportError:
+        return False
+
+
+def names(ref: str, topic: object, channel: Channel) -> bool:
+    """Whether capabilities may name this topic for the channel: the component's own, and no other channel's."""
+    if not own_topic(ref, topic, channel.direction):
+        return False
+    return channel_of(str(topic)[len(ref) + 1 :]) in (None, channel)
 
 
 def _channel(metric: str) -> Channel | None:

@@ -59,7 +59,7 @@ class Server:
         self.broker = Broker(settings.broker)
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
         self.media = MediaHub(self.broker, self.robots)
-        self.sound = SoundHub(self.broker, self.robots, lambda ref, user: audit.write("talk", ref=ref, user=user))
+        self.sound = SoundHub(self.broker, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         self.drive_changed: set[str] = set()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -79,13 +79,15 @@ class Server:
 
     async def close(self) -> None:
         """Stop what pages move, then disconnect."""
-        for lease in list(self.driving.leases.values()):
-            self.publish(self.driving.closed(lease.tab, clock()))
-        for task in list(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        await asyncio.gather(self.media.close(), self.sound.close())
-        await self.broker.close()
+        try:
+            for lease in list(self.driving.leases.values()):
+                self.publish(self.driving.closed(lease.tab, clock()))
+            for task in list(self._tasks):
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+        finally:
+            await asyncio.gather(self.media.close(), self.sound.close())
+            await self.broker.close()
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run it until it ends or the server does."""
@@ -107,7 +109,8 @@ class Server:
             self.stops.changed.add(ref)
             self._note_latch(ref)
         if address.metric == CAPABILITIES.metric:
-            self.open_components.update(ref)
+            for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
+                self.open_components.update(one)
 
     def _note_latch(self, ref: str) -> None:
         component = self.robots.components.get(ref)
@@ -198,6 +201,9 @@ class Server:
         by = self.driving.moved_by(component.ref, clock())
         arbitrates = section_of(component.capabilities, "drive").get("arbitrates") is True
         return f"{by} is driving" if by and not arbitrates else ""
+
+    def _note_talk(self, ref: str, session: Session, device: str, address: str) -> None:
+        self.audit.write("talk", ref=ref, user=session.user, device=device, address=address)
 
     def picture_from(self, ref: str, source: str) -> None:
         """Show the picture of ``source`` on the page of ``ref``, for everybody; "" is its own."""

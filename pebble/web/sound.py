@@ -38,7 +38,7 @@ _PIECE: Final = struct.Struct(">BII")
 _RECEIVED, _VOICE, _END = range(3)  # what a page sends
 _BAD_REQUEST: Final = 4400  # code of a closed socket
 
-NoteTalk = Callable[[str, str], None]  # component and user, for the audit log
+NoteTalk = Callable[[str, Session, str, str], None]  # component, session, device and address, for the audit log
 
 
 class SoundQueue:
@@ -73,8 +73,8 @@ class SoundQueue:
 class SoundPage:
     """One page at a robot's sound. ``can`` empty: it only talks."""
 
-    def __init__(self, can: frozenset[str], session: Session) -> None:
-        self.can, self.session = can, session
+    def __init__(self, can: frozenset[str], session: Session, device: str = "", address: str = "") -> None:
+        self.can, self.session, self.device, self.address = can, session, device, address
         self.queue = SoundQueue()
         self.answers: deque[TalkAnswer] = deque(maxlen=_MAX_ANSWERS)
         self.wakeup = asyncio.Event()
@@ -130,7 +130,8 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         if self._talk is not None and self._talk.takes(piece, now):
             topic = self._robots.topic(self.ref, "audio", "uplink_topic", AUDIO_STREAM)
             packet = self._voice.packet(sound, time.time())
-            self._broker.publish(topic, packet, qos=QoS(AUDIO_STREAM.default_qos))
+            if not self._broker.publish(topic, packet, qos=QoS(AUDIO_STREAM.default_qos)):
+                self._interrupt("The server cannot reach the broker")
 
     def end_talk(self, page: SoundPage, talk: int) -> None:
         """The page ends this talk."""
@@ -143,7 +144,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         page.over = talk - 1
         self._voice.begin(time.time())
         page.answer(talk, on=True)
-        self._note_talk(self.ref, page.session.user)
+        self._note_talk(self.ref, page.session, page.device, page.address)
         self._wakeup.set()
 
     def _why_not(self, page: SoundPage) -> str:
@@ -157,8 +158,13 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
     def _release(self, now: float) -> None:
         """End a talk of which nothing comes any more."""
-        if self._talk is not None and self._talker is not None and self._talk.is_over(now):
-            self._talker.answer(self._talk.number, on=False, why=f"No sound came for {SILENT_S:g} s")
+        if self._talk is not None and self._talk.is_over(now):
+            self._interrupt(f"No sound came for {SILENT_S:g} s")
+
+    def _interrupt(self, why: str) -> None:
+        """End a talk, and tell its page why."""
+        if self._talk is not None and self._talker is not None:
+            self._talker.answer(self._talk.number, on=False, why=why)
             self._end_talk(self._talker)
 
     def _end_talk(self, page: SoundPage) -> None:
@@ -174,6 +180,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         capabilities = self._robots.capabilities(self.ref)
         self._why = refusal(self.ref, capabilities, "audio")
         if self._why:
+            self._interrupt(self._why)
             await self._source.withdraw()
         elif self.viewers:
             await self._source.follow(capabilities, best(offered(capabilities, "audio"), self._listening()))
@@ -206,12 +213,20 @@ class SoundHub:
         self._robots = robots
         self._streams = Streams(lambda ref: SoundStream(broker, robots, ref, self._show, note))
 
-    async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str], session: Session) -> None:
+    async def serve(
+        self,
+        websocket: WebSocket,
+        ref: str,
+        can: frozenset[str],
+        session: Session,
+        device: str = "",
+        address: str = "",
+    ) -> None:
         """Serve a page that plays ``can`` and may talk, until either end closes the socket."""
         if self._streams.closed or not own_topic(ref, AUDIO.topic(ref), Direction.OUTGOING):
             await websocket.close(_BAD_REQUEST, "no such component")
             return
-        page = SoundPage(can & frozenset(ENCODINGS), session)
+        page = SoundPage(can & frozenset(ENCODINGS), session, device, address)
         await self._streams.serve(
             websocket, ref, page, lambda _: _send(websocket, page), lambda stream: _receive(websocket, stream, page)
         )

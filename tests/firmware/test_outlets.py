@@ -126,9 +126,19 @@ def test_a_relay_that_is_not_there_is_unreachable_until_it_is_back(bench: Bench)
     bench.command(7, b"\1")
     bench.body.connect("o4", False)
     assert states(bench.run()) == {4: (True, False, False)}
-    assert of(bench.command(7, b"\0"), Type.NACK)[0].payload == b"command_failed"
+    assert of(bench.command(7, b"\1"), Type.NACK)[0].payload == b"command_failed"
+    assert len(of(bench.command(7, b"\0"), Type.ACK)) == 1
     bench.body.connect("o4", True)
-    assert states(bench.run()) == {4: (True, True, True)}
+    assert states(bench.run()) == {4: (True, True, False)}
+
+
+def test_an_outlet_does_not_come_on_by_itself(bench: Bench) -> None:
+    bench.command(7, b"\1")
+    for there in (False, True):
+        bench.body.connect("o4", there)
+        frames = bench.run()
+    assert states(frames) == {4: (True, True, False)}
+    assert bench.relays == [("o4", True), ("o4", False)]
 
 
 def test_everything_is_off_after_a_reset(bench: Bench) -> None:
@@ -155,3 +165,17 @@ def test_states_for_which_there_was_no_room_are_sent_later(bench: Bench, command
     frames = bench.run(1.0)
     assert of(frames, Type.LOG), "nothing was lost"
     assert states(frames)[1] == (True, True, commands % 2 == 0)
+
+
+def test_a_state_that_waits_for_room_is_not_lost(bench: Bench) -> None:
+    bench.board.console.reading = False
+    while bench.robot.out.used <= len(bench.robot.out.ring) - 23:  # so that a pong has room, and then a state has not
+        bench.board.type(encode(Frame(Type.PING)))
+        bench.turn(0.01)
+    bench.body.connect("o4", False)
+    bench.turn(1.0)
+    bench.board.console.reading = True
+    frames = bench.run(1.0)
+    assert of(frames, Type.LOG) == []
+    (state,) = of(frames, Type.STATE)
+    assert (state.interface, state.sequence) == (8, 5)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import ConfigError
+from pebble.simulation.mcu import main
 from pebble.simulation.pty import PtyMcu
 from pebble.simulation.trace import read_trace
 from tests.services.serial_mcu_bridge import mcu_wire as wire
@@ -75,6 +76,12 @@ def test_only_outlets_that_are_there_can_be_taken_away(station: PtyMcu, tmp_path
         station.connect("o9", False)
     with PtyMcu("goob_imu", tmp_path / "imu") as imu, pytest.raises(ConfigError, match="goob_imu has no outlet"):
         imu.connect("o1", False)
+
+
+def test_only_a_station_has_a_number_of_outlets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--kind", "goob", "--link", str(tmp_path / "port"), "--outlets", "2"])
+    assert "--outlets: goob has none" in capsys.readouterr().err
 
 
 def test_the_program_prints_what_its_relays_do(tmp_path: Path) -> None:

@@ -182,7 +182,9 @@ class Server:
         self.broker = _Broker(hub)
         self.robots = Robots()
         self.noted: list[tuple[str, str]] = []
-        self.sound = SoundHub(cast(Broker, self.broker), self.robots, lambda ref, user: self.noted.append((ref, user)))
+        self.sound = SoundHub(
+            cast(Broker, self.broker), self.robots, lambda ref, session, *_: self.noted.append((ref, session.user))
+        )
         self.view: Any = None
         self.tasks: set[asyncio.Task[None]] = set()
         publish = self.robots.set_server_metric

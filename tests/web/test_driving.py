@@ -374,6 +374,15 @@ def test_a_server_may_release_a_robot(world: World) -> None:
     assert world.take(world.tab()) == ""
 
 
+def test_who_takes_another_robot_moves_the_first_one_no_more(world: World) -> None:
+    tab = world.holder()
+    assert world.drive(tab, 1) == [MOVE]
+    assert world.driving.moved_by(REF, world.now) == "anna"
+    assert world.driving.take(tab, OTHER, world.now, 0) == ([FINAL], "")
+    assert world.driving.moved_by(REF, world.now) == ""
+    assert world.drive(tab, 1, ref=OTHER) == LET_GO
+
+
 def test_each_robot_has_a_lease_of_its_own(world: World) -> None:
     tab, other = world.holder(), world.tab("eve")
     assert world.driving.take(other, OTHER, world.now, 0) == ([], "")

@@ -9,7 +9,7 @@ import pytest
 
 from pebble.config import load, parse
 from pebble.errors import ConfigError
-from pebble.web.from_config import settings_of
+from pebble.web.from_config import settings_of, settings_or_all_problems
 from pebble.web.settings import WebSettings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,6 +61,15 @@ def test_other_machines_need_a_certificate() -> None:
     assert found.startswith("web_interface.host: other machines reach 0.0.0.0, which needs a certificate and a user")
     assert "`pebble cert init`" in found
     assert "`pebble web user add`" in found
+
+
+def test_users_that_cannot_be_read_hide_no_other_problem(tmp_path: Path) -> None:
+    raw = {"robot": {"id": "goob"}, "web_interface": {"host": "0.0.0.0", "people": str(tmp_path)}, **REMOTE}
+    with pytest.raises(ConfigError) as caught:
+        settings_or_all_problems(parse(raw, folder=tmp_path, env={}))
+    first, second = caught.value.problems
+    assert first.startswith("web_interface.host: other machines reach 0.0.0.0")
+    assert second.startswith(f"{tmp_path}: cannot be used")
 
 
 def test_plain_http_for_other_machines_must_be_written_and_does_not_drive() -> None:

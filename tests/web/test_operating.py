@@ -5,17 +5,21 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import httpx
 import pytest
+from websockets.sync.client import connect
 
+from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web import open_components
 from pebble.web.broker import Broker as BrokerOfPages
 from pebble.web.open_components import OpenComponents
-from pebble.web.robots import Robots
+from pebble.web.robots import Interest, Robots
 from tests.support import Broker, until
 from tests.web.attacker import Hall
 from tests.web.served import Page, RecordingRobot, Served
@@ -120,6 +124,20 @@ def test_lines_that_the_server_drops_leave_a_gap(page, robot, broker) -> None:
     last = page.logs[-1]
     before = page.logs[-2]
     assert last["first"] == before["first"] + len(before["lines"]) + 1
+
+
+def test_a_part_of_the_logs_waits_for_an_echo(page, robot) -> None:
+    assert until(lambda: _logged(robot, page, "ready"))
+    for _ in range(60):
+        robot.publish("logs", {"message": "x" * 1000})
+    robot.publish("charging-level", {"value": 3.5})
+    assert until(lambda: page.value(robot.base, "charging-level") is not None)
+    page.answers = False
+    page.send("read-logs", ref=robot.base, on=True)
+    assert until(lambda: page.logs)
+    assert not until(lambda: len(page.logs) > 2, 0.5)  # an answer may have been under way
+    page.answers = True
+    assert until(lambda: len(page.logs) > 3, 4)
 
 
 def test_logs_of_another_component_are_not_sent(page, robot, served, broker) -> None:
@@ -245,6 +263,7 @@ class SlowBroker:
 
     def __init__(self) -> None:
         self.filters: set[str] = set()
+        self.refuses = ""  # a filter
         self.may_unsubscribe = asyncio.Event()
 
     @property
@@ -255,6 +274,8 @@ class SlowBroker:
         pass
 
     async def subscribe(self, filter_: str, _handler: object, **_options: object) -> str:
+        if filter_ == self.refuses:
+            raise TransportError("no")
         self.filters.add(filter_)
         return filter_
 
@@ -288,7 +309,101 @@ def test_a_component_that_is_opened_while_it_is_being_closed_is_received(monkeyp
     asyncio.run(work())
 
 
+def test_one_topic_that_cannot_be_received_holds_back_no_other(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(open_components, "_STEP_S", 0)
+    base = "pebble/robots/rig"
+
+    async def work() -> None:
+        broker, tasks = SlowBroker(), []
+        opened = OpenComponents(
+            cast(BrokerOfPages, broker), Robots(), lambda work: tasks.append(asyncio.ensure_future(work))
+        )
+        broker.refuses = f"{base}/outgoing/sensors/imu"
+        opened.open(base)
+        for _ in range(100):
+            await asyncio.sleep(0)
+        assert {f"{base}/outgoing/logs", f"{base}/incoming/flags/mqtt-video"} <= broker.filters
+        assert [record.getMessage() for record in caplog.records] == [f"{broker.refuses} is not received: no"]
+        broker.refuses = ""
+        await asyncio.gather(*tasks)
+        assert f"{base}/outgoing/sensors/imu" in broker.filters
+
+    asyncio.run(work())
+
+
+def test_what_is_no_component_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(open_components, "_KEEP_S", 0)
+    monkeypatch.setattr(open_components, "_STEP_S", 0)
+    base = "pebble/robots/made-up"
+
+    async def work() -> None:
+        broker, robots, tasks = SlowBroker(), Robots(), []
+        broker.may_unsubscribe.set()
+        other = Interest(lambda: None)
+        robots.join(other)
+        opened = OpenComponents(
+            cast(BrokerOfPages, broker), robots, lambda work: tasks.append(asyncio.ensure_future(work))
+        )
+        opened.open(base)
+        robots.set_server_metric(base, "web/picture-from", {"source": ""})
+        await asyncio.gather(*tasks)
+        assert robots.value(base, "web/flags") is not None
+        opened.close(base)
+        while len(tasks) == 1:
+            await asyncio.sleep(0)
+        await asyncio.gather(*tasks)
+        assert (broker.filters, robots.logs, robots._server) == (set(), {}, {})
+        assert (opened._wanted, opened._subscriptions, opened._flags) == ({}, {}, {})
+        assert other.gone == {base}
+
+    asyncio.run(work())
+
+
+def test_capabilities_cannot_pass_one_channel_off_as_another() -> None:
+    async def work() -> None:
+        base, robots, tasks = "pebble/robots/rig", Robots(), []
+        telemetry = {"imu_topic": f"{base}/outgoing/front-camera", "touch_topic": f"{base}/outgoing/renamed"}
+        value = {"telemetry": telemetry, "video": {"flag_topic": f"{base}/incoming/estop"}}
+        payload = json.dumps({"schema": "pebble-capabilities/v1", "t": 1, "value": value}).encode()
+        robots.receive(Message(f"{base}/outgoing/capabilities", payload), 0.0)
+        broker = SlowBroker()
+        opened = OpenComponents(
+            cast(BrokerOfPages, broker), robots, lambda work: tasks.append(asyncio.ensure_future(work))
+        )
+        opened.open(base)
+        while f"{base}/outgoing/video-overlays" not in broker.filters:
+            await asyncio.sleep(0)
+        assert {f"{base}/outgoing/renamed", f"{base}/incoming/flags/mqtt-video"} <= broker.filters
+        assert not {f"{base}/outgoing/front-camera", f"{base}/incoming/estop"} & broker.filters
+        tasks[0].cancel()
+
+    asyncio.run(work())
+
+
 # -- names
+
+
+def test_the_name_of_a_page_without_a_login_counts_for_its_voice_and_for_a_stop_by_request(served, broker) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    audio = {"available": True, "controls": True, "topic": f"{base}/outgoing/audio"}
+    url = f"ws://127.0.0.1:{served.port}/ws/sound?ref={base}&name=Alice&device=phone"
+    with RecordingRobot(broker.port, base, capabilities={"audio": audio}), Reader(served) as page:
+        assert page.knows(base)
+        with connect(url, origin=served.origin) as sound:
+            sound.send(struct.pack(">BII", 1, 1, 0) + bytes(640))
+            assert json.loads(sound.recv(timeout=3)) == {"talk": 1, "on": True, "why": ""}
+            assert until(lambda: page.value(base, "web/sound", "talker") == "Alice")
+        stop = {"op": "estop", "ref": base, "stop": "00112233445566aa"}
+        with httpx.Client(headers={"origin": served.origin}) as client:
+            assert client.post(f"{served.origin}/api/estop?name=Alice", json=stop).status_code == 202
+    audit = served.app.state.audit
+
+    def noted() -> set[tuple[str, str, str, str]]:
+        return {(one.what, one.user, one.device, one.address) for one in audit.read(20) if one.ref == base}
+
+    assert until(lambda: {("talk", "Alice", "phone", "127.0.0.1"), ("stop", "Alice", "", "127.0.0.1")} <= noted())
 
 
 def test_without_a_login_a_page_gives_its_own_name(served, robot) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.web.in_node import evaluate
+from tests.web.in_node import STATIC, evaluate
 
 
 def run(module: str, names: str, steps: str) -> Any:
@@ -331,3 +331,29 @@ _GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
 )
 def test_limits_of_reasons(change: str, code: str | None) -> None:
     assert reasons(f"{_GOOD} result = driveReason({{ ...situation, ...{change} }})?.code ?? null;") == code
+
+
+# -- whose it is
+
+
+def test_a_stop_by_request_has_the_name_of_the_person() -> None:
+    steps = """
+      const asked = [];
+      globalThis.fetch = async (url) => (asked.push(url), { ok: true });
+      new Estop({ send: () => false, you: { user: "Ann & Bo" } }).press("pebble/robots/goob");
+      result = asked;
+    """
+    assert run("estop.js", "Estop", steps) == ["/api/estop?name=Ann%20%26%20Bo"]
+
+
+def test_the_sound_socket_has_the_name_and_device_of_the_person() -> None:
+    steps = """
+      const urls = [];
+      const WebSocket = class { constructor(url) { urls.push(url); } };
+      Object.assign(globalThis, { self: {}, location: { protocol: "http:", host: "here" }, WebSocket });
+      await import(given);
+      self.onmessage({ data: { op: "open", ref: "a/b/c", port: null, name: "Ann & Bo", device: "phone" } });
+      result = Object.fromEntries(new URL(urls[0]).searchParams);
+    """
+    worker = (STATIC / "media" / "sound-worker.js").as_uri()
+    assert evaluate({}, steps, worker) == {"ref": "a/b/c", "can": "", "name": "Ann & Bo", "device": "phone"}

@@ -126,6 +126,11 @@ def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str,
         "pebble/robots/fred/incoming/x",
         f"{BASE}/outgoing/x",
         f"{BASE}/incoming/#",
+        f"{BASE}/incoming/a\x01b",
+        f"{BASE}/incoming/{'x' * 1100}",
+        f"{BASE}/incoming{'/x' * 250}",
+        f"{BASE}/incoming/drive-values",
+        f"{BASE}/incoming/estop",
         f"{BASE}x/incoming/x",
         7,
         None,
@@ -174,6 +179,9 @@ OUTLET: Fields = {"tag": "outlet", "outlet": "o1", "on": True}
         (OUTLET, {"outlets": {"outlets": [{"name": "o1", "controls": False}]}}, "outlets/o1/power"),
         (OUTLET, {"outlets": {"outlets": [{"name": "o2", "controls": False}, "o1"]}}, ""),
         (OUTLET, {"outlets": {"controls": False, "outlets": {"o1": False}}}, ""),
+        (OUTLET | {"on": False}, {"outlets": {"outlets": [{"name": "o1", "controls": False}]}}, ""),
+        ({"tag": "lights"}, {"lights": {"solid": False}}, ""),
+        ({"tag": "lights", "period": 1}, {"lights": {"flash": False}}, ""),
     ],
 )  # fmt: skip
 def test_what_capabilities_rule_out(fields: dict[str, Any], capabilities: dict[str, Any], refused: str) -> None:
@@ -267,11 +275,11 @@ def test_a_silent_robot_is_asked_nothing_but_to_end_and_its_flags(page: Page, ro
     assert until(lambda: page.value(robot.base, "web/liveness", "online") is False, 4)
     for fields, *_ in PUBLISHED:
         ask(page, robot.base, **fields)
-    assert until(lambda: len(asked_of(robot)) == 5, 3), asked_of(robot)
-    assert [value for _, value in asked_of(robot)[:2]] == [
-        {"action": "stop", "enabled": False, "file": None}, {"action": "stop"},
+    assert until(lambda: len(asked_of(robot)) == 6, 3), asked_of(robot)
+    assert [value for _, value in asked_of(robot)[:3]] == [
+        {"b": 0.0, "g": 0.0, "r": 0.0}, {"action": "stop", "enabled": False, "file": None}, {"action": "stop"},
     ]  # fmt: skip
-    assert set(refusals(page, len(PUBLISHED) - 5)) == {f"{robot.base.rpartition('/')[2]} is silent"}
+    assert set(refusals(page, len(PUBLISHED) - 6)) == {f"{robot.base.rpartition('/')[2]} is silent"}
 
 
 def test_a_robot_whose_script_service_takes_no_commands(broker: Broker, served: Served) -> None:
@@ -379,6 +387,7 @@ def test_a_script_starts_beside_a_person_only_where_it_gives_way(
         {"tag": "lights", "period": 0.01},
         {"tag": "action", "name": "shutdown"},
         {"tag": "outlet", "outlet": "a/b", "on": True},
+        {"tag": "outlet", "outlet": "a\x01", "on": True},
         {"tag": "outlet", "outlet": "o1", "on": 1},
         {"tag": "mcu", "uid": "#", "name": "led", "value": {}},
         {"tag": "mcu", "uid": "a", "name": "led", "value": {"x": "text"}},

@@ -126,6 +126,8 @@ async def test_a_page_that_cannot_play_what_comes_gets_a_reason() -> None:
         ({**AUDIO, "topic": "pebble/robots/victim/outgoing/audio"}, "not its own (topic)"),
         ({**AUDIO, "command_topic": "pebble/robots/victim/incoming/drive-values"}, "not its own (command_topic)"),
         ({**AUDIO, "flag_topic": f"{REF}/incoming/+"}, "not its own (flag_topic)"),
+        ({**AUDIO, "flag_topic": f"{REF}/incoming/estop"}, "not its own (flag_topic)"),
+        ({**AUDIO, "command_topic": f"{REF}/incoming/flags/reboot"}, "not its own (command_topic)"),
     ],
 )
 @on_loop
@@ -308,10 +310,35 @@ async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound() ->
 
 
 @on_loop
+async def test_a_talk_ends_when_the_robots_sound_is_refused() -> None:
+    robot = SoundRobot()
+    async with serving(robot) as server:
+        page = server.open(Page(), NOTHING)
+        talking = asyncio.create_task(page.speak(1, 250))
+        await until(lambda: server.view and server.view.talker == "alice")
+        changed = capabilities({**AUDIO, "controls": False})
+        robot.transport.publish(CAPABILITIES, changed, qos=QoS.DELIVERED, retain=True)
+        await talking
+        assert page.talks[1:] == [{"talk": 1, "on": False, "why": "its sound cannot be switched on from here"}]
+        await until(lambda: server.view.talker == "")
+
+
+@on_loop
+async def test_a_talk_ends_when_the_broker_takes_nothing() -> None:
+    robot = SoundRobot()
+    async with serving(robot) as server:
+        server.broker.publish = lambda *_, **__: False  # type: ignore[method-assign]
+        page = server.open(Page(), NOTHING)
+        await page.speak(1, 50)
+        assert page.talks[1:] == [{"talk": 1, "on": False, "why": "The server cannot reach the broker"}]
+
+
+@on_loop
 async def test_the_voice_goes_to_the_robots_own_topic_only() -> None:
     for named, topic in [
         (f"{REF}/incoming/voice", f"{REF}/incoming/voice"),
         ("pebble/robots/victim/incoming/audio-stream", UPLINK),
+        (f"{REF}/incoming/drive-values", UPLINK),
     ]:
         robot = SoundRobot({**AUDIO, "uplink_topic": named})
         async with serving(robot) as server:

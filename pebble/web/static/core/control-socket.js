@@ -148,7 +148,7 @@ async function askForLogin() {
   }
 }
 
-function device() {
+export function device() {
   const phone = matchMedia("(pointer: coarse)").matches;
   const system = /Android|iPhone|iPad|Windows|Mac|Linux/.exec(navigator.userAgent)?.[0] ?? "";
   return phone ? `phone ${system}`.trim() : system || "browser";

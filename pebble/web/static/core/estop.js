@@ -6,7 +6,7 @@ function randomHex(bytes) {
 }
 
 export class Estop {
-  /** @param {{send: (op: Record<string, any>) => boolean}} socket */
+  /** @param {{send: (op: Record<string, any>) => boolean, you?: any}} socket */
   constructor(socket) {
     this.socket = socket;
     /** @type {{ref: string, stop: string, at: number, reached: boolean}|null} */
@@ -38,7 +38,8 @@ export class Estop {
     pressed.reached = false;
     try {
       const headers = { "content-type": "application/json" };
-      const answer = await fetch("/api/estop", { method: "POST", headers, body: JSON.stringify(op), keepalive: true });
+      const url = `/api/estop?name=${encodeURIComponent(this.socket.you?.user ?? "")}`;
+      const answer = await fetch(url, { method: "POST", headers, body: JSON.stringify(op), keepalive: true });
       pressed.reached = answer.ok;
     } catch {
       pressed.reached = false;

@@ -14,6 +14,8 @@ const ALIVE_MS = 1000; // without a message of the page, which may stand still w
 
 let ref = "";
 let can = "";
+let name = "";
+let device = "";
 /** @type {WebSocket|null} */
 let socket = null;
 let wait = FIRST_WAIT_MS;
@@ -31,9 +33,12 @@ self.onmessage = ({ data }) => {
   else if (data.op === "end") end();
 };
 
-/** @param {{ref: string, port: MessagePort|null, rate: number}} message ``port`` null: this page only talks */
+/**
+ * ``port`` null: this page only talks; ``name`` and ``device``: whose it is
+ * @param {{ref: string, port: MessagePort|null, rate: number, name: string, device: string}} message
+ */
 async function open(message) {
-  ref = message.ref;
+  ({ ref, name, device } = message);
   if (message.port) {
     playout = new Playout(message.port, message.rate);
     can = (await decodesOpus()) ? "opus,pcm" : "pcm";
@@ -44,7 +49,7 @@ async function open(message) {
 
 function connect() {
   const scheme = location.protocol === "https:" ? "wss:" : "ws:";
-  const mine = new WebSocket(`${scheme}//${location.host}/ws/sound?${new URLSearchParams({ ref, can })}`);
+  const mine = new WebSocket(`${scheme}//${location.host}/ws/sound?${new URLSearchParams({ ref, can, name, device })}`);
   mine.binaryType = "arraybuffer";
   received = 0;
   mine.onopen = () => self.postMessage({ connection: "open" });

@@ -1,5 +1,6 @@
 // Listening to the component that is open, and talking to it: what is under way, and why not more.
 
+import { device } from "../core/control-socket.js";
 import { Microphone, hasMicrophone } from "../media/microphone.js";
 import { makeSpeaker } from "../media/speaker.js";
 import { Model, Offers } from "./models.js";
@@ -22,6 +23,7 @@ export class Sound extends Model {
     this.connection = connection;
     this.route = route;
     this.ref = ""; // of the component that the worker is connected to
+    this.name = ""; // whose connection it is
     this.listening = false;
     this.muted = false;
     /** @type {Talk|null} */
@@ -46,6 +48,7 @@ export class Sound extends Model {
     this.timer = 0;
     route.onChange(() => route.ref !== this.ref && this.leave());
     connection.onChange(() => !connection.isOpen && this.silence());
+    connection.onChange(() => this.worker && connection.isOpen && connection.you.user !== this.name && this.leave());
     for (const name of ["blur", "pagehide"]) addEventListener(name, () => this.interrupt());
     document.addEventListener("freeze", () => this.interrupt());
     document.addEventListener("visibilitychange", () => document.hidden && this.interrupt());
@@ -191,9 +194,11 @@ export class Sound extends Model {
   connect(ref, port) {
     this.disconnect();
     this.ref = ref;
+    this.name = this.connection.you?.user ?? "";
     const worker = new Worker(WORKER, { type: "module" });
     worker.onmessage = ({ data }) => worker === this.worker && this.take(data);
-    worker.postMessage({ op: "open", ref, port, rate: this.context?.sampleRate }, port ? [port] : []);
+    const message = { op: "open", ref, name: this.name, device: device(), port, rate: this.context?.sampleRate };
+    worker.postMessage(message, port ? [port] : []);
     this.worker = worker;
   }
 
