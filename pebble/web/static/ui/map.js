@@ -1,7 +1,8 @@
 // Where a component was and is, by its odometry: a trail over a grid.
 
 import { differs, pieces, poseOf } from "../core/trail.js";
-import { html, useEffect, useMetrics, usePage, useRef, useState, useTick } from "./hooks.js";
+import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "./hooks.js";
+import { Live, isGone } from "./parts.js";
 import { recorderOf } from "./recorder.js";
 import { number } from "./words.js";
 
@@ -28,9 +29,16 @@ export function Odometry({ at }) {
     return () => own.close();
   }, [series]);
   useTick(WORDS_MS);
+  const online = useOnline(at);
+  const entry = series.newest && { age: page.store.clock() - series.newestAt, period: series.gapMs / 3 };
+  if (view.current) view.current.gone = entry !== null && isGone(entry, online);
   return html`<div class="map">
     <canvas ref=${canvas} class="map-canvas" role="img" aria-label="Trail of the odometry" data-test="map"></canvas>
-    <p class="map-words" data-test="map-pose">${poseWords(series.newest)}</p>
+    <p class="map-words" data-test="map-pose">
+      ${entry
+        ? html`<${Live} entry=${entry} online=${online}>${poseWords(series.newest)}<//>`
+        : "No position was received yet."}
+    </p>
     <div class="map-tools">
       <button type="button" data-test="map-in" aria-label="Zoom in" onClick=${() => view.current?.zoom(1.5)}>+</button>
       <button type="button" data-test="map-out" aria-label="Zoom out" onClick=${() => view.current?.zoom(1 / 1.5)}>−</button>
@@ -48,7 +56,6 @@ export function Odometry({ at }) {
 }
 
 function poseWords(pose) {
-  if (!pose) return "No position was received yet.";
   const degrees = ((pose.heading * 180) / Math.PI).toFixed(0);
   return `x ${number(pose.x, 2)} m · y ${number(pose.y, 2)} m · heading ${degrees}°`;
 }
@@ -63,6 +70,7 @@ class View {
     /** @type {{x: number, y: number} | null} what is in the middle; null: the component */
     this.middle = null;
     this.drawn = "";
+    this.gone = false; // whether the newest pose is an old one
     this.seen = true;
     this.timer = setInterval(() => this.seen && !document.hidden && this.draw(), STEP_MS);
     this.sizes = new ResizeObserver(() => this.draw());
@@ -145,7 +153,7 @@ class View {
     const colours = ["--line", "--edge", "--accent", "--dim", "--fg"].map((name) => style.getPropertyValue(name).trim());
     const { x, y } = this.centre;
     canvas.dataset.scale = String(this.scale); // for tests
-    const drawn = JSON.stringify([series.version, this.scale, x, y, width, height, pixels, colours]);
+    const drawn = JSON.stringify([series.version, this.gone, this.scale, x, y, width, height, pixels, colours]);
     if (drawn === this.drawn || width < 2) return;
     this.drawn = drawn;
     const [line, edge, accent, dim, ink] = colours;
@@ -163,7 +171,8 @@ class View {
       for (const pose of piece) context.lineTo(...place(pose));
       context.stroke();
     }
-    if (series.newest) drawArrow(context, place(series.newest), series.newest.heading, ink, accent);
+    const fill = this.gone ? dim : accent;
+    if (series.newest) drawArrow(context, place(series.newest), series.newest.heading, ink, fill);
   }
 
   drawGrid(context, { width, height, x, y, line, edge, dim }) {
