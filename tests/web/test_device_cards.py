@@ -11,7 +11,7 @@ from playwright.sync_api import Browser
 
 from tests.web.browser import Tab, tab
 from tests.web.canned import CannedServer, State, Value, serving
-from tests.web.states import GOOB, STATES, at, changed, devices, outlet
+from tests.web.states import GOOB, STATES, at, changed, devices, liveness, outlet
 
 O2 = "outlets/o2/status"
 
@@ -95,7 +95,7 @@ def test_a_refusal_stands_at_what_was_asked(server: CannedServer, browser: Brows
 
 
 def test_what_is_on_can_be_switched_off_while_the_robot_is_silent(server: CannedServer, browser: Browser) -> None:
-    silent = at(GOOB, "web/liveness", {"online": False, "silent_s": 9.0, "latency_ms": None, "whole_seconds": False})
+    silent = at(GOOB, "web/liveness", liveness(online=False, silent_s=9.0, latency_ms=None))
     server.show(with_values(silent))
     with tab(browser, server.url + server.state.path) as opened:
         assert opened.until(lambda: opened.test("outlet-o2").is_disabled())

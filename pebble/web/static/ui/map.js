@@ -2,7 +2,7 @@
 
 import { differs, pieces, poseOf } from "../core/trail.js";
 import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "./hooks.js";
-import { Live, isGone } from "./parts.js";
+import { Gone, isGone } from "./parts.js";
 import { recorderOf } from "./recorder.js";
 import { number } from "./words.js";
 
@@ -30,14 +30,14 @@ export function Odometry({ at }) {
   }, [series]);
   useTick(WORDS_MS);
   const online = useOnline(at);
-  const entry = series.newest && { age: page.store.clock() - series.newestAt, period: series.gapMs / 3 };
-  if (view.current) view.current.gone = entry !== null && isGone(entry, online);
+  const age = page.store.clock() - series.newestAt;
+  const gone = isGone({ age, period: series.gapMs / 3 }, online);
+  if (view.current) view.current.gone = gone;
+  const words = poseWords(series.newest);
   return html`<div class="map">
     <canvas ref=${canvas} class="map-canvas" role="img" aria-label="Trail of the odometry" data-test="map"></canvas>
     <p class="map-words" data-test="map-pose">
-      ${entry
-        ? html`<${Live} entry=${entry} online=${online}>${poseWords(series.newest)}<//>`
-        : "No position was received yet."}
+      ${gone && series.newest ? html`<${Gone} age=${age}>${words}<//>` : words}
     </p>
     <div class="map-tools">
       <button type="button" data-test="map-in" aria-label="Zoom in" onClick=${() => view.current?.zoom(1.5)}>+</button>
@@ -56,6 +56,7 @@ export function Odometry({ at }) {
 }
 
 function poseWords(pose) {
+  if (!pose) return "No position was received yet.";
   const degrees = ((pose.heading * 180) / Math.PI).toFixed(0);
   return `x ${number(pose.x, 2)} m · y ${number(pose.y, 2)} m · heading ${degrees}°`;
 }

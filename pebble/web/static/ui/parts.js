@@ -92,13 +92,16 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
 /** The reason under a control that is off. */
 export const Why = ({ id, children }) => html`<span class="why" id=${id}>${children}</span>`;
 
+/** What is no longer shown as a value. */
+export const Gone = ({ age, children }) => html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
+
 /** Whether it is too old to be shown as a value. @param {{age: number, period: number}} entry @param {boolean} online */
 export const isGone = ({ age, period }, online) => !online || (period > 0 && age > Math.max(GONE_MS, 3 * period));
 
 /**
  * A value and how old it is: of another colour after two periods; after ten seconds, or three periods if these are
  * longer, it is no longer shown as a value.
- * @param {{entry?: {age: number, period: number}, online?: boolean, children: any}} props
+ * @param {{entry?: import("../core/store.js").Value, online?: boolean, children: any}} props
  */
 export function Live({ entry, online = true, children }) {
   const { age = 0, period = 0 } = entry ?? {};
@@ -107,9 +110,7 @@ export function Live({ entry, online = true, children }) {
   useTick(!online || late ? 1000 : 0); // its age is shown
   useLater(online && !late ? lateAt - age + 1 : Infinity);
   if (!entry) return html`<span class="dim">–</span>`;
-  if (isGone(entry, online)) {
-    return html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
-  }
+  if (isGone(entry, online)) return html`<${Gone} age=${age}>${children}<//>`;
   return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 
