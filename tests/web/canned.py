@@ -166,7 +166,9 @@ class CannedServer:
                     await self._send_series(websocket, state, message["ref"])
                 if message["op"] != "echo" and "n" in message:
                     answer = {"op": "refused", "why": state.refused, "g": -1} if state.refused else {"op": "done"}
-                    await self._send(websocket, answer | {"cmd": message["op"], "ref": message["ref"], "n": message["n"]})
+                    await self._send(
+                        websocket, answer | {"cmd": message["op"], "ref": message["ref"], "n": message["n"]}
+                    )
         except (WebSocketDisconnect, RuntimeError):
             pass
         finally:

@@ -496,14 +496,16 @@ def test_a_memory_of_something_else_is_none(stored: str) -> None:
 
 # -- what may be asked
 
+MAINTAINER = "Log in as maintainer to use this"
+
 
 @pytest.mark.parametrize(
     ("change", "whys"),
     [
-        ("", ["", "", "Log in as maintainer to use this"]),
+        ("", ["", "", MAINTAINER]),
         ("page.connection.may = () => true", ["", "", ""]),
-        ("page.connection.may = () => false", ["Log in as driver to use this"] * 2 + ["Log in as maintainer to use this"]),
-        ('values[ref]["web/liveness"].online = false', ["", "goob is silent", "Log in as maintainer to use this"]),
+        ("page.connection.may = () => false", ["Log in as driver to use this"] * 2 + [MAINTAINER]),
+        ('values[ref]["web/liveness"].online = false', ["", "goob is silent", MAINTAINER]),
         ('values[""]["web/broker"].problem = "x"', ["The server cannot reach the broker"] * 3),
         ("page.connection.isOpen = false", ["No connection to the server"] * 3),
     ],
@@ -528,7 +530,14 @@ def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> Non
 
 @pytest.mark.parametrize(
     ("age", "period", "online", "gone"),
-    [(9, 1, True, False), (11, 1, True, True), (11, 5, True, False), (16, 5, True, True), (99, 0, True, False), (0, 1, False, True)],
+    [
+        (9, 1, True, False),
+        (11, 1, True, True),
+        (11, 5, True, False),
+        (16, 5, True, True),
+        (99, 0, True, False),
+        (0, 1, False, True),
+    ],
 )
 def test_a_value_is_gone(age: float, period: float, online: bool, gone: bool) -> None:
     steps = f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});"
