@@ -494,7 +494,7 @@ def script(now: int, **more: Any) -> Value:
     )
 
 
-def playback(**more: Any) -> Callable[[int], Value]:
+def clip(**more: Any) -> Callable[[int], Value]:
     return at(GOOB, "soundboard-status", {"playing": False, "file": None, "error": None, "timestamp": 1.0} | more, 2000)
 
 
@@ -503,7 +503,7 @@ ASKED = changed(
     asked(),
     at(GOOB, "soundboard-files", CLIPS, 9000),
     at(GOOB, "autonomy-files", SCRIPTS, 9000),
-    playback(),
+    clip(),
     at(GOOB, "autonomy-status", {"running": False, "timestamp": 1.0, "error": None}, 9000),
 )
 NOT_ARBITRATED = asked(drive={"available": True, "controls": True})
@@ -511,7 +511,7 @@ STATES |= {
     "asked": State(GOOB_PATH, changed(ASKED, MINE), LIVE),
     "asked-busy": State(
         GOOB_PATH,
-        changed(ASKED, MINE, lambda now: script(now, overridden=True), playback(playing=True, file="speech/number 3.wav")),
+        changed(ASKED, MINE, lambda now: script(now, overridden=True), clip(playing=True, file="speech/number 3.wav")),
         LIVE,
     ),
     "asked-failed": State(
@@ -524,7 +524,7 @@ STATES |= {
                 "autonomy-status",
                 {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"},
             ),
-            playback(error="the loudspeaker is busy (talk-back plays)"),
+            clip(error="the loudspeaker is busy (talk-back plays)"),
         ),
         LIVE,
     ),

@@ -84,5 +84,5 @@ def test_the_picture_outlives_what_belongs_to_it(browser: Browser):
         )
         opened.page.goto(canned.url + STATES["driving"].path)
         assert opened.until(lambda: opened.page.locator(".failed").count() == 2)
-        assert opened.page.locator(".canvas canvas").is_visible()
+        assert opened.until(lambda: opened.page.locator(".canvas canvas").is_visible())
         assert opened.test("video").is_enabled()
