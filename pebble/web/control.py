@@ -219,7 +219,7 @@ class Control:
         if not self._server.broker.publish(message.topic, message.payload, retain=message.retain, qos=message.qos):
             self._refuse(op, "The server cannot reach the broker")
             return
-        self._post(m.Done(cmd=_tag(op), ref=op.ref))
+        self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
         if not isinstance(op, m.LightsOp | m.SoundboardOp):
             self._audit(_tag(op), op.ref, detail=_detail(op))
 
@@ -307,7 +307,8 @@ class Control:
         return False
 
     def _refuse(self, op: m.FromPage, why: str) -> None:
-        self._post(m.Refused(cmd=_tag(op), ref=getattr(op, "ref", ""), why=why, g=getattr(op, "g", -1)))
+        g = op.g if isinstance(op, m.DriveOp) else -1  # lights have a g, too
+        self._post(m.Refused(cmd=_tag(op), ref=getattr(op, "ref", ""), why=why, g=g, n=getattr(op, "n", 0)))
 
     def _audit(self, what: str, ref: str, detail: str = "") -> None:
         client = self._websocket.client
@@ -402,4 +403,4 @@ def _tag(op: m.FromPage) -> str:
 
 def _detail(op: m.RobotOp) -> str:
     fields = msgspec.to_builtins(op)
-    return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in ("op", "ref"))[:200]
+    return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in ("op", "ref", "n"))[:200]

@@ -135,7 +135,13 @@ class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
     source: Ref
 
 
-class LightsOp(_FromPage, frozen=True, kw_only=True, tag="lights"):
+class _Asked(_FromPage, frozen=True, kw_only=True):
+    """What is asked of a robot; it is answered with Done or Refused."""
+
+    n: Number = 0  # of the page, growing; the answer carries it
+
+
+class LightsOp(_Asked, frozen=True, kw_only=True, tag="lights"):
     """A colour; with ``period`` (seconds) it fades in and out. Black is off."""
 
     ref: Ref
@@ -145,7 +151,7 @@ class LightsOp(_FromPage, frozen=True, kw_only=True, tag="lights"):
     period: Annotated[float, Meta(ge=0.05, le=600)] | None = None
 
 
-class SoundboardOp(_FromPage, frozen=True, kw_only=True, tag="soundboard"):
+class SoundboardOp(_Asked, frozen=True, kw_only=True, tag="soundboard"):
     """Play one of the robot's clips, once or until it is stopped; "" stops."""
 
     ref: Ref
@@ -153,7 +159,7 @@ class SoundboardOp(_FromPage, frozen=True, kw_only=True, tag="soundboard"):
     repeat: bool = False
 
 
-class AutonomyOp(_FromPage, frozen=True, kw_only=True, tag="autonomy"):
+class AutonomyOp(_Asked, frozen=True, kw_only=True, tag="autonomy"):
     """Start one of the robot's scripts; "" stops."""
 
     ref: Ref
@@ -161,7 +167,7 @@ class AutonomyOp(_FromPage, frozen=True, kw_only=True, tag="autonomy"):
     config: Annotated[dict[str, str | float | int | bool | None], Meta(max_length=200)] = {}
 
 
-class OutletOp(_FromPage, frozen=True, kw_only=True, tag="outlet"):
+class OutletOp(_Asked, frozen=True, kw_only=True, tag="outlet"):
     """Switch one of the component's outlets."""
 
     ref: Ref
@@ -169,7 +175,7 @@ class OutletOp(_FromPage, frozen=True, kw_only=True, tag="outlet"):
     on: bool
 
 
-class McuOp(_FromPage, frozen=True, kw_only=True, tag="mcu"):
+class McuOp(_Asked, frozen=True, kw_only=True, tag="mcu"):
     """A command to a self-describing MCU, with the fields of its manifest."""
 
     ref: Ref
@@ -178,14 +184,14 @@ class McuOp(_FromPage, frozen=True, kw_only=True, tag="mcu"):
     value: Annotated[dict[str, bool | int | float], Meta(max_length=64)]
 
 
-class ActionOp(_FromPage, frozen=True, kw_only=True, tag="action"):
+class ActionOp(_Asked, frozen=True, kw_only=True, tag="action"):
     """What the robot does once, and does not acknowledge."""
 
     ref: Ref
     name: Literal["reboot", "service-restart", "git-pull"]
 
 
-class FlagOp(_FromPage, frozen=True, kw_only=True, tag="flag"):
+class FlagOp(_Asked, frozen=True, kw_only=True, tag="flag"):
     """A switch whose last position the broker remembers."""
 
     ref: Ref
@@ -253,19 +259,21 @@ class Logs(_ToPage, frozen=True, kw_only=True, tag="logs"):
 
 
 class Refused(_ToPage, frozen=True, kw_only=True, tag="refused"):
-    """Something was not done. ``g``: the gesture that is over, if it was a drive command."""
+    """Something was not done. ``g``: the gesture that is over, if it was a drive command. ``n``: of the command."""
 
     cmd: str
     ref: str
     why: str  # for people
     g: int = -1
+    n: int = 0
 
 
 class Done(_ToPage, frozen=True, kw_only=True, tag="done"):
-    """A command was handed to the broker. Whether the robot obeys is seen in its own states."""
+    """A command, the one with ``n``, was handed to the broker. Whether the robot obeys is seen in its own states."""
 
     cmd: str
     ref: str
+    n: int = 0
 
 
 class Series(_ToPage, frozen=True, kw_only=True, tag="series"):

@@ -58,6 +58,7 @@ class State:
     silent: bool = False  # the server answers nothing any more once everything is shown
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
     series: Callable[[], dict[tuple[str, str], list[Any]]] = dict  # points of messages.Series, by component and metric
+    refused: str = ""  # why nothing that is asked of a robot is done
     frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
@@ -109,8 +110,9 @@ class CannedServer:
         self.posted.clear()
 
     def sent(self, op: str) -> list[dict[str, Any]]:
-        """What pages sent of one kind."""
-        return [message for message in list(self.received) if message["op"] == op]
+        """What pages sent of one kind, without the numbers of commands."""
+        messages = [message for message in list(self.received) if message["op"] == op]
+        return [{name: value for name, value in message.items() if name != "n"} for message in messages]
 
     # -- http
 
@@ -162,6 +164,11 @@ class CannedServer:
                     await self._send(websocket, logs)
                 if message["op"] == "watch" and message.get("series"):
                     await self._send_series(websocket, state, message["ref"])
+                if message["op"] != "echo" and "n" in message:
+                    answer = {"op": "refused", "why": state.refused, "g": -1} if state.refused else {"op": "done"}
+                    await self._send(
+                        websocket, answer | {"cmd": message["op"], "ref": message["ref"], "n": message["n"]}
+                    )
         except (WebSocketDisconnect, RuntimeError):
             pass
         finally:

@@ -28,8 +28,10 @@ const values = {
   },
 };
 const sent = [];
+const followers = new Set();
+const onChange = (fn) => { followers.add(fn); return () => followers.delete(fn); };
 const page = {
-  connection: { isOpen: true, may: (right) => right === "drive" },
+  connection: { isOpen: true, may: (right) => right === "drive", answers: new Map(), onChange },
   store: { get: (at, metric) => (metric in (values[at] ?? {}) ? { value: values[at][metric] } : undefined) },
   commands: {
     setLights: (_ref, colour) => sent.push(colour),
@@ -104,6 +106,50 @@ def test_a_flash_ends_in_what_was_before(before: str, after: str) -> None:
     one.ask(page, {{ mode: "{before}" }});
     result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref), one.mode];"""
     assert lights(steps) == ["", "flash", "", after]
+
+
+_ANSWER = """
+const answer = (n, op) => { page.connection.answers.set(n, { op, n }); [...followers].forEach((fn) => fn()); };
+const one = lightsOf(ref);
+const lit = () => [one.mode, one.colour];
+"""
+
+
+def test_lights_that_were_refused_are_as_before() -> None:
+    steps = """
+    one.ask(page, { mode: "solid", colour: "#0000ff" });
+    answer(1, "done");
+    one.pacer.calledAt = -Infinity;
+    result = [toggleFlash(page, ref), lit()];
+    answer(2, "refused");
+    result.push(lit(), followers.size);
+    one.pacer.calledAt = -Infinity;
+    page.commands.setLights = () => 0;
+    one.ask(page, { mode: "off" });
+    result.push(lit());"""
+    blue = ["solid", "#0000ff"]
+    assert lights(_ANSWER + steps) == ["", ["flash", "#0000ff"], blue, 0, blue]
+
+
+def test_a_refusal_does_not_undo_what_was_asked_after_it() -> None:
+    steps = """
+    one.ask(page, { mode: "solid" });
+    one.pacer.calledAt = -Infinity;
+    one.ask(page, { mode: "off" });
+    answer(1, "refused");
+    result = [lit()[0]];
+    answer(2, "done");
+    result.push(lit()[0], followers.size);"""
+    assert lights(_ANSWER + steps) == ["off", "off", 0]
+
+
+def test_a_flash_of_a_silent_robot_can_be_switched_off() -> None:
+    steps = """
+    const one = lightsOf(ref);
+    one.ask(page, { mode: "flash" });
+    values[ref]["web/liveness"].online = false;
+    result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];"""
+    assert lights(steps) == ["", "off", "goob is silent"]
 
 
 @pytest.mark.parametrize(
@@ -446,6 +492,56 @@ def test_the_memory_of_forms_is_bounded() -> None:
 def test_a_memory_of_something_else_is_none(stored: str) -> None:
     steps = f"{_STORED} stored.set('pebble forms', {json.dumps(stored)});"
     assert forms(f"{steps} result = [texts(remembered('goob', 'a')), lastScript('goob')];") == [{}, ""]
+
+
+# -- what may be asked
+
+MAINTAINER = "Log in as maintainer to use this"
+
+
+@pytest.mark.parametrize(
+    ("change", "whys"),
+    [
+        ("", ["", "", MAINTAINER]),
+        ("page.connection.may = () => true", ["", "", ""]),
+        ("page.connection.may = () => false", ["Log in as driver to use this"] * 2 + [MAINTAINER]),
+        ('values[ref]["web/liveness"].online = false', ["", "goob is silent", MAINTAINER]),
+        ('values[""]["web/broker"].problem = "x"', ["The server cannot reach the broker"] * 3),
+        ("page.connection.isOpen = false", ["No connection to the server"] * 3),
+    ],
+)
+def test_what_ends_something_may_be_asked_of_a_silent_robot(change: str, whys: list[str]) -> None:
+    steps = f'{change}; result = [whyNotEnd(page), whyNot(page, ref), whyNot(page, ref, "", "system")];'
+    assert run("../ui/why-not.js", "whyNot, whyNotEnd", _PAGE + steps) == whys
+
+
+def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> None:
+    steps = """
+    const connection = new Connection("v");
+    const answer = (n, op) => connection.answered({ op, cmd: "outlet", ref: "a", n, why: "no" });
+    answer(1, "refused");
+    answer(2, "done");
+    result = [connection.answers.get(1).op, connection.answers.get(2).op];
+    for (let n = 3; n <= 500; n++) answer(n, "done");
+    answer(0, "refused");
+    result.push(connection.answers.size, connection.answers.has(500), connection.answers.has(300));"""
+    assert run("../ui/models.js", "Connection", steps) == ["refused", "done", 200, True, False]
+
+
+@pytest.mark.parametrize(
+    ("age", "period", "online", "gone"),
+    [
+        (9, 1, True, False),
+        (11, 1, True, True),
+        (11, 5, True, False),
+        (16, 5, True, True),
+        (99, 0, True, False),
+        (0, 1, False, True),
+    ],
+)
+def test_a_value_is_gone(age: float, period: float, online: bool, gone: bool) -> None:
+    steps = f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});"
+    assert run("../ui/parts.js", "isGone", steps) is gone
 
 
 # -- scripts that run

@@ -47,7 +47,7 @@ def test_without_the_lease_nothing_moves(page, robot):
     page.drive(robot.base, 1, z=0.5)
     assert until(lambda: page.refused)
     assert page.refused[0] == {
-        "op": "refused", "cmd": "drive", "ref": robot.base, "why": "Take control to drive", "g": 1,
+        "op": "refused", "cmd": "drive", "ref": robot.base, "why": "Take control to drive", "g": 1, "n": 0,
     }  # fmt: skip
     assert robot.drives() == []
 

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser
 
 from tests.web.browser import Tab, tab
 from tests.web.canned import CannedServer, State, Value, serving
-from tests.web.states import GOOB, STATES, at, changed, devices, outlet
+from tests.web.states import GOOB, STATES, at, changed, devices, liveness, outlet
 
 O2 = "outlets/o2/status"
 
@@ -79,13 +79,39 @@ def test_what_was_asked_is_shown_until_the_outlet_reports_it(server: CannedServe
         assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [True, False])
 
 
+def test_a_refusal_stands_at_what_was_asked(server: CannedServer, browser: Browser) -> None:
+    server.show(replace(STATES["devices"], refused="No, why"))
+    with tab(browser, server.url + server.state.path) as opened:
+        opened.test("outlet-o2").click()
+        card = opened.page.locator('[data-card="outlets"]')
+        assert opened.until(lambda: card.get_by_text("not done: No, why").count() == 1)
+        assert "not done" in opened.page.locator("li.outlet", has=opened.test("outlet-o2")).inner_text()
+        assert opened.test("outlet-asked-o2").count() == 0
+        form = opened.test("mcu-in-lamp")
+        form.locator('[data-test="field-level"]').fill("1")
+        opened.test("send-lamp").click()
+        assert opened.until(lambda: "not done: No, why" in form.inner_text())
+        assert "not done" not in opened.test("mcu-in-arm").inner_text()
+
+
+def test_what_is_on_can_be_switched_off_while_the_robot_is_silent(server: CannedServer, browser: Browser) -> None:
+    silent = at(GOOB, "web/liveness", liveness(online=False, silent_s=9.0, latency_ms=None))
+    server.show(with_values(silent))
+    with tab(browser, server.url + server.state.path) as opened:
+        assert opened.until(lambda: opened.test("outlet-o2").is_disabled())
+        assert reason(opened, "outlet-o2") == "goob is silent"
+        assert opened.test("outlet-state-o1").inner_text() == "was on"
+        opened.test("outlet-o1").click()
+        assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [False])
+
+
 def test_a_viewer_may_look(server: CannedServer, browser: Browser) -> None:
     server.show(STATES["devices-viewer"])
     with tab(browser, server.url + server.state.path) as opened:
         assert opened.until(lambda: opened.test("outlet-o1").is_disabled())
-        assert reason(opened, "outlet-o1") == "Log in as driver to switch outlets"
+        assert reason(opened, "outlet-o1") == "Log in as driver to use this"
         assert opened.test("send-lamp").is_disabled()
-        assert reason(opened, "send-lamp") == "Log in as driver to send commands"
+        assert reason(opened, "send-lamp") == "Log in as driver to use this"
 
 
 # -- microcontrollers
@@ -109,7 +135,7 @@ def test_a_form_sends_exactly_the_declared_fields_in_their_types(cards: Tab, ser
         head | {"name": "lamp", "value": {"level": 62.5, "on": True}},
         head | {"name": "arm", "value": {"angle": -12, "k": 0.001}},
     ]
-    assert "sent at" in arm.inner_text()
+    assert cards.until(lambda: "sent at" in arm.inner_text())
 
 
 def test_values_have_their_unit_and_a_line_of_the_last_minute(cards: Tab) -> None:

@@ -15,7 +15,7 @@ _MODULES = {
     "ui/lines.js": "Lines",
     "ui/outlets.js": "outletsOf, obstacle",
     "ui/models.js": "Offers",
-    "ui/spark.js": "remember, series",
+    "ui/spark.js": "lastMinute, remember, series",
 }
 
 
@@ -199,7 +199,22 @@ def test_outlets_are_those_that_are_listed_and_those_that_report() -> None:
     ],
 )
 def test_why_an_outlet_cannot_be_switched(name: str, controls: bool, report: dict[str, Any], why: str) -> None:
-    assert run("obstacle(...v)", name, controls, report) == why
+    assert run("obstacle(...v)", name, controls, report, True) == why
+
+
+@pytest.mark.parametrize("report", [{"reachable": False}, {"bound": False}, {"on": True}])
+def test_an_outlet_can_be_switched_off_whatever_it_reports(report: dict[str, Any]) -> None:
+    assert run("obstacle(...v)", "o1", True, report, False) == ""
+
+
+@pytest.mark.parametrize(
+    ("now", "gone", "left"),
+    [(50, False, [0, 10, 40]), (65, False, [10, 40]), (200, False, [40]), (65, True, [10, 40]), (200, True, [])],
+)
+def test_a_sparkline_loses_what_is_older_also_when_nothing_arrives(now: int, gone: bool, left: list[int]) -> None:
+    points = [{"at": 1000 * at} for at in (0, 10, 40)]
+    seen = run("lastMinute(...v).map(({ at }) => at / 1000)", points, 1000 * now, gone)
+    assert seen == left
 
 
 def test_a_sparkline_has_the_last_minute() -> None:

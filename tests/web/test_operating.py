@@ -223,6 +223,17 @@ def test_what_each_role_may_ask(broker, tmp_path: Path, role: str, may: set[str]
         assert until(lambda: robot.topics() == {f"{base}/incoming/flags/{name}" for name in may})
 
 
+def test_an_answer_has_the_number_of_what_was_asked(page, robot) -> None:
+    page.send("outlet", ref=robot.base, outlet="o1", on=True, n=5)
+    page.send("lights", ref="pebble/robots/nobody", g=0.5, n=6)
+    assert until(lambda: page.done and page.refused)
+    assert page.done == [{"op": "done", "cmd": "outlet", "ref": robot.base, "n": 5}]
+    why = "unknown component"
+    assert page.refused == [
+        {"op": "refused", "cmd": "lights", "ref": "pebble/robots/nobody", "why": why, "g": -1, "n": 6}
+    ]
+
+
 def test_an_action_never_goes_to_another_robot(served, broker) -> None:
     base = f"pebble/robots/rig{next(NAMES)}"
     lie = {"system": {"reboot": {"flag_topic": "pebble/robots/other/incoming/flags/reboot"}}}

@@ -86,6 +86,19 @@ def test_markup_has_no_script_and_no_style_of_its_own():
         assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\sstyle=|\son[a-z]+=", markup), path.name
 
 
+def test_style_sheets_that_are_fetched_later_do_not_restyle_each_other():
+    """They stay for good, in the order in which they came: a class alone belongs to one of them."""
+    found: dict[str, set[str]] = {}
+    for path in STATIC.glob("*.css"):
+        if path.name in ("app.css", "login.css"):
+            continue
+        rules = re.findall(r"([^{}]+)\{", re.sub(r"/\*.*?\*/", "", path.read_text(), flags=re.DOTALL))
+        for selector in ",".join(rules).split(","):
+            if name := re.fullmatch(r"\s*[a-z]*\.([\w-]+)\s*", selector):
+                found.setdefault(name[1], set()).add(path.name)
+    assert {name: sheets for name, sheets in found.items() if len(sheets) > 1} == {}
+
+
 def test_comments_and_indentation_are_left_out():
     code = ['const a = "// no"; // it\'s kept: a quote follows', "b = 1 /* in */ + 2;", "c = `// ${a}`;"]
     source = f"/** What.\n * @param {{string}} a */\n  {code[0]}\n  // gone\n{code[1]} // gone\n{code[2]}\n"

@@ -47,3 +47,42 @@ def test_the_other_screens_are_here_without_a_server(server: CannedServer, brows
         opened.test("why").first.wait_for()
         opened.test("settings").click()
         opened.test("theme-dark").wait_for()
+
+
+def test_only_one_panel_is_open(server: CannedServer, browser: Browser):
+    with tab(browser, server.url + STATES["driving"].path) as opened:
+        opened.test("bell").click()
+        opened.test("panel-notices").wait_for()
+        opened.test("help").click()
+        opened.test("panel-help").wait_for()
+        assert opened.until(lambda: opened.page.locator("dialog").count() == 1)
+        opened.test("bell").click()
+        opened.test("panel-notices").wait_for()
+        assert opened.until(lambda: opened.page.locator("dialog").count() == 1)
+
+
+def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(browser: Browser):
+    with serving(STATES["stopped"]) as stopped, tab(browser, stopped.url + STATES["stopped"].path) as opened:
+        opened.test("reset").click()
+        opened.test("reset-hold").hover()
+        opened.page.evaluate("pebble.pressedAt = performance.now()")
+        opened.page.mouse.down()
+        opened.page.locator(".held").wait_for()
+        opened.page.evaluate("pebble.connection.may = () => false; pebble.connection.changed()")
+        assert opened.until(lambda: opened.page.locator(".held").count() == 0, 0.9)
+        opened.page.evaluate("delete pebble.connection.may; pebble.connection.changed()")
+        assert opened.until("performance.now() - pebble.pressedAt > 1500")
+        assert stopped.sent("estop-reset") == []
+
+
+def test_the_picture_outlives_what_belongs_to_it(browser: Browser):
+    """What a robot reports of its own stream is drawn by a part that is fetched later; here that part fails."""
+    with serving(STATES["driving"]) as canned, tab(browser, "about:blank") as opened:
+        broken = "export const Layer = () => { throw new Error('broken'); }; export const Tools = Layer;"
+        opened.context.route(
+            "**/ui/picture-extras.js", lambda route: route.fulfill(body=broken, content_type="text/javascript")
+        )
+        opened.page.goto(canned.url + STATES["driving"].path)
+        assert opened.until(lambda: opened.page.locator(".failed").count() == 2)
+        assert opened.until(lambda: opened.page.locator(".canvas canvas").is_visible())
+        assert opened.test("video").is_enabled()

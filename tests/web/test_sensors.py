@@ -18,7 +18,7 @@ from playwright.sync_api import Browser
 
 from tests.web.browser import Tab, tab
 from tests.web.canned import CannedServer, State, serving
-from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, at, changed, fleet, with_stream
+from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, at, changed, fleet, liveness, with_stream
 
 #: Counts how often each canvas is drawn: before anything is drawn, it is cleared.
 COUNT = """
@@ -129,6 +129,15 @@ def test_the_newest_values_are_text(sensors: Tab) -> None:
     swatches = sensors.test("plot-touch").locator("svg")
     dashes = swatches.evaluate_all("(all) => all.map((one) => getComputedStyle(one).strokeDasharray)")
     assert len(set(dashes)) == 3
+
+
+def test_the_last_values_of_a_silent_robot_are_old_ones(server: CannedServer, browser: Browser) -> None:
+    silent = at(GOOB, "web/liveness", liveness(online=False, silent_s=9.0, latency_ms=None))
+    with showing(server, browser, replace(SENSORS, values=changed(SENSORS.values, silent), repeated={})) as opened:
+        see(opened, "plot-battery")
+        text = opened.test("plot-battery").locator("li")
+        assert opened.until(lambda: re.fullmatch(r"battery\s+– \(\d+ s ago: 7\.92 V\)", text.inner_text()))
+        assert re.fullmatch(r"– \(\d+ s ago: x .*°\)", opened.test("map-pose").inner_text())
 
 
 def test_only_what_is_seen_is_drawn_and_not_often(sensors: Tab) -> None:

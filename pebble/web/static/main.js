@@ -80,6 +80,9 @@ function sound(services) {
 
 /** Everything that widgets can ask for. */
 function commands(socket, driver, estop) {
+  let asked = 0;
+  /** Of a robot: the number that the answer carries, see Connection.answers; 0: it was not sent. */
+  const ask = (op) => (socket.send({ ...op, n: ++asked }) ? asked : 0);
   return {
     stop: (ref) => {
       driver.interrupt();
@@ -93,17 +96,17 @@ function commands(socket, driver, estop) {
     setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
     setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
     /** @param {string} ref @param {{r: number, g: number, b: number, period?: number}} colour each 0..1; seconds */
-    setLights: (ref, colour) => socket.send({ op: "lights", ref, ...colour }),
-    playSound: (ref, file, repeat = false) => socket.send({ op: "soundboard", ref, file, repeat }),
-    stopSound: (ref) => socket.send({ op: "soundboard", ref, file: "" }),
-    startScript: (ref, file, config) => socket.send({ op: "autonomy", ref, file, config }),
-    stopScript: (ref) => socket.send({ op: "autonomy", ref, file: "" }),
-    switchOutlet: (ref, outlet, on) => socket.send({ op: "outlet", ref, outlet, on }),
-    commandMcu: (ref, uid, name, value) => socket.send({ op: "mcu", ref, uid, name, value }),
+    setLights: (ref, colour) => ask({ op: "lights", ref, ...colour }),
+    playSound: (ref, file, repeat = false) => ask({ op: "soundboard", ref, file, repeat }),
+    stopSound: (ref) => ask({ op: "soundboard", ref, file: "" }),
+    startScript: (ref, file, config) => ask({ op: "autonomy", ref, file, config }),
+    stopScript: (ref) => ask({ op: "autonomy", ref, file: "" }),
+    switchOutlet: (ref, outlet, on) => ask({ op: "outlet", ref, outlet, on }),
+    commandMcu: (ref, uid, name, value) => ask({ op: "mcu", ref, uid, name, value }),
     /** @param {string} ref @param {"reboot" | "service-restart" | "git-pull"} name */
-    act: (ref, name) => socket.send({ op: "action", ref, name }),
+    act: (ref, name) => ask({ op: "action", ref, name }),
     /** @param {string} ref @param {"remote-mirror" | "mqtt-audio" | "mqtt-video"} name @param {boolean} on */
-    setFlag: (ref, name, on) => socket.send({ op: "flag", ref, name, on }),
+    setFlag: (ref, name, on) => ask({ op: "flag", ref, name, on }),
     readLogs: (ref, on, origin = "", after = 0) => socket.send({ op: "read-logs", ref, on, origin, after }),
     /** What others see of who this is, where there is no login; it connects anew. */
     setName(name) {

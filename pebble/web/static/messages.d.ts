@@ -83,6 +83,7 @@ export interface PictureFromOp {
 
 export interface LightsOp {
   op: "lights";
+  n?: number;
   ref: string;
   r?: number;
   g?: number;
@@ -92,6 +93,7 @@ export interface LightsOp {
 
 export interface SoundboardOp {
   op: "soundboard";
+  n?: number;
   ref: string;
   file: string;
   repeat?: boolean;
@@ -99,6 +101,7 @@ export interface SoundboardOp {
 
 export interface AutonomyOp {
   op: "autonomy";
+  n?: number;
   ref: string;
   file: string;
   config?: Record<string, string | number | number | boolean | null>;
@@ -106,6 +109,7 @@ export interface AutonomyOp {
 
 export interface OutletOp {
   op: "outlet";
+  n?: number;
   ref: string;
   outlet: string;
   on: boolean;
@@ -113,6 +117,7 @@ export interface OutletOp {
 
 export interface McuOp {
   op: "mcu";
+  n?: number;
   ref: string;
   uid: string;
   name: string;
@@ -121,12 +126,14 @@ export interface McuOp {
 
 export interface ActionOp {
   op: "action";
+  n?: number;
   ref: string;
   name: "git-pull" | "reboot" | "service-restart";
 }
 
 export interface FlagOp {
   op: "flag";
+  n?: number;
   ref: string;
   name: "mqtt-audio" | "mqtt-video" | "remote-mirror";
   on: boolean;
@@ -173,12 +180,14 @@ export interface Refused {
   ref: string;
   why: string;
   g?: number;
+  n?: number;
 }
 
 export interface Done {
   op: "done";
   cmd: string;
   ref: string;
+  n?: number;
 }
 
 export interface Series {

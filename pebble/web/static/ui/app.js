@@ -54,11 +54,11 @@ export function App() {
     <//>
     <${Boundary} what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
     ${shown &&
-    html`<${Boundary} what="This panel"
+    html`<${Boundary} key=${shown} what="This panel"
       ><${Part} part=${PARTS.panels} shown=${shown} onClose=${() => panels.show("")}
     /><//>`}
     <main id="main" tabindex="-1">
-      <${Boundary} what="This screen">
+      <${Boundary} key=${ref || "fleet"} what="This screen">
         ${ref
           ? html`<${Part}
               part=${PARTS.robot}

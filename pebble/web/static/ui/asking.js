@@ -1,7 +1,6 @@
-// Whether something can be asked of a component besides driving, and what came of it.
+// What came of what was asked of a component.
 
-import { useModel, usePage, useValue } from "./hooks.js";
-import { nameOf } from "./words.js";
+import { useModel, usePage, useRef } from "./hooks.js";
 
 /** What stands between the slashes of a topic; the server refuses any other name. */
 const LEVEL = /^[^/+#\0]{1,64}$/u;
@@ -9,34 +8,24 @@ const LEVEL = /^[^/+#\0]{1,64}$/u;
 /** @param {string} name @returns {boolean} whether a command can carry this name in its topic */
 export const isLevel = (name) => LEVEL.test(name);
 
-const asWhom = (connection) => `${connection.isOpen} ${connection.may("drive")}`;
-
-/**
- * Why nothing can be asked of it now; "" it can.
- * @param {string} at @param {string} what "to switch outlets" @returns {string}
- */
-export function useWhyNot(at, what) {
-  const { connection } = usePage();
-  useModel(connection, asWhom);
-  const broker = useValue("", "web/broker");
-  const liveness = useValue(at, "web/liveness");
-  if (!connection.isOpen) return "No connection to the server";
-  if (broker?.connected === false) return "The server cannot reach the broker";
-  if (!connection.may("drive")) return `Log in as driver ${what}`;
-  if (liveness?.online === false) return `${nameOf(at)} is silent`;
-  return "";
-}
-
 const answersOf = (connection) => connection.answers;
 
+/** @typedef {{n?: number, op: "" | "asked" | "done" | "refused", why?: string}} Progress */
+
+/** @type {Progress} */
+const NONE = { op: "" };
+/** @type {Progress} */
+const UNSENT = { op: "refused", why: "no connection to the server" };
+
 /**
- * Why the server has not passed on what was asked; "" it has, as far as is known.
- * @param {string} at @param {string} cmd "outlet" @param {{answer: unknown} | null} asked ``answer``: the last one then
- * @returns {string}
+ * What came of a command so far: "asked" until the server has answered.
+ * @param {number | undefined} n its number; 0: it was not sent; undefined: there is none @returns {Progress}
  */
-export function useRefusal(at, cmd, asked) {
+export function useAnswer(n) {
   const { connection } = usePage();
   useModel(connection, answersOf);
-  const answer = connection.answerTo(cmd, at);
-  return asked !== null && answer !== asked.answer && answer?.op === "refused" ? answer.why : "";
+  const last = useRef(NONE); // the connection remembers only the newest answers
+  if (!n) return n === 0 ? UNSENT : NONE;
+  last.current = connection.answers.get(n) ?? (last.current.n === n ? last.current : { n, op: "asked" });
+  return last.current;
 }

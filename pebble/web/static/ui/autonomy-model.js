@@ -51,16 +51,6 @@ export class Since {
   }
 }
 
-/** @type {Map<string, Since>} */
-const all = new Map();
-
-/** @param {string} ref @returns {Since} */
-export function sinceOf(ref) {
-  let since = all.get(ref);
-  if (!since) all.set(ref, (since = new Since()));
-  return since;
-}
-
 /**
  * Who moves the robot by hand now, and whether scripts give way there: then one may be started, and waits.
  * @param {any} page its services @param {string} ref @returns {{by: string, waits: boolean}} by "bob is"; "" nobody

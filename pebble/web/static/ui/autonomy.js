@@ -1,9 +1,10 @@
 // The scripts of a robot: which one runs, and a form to start one.
 
-import { handDriven, sinceOf, statusOf, whyNotStarted } from "./autonomy-model.js";
+import { useAnswer } from "./asking.js";
+import { Since, handDriven, statusOf, whyNotStarted } from "./autonomy-model.js";
 import { filled, lastScript, remember, remembered, scripts, whyNotSent } from "./form-model.js";
 import { Form } from "./form.js";
-import { html, useMetric, useState, useTick, useValue } from "./hooks.js";
+import { html, useMetric, useOnline, useState, useTick, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
 import { useReasons, whyNotEnd } from "./why-not.js";
 import { clockTime, nameOf, plain } from "./words.js";
@@ -47,14 +48,15 @@ export function Autonomy({ at }) {
 function Running({ at, page, entry, status, script }) {
   const why = whyNotEnd(page);
   const label = (key) => script?.fields.find((one) => one.key === key)?.label ?? key;
-  if (entry) sinceOf(at).update(status, entry.at);
-  const past = page.store.get(at, "web/liveness")?.value.online === false || !page.connection.isOpen;
+  const [seen] = useState(() => new Since()); // what runs while the card is closed may be another run
+  if (entry) seen.update(status, entry.at);
+  const past = !useOnline(at);
   return html`<div class="ask-row ask-now">
       <p role="status" data-test="script-state">
         ${status.running
           ? html`<b>${past ? "○" : "●"} ${plain(status.file)}</b>
               ${status.waits ? " waits: a person drives" : past ? " ran when it was last seen" : " runs"},
-              ${" "}${since(sinceOf(at))}`
+              ${" "}${since(seen)}`
           : html`<span class="dim">No script runs.</span>`}
       </p>
       <button
@@ -138,13 +140,14 @@ function Starter({ at, page, entry, status, script }) {
 }
 
 function StartButton({ at, page, entry, why, note, config, file, children }) {
-  const [asked, setAsked] = useState({ at: -Infinity, of: 0 });
-  const isAsked = Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
+  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
+  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
   useTick(isAsked ? 1000 : 0);
   const start = () => {
-    if (!page.commands.startScript(at, file, config)) return;
-    remember(at, file, remembered(at, file)); // it is the last one now
-    setAsked({ at: Date.now(), of: entry?.receivedAt });
+    const n = page.commands.startScript(at, file, config);
+    if (n) remember(at, file, remembered(at, file)); // it is the last one now
+    setAsked({ at: Date.now(), of: entry?.receivedAt, n });
   };
   return html`<button
       type="button"
@@ -156,7 +159,15 @@ function StartButton({ at, page, entry, why, note, config, file, children }) {
     >
       <${Icon} name="play" />${children}
     </button>
-    <span role="status" class="dim" data-test="asked">${isAsked ? `${nameOf(at)} was asked to start it` : ""}</span>`;
+    <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
+      >${isAsked && startedWords(answer, nameOf(at))}</span
+    >`;
+}
+
+/** @param {import("./asking.js").Progress} answer @param {string} name */
+function startedWords({ op, why }, name) {
+  if (op === "refused") return `not done: ${why}`;
+  return op === "done" ? `${name} was asked to start it` : "asking…";
 }
 
 function startWords({ running, file }, script) {

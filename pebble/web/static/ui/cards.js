@@ -105,7 +105,7 @@ export const CARDS = [
     icon: "power",
     tab: "more",
     wants: (offers) => offers.has("system"),
-    part: styled(async () => (await import("./system.js")).System, "system.css"),
+    part: styled(async () => (await import("./system.js")).System, "system.css", "panels.css"),
   },
   {
     id: "values",

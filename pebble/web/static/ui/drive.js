@@ -1,6 +1,6 @@
 // Driving: who may, why not, the stick, and how fast.
 
-import { html, useCalm, useModel, usePage, useValue } from "./hooks.js";
+import { html, styled, useCalm, useModel, usePage, useValue } from "./hooks.js";
 import { Card, HoldButton, Icon, Part } from "./parts.js";
 import { Stick } from "./stick.js";
 import { driverName, nameOf } from "./words.js";
@@ -16,7 +16,7 @@ export function DriveCard({ at }) {
 }
 
 const MORE = {
-  keyHints: async () => (await import("./key-hints.js")).KeyHints,
+  keyHints: styled(async () => (await import("./key-hints.js")).KeyHints, "panels.css"),
   settings: async () => (await import("./drive-settings.js")).DriveSettings,
 };
 

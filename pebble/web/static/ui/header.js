@@ -1,6 +1,6 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
-import { Boundary, html, styled, useMetric, useModel, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
+import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
 import { Route } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
@@ -16,7 +16,7 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     ${at && wide && html`<${Vital} at=${at} />`}
     <div class="top-space"></div>
     ${wide && html`<${ConnectionState} />`}
-    <${Boundary} what="Notices"><${Notices} wide=${wide} panel=${panel} onPanel=${onPanel} /><//>
+    <${Boundary} what="Notices"><${Notices} wide=${wide} /><//>
     ${layout === "immersive" &&
     html`<button
         type="button"
@@ -98,8 +98,9 @@ function Picker({ at }) {
 }
 
 function Volts({ at }) {
-  const level = useValue(at, "charging-level");
-  return level ? html`<span class="volts">${battery(level)}</span>` : null;
+  const level = useMetric(at, "charging-level");
+  const online = useOnline(at);
+  return level ? html`<span class="volts"><${Live} entry=${level} online=${online}>${battery(level.value)}<//></span>` : null;
 }
 
 /** Whether a component is there, and how late its heartbeats are. @param {{at: string}} props */
@@ -124,11 +125,10 @@ export function Liveness({ at }) {
 
 function Vital({ at }) {
   const { connection } = usePage();
-  useModel(connection);
   const level = useMetric(at, "charging-level");
   const charging = useValue(at, "charging-status");
   const view = useValue(at, "web/driver");
-  const online = useValue(at, "web/liveness")?.online !== false && connection.isOpen;
+  const online = useOnline(at);
   return html`<div class="vital">
     ${level &&
     html`<span class="chip"
@@ -154,7 +154,7 @@ function ConnectionState() {
   return html`<span class=${`chip plain ${socket.roundTripMs > 300 ? "late" : ""}`}>connected${round}</span>`;
 }
 
-const BELL = styled(async () => (await import("./notices.js")).Bell, "notices.css");
+const BELL = styled(async () => (await import("./notices.js")).Bell, "notices.css", "panels.css");
 
 /** Fetched later. Where there is little room only their number is shown, with the settings. */
 function Notices(props) {

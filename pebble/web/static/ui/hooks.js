@@ -75,6 +75,15 @@ export function useModel(model, pick) {
   return model;
 }
 
+const openness = (connection) => connection.isOpen;
+
+/** @param {string} ref @returns {boolean} whether what was received of it last may still be so */
+export function useOnline(ref) {
+  const { connection } = usePage();
+  useModel(connection, openness);
+  return useValue(ref, "web/liveness")?.online !== false && connection.isOpen;
+}
+
 /** Draw again every ``ms``, for ages; 0: never. @param {number} ms */
 export function useTick(ms) {
   const redraw = useRedraw();

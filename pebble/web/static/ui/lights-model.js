@@ -1,7 +1,7 @@
 // The lights of each component, as this browser asked for them last: no robot reports its lights.
 
 import { Model, read, write } from "./models.js";
-import { sectionOf, whyNot } from "./why-not.js";
+import { sectionOf, whyNot, whyNotEnd } from "./why-not.js";
 import { nameOf } from "./words.js";
 
 export const SHORTEST_S = 0.05;
@@ -56,35 +56,60 @@ export class Lights extends Model {
     /** @type {Mode} what a flash returns to */
     this.steady = stored.steady === "solid" ? "solid" : "off";
     this.pacer = new Pacer(STEP_MS);
+    this.passed = this.state; // what the server has passed on last
+    this.n = 0; // of the newest command
+  }
+
+  get state() {
+    const { colour, mode, steady } = this;
+    return { colour, period: this.period, mode, steady };
   }
 
   /**
    * Ask for this; in quick succession at most five times a second, and always for the newest.
    * @param {any} page its services @param {{colour?: string, period?: number, mode?: Mode}} change
    */
-  ask({ store, commands }, { colour = this.colour, period: seconds = this.period, mode }) {
+  ask(page, { colour = this.colour, period: seconds = this.period, mode }) {
     if (COLOUR.test(colour)) this.colour = colour;
     this.period = period(seconds);
     this.mode = mode ?? (this.mode === "flash" ? "flash" : "solid");
     if (this.mode !== "flash") this.steady = this.mode;
+    this.pacer.call(() => this.send(page));
+    this.changed();
+  }
+
+  /** What is refused was not asked: it is as it was before. */
+  send({ store, commands, connection }) {
     const { solid } = supported(store.get(this.ref, "capabilities")?.value);
-    this.pacer.call(() => {
-      commands.setLights(this.ref, command(this, solid));
-      this.save();
+    const { state } = this;
+    const n = (this.n = commands.setLights(this.ref, command(this, solid)));
+    if (!n) return this.restore();
+    const end = connection.onChange(() => {
+      const answer = connection.answers.get(n);
+      if (answer?.op === "done") {
+        this.passed = state;
+        this.save();
+      } else if (answer && n === this.n && !this.pacer.waiting) {
+        this.restore();
+      }
+      if (answer || !connection.isOpen) end();
     });
+  }
+
+  restore() {
+    Object.assign(this, this.passed);
     this.changed();
   }
 
   /** For the next flash. @param {number} seconds */
   setPeriod(seconds) {
-    this.period = period(seconds);
+    this.period = this.passed.period = period(seconds);
     this.save();
     this.changed();
   }
 
   save() {
-    const { ref, colour, mode, steady } = this;
-    write(`lights ${ref}`, { colour, period: this.period, mode, steady });
+    write(`lights ${this.ref}`, this.passed);
   }
 }
 
@@ -127,9 +152,9 @@ export function whyNotLights(page, ref, kind) {
  * @param {any} page its services @param {string} ref @returns {string} why not; "" it was asked
  */
 export function toggleFlash(page, ref) {
-  const why = whyNotLights(page, ref, "flash");
-  if (why) return why;
   const lights = lightsOf(ref);
-  lights.ask(page, { mode: lights.mode === "flash" ? lights.steady : "flash" });
-  return "";
+  const mode = lights.mode === "flash" ? lights.steady : "flash";
+  const why = mode === "off" ? whyNotEnd(page) : whyNotLights(page, ref, "flash");
+  if (!why) lights.ask(page, { mode });
+  return why;
 }

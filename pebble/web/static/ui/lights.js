@@ -3,7 +3,7 @@
 import { html, useModel } from "./hooks.js";
 import { LONGEST_S, SHORTEST_S, lightsOf, toggleFlash, whyNotLights } from "./lights-model.js";
 import { Why } from "./parts.js";
-import { useReasons } from "./why-not.js";
+import { useReasons, whyNotEnd } from "./why-not.js";
 import { nameOf } from "./words.js";
 
 const COLOURS = {
@@ -60,7 +60,7 @@ export function Lights({ at }) {
       <${ModeButton} lights=${lights} mode="flash" why=${noFlash} onPress=${() => toggleFlash(page, at)}
         >Flash <kbd aria-hidden="true">F</kbd><//
       >
-      <${ModeButton} lights=${lights} mode="off" why=${off ? why : ""} onPress=${() => mode("off")}>Off<//>
+      <${ModeButton} lights=${lights} mode="off" why=${whyNotEnd(page)} onPress=${() => mode("off")}>Off<//>
       <${Period} page=${page} lights=${lights} why=${noFlash} />
     </div>
     ${why && html`<${Why} id="why-lights">${why}<//>`}

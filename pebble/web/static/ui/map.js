@@ -1,7 +1,8 @@
 // Where a component was and is, by its odometry: a trail over a grid.
 
 import { differs, pieces, poseOf } from "../core/trail.js";
-import { html, useEffect, useMetrics, usePage, useRef, useState, useTick } from "./hooks.js";
+import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "./hooks.js";
+import { Gone, isGone } from "./parts.js";
 import { recorderOf } from "./recorder.js";
 import { number } from "./words.js";
 
@@ -28,9 +29,16 @@ export function Odometry({ at }) {
     return () => own.close();
   }, [series]);
   useTick(WORDS_MS);
+  const online = useOnline(at);
+  const age = page.store.clock() - series.newestAt;
+  const gone = isGone({ age, period: series.gapMs / 3 }, online);
+  if (view.current) view.current.gone = gone;
+  const words = poseWords(series.newest);
   return html`<div class="map">
     <canvas ref=${canvas} class="map-canvas" role="img" aria-label="Trail of the odometry" data-test="map"></canvas>
-    <p class="map-words" data-test="map-pose">${poseWords(series.newest)}</p>
+    <p class="map-words" data-test="map-pose">
+      ${gone && series.newest ? html`<${Gone} age=${age}>${words}<//>` : words}
+    </p>
     <div class="map-tools">
       <button type="button" data-test="map-in" aria-label="Zoom in" onClick=${() => view.current?.zoom(1.5)}>+</button>
       <button type="button" data-test="map-out" aria-label="Zoom out" onClick=${() => view.current?.zoom(1 / 1.5)}>−</button>
@@ -63,6 +71,7 @@ class View {
     /** @type {{x: number, y: number} | null} what is in the middle; null: the component */
     this.middle = null;
     this.drawn = "";
+    this.gone = false; // whether the newest pose is an old one
     this.seen = true;
     this.timer = setInterval(() => this.seen && !document.hidden && this.draw(), STEP_MS);
     this.sizes = new ResizeObserver(() => this.draw());
@@ -145,7 +154,7 @@ class View {
     const colours = ["--line", "--edge", "--accent", "--dim", "--fg"].map((name) => style.getPropertyValue(name).trim());
     const { x, y } = this.centre;
     canvas.dataset.scale = String(this.scale); // for tests
-    const drawn = JSON.stringify([series.version, this.scale, x, y, width, height, pixels, colours]);
+    const drawn = JSON.stringify([series.version, this.gone, this.scale, x, y, width, height, pixels, colours]);
     if (drawn === this.drawn || width < 2) return;
     this.drawn = drawn;
     const [line, edge, accent, dim, ink] = colours;
@@ -163,7 +172,8 @@ class View {
       for (const pose of piece) context.lineTo(...place(pose));
       context.stroke();
     }
-    if (series.newest) drawArrow(context, place(series.newest), series.newest.heading, ink, accent);
+    const fill = this.gone ? dim : accent;
+    if (series.newest) drawArrow(context, place(series.newest), series.newest.heading, ink, fill);
   }
 
   drawGrid(context, { width, height, x, y, line, edge, dim }) {

@@ -1,32 +1,33 @@
 // A section for each self-describing microcontroller: what it measures, and what it takes as commands.
 
-import { isLevel, useRefusal, useWhyNot } from "./asking.js";
-import { html, useMetric, usePage, useRef, useState, useTick, useValue } from "./hooks.js";
+import { isLevel, useAnswer } from "./asking.js";
+import { html, useMetric, useOnline, usePage, useRef, useState, useTick, useValue } from "./hooks.js";
 import { command, fieldOf, range, readManifest, step, text, unsendable } from "./manifest.js";
-import { Icon, Why } from "./parts.js";
+import { Icon, Why, isGone } from "./parts.js";
 import { Spark, remember } from "./spark.js";
+import { useReasons, whyNot } from "./why-not.js";
 import { clockTime, plain, roughly } from "./words.js";
 
 const MOST = 16;
-const GONE_MS = 10_000;
 
 export function Mcus({ at, offers }) {
-  const whyNot = useWhyNot(at, "to send commands");
+  const why = whyNot(useReasons(at), at);
   const uids = offers.metrics
     .map((metric) => /^mcu\/([^/]+)\/describe$/.exec(metric)?.[1])
     .filter(Boolean)
     .sort();
   return html`${uids
     .slice(0, MOST)
-    .map((uid, index) => html`<${Mcu} key=${uid} at=${at} uid=${uid} id=${`mcu-${index}`} whyNot=${whyNot} />`)}
+    .map((uid, index) => html`<${Mcu} key=${uid} at=${at} uid=${uid} id=${`mcu-${index}`} whyNot=${why} />`)}
   ${uids.length > MOST && html`<p class="dim">… ${uids.length - MOST} more</p>`}`;
 }
 
 function Mcu({ at, uid, id, whyNot }) {
   const manifest = readManifest(useValue(at, `mcu/${uid}/describe`));
   const rows = manifest?.interfaces.map((one, index) => {
-    if (one.isOut) return html`<${Readings} key=${index} at=${at} uid=${uid} one=${one} />`;
-    return html`<${Form} key=${index} at=${at} uid=${uid} one=${one} id=${`${id}-${index}`} whyNot=${whyNot} />`;
+    const key = `${one.isOut} ${one.name} ${index}`; // a new manifest must not inherit what was entered
+    if (one.isOut) return html`<${Readings} key=${key} at=${at} uid=${uid} one=${one} />`;
+    return html`<${Form} key=${key} at=${at} uid=${uid} one=${one} id=${`${id}-${index}`} whyNot=${whyNot} />`;
   });
   return html`<section class="mcu" aria-labelledby=${id} data-test=${`mcu-${uid}`}>
     <h3 id=${id}>${text(uid)}</h3>
@@ -48,12 +49,12 @@ function useReading(at, uid, one) {
 function Readings({ at, uid, one }) {
   useTick(1000);
   const entry = useReading(at, uid, one);
-  const online = useValue(at, "web/liveness")?.online !== false;
+  const online = useOnline(at);
   const history = useRef(/** @type {import("./spark.js").Point[]} */ ([]));
   if (entry) remember(history.current, entry);
   const { age = 0, period = 0 } = entry ?? {};
   const repeats = one.kind === "sample" || one.rateHz > 0; // others are sent when they change
-  const gone = Boolean(entry) && (!online || (repeats && period > 0 && age > Math.max(GONE_MS, 3 * period)));
+  const gone = Boolean(entry) && isGone({ age, period: repeats ? period : 0 }, online);
   const late = repeats && period > 0 && age > 2 * period + 250;
   const rate = period > 0 && repeats && !gone ? `${plain(Number((1000 / period).toPrecision(2)))}/s` : "";
   const since = entry ? `${roughly(age)} ago` : one.isPrivate ? "stays on the robot" : "nothing received yet";
@@ -90,15 +91,15 @@ function Reading({ field, value, gone, history }) {
     >
       ${name}${shown}<${Icon} name=${open ? "up" : "plot"} />
     </button>
-    ${open && html`<${Spark} field=${field} history=${history} />`}
+    ${open && html`<${Spark} field=${field} history=${history} gone=${gone} />`}
   </li>`;
 }
 
 function Form({ at, uid, one, id, whyNot }) {
-  const { commands, connection } = usePage();
+  const { commands } = usePage();
   const [entered, enter] = useState(/** @type {Map<string, string | boolean>} */ (new Map()));
-  const [asked, ask] = useState(/** @type {{at: number, answer: unknown} | null} */ (null));
-  const refused = useRefusal(at, "mcu", asked);
+  const [asked, ask] = useState(/** @type {{at: number, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
   const names = isLevel(uid) && isLevel(one.name);
   const own = unsendable(one) || (names ? "" : "its name cannot be part of a topic");
   const { value, problems } = command(one, entered);
@@ -106,8 +107,7 @@ function Form({ at, uid, one, id, whyNot }) {
   const send = (event) => {
     event.preventDefault();
     if (why) return;
-    const answer = connection.answerTo("mcu", at);
-    if (commands.commandMcu(at, uid, one.name, value)) ask({ at: Date.now(), answer });
+    ask({ at: Date.now(), n: commands.commandMcu(at, uid, one.name, value) });
   };
   const change = (name, what) => enter(new Map(entered).set(name, what));
   return html`<form class="mcu-in" data-test=${`mcu-in-${one.name}`} noValidate onSubmit=${send}>
@@ -125,10 +125,14 @@ function Form({ at, uid, one, id, whyNot }) {
     </button>
     ${why && html`<${Why} id=${id}>${why}<//>`}
     ${asked &&
-    html`<span class=${refused ? "bad" : "dim"} role="status"
-      >${refused ? `not done: ${refused}` : `sent at ${clockTime(asked.at)}`}</span
-    >`}
+    html`<span class=${answer.op === "refused" ? "bad" : "dim"} role="status">${askedWords(answer, asked.at)}</span>`}
   </form>`;
+}
+
+/** @param {import("./asking.js").Progress} answer @param {number} at epoch ms */
+function askedWords({ op, why }, at) {
+  if (op === "refused") return `not done: ${why}`;
+  return `${op === "done" ? "sent" : "asked"} at ${clockTime(at)}`;
 }
 
 function Entry({ field, entered, change }) {

@@ -23,6 +23,10 @@ export class Model {
   }
 }
 
+const MOST_ANSWERS = 200;
+
+/** @typedef {import("../messages.js").Done | import("../messages.js").Refused} Answer */
+
 /** The state of the control socket, and what the server answered. */
 export class Connection extends Model {
   constructor(version) {
@@ -32,7 +36,7 @@ export class Connection extends Model {
     this.bye = null;
     /** @type {{text: string, at: number} | null} */
     this.notice = null;
-    /** @type {Map<string, {op: "done" | "refused", why?: string}>} what last came of a command, by command and component */
+    /** @type {Map<number, Answer>} what came of the newest commands, by their numbers */
     this.answers = new Map();
     /** @type {((message: any) => void) | null} */
     this.onLogs = null;
@@ -60,15 +64,11 @@ export class Connection extends Model {
     return this.isOpen && !WATCHES && (this.you?.rights ?? []).includes(right);
   }
 
-  /** @param {{op: any, cmd: string, ref: string, why?: string}} message what the server did or refused to do */
+  /** @param {Answer} message what the server did or refused to do */
   answered(message) {
-    this.answers = new Map(this.answers).set(`${message.cmd} ${message.ref}`, message);
+    if (!message.n) return;
+    this.answers = new Map([...this.answers, /** @type {[number, Answer]} */ ([message.n, message])].slice(-MOST_ANSWERS));
     this.changed();
-  }
-
-  /** @param {string} cmd @param {string} ref */
-  answerTo(cmd, ref) {
-    return this.answers.get(`${cmd} ${ref}`);
   }
 
   /** Show a text for a few seconds. @param {string} text */
@@ -137,6 +137,7 @@ export class Settings extends Model {
     if (this.theme === "light" || this.theme === "dark") root.dataset.theme = this.theme;
     else delete root.dataset.theme;
     root.dataset.side = this.side;
+    root.toggleAttribute("data-watch", WATCHES);
   }
 
   forget(ref, forgotten = true) {

@@ -2,7 +2,6 @@
 
 import { Actions } from "../core/actions.js";
 import { Awake } from "../core/awake.js";
-import { fetchStyle } from "./hooks.js";
 import { WATCHES } from "./models.js";
 import { pads } from "./pads.js";
 
@@ -23,7 +22,6 @@ export function install(page) {
   );
   page.pads = pads;
   driver.mappingOf = (id) => pads.mappingOf(id);
-  fetchStyle("panels.css").catch(() => {}); // key hints and wall screens; the panels fetch it again
   new Wall(page).start();
 }
 
@@ -79,7 +77,6 @@ class Wall {
   }
 
   start() {
-    document.documentElement.toggleAttribute("data-watch", WATCHES);
     setInterval(() => this.check(), CHECK_MS);
     document.addEventListener("visibilitychange", () => this.check());
   }

@@ -119,16 +119,18 @@ function useNotices() {
   return useModel(models.get(page));
 }
 
-/** ``wide``: there is room for a button; else the list is with the settings. ``panel``: the settings are open. */
-export function Bell({ wide, panel, onPanel }) {
+/** ``wide``: there is room for a button; else the list is with the settings. */
+export function Bell({ wide }) {
+  const { panels } = usePage();
+  const { shown } = useModel(panels);
   const { notices } = useNotices();
   const { unread } = notices;
   const [open, show] = useState(false);
   useEffect(() => {
-    if (panel) show(false);
-  }, [panel]);
+    if (shown) show(false);
+  }, [shown]);
   const toggle = () => {
-    if (!open && panel) onPanel();
+    if (!open) panels.show("");
     show(!open);
   };
   return html`<${Announcement} newest=${notices.list[0]} />

@@ -1,8 +1,9 @@
 // Switched sockets: what their station reports of each, and what was asked of it.
 
-import { isLevel, useRefusal, useWhyNot } from "./asking.js";
-import { html, useEffect, useMetric, usePage, useState, useTick, useValue } from "./hooks.js";
+import { isLevel, useAnswer } from "./asking.js";
+import { html, useEffect, useMetric, useOnline, useState, useTick } from "./hooks.js";
 import { Why } from "./parts.js";
+import { useReasons, whyNot, whyNotEnd } from "./why-not.js";
 import { inner, isObject } from "./words.js";
 
 const MOST = 64;
@@ -10,13 +11,14 @@ const LONG = 64; // characters of a name
 const CONFIRMED_MS = 3000;
 
 export function Outlets({ at, offers }) {
-  const whyNot = useWhyNot(at, "to switch outlets");
+  const page = useReasons(at);
+  const why = whyNot(page, at);
   const all = outletsOf(offers);
-  return html`${whyNot && html`<${Why} id="why-outlets">${whyNot}<//>`}
+  return html`${why && html`<${Why} id="why-outlets">${why}<//>`}
     <ul class="outlets">
       ${all
         .slice(0, MOST)
-        .map((one, index) => html`<${Outlet} key=${one.name} ...${one} at=${at} id=${index} whyNot=${whyNot} />`)}
+        .map((one, index) => html`<${Outlet} key=${one.name} ...${one} at=${at} id=${index} page=${page} />`)}
     </ul>
     ${!all.length && html`<p class="dim">No outlet is connected.</p>`}
     ${all.length > MOST && html`<p class="dim">… ${all.length - MOST} more</p>`}`;
@@ -42,38 +44,37 @@ export function outletsOf(offers) {
 }
 
 /**
- * Why this one cannot be switched; "" it can. What is not reported is no obstacle.
- * @param {string} name @param {boolean} controls @param {Record<string, unknown>} report
+ * Why this one cannot be switched; "" it can. What is not reported is no obstacle; to switch off, no report is one.
+ * @param {string} name @param {boolean} controls @param {Record<string, unknown>} report @param {boolean} on
  */
-export function obstacle(name, controls, report) {
+export function obstacle(name, controls, report, on) {
   if (!controls) return "this outlet cannot be switched from here: its robot lists no control";
   if (!isLevel(name)) return "its name cannot be part of a topic";
+  if (!on) return "";
   if (report.bound === false) return "no device is bound to this outlet";
   if (report.reachable === false) return "outlet is unreachable";
   return "";
 }
 
-function Outlet({ at, id, name, controls, whyNot }) {
-  const { commands, connection } = usePage();
+function Outlet({ at, id, name, controls, page }) {
   const payload = useMetric(at, `outlets/${name}/status`)?.value;
-  const online = useValue(at, "web/liveness")?.online !== false;
+  const online = useOnline(at);
   const report = isObject(inner(payload)) ? inner(payload) : {};
-  const [asked, ask] = useState(/** @type {{on: boolean, at: number, answer: unknown} | null} */ (null));
-  const refused = useRefusal(at, "outlet", asked);
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
+  const refused = answer.op === "refused";
   const waits = asked !== null && report.on !== asked.on && !refused;
   useEffect(() => {
     if (asked && report.on === asked.on) ask(null);
   }, [asked, report.on]);
   useTick(waits ? 500 : 0);
   const late = waits && performance.now() - asked.at > CONFIRMED_MS;
-  const own = obstacle(name, controls, report);
   const words = report.on === true ? "on" : report.on === false ? "off" : "unknown";
-  const press = () => {
-    const on = !(waits && !late ? asked.on : report.on === true);
-    const answer = connection.answerTo("outlet", at);
-    if (commands.switchOutlet(at, name, on)) ask({ on, at: performance.now(), answer });
-  };
-  const why = [whyNot && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
+  const on = !(waits && !late ? asked.on : report.on === true); // what the next press asks
+  const own = obstacle(name, controls, report, on);
+  const common = on ? whyNot(page, at) : whyNotEnd(page);
+  const press = () => ask({ on, at: performance.now(), n: page.commands.switchOutlet(at, name, on) });
+  const why = [common && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
   return html`<li class="outlet">
     <span class="outlet-name">
       <b id=${`outlet-${id}`}>${labelOf(payload, name)}</b>
@@ -82,7 +83,7 @@ function Outlet({ at, id, name, controls, whyNot }) {
       html`<span class=${late ? "bad" : "late"} role="status" data-test=${`outlet-asked-${name}`}
         >asked: ${asked.on ? "on" : "off"}${late ? ", not confirmed" : ""}</span
       >`}
-      ${refused && html`<span class="bad" role="status">not done: ${refused}</span>`}
+      ${refused && html`<span class="bad" role="status">not done: ${answer.why}</span>`}
       ${own && html`<${Why} id=${`why-outlet-${id}`}>${own}<//>`}
     </span>
     <button
@@ -93,7 +94,7 @@ function Outlet({ at, id, name, controls, whyNot }) {
       aria-checked=${String(report.on === true)}
       aria-labelledby=${`outlet-${id}`}
       aria-describedby=${why || undefined}
-      disabled=${Boolean(whyNot || own)}
+      disabled=${Boolean(common || own)}
       onClick=${press}
     >
       <span aria-hidden="true"></span>

@@ -40,15 +40,16 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
   const [held, hold] = useState(false);
   const [tapped, setTapped] = useState(false);
   const done = useRef(onHeld);
-  done.current = onHeld;
+  done.current = disabled ? () => {} : onHeld;
   useEffect(() => {
-    if (!held) return undefined;
+    if (disabled) hold(false); // the end of a press on a button that is off is not reported
+    if (!held || disabled) return undefined;
     const timer = setTimeout(() => {
       hold(false);
       done.current();
     }, HOLD_MS);
     return () => clearTimeout(timer);
-  }, [held]);
+  }, [held, disabled]);
   useEffect(() => {
     if (!tapped) return undefined;
     const timer = setTimeout(() => setTapped(false), HINT_MS);
@@ -91,6 +92,12 @@ export function HoldButton({ onHeld, disabled = false, children, className = "",
 /** The reason under a control that is off. */
 export const Why = ({ id, children }) => html`<span class="why" id=${id}>${children}</span>`;
 
+/** What is no longer shown as a value. */
+export const Gone = ({ age, children }) => html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
+
+/** Whether it is too old to be shown as a value. @param {{age: number, period: number}} entry @param {boolean} online */
+export const isGone = ({ age, period }, online) => !online || (period > 0 && age > Math.max(GONE_MS, 3 * period));
+
 /**
  * A value and how old it is: of another colour after two periods; after ten seconds, or three periods if these are
  * longer, it is no longer shown as a value.
@@ -103,9 +110,7 @@ export function Live({ entry, online = true, children }) {
   useTick(!online || late ? 1000 : 0); // its age is shown
   useLater(online && !late ? lateAt - age + 1 : Infinity);
   if (!entry) return html`<span class="dim">–</span>`;
-  if (!online || (period > 0 && age > Math.max(GONE_MS, 3 * period))) {
-    return html`<span class="dim">– <small>(${roughly(age)} ago: ${children})</small></span>`;
-  }
+  if (isGone(entry, online)) return html`<${Gone} age=${age}>${children}<//>`;
   return html`<span class=${late ? "late" : ""}>${children}${late && html` <small>${roughly(age)} old</small>`}</span>`;
 }
 

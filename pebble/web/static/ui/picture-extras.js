@@ -33,7 +33,7 @@ export function Layer({ source }) {
   useEffect(() => {
     if (moved) show(video, driver, "");
   }, [moved]);
-  return html`${switches.isOn(source) && html`<${Overlays} key=${source} source=${source} />`}
+  return html`${switches.isOn(source) && html`<${Overlays} source=${source} />`}
   ${video.stream &&
   html`<iframe
     class="stream"
@@ -134,13 +134,13 @@ export function fileName(source, ms) {
 /** Open the stream that the robot serves by itself, and what to know of it. */
 function Stream({ source, wanted }) {
   const { video, driver } = usePage();
-  const [blocked, block] = useState(false);
+  const [blocked, block] = useState(""); // the address that the page's policy refused
   const address = reported(useValue(source, "status"));
   useEffect(() => {
     const violated = (event) => {
       if (event.effectiveDirective !== "frame-src") return;
+      block(video.stream);
       show(video, driver, "");
-      block(true);
     };
     document.addEventListener("securitypolicyviolation", violated);
     return () => document.removeEventListener("securitypolicyviolation", violated);
@@ -171,7 +171,7 @@ function Stream({ source, wanted }) {
     ${why && html`<${Why} id="why-stream">${why}<//>`}
     ${refused === MIXED &&
     html`<a class="button" href=${address} target="_blank" rel="noopener noreferrer">Open it in another tab</a>`}
-    ${blocked &&
+    ${blocked === address &&
     html`<p class="why" role="status">The robot reports this address only since the page was loaded.</p>
       <button type="button" data-test="reload-stream" onClick=${() => location.reload()}>Reload</button>`}
   </div>`;

@@ -2,9 +2,9 @@
 
 import { numbers } from "../core/series.js";
 import { MOST_ADDED, USUAL, choices, fieldsOf, limitsOf, nameOfLine, restored } from "../core/plot-choices.js";
-import { html, useMetrics, usePage, useState, useTick } from "./hooks.js";
+import { html, useMetrics, useOnline, usePage, useState, useTick } from "./hooks.js";
 import { read, write } from "./models.js";
-import { Icon, Why } from "./parts.js";
+import { Gone, Icon, Why, isGone } from "./parts.js";
 import { Lines } from "./plot.js";
 import { recorderOf } from "./recorder.js";
 import { isObject, number, plain } from "./words.js";
@@ -47,6 +47,10 @@ function Figure({ at, plot, paused, onRemove }) {
   const limits = limitsOf(plot.metric);
   const series = recorderOf(page, at).follow("numbers", plot.metric, numbers, limits);
   useTick(paused ? 0 : WORDS_MS);
+  const online = useOnline(at);
+  const age = page.store.clock() - series.newestAt;
+  const gone = isGone({ age, period: series.gapMs / 3 }, online);
+  const newest = (field) => words(series, field, plot, page.store.get(at, plot.metric)?.value);
   const fields = fieldsOf(plot, series.newest);
   const name = `plot-${plot.id}`;
   const minutes = Math.round(limits.shownMs / 60_000);
@@ -69,8 +73,9 @@ function Figure({ at, plot, paused, onRemove }) {
     <ul class="plot-values">
       ${fields.map(
         (field, index) => html`<li key=${field}>
-          <svg class=${`swatch line-${index}`} viewBox="0 0 34 10" aria-hidden="true"><path d="M1 5h32" /></svg>
-          ${nameOfLine(field, plot)} <b>${words(series, field, plot, page.store.get(at, plot.metric)?.value)}</b>
+          <svg class=${`plot-line line-${index}`} viewBox="0 0 34 10" aria-hidden="true"><path d="M1 5h32" /></svg>
+          ${nameOfLine(field, plot)}${" "}
+          <b>${gone && series.newest ? html`<${Gone} age=${age}>${newest(field)}<//>` : newest(field)}</b>
         </li>`,
       )}
     </ul>

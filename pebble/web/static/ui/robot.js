@@ -1,20 +1,21 @@
 // One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
 
+import { reported } from "../core/stream.js";
 import { CARDS, TABS, VOICE } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
 import { CardView, Offers } from "./models.js";
 import { Card, Icon, Part } from "./parts.js";
 import { NoCamera, PictureSettings, Stage, useVideo } from "./video.js";
-import { inner, nameOf, typeOf } from "./words.js";
+import { nameOf, typeOf } from "./words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
   const offers = new Offers(at, useValue(at, "capabilities"), useMetrics(at));
   const [view] = useState(() => new CardView(at));
   useModel(view);
   const source = useValue(at, "web/picture-from")?.source || at;
-  const status = inner(useValue(at, "status"));
-  const hasVideo = offers.hasVideo || source !== at || Boolean(status?.webrtc_url); // it streams by itself
+  const stream = reported(useValue(at, "status")); // its own
+  const hasVideo = offers.hasVideo || source !== at || stream !== "";
   const known = useKnown(at);
   const video = useVideo(at, hasVideo && known ? source : "");
   const parts = { at, offers, view, video: hasVideo ? video : null, source };

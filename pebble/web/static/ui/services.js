@@ -1,6 +1,6 @@
 // The services of a robot: which are well, which restart, and where their log lines are.
 
-import { html, usePage, useTick, useValue } from "./hooks.js";
+import { html, useOnline, usePage, useTick, useValue } from "./hooks.js";
 import { logViewOf } from "./log-view.js";
 import { inner, isObject, plain, roughly } from "./words.js";
 
@@ -11,6 +11,7 @@ const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", sto
 export function Services({ at, view }) {
   const services = inner(useValue(at, "status"))?.services;
   const times = useValue(at, "web/restarts")?.times ?? {};
+  const online = useOnline(at);
   useTick(5000);
   if (!isObject(services)) return null;
   const names = Object.keys(services);
@@ -23,6 +24,7 @@ export function Services({ at, view }) {
           at=${at}
           view=${view}
           name=${name}
+          online=${online}
           one=${services[name]}
           times=${Object.hasOwn(times, name) ? times[name] : []}
         />`,
@@ -31,7 +33,7 @@ export function Services({ at, view }) {
   </ul>`;
 }
 
-function Service({ at, view, name, one, times }) {
+function Service({ at, view, name, online, one, times }) {
   const { store } = usePage();
   const state = plain(isObject(one) ? one.state : one);
   const bad = state === "failed" || state === "restarting";
@@ -40,10 +42,10 @@ function Service({ at, view, name, one, times }) {
     logViewOf(at).choose({ service: name, rank: 0, search: "" });
     view?.reveal("logs");
   };
-  return html`<li class=${bad ? "bad" : ""} data-test=${`service-${name}`}>
+  return html`<li class=${online ? (bad ? "bad" : "") : "dim"} data-test=${`service-${name}`}>
     <i aria-hidden="true">${Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
     <span class="services-name">${name.replaceAll("_", " ")}</span>
-    <span class="services-state">${state}</span>
+    <span class="services-state">${online ? "" : "was "}${state}</span>
     <button type="button" class="quiet" aria-label=${`Logs of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
       Logs
     </button>

@@ -1,6 +1,6 @@
 // The clips that a robot can play.
 
-import { html, useModel, useValue } from "./hooks.js";
+import { html, useModel, useOnline, useValue } from "./hooks.js";
 import { Icon, Why } from "./parts.js";
 import { clips, grouped, play, playing, repeatLast, soundsOf } from "./sounds-model.js";
 import { useReasons, whyNot, whyNotEnd } from "./why-not.js";
@@ -44,8 +44,7 @@ export function Sounds({ at }) {
 function NowPlaying({ at, page }) {
   const { file, error } = playing(useValue(at, "soundboard-status"));
   const why = whyNotEnd(page);
-  const silent = page.store.get(at, "web/liveness")?.value.online === false;
-  const was = silent || !page.connection.isOpen ? "played when it was last seen" : "plays";
+  const was = useOnline(at) ? "plays" : "played when it was last seen";
   return html`<div class="ask-row ask-now">
       <p role="status" data-test="playing">
         ${file ? html`<b>♪ ${plain(file)}</b> ${was}` : html`<span class="dim">Nothing ${was}.</span>`}
@@ -99,9 +98,10 @@ function Clips({ at, page, sounds, why }) {
     </div>`;
 }
 
-function Clip({ at, page, file, folder, plays, why }) {
+function Clip({ at, page, file, folder, plays, why: whyNotPlay }) {
+  const why = plays ? whyNotEnd(page) : whyNotPlay;
   const press = () => {
-    const problem = plays ? whyNotEnd(page) : play(page, at, file, soundsOf(at).repeat);
+    const problem = why || (plays ? "" : play(page, at, file, soundsOf(at).repeat));
     if (problem) page.connection.show(problem);
     else if (plays) page.commands.stopSound(at);
   };
@@ -110,7 +110,7 @@ function Clip({ at, page, file, folder, plays, why }) {
     class=${`clip ${plays ? "on" : ""}`}
     data-test="clip"
     disabled=${Boolean(why)}
-    aria-describedby=${why ? "why-again" : undefined}
+    aria-describedby=${why ? (plays ? "why-stop-sound" : "why-again") : undefined}
     aria-label=${`${plays ? "Stop" : "Play"} ${plain(file)}`}
     onClick=${press}
   >

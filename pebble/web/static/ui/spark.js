@@ -27,14 +27,21 @@ export function series(history, name) {
     .filter(([, number]) => Number.isFinite(number));
 }
 
-/** @param {{field: import("./manifest.js").Field, history: {current: Point[]}}} props */
-export function Spark({ field, history }) {
+/**
+ * The points of the last minute, and the newest one: unless it is ``gone``, it still holds.
+ * @template {{at: number}} T @param {T[]} points @param {number} now @param {boolean} gone @returns {T[]}
+ */
+export const lastMinute = (points, now, gone) =>
+  points.filter(({ at }, index) => at >= now - SPAN_MS || (!gone && index === points.length - 1));
+
+/** @param {{field: import("./manifest.js").Field, history: {current: Point[]}, gone: boolean}} props */
+export function Spark({ field, history, gone }) {
   const calm = useMedia("(prefers-reduced-motion: reduce)");
   useTick(calm ? CALM_MS : DRAWN_MS);
   const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
-  const points = series(history.current, field.name);
+  const points = series(lastMinute(history.current, performance.now(), gone), field.name);
   useEffect(() => {
-    if (canvas.current) draw(canvas.current, points);
+    if (canvas.current) draw(canvas.current, points, gone);
   });
   const numbers = points.map(([, number]) => number);
   const unit = field.unit && ` ${field.unit}`;
@@ -45,8 +52,8 @@ export function Spark({ field, history }) {
   </div>`;
 }
 
-/** @param {HTMLCanvasElement} canvas @param {[number, number][]} points */
-function draw(canvas, points) {
+/** @param {HTMLCanvasElement} canvas @param {[number, number][]} points @param {boolean} gone */
+function draw(canvas, points, gone) {
   const ratio = devicePixelRatio || 1;
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
   canvas.width = width * ratio;
@@ -64,6 +71,6 @@ function draw(canvas, points) {
   context.lineJoin = "round";
   context.beginPath();
   for (const [at, number] of points) context.lineTo(x(at), y(number));
-  context.lineTo(x(now), y(numbers[numbers.length - 1])); // it holds until the next one
+  if (!gone) context.lineTo(x(now), y(numbers[numbers.length - 1])); // it holds until the next one
   context.stroke();
 }

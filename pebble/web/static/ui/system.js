@@ -1,11 +1,13 @@
 // What can be done to the whole robot: restart, reboot, update; and the flags that allow pictures and sound.
 
 import { Outcome, bootsOf, lacks } from "../core/outcome.js";
+import { useAnswer } from "./asking.js";
 import { html, useEffect, useModel, usePage, useState, useTick, useValue } from "./hooks.js";
 import { logViewOf } from "./log-view.js";
 import { Model } from "./models.js";
 import { Panel } from "./panel.js";
 import { HoldButton, Icon, Why } from "./parts.js";
+import { useReasons, whyNot, whyNotEnd } from "./why-not.js";
 import { clockTime, driverName, nameOf, plain } from "./words.js";
 
 /** @typedef {import("../core/outcome.js").Action} Action */
@@ -36,15 +38,13 @@ const ACTIONS = {
 };
 
 export function System({ at, offers, view }) {
-  const { connection } = usePage();
-  useModel(connection);
+  const page = useReasons(at);
   const [asked, ask] = useState(/** @type {Action | ""} */ (""));
-  const online = useValue(at, "web/liveness")?.online;
   useEffect(() => ask(""), [at]);
   return html`<div class="system">
     <div class="system-actions">
       ${Object.keys(ACTIONS).map((action) => {
-        const why = whyNot(connection, offers, action, at, online);
+        const why = whyNotAct(page, at, offers, action);
         const id = `why-${action}`;
         return html`<div key=${action}>
           <button
@@ -60,25 +60,21 @@ export function System({ at, offers, view }) {
         </div>`;
       })}
     </div>
-    ${asked && html`<${Ask} at=${at} action=${asked} offers=${offers} online=${online} onClose=${() => ask("")} />`}
+    ${asked && html`<${Ask} at=${at} action=${asked} offers=${offers} onClose=${() => ask("")} />`}
     <${LastOutcome} at=${at} view=${view} />
     <${Flags} at=${at} offers=${offers} />
   </div>`;
 }
 
 /** Why an action is off now; "" it is not. */
-function whyNot(connection, offers, action, at, online) {
-  if (!connection.isOpen) return "No connection to the server";
-  if (!connection.may("system")) return "Log in as maintainer to do this";
-  return lacks(action, offers.known ? offers.value : undefined) || (online === false ? `${nameOf(at)} is offline` : "");
-}
+const whyNotAct = (page, at, offers, action) =>
+  whyNot(page, at, "", "system") || lacks(action, offers.known ? offers.value : undefined);
 
-function Ask({ at, action, offers, online, onClose }) {
-  const page = usePage();
-  useModel(page.connection);
+function Ask({ at, action, offers, onClose }) {
+  const page = useReasons(at);
   const name = nameOf(at);
   const { title, effects } = ACTIONS[action];
-  const why = whyNot(page.connection, offers, action, at, online);
+  const why = whyNotAct(page, at, offers, action);
   const held = () => {
     begin(page, at, action);
     onClose();
@@ -117,7 +113,7 @@ class Watch extends Model {
     this.page = page;
     this.ref = ref;
     this.outcome = new Outcome(action, page.store.now(), boots(page.store, ref));
-    this.answer = page.connection.answerTo("action", ref); // the last one before
+    this.n = 0; // of the command
     const see = () => this.see();
     this.ends = [
       page.store.subscribe(ref, "web/liveness", see),
@@ -129,8 +125,8 @@ class Watch extends Model {
 
   see() {
     const { store, connection } = this.page;
-    const answer = connection.answerTo("action", this.ref);
-    if (answer !== this.answer && answer?.op === "refused") this.outcome.refused = String(answer.why);
+    const answer = connection.answers.get(this.n);
+    if (answer?.op === "refused") this.outcome.refused = answer.why;
     const entry = store.get(this.ref, "web/liveness");
     const silent = entry?.value.silent_s;
     this.outcome.see(
@@ -163,7 +159,8 @@ function begin(page, ref, action) {
   watches.get(ref)?.end();
   const watch = new Watch(page, ref, action);
   watches.set(ref, watch);
-  if (!page.commands.act(ref, action)) watch.outcome.refused = "no connection to the server";
+  watch.n = page.commands.act(ref, action);
+  if (!watch.n) watch.outcome.refused = "no connection to the server";
   begun.changed();
 }
 
@@ -173,17 +170,23 @@ function LastOutcome({ at, view }) {
   const watch = watches.get(at);
   useModel(watch ?? NOTHING);
   useTick(watch ? 1000 : 0);
-  if (!watch) return html`<div role="status"></div>`;
-  const { outcome } = watch;
-  const words = outcome.words(store.now(), clockTime);
+  const { seen, waits } = watch ? outcomeWords(watch.outcome, store.now()) : { seen: "", waits: "" };
   const logs = () => {
-    logViewOf(at).choose({ service: "", rank: 0, search: outcome.action });
+    logViewOf(at).choose({ service: "", rank: 0, search: watch?.outcome.action ?? "" });
     view?.reveal("logs");
   };
-  return html`<div class="system-outcome" data-test="outcome">
-    <p><b>${ACTIONS[outcome.action].title}:</b> ${words.join("; ")}</p>
-    <button type="button" data-test="outcome-logs" onClick=${logs}><${Icon} name="list" />Its log lines</button>
+  return html`<div class=${watch ? "system-outcome" : ""} data-test="outcome">
+    <p><span role="status">${seen}</span>${waits && `; ${waits}`}</p>
+    ${watch &&
+    html`<button type="button" data-test="outcome-logs" onClick=${logs}><${Icon} name="list" />Its log lines</button>`}
   </div>`;
+}
+
+/** ``waits`` counts seconds: it is not read aloud. */
+function outcomeWords(outcome, now) {
+  const waits = outcome.refused ? "" : outcome.conclusion(now);
+  const words = outcome.words(now, clockTime).filter((one) => one !== waits);
+  return { seen: html`<b>${ACTIONS[outcome.action].title}:</b> ${words.join("; ")}`, waits };
 }
 
 // -- flags
@@ -210,20 +213,20 @@ function Flags({ at, offers }) {
 }
 
 function Flag({ at, name, title, meaning, value, known }) {
-  const { commands, connection } = usePage();
-  useModel(connection);
-  const [asked, ask] = useState(/** @type {{on: boolean, at: number, was: any} | null} */ (null));
+  const page = useReasons(at);
+  const [asked, ask] = useState(/** @type {{on: boolean, at: number, was: any, n: number} | null} */ (null));
   useEffect(() => {
     // another operator's change may arrive in place of the echo
     if (asked && (value === asked.on || value !== asked.was)) ask(null);
   }, [asked, value]);
   useTick(asked ? 500 : 0);
-  const pending = asked && performance.now() - asked.at < ECHO_MS ? asked : null;
-  const why = flagReason(connection, known);
+  const answer = useAnswer(asked?.n);
+  const isWaiting = asked && answer.op !== "refused" && performance.now() - asked.at < ECHO_MS;
+  const pending = isWaiting ? asked : null;
+  const why = whyNotEnd(page) || (known ? "" : "Not received yet");
   const change = (event) => {
     const on = event.currentTarget.checked;
-    commands.setFlag(at, name, on);
-    ask({ on, at: performance.now(), was: value });
+    ask({ on, at: performance.now(), was: value, n: page.commands.setFlag(at, name, on) });
   };
   const id = `flag-${name}`;
   return html`<div class="flag">
@@ -238,19 +241,14 @@ function Flag({ at, name, title, meaning, value, known }) {
         onChange=${change}
       /><span>${title}</span></label
     >
-    <span class="flag-state" role="status">${flagWords(asked, pending, value)}</span>
+    <span class="flag-state" role="status">${flagWords(asked, pending, value, answer)}</span>
     <${Why} id=${`${id}-why`}>${why || meaning}<//>
   </div>`;
 }
 
-function flagReason(connection, known) {
-  if (!connection.isOpen) return "No connection to the server";
-  if (!connection.may("drive")) return "Log in as driver to change it";
-  return known ? "" : "Not received yet";
-}
-
-function flagWords(asked, pending, value) {
+function flagWords(asked, pending, value, answer) {
   const now = value === true ? "on" : value === false ? "off" : "never set";
   if (pending) return `asked: ${pending.on ? "on" : "off"}…`;
+  if (answer.op === "refused") return `✖ ${now}; not done: ${answer.why}`;
   return asked && asked.on !== value ? `✖ not confirmed: ${now}` : now;
 }

@@ -1,15 +1,13 @@
 // What the component reports of itself, in words and numbers.
 
-import { html, styled, useMetric, useModel, usePage, useTick, useValue } from "./hooks.js";
+import { html, styled, useMetric, useOnline, useTick, useValue } from "./hooks.js";
 import { Live, Part } from "./parts.js";
 import { battery, charging, inner, isObject, number, plain, roughly, span } from "./words.js";
 
 const SERVICES = styled(async () => (await import("./services.js")).Services, "system.css");
 
 export function Telemetry({ at, view }) {
-  const { connection } = usePage();
-  useModel(connection);
-  const online = useValue(at, "web/liveness")?.online !== false && connection.isOpen;
+  const online = useOnline(at);
   return html`<dl class="values">
     <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
     <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>

@@ -2,6 +2,7 @@
 
 import { VOICE } from "./cards.js";
 import {
+  Boundary,
   html,
   styled,
   useEffect,
@@ -9,23 +10,19 @@ import {
   usePage,
   usePart,
   useRef,
-  useRefs,
   useState,
   useTick,
   useValue,
 } from "./hooks.js";
-import { Offers } from "./models.js";
-import { Icon, Part, Why } from "./parts.js";
+import { Icon, Part } from "./parts.js";
 import { nameOf, span } from "./words.js";
-
-const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
 
 const EXTRAS = styled(() => import("./picture-extras.js"), "picture.css");
 
-/** What belongs to a picture besides it, as soon as it was fetched. @param {any} props */
-function Extra({ part, ...props }) {
+/** What belongs to a picture besides it, as soon as it was fetched; it may fail without the picture. @param {any} props */
+export function Extra({ part, what, source, ...props }) {
   const { body } = usePart(EXTRAS);
-  return body ? html`<${body[part]} ...${props} />` : null;
+  return body && html`<${Boundary} key=${source} what=${what}><${body[part]} source=${source} ...${props} /><//>`;
 }
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
@@ -62,14 +59,15 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
   const cover = useCover(control, source);
   const stale = cover !== "";
   const info = video.stream ? null : video.info;
+  const view = useValue(source, "web/picture");
   video.canvas.setAttribute("role", "img");
   video.canvas.setAttribute("aria-label", `What ${nameOf(source)} sees`);
   return html`<section class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`} aria-label="Live picture">
     <div class="picture">
       <div class="canvas" ref=${place}></div>
-      <${Extra} part="Layer" source=${source} />
+      <${Extra} part="Layer" what="What is drawn over it" source=${source} />
       ${cover && html`<p class="cover" data-test="cover">${cover}</p>`}
-      ${info && html`<span class="tag tag-how">${howWords(video, useValue(source, "web/picture"))}</span>`}
+      ${info && html`<span class="tag tag-how">${howWords(video, view)}</span>`}
       ${info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`}>${ageWords(video)}</span>`}
       ${source !== at && html`<span class="tag tag-from">seen from ${nameOf(source)}</span>`}
     </div>
@@ -88,9 +86,9 @@ export function Stage({ at, video: control, source, offers, wide = false, immers
           ? "Leave full screen"
           : "Full screen"}
       </button>
-      <${Extra} part="Tools" source=${source} wanted=${control.wanted} />
+      <${Extra} part="Tools" what="More of the picture" source=${source} wanted=${control.wanted} />
       ${wide && html`<${PictureSettings} at=${at} source=${source} offers=${offers} />`}
-      ${wide && offers.has("audio") && html`<${Part} part=${VOICE} at=${at} />`}
+      ${wide && offers.has("audio") && html`<${Boundary} what="Sound"><${Part} part=${VOICE} at=${at} /><//>`}
     </div>`}
   </section>`;
 }
@@ -130,76 +128,12 @@ function ageWords(video) {
   return since === "taken" ? `${span(ms)} old` : `arrived ${span(ms)} ago`;
 }
 
-/** Encoding and source; they count for everybody who looks at this component. */
-export function PictureSettings({ at, source, offers, video }) {
-  const { commands, connection } = usePage();
-  useModel(connection);
-  const view = useValue(source, "web/picture");
-  const listed = offers.section("video").encodings;
-  const encodings = ENCODINGS.filter((one) => !Array.isArray(listed) || listed.includes(one) || one === view?.pinned);
-  const may = connection.may("drive") ? "" : "Log in as driver to change";
-  const why = connection.isOpen ? may : "No connection to the server";
-  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
-  return html`<div class="picture-settings">
-    ${video &&
-    html`<button type="button" data-test="video" onClick=${video.toggle}>
-        ${video.wanted ? "Stop video" : "Start video"}
-      </button>
-      <${Extra} part="Tools" source=${source} wanted=${video.wanted} />`}
-    <label class="field"
-      ><span>Encoding</span>
-      <select
-        data-test="encoding"
-        value=${view?.pinned ?? ""}
-        ...${more}
-        onChange=${(event) => commands.setEncoding(source, event.currentTarget.value)}
-      >
-        <option value="">automatic</option>
-        ${encodings.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
-      </select></label
-    >
-    <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
-    ${why && html`<${Why} id="why-picture">${why}<//>`}
-  </div>`;
-}
+const MORE = {
+  settings: async () => (await import("./picture-settings.js")).PictureSettings,
+  noCamera: async () => (await import("./picture-settings.js")).NoCamera,
+};
 
-/** For a component without a camera: another one may look at it. */
-export function NoCamera({ at, offers }) {
-  const { connection } = usePage();
-  useModel(connection);
-  if (useCameras(at).length === 0) return null;
-  const may = connection.may("drive") ? "" : "Log in as driver to choose one";
-  const why = connection.isOpen ? may : "No connection to the server";
-  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
-  return html`<section class="no-camera picture-settings" aria-label="Picture">
-    <p>${nameOf(at)} has no camera.</p>
-    <${PictureFrom} at=${at} source=${at} offers=${offers} more=${more} />
-    ${why && html`<${Why} id="why-picture">${why}<//>`}
-  </section>`;
-}
+/** How the picture comes, and where from; fetched later. */
+export const PictureSettings = (props) => html`<${Part} part=${MORE.settings} ...${props} />`;
 
-function PictureFrom({ at, source, offers, more }) {
-  const { commands } = usePage();
-  const cameras = useCameras(at);
-  if (!cameras.length) return null;
-  return html`<label class="field"
-    ><span>Picture from</span>
-    <select
-      data-test="picture-from"
-      value=${source === at ? "" : source}
-      ...${more}
-      onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
-    >
-      <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
-      ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
-    </select></label
-  >`;
-}
-
-function useCameras(at) {
-  const { store } = usePage();
-  useTick(2000);
-  return useRefs()
-    .filter((ref) => ref !== at && new Offers(ref, store.get(ref, "capabilities")?.value).hasVideo)
-    .sort();
-}
+export const NoCamera = (props) => html`<${Part} part=${MORE.noCamera} ...${props} />`;

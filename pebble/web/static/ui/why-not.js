@@ -5,19 +5,25 @@ import { inner, isObject, nameOf } from "./words.js";
 
 /** @typedef {{store: import("../core/store.js").Store, connection: import("./models.js").Connection}} Services */
 
-/** Why this page may not even end anything; "" it may. @param {Services} page @returns {string} */
-export function whyNotEnd({ store, connection }) {
+const ROLES = { drive: "driver", system: "maintainer" }; // the least that have the right
+
+/**
+ * Why this page may not even end anything: what ends something is asked of every robot, also of one that is silent.
+ * @param {Services} page @param {"drive" | "system"} [right] @returns {string} "" it may
+ */
+export function whyNotEnd({ store, connection }, right = "drive") {
   if (!connection.isOpen) return "No connection to the server";
   if (store.get("", "web/broker")?.value.problem) return "The server cannot reach the broker";
-  return connection.may("drive") ? "" : "Log in as driver to use this";
+  return connection.may(right) ? "" : `Log in as ${ROLES[right]} to use this`;
 }
 
 /**
- * Why it cannot be asked for what this section of its capabilities offers; "" it can.
- * @param {Services} page @param {string} ref @param {string} section @returns {string}
+ * Why it cannot be asked for anything, or for what this section of its capabilities offers; "" it can.
+ * @param {Services} page @param {string} ref @param {string} [section] @param {"drive" | "system"} [right]
+ * @returns {string}
  */
-export function whyNot(page, ref, section) {
-  const why = whyNotEnd(page);
+export function whyNot(page, ref, section = "", right = "drive") {
+  const why = whyNotEnd(page, right);
   if (why) return why;
   const { store } = page;
   if (store.get(ref, "web/liveness")?.value.online === false) return `${nameOf(ref)} is silent`;
