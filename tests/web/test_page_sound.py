@@ -103,7 +103,7 @@ def test_a_device_that_was_taken_away_leaves_no_source() -> None:
     assert microphone(steps) == 1
 
 
-def test_a_talk_hears_the_microphone_and_keeps_it_muted_for_the_next_one() -> None:
+def test_a_talk_uses_the_microphone_which_is_muted_until_the_next_one() -> None:
     steps = """await talk(true); await answer(); result = [heard()];
     await talk(false); result.push(open().length, heard());
     await talk(true); result.push(heard(), questions.length, [...told]);"""
@@ -153,7 +153,7 @@ def test_a_key_that_cannot_talk_shows_why() -> None:
 # -- the worker
 
 
-def test_a_page_that_stood_still_is_told_that_its_talk_has_ended() -> None:
+def test_a_page_that_stood_still_learns_that_its_talk_has_ended() -> None:
     steps = """const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
     const said = [];
     define("self", { postMessage: (message) => said.push(message) });

@@ -253,7 +253,7 @@ def test_a_component_at_rest_leaves_few_poses() -> None:
 # -- what the recorder keeps
 
 
-def test_the_past_is_kept_only_while_its_component_is_open() -> None:
+def test_the_past_is_dropped_when_another_component_is_opened() -> None:
     steps = """
     const store = new Store(undefined, (flush) => flush());
     const [goob, lamp] = ["pebble/robots/goob", "pebble/robots/minilamp"];
