@@ -30,10 +30,13 @@ def _evaluator() -> subprocess.Popen[str]:
 def evaluate(imports: dict[str, str], steps: str, given: Any = None) -> Any:
     """The value of ``result`` after ``steps``, which see ``given``.
 
-    ``imports``: the names that are imported, by the module below the page's static files. Raises AssertionError with
-    the error of the steps.
+    ``imports``: the names that are imported, or "* as name", by the module below the page's static files. Raises
+    AssertionError with the error of the steps.
     """
-    lines = [f"import {{ {names} }} from {json.dumps((STATIC / path).as_uri())};" for path, names in imports.items()]
+    lines = [
+        f"import {names if names.startswith('*') else f'{{ {names} }}'} from {json.dumps((STATIC / path).as_uri())};"
+        for path, names in imports.items()
+    ]
     lines += ['import { parentPort as _parent } from "node:worker_threads";']
     lines += [
         f"const given = {json.dumps(given)};",

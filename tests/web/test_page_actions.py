@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.web.test_page_core import CORE, _node, run
-
-__all__ = ["_node"]  # without Node.js these tests are skipped, too
+from tests.web.in_node import STATIC, evaluate
+from tests.web.test_page_core import run
 
 # -- actions: what is done is listed as [action, phase]
 
@@ -42,6 +41,8 @@ def test_each_key_has_its_action() -> None:
         'key("Slash", { key: "?" })': "help",
         'key("Minus", { key: "?" })': "help",  # on a German keyboard
         'key("Slash", { key: "-" })': "slower",  # there, too
+        'key("KeyM", { key: "?" })': "help",  # on a French keyboard
+        'key("KeyM", { key: "," })': "mute",  # there, too
         'key("NumpadAdd", { key: "+" })': "faster",
         'key("Equal", { key: "=" })': "faster",
     }
@@ -150,8 +151,7 @@ const rest = pad([0, 0, 0, 0]);
 
 
 def mapping(steps: str) -> Any:
-    imports = f"const {{ validMapping }} = await import({json.dumps((CORE / 'pad-mapping.js').as_uri())});"
-    return run("inputs.js", "Inputs, USUAL", imports + _MAPPING + steps)
+    return evaluate({"core/inputs.js": "Inputs, USUAL", "core/pad-mapping.js": "validMapping"}, _MAPPING + steps)
 
 
 def test_a_mapping_has_the_axes_and_their_directions() -> None:
@@ -204,12 +204,13 @@ def test_no_mapping_has_the_buttons_of_the_emergency_stop() -> None:
 # -- learning a gamepad
 
 _LEARNING = """
-const { validMapping } = await import("%s");
 const pad = (axes, ...pressed) =>
   ({ axes, buttons: Array.from({ length: 16 }, (_, i) => ({ pressed: pressed.includes(i) })) });
 const rest = [0.02, -0.03, 1, 0];
 const learning = new Learning(pad(rest));
-const take = (...samples) => samples.forEach((one) => learning.take(one));
+let now = 0;
+const take = (...samples) => samples.forEach((one) => learning.take(one, (now += 50)));
+const stay = (one) => take(...Array(14).fill(one));
 const still = pad(rest);
 const forward = () => take(pad([0.02, -0.03, 1, 0.9]), still);
 const right = () => take(pad([-0.9, -0.03, 1, 0]), still);
@@ -218,7 +219,8 @@ const press = (...buttons) => buttons.forEach((button) => take(pad(rest, button)
 
 
 def learning(steps: str) -> Any:
-    return run("pad-learning.js", "Learning, STEPS", _LEARNING % (CORE / "pad-mapping.js").as_uri() + steps)
+    imports = {"core/pad-learning.js": "Learning, STEPS", "core/pad-mapping.js": "validMapping"}
+    return evaluate(imports, _LEARNING + steps)
 
 
 def test_a_gamepad_is_learned_from_what_is_moved() -> None:
@@ -256,6 +258,24 @@ def test_each_movement_counts_once_and_only_when_it_is_large() -> None:
 )
 def test_what_cannot_be_used_is_refused_with_the_reason(steps: str, problem: str) -> None:
     assert learning(f"{steps} result = learning.problem;").startswith(problem)
+
+
+def test_an_axis_that_rests_outside_of_every_dead_zone_is_refused() -> None:
+    steps = "rest[3] = %s; take(pad([0.02, -0.03, 1, 1])); result = learning.problem !== '';"
+    assert [learning(steps % at) for at in (0.29, 0.32)] == [False, True]
+
+
+def test_a_lever_that_is_left_elsewhere_does_not_hold_up_the_next_step() -> None:
+    steps = "take(pad([0.02, -0.03, 0.2, 0.9])); stay(pad([0.02, -0.03, 0.2, 0])); result = [learning.released];"
+    steps += "take(pad([-0.9, -0.03, 0.2, 0])); take(pad([0.02, 1, 1, 0]), pad([0.02, 1, 1, 0], 3));"
+    assert learning(f"{steps} result.push(learning.axes, learning.buttons);") == [
+        True, {"z": {"axis": 3, "invert": False}, "x": {"axis": 0, "invert": True}}, {"stop": 3},
+    ]  # fmt: skip
+
+
+def test_a_stick_that_is_held_for_long_still_has_to_be_let_go() -> None:
+    steps = "const held = pad([0.02, -0.03, 1, 1]); take(held); stay(held); result = [learning.released];"
+    assert learning(f"{steps} take(still); right(); result.push(learning.released, learning.at);") == [False, True, 2]
 
 
 def test_axes_cannot_be_left_out_and_values_may_be_no_numbers() -> None:
@@ -296,6 +316,52 @@ def test_what_is_granted_too_late_is_given_back() -> None:
 def test_a_browser_that_refuses_is_asked_again_and_one_that_cannot_is_left_alone() -> None:
     assert awake("granted = false; await awake.want(true); granted = true; await awake.want(true);") == [2, 0]
     assert awake("await new Awake(undefined).want(true);") == [0, 0]
+
+
+# -- what is joined to the page later; ``later`` runs what it does each second
+
+_MORE = """
+const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
+let dialog = null;
+let later;
+let now = 0;
+const seen = [];
+define("location", { search: given.search, reload: () => seen.push("reload") });
+define("document", {
+  querySelector: () => dialog, createElement: () => ({}), head: { append() {} }, addEventListener() {},
+  documentElement: { toggleAttribute() {} },
+});
+define("navigator", {});
+define("setInterval", (run) => (later = run));
+define("fetch", async () => ({ ok: healthy }));
+performance.now = () => now;
+let healthy = true;
+const { install } = await import(given.more);
+const driver = { ref: "pebble/robots/goob" };
+const page = { driver, connection: {}, store: { get: () => undefined }, panels: { toggle: (name) => seen.push(name) } };
+page.sound = { toggleMute: () => seen.push("mute") };
+install(page);
+const key = (code, key = code) => driver.actions.keyDown({ code, key, repeat: false });
+const turn = () => new Promise((resolve) => setImmediate(resolve));
+"""
+
+
+def more(steps: str, search: str = "") -> Any:
+    given = {"more": (STATIC / "ui" / "more.js").as_uri(), "search": search}
+    return evaluate({}, f"{_MORE}{steps}\nawait turn();\nresult ??= seen;", given)
+
+
+def test_behind_an_open_panel_there_is_only_the_help() -> None:
+    assert more('key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?");') == ["mute", "help"]
+
+
+def test_a_wall_screen_loads_itself_again_only_from_a_server_that_answers() -> None:
+    steps = """page.connection.bye = { why: "" }; healthy = false;
+    for (now = 0; now < 20_000; now += 1000) { later(); await turn(); }
+    result = seen.length; healthy = true;
+    for (; now < 27_000; now += 1000) { later(); await turn(); }
+    result = [result, seen];"""
+    assert more(steps, "?watch") == [0, ["reload"]]
 
 
 # -- QR codes, read by OpenCV

@@ -230,6 +230,13 @@ def test_a_gamepad_whose_time_stands_still_is_not_believed_for_long() -> None:
     assert inputs(steps) == [[0, 1, 0], False, [0, 0, 0], True, [0, 0, 0], [0, 1, 0], False]
 
 
+def test_a_gamepad_that_never_was_in_neutral_is_no_frozen_one() -> None:
+    steps = """
+    inputs.padSample(pad(0, 1), 0); inputs.padSample(pad(0, 1), 10_000);
+    result = [vector(), inputs.padFrozen];"""
+    assert inputs(steps) == [[0, 0, 0], False]
+
+
 def test_the_second_button_of_a_gamepad_chooses_the_auxiliary_axis() -> None:
     assert inputs("seen(pad(0, 0), pad(-1, 0, 2, [1])); result = vector();") == [0, 0, -1]
 

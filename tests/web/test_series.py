@@ -248,3 +248,24 @@ def test_a_component_at_rest_leaves_few_poses() -> None:
     for (let at = 0; at < 100_000; at += 50) path.push(at, { value: { x_mm: 1, y_mm: 0 } });
     result = [path.times.length, trail.pieces(path.times, path.rows).length];"""
     assert run(steps) == [100, 1]
+
+
+# -- what the recorder keeps
+
+
+def test_the_past_is_dropped_when_another_component_is_opened() -> None:
+    steps = """
+    const store = new Store(undefined, (flush) => flush());
+    const [goob, lamp] = ["pebble/robots/goob", "pebble/robots/minilamp"];
+    const commands = { askSeries: () => true };
+    const page = { store, connection: { isOpen: true, onChange: () => () => {} }, commands, driver: { ref: goob } };
+    const limits = { spanMs: 1e6, most: 1000 };
+    store.set(goob, "charge", 7);
+    const series = recorderOf(page, goob).follow("charge", "charge", (payload) => ({ value: payload }), limits);
+    store.set(goob, "web/series/charge", { now: store.now(), points: [[5000, 1]] });
+    store.set(goob, "web/series/imu", { now: store.now(), points: [] });
+    result = [series.rows.map((row) => row.value)];
+    recorderOf(page, lamp);
+    result.push(store.metrics(goob));"""
+    modules = {"core/store.js": "Store", "ui/recorder.js": "recorderOf"}
+    assert evaluate(modules, steps) == [[1, 7], ["charge"]]

@@ -33,7 +33,8 @@ function join() {
     name: () => String(settings.name).slice(0, 32),
     onLogs: (message) => connection.onLogs?.(message),
     onDone: (message) => connection.answered(message),
-    onSeries: (message) => store.set(message.ref, `web/series/${message.metric}`, message),
+    onSeries: (message) =>
+      store.metrics(message.ref).length && store.set(message.ref, `web/series/${message.metric}`, message),
     onBye: (message) => {
       connection.bye = message.again ? null : message;
       connection.changed();
@@ -49,7 +50,7 @@ function join() {
   connection.socket = socket;
   estop.onChange = () => connection.changed();
   driver.onControlLost = (by) => connection.show(by ? `${by} took over` : "Your control has ended: take it again");
-  if (read("pads", null)) driver.mappingOf = () => null; // until ui/more.js is here
+  if (read("pads", null)) driver.mappingOf = () => null; // until ui/more.js is here they only stop
   driver.loading = () => !isHere(PARTS.robot);
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
   video.pictures = new Pictures(
@@ -71,10 +72,11 @@ function sound(services) {
     model: null,
     talk(on) {
       held = on;
-      use((model) => model.talk(held)).catch(console.error);
+      use((model) => model.talk(held)).catch((error) => services.connection.show(`Not done: ${error.message}`));
     },
     toggleMute: () => one.model?.toggleMute(),
   };
+  services.driver.onInterrupt = () => one.model?.interrupt();
   return one;
 }
 

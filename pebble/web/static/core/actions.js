@@ -72,8 +72,9 @@ export const PAD_ACTIONS = ACTIONS.filter((action) => action.button !== undefine
 /** @param {Action} action @param {import("./inputs.js").Mapping} mapping @returns {number} -1: none */
 export const buttonOf = (action, mapping) => mapping.buttons[action.id] ?? action.button ?? -1;
 
-/** @param {{code: string, key: string}} event @returns {Action | undefined} */
-const actionOf = ({ code, key }) => BOUND.find((one) => one.keys?.includes(code) || one.signs?.includes(key));
+/** By its sign first: on French keyboards ? is on KeyM. @param {{code: string, key: string}} event @returns {Action | undefined} */
+const actionOf = ({ code, key }) =>
+  BOUND.find((one) => one.signs?.includes(key)) ?? BOUND.find((one) => one.keys?.includes(code));
 
 /** Which actions begin and end, from keys and the buttons of a gamepad. */
 export class Actions {

@@ -142,7 +142,7 @@ export class ControlSocket {
 async function askForLogin() {
   try {
     const answer = await fetch("/", { redirect: "manual", cache: "no-store" });
-    if (answer.type === "opaqueredirect") location.assign("/login");
+    if (answer.type === "opaqueredirect") location.reload(); // to the login, which leads back here
   } catch {
     // there is no server at the moment
   }

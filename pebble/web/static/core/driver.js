@@ -26,14 +26,16 @@ export class Driver {
     this.loading = () => false;
     /** @type {(by: string) => void} called when this page loses the lease: to ``by``, or "" */
     this.onControlLost = () => {};
+    /** @type {() => void} called when something ends gestures: a talk ends with them */
+    this.onInterrupt = () => {};
     /** @type {(id: string, phase: "down" | "up") => void} what else keys and buttons do; "up" is of those that are held */
     this.onAction = () => {};
     /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
     this.actions = null;
-    /** @type {(id: string) => import("./inputs.js").Mapping | null} of a gamepad; null: it is not known yet */
+    /** @type {(id: string) => import("./inputs.js").Mapping | null} of a gamepad; null: unknown yet, it only stops */
     this.mappingOf = () => USUAL;
     this.mine = false;
-    this.padName = "";
+    this.padName = this.padKey = "";
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
     this.padStopped = this.padLatched = false;
@@ -82,6 +84,7 @@ export class Driver {
 
   /** What was under way is over. */
   lost() {
+    this.letGo();
     this.inputs.clear();
     this.gesture.reset();
     this.changed();
@@ -89,7 +92,10 @@ export class Driver {
 
   /** @param {{cmd: string, ref: string, g: number, why: string}} message */
   refused(message) {
-    if (message.cmd === "drive" && message.ref === this.ref && this.gesture.refused(message.g)) this.refusal = message.why;
+    if (message.cmd === "drive" && message.ref === this.ref && this.gesture.refused(message.g)) {
+      this.refusal = message.why;
+      this.letGo();
+    }
     this.changed();
   }
 
@@ -157,9 +163,15 @@ export class Driver {
   interrupt() {
     this.inputs.clear();
     this.gesture.interrupt(performance.now());
-    this.actions?.clear();
+    this.letGo();
     this.output = { x: 0, z: 0, y: 0 };
     this.changed();
+  }
+
+  /** What else is held ends, too; a little later, so that it cannot keep a stop from being sent. */
+  letGo() {
+    this.actions?.clear();
+    queueMicrotask(this.onInterrupt);
   }
 
   /** The window has lost the keyboard, or the page is hidden. */
@@ -224,8 +236,9 @@ export class Driver {
     }
     if (event.target.matches?.(TYPING)) return;
     if (event.code === "Space") {
-      if (!event.target.matches?.("button, [role=button], summary, a")) event.preventDefault();
-      this.space();
+      const button = event.target.matches?.("button, [role=button], summary, a");
+      if (!button) event.preventDefault();
+      if (!button || !event.repeat) this.space(); // a button that is held by it stays held
     } else if (event.ctrlKey || event.altKey || event.metaKey) {
       // a shortcut of the browser
     } else if (DRIVE_KEYS.has(event.code) && this.ref && !isOwn(event)) {
@@ -272,21 +285,21 @@ export class Driver {
 
   readPad() {
     const { pad } = this;
-    this.padName = pad?.id ?? "";
-    const mapping = this.mappingOf(this.padName);
     const focused = document.hasFocus() ? pad : null;
+    const pressed = (index) => pad?.buttons[index]?.pressed === true;
+    const latched = focused !== null && PAD_ESTOP.every(pressed);
+    if (latched && !this.padLatched) this.latch("gamepad"); // before all that may fail
+    this.padLatched = latched;
+    this.padName = pad?.id ?? "";
+    const key = `${pad?.index} ${this.padName}`;
+    if (key !== this.padKey) this.inputs.padGone(); // another one has to be seen in neutral, too
+    this.padKey = key;
+    const mapping = this.mappingOf(this.padName);
+    const stop = latched || pressed((mapping ?? USUAL).buttons.stop);
+    if (stop && !this.padStopped && !latched) this.space();
+    this.padStopped = stop;
     this.inputs.padSample(mapping && focused, performance.now(), mapping);
     this.actions?.padSample(focused, mapping);
-    const pressed = (index) => pad?.buttons[index]?.pressed === true;
-    if (focused && PAD_ESTOP.every(pressed)) {
-      if (!this.padLatched) this.latch("gamepad");
-      this.padLatched = this.padStopped = true;
-    } else {
-      const stop = pressed(mapping?.buttons.stop);
-      if (stop && !this.padStopped) this.space();
-      this.padStopped = stop;
-      this.padLatched = false;
-    }
   }
 
   update() {
@@ -300,7 +313,9 @@ export class Driver {
     const slow = this.socket.roundTripMs >= SLOW_MS ? SLOW_SPEED : 1;
     const vector = this.inputs.vector({ ...this.sliders, speed: Math.min(this.sliders.speed, slow) });
     const { neutral, waiting } = this.inputs;
+    const { active } = this.gesture;
     this.gesture.update(vector, situation !== null && why === null, now, neutral, waiting.size > 0);
+    if (active && this.gesture.mustRelease) this.letGo();
     if (this.gesture.mustRelease) this.inputs.clearKeys();
     else this.refusal = "";
     this.output = this.gesture.active ? vector : { x: 0, z: 0, y: 0 };

@@ -9,7 +9,7 @@ export const DOWN = ["KeyE"];
 export const DRIVE_KEYS = new Set([...LEFT, ...RIGHT, ...FORWARD, ...BACK, ...UP, ...DOWN]);
 
 const DEAD_ZONE = 0.1;
-const FROZEN_MS = 3000; // a deflected gamepad whose time stands still may be gone
+const FROZEN_MS = 3000; // a deflected gamepad that drives, and whose time stands still, may be gone
 export const PAD_ESTOP = [8, 9]; // buttons that no mapping has
 
 /** @typedef {{speed: number, turn: number, balance: number}} Sliders speed and turn 0..1, balance -1..1 */
@@ -105,7 +105,7 @@ export class Inputs {
       this.padStamp = pad.timestamp;
       this.padMovedAt = now;
       this.padFrozen = false;
-    } else if (now - this.padMovedAt > FROZEN_MS) {
+    } else if (this.padArmed && now - this.padMovedAt > FROZEN_MS) {
       this.padFrozen = true;
       this.padArmed = false;
     }

@@ -1,5 +1,7 @@
 /** Log lines of one component as the page keeps and filters them. Everything in them is of a robot: any JSON. Pure. */
 
+import { isObject } from "./json.js";
+
 export const MOST = 500;
 const LONGEST = 4000; // characters of a line
 const NAME = 64; // characters of a service or logger
@@ -129,6 +131,3 @@ const name = (value) => (typeof value === "string" || typeof value === "number" 
 const words = (value) => (typeof value === "string" ? value : (JSON.stringify(value) ?? ""));
 
 const cut = (text, most) => (text.length > most ? `${text.slice(0, most)}…` : text);
-
-/** @param {unknown} value @returns {value is Record<string, any>} */
-const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);

@@ -1,5 +1,7 @@
 /** What an operator of many robots should learn without looking at each: found in their states, listed once. Pure. */
 
+import { isObject } from "./json.js";
+
 export const MOST = 50;
 const COMPONENTS = 600; // whose last states are remembered
 const SERVICES = 64; // of one component
@@ -140,6 +142,3 @@ const short = (value) => {
   const text = typeof value === "object" && value !== null ? JSON.stringify(value) : String(value ?? "");
   return text.length > LONGEST ? `${text.slice(0, LONGEST)}…` : text;
 };
-
-/** @param {unknown} value @returns {value is Record<string, any>} */
-const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);

@@ -3,6 +3,8 @@
  * epoch ms.
  */
 
+import { isObject } from "./json.js";
+
 const NOTHING_MS = 30_000; // without any change the robot has probably not done it
 const WATCHED_MS = 15 * 60_000; // for so long a reboot may take
 const UPDATE_MS = 120_000; // an update shows nothing here
@@ -109,6 +111,3 @@ export function lacks(action, capabilities) {
   if (!isObject(entry) || entry.available === false) return "This robot does not offer it";
   return entry.controls === false ? "This robot has no command for it in its config" : "";
 }
-
-/** @param {unknown} value @returns {value is Record<string, any>} */
-const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);

@@ -6,8 +6,11 @@ import { MOST } from "./pad-mapping.js";
 
 const MOVED = 0.6; // an axis that was pushed on purpose
 const STILL = 0.25; // one that was let go
-const OFF_CENTRE = 0.4; // of an axis at rest: it is a lever, or a trigger
 const [LEAST_ZONE, MOST_ZONE] = [0.1, 0.35];
+const MARGIN = 0.05; // of the dead zone, beyond where an axis rests
+const OFF_CENTRE = MOST_ZONE - MARGIN; // of an axis at rest: it is a lever, or a trigger
+const NOISE = 0.05; // of an axis that stays where it is
+const SETTLED_MS = 500;
 
 /** @typedef {{id: string, kind: "axis" | "button", ask: string}} Step */
 
@@ -26,6 +29,9 @@ export class Learning {
     this.rest = sample;
     this.at = 0;
     this.released = true; // what was moved for the step before
+    /** @type {readonly number[]} the axes when they last changed, while something has to be released */
+    this.seen = [];
+    this.seenAt = 0;
     this.problem = "";
     /** @type {Record<string, import("./inputs.js").Axis>} */
     this.axes = {};
@@ -38,13 +44,17 @@ export class Learning {
     return STEPS[this.at];
   }
 
-  /** @param {Sample} sample what the gamepad shows now */
-  take(sample) {
-    const axis = this.movedAxis(sample, this.released ? MOVED : STILL);
-    const button = sample.buttons.slice(0, MOST).findIndex((one, index) => one.pressed && !this.rest.buttons[index]?.pressed);
-    if (!this.released) this.released = axis < 0 && button < 0;
-    else if (this.step?.kind === "axis" && axis >= 0) this.takeAxis(axis, sample);
-    else if (this.step?.kind === "button" && button >= 0) this.takeButton(button);
+  /** @param {Sample} sample what the gamepad shows now @param {number} now milliseconds */
+  take(sample, now) {
+    const isAxis = this.step?.kind === "axis";
+    const moved = isAxis ? this.movedAxis(sample, this.released ? MOVED : STILL) : this.pressedButton(sample);
+    if (!this.released) {
+      this.released = moved < 0;
+      this.settle(sample.axes, now);
+    } else if (moved >= 0) {
+      if (isAxis) this.takeAxis(moved, sample);
+      else if (this.step) this.takeButton(moved);
+    }
   }
 
   /** Without a button for this step. Axes cannot be left out. */
@@ -57,19 +67,40 @@ export class Learning {
   /** @returns {import("./inputs.js").Mapping} what was learned */
   mapping() {
     const noise = Math.max(...Object.values(this.axes).map(({ axis }) => Math.abs(this.rest.axes[axis])));
-    const deadZone = Math.round(100 * Math.min(MOST_ZONE, Math.max(LEAST_ZONE, noise + 0.05))) / 100;
+    const deadZone = Math.round(100 * Math.min(MOST_ZONE, Math.max(LEAST_ZONE, noise + MARGIN))) / 100;
     return { x: this.axes.x, z: this.axes.z, deadZone, buttons: this.buttons };
   }
 
   next() {
     this.problem = "";
     this.at += 1;
-    this.released = false;
+    this.wait();
   }
 
   refuse(why) {
     this.problem = why;
+    this.wait();
+  }
+
+  /** Until it is released. */
+  wait() {
     this.released = false;
+    this.seen = [];
+  }
+
+  /** An axis that stays where it is, as a lever does, rests there; those that were learned rest where they did. */
+  settle(axes, now) {
+    if (!axes.every((value, index) => Math.abs(value - this.seen[index]) < NOISE)) {
+      this.seen = [...axes];
+      this.seenAt = now;
+    } else if (now - this.seenAt > SETTLED_MS) {
+      const known = Object.values(this.axes).map(({ axis }) => axis);
+      this.rest = { ...this.rest, axes: axes.map((value, index) => (known.includes(index) ? this.rest.axes[index] : value)) };
+    }
+  }
+
+  pressedButton({ buttons }) {
+    return buttons.slice(0, MOST).findIndex((one, index) => one.pressed && !this.rest.buttons[index]?.pressed);
   }
 
   movedAxis({ axes }, limit) {

@@ -1,5 +1,7 @@
 /** One metric over time: the server's past, then live values. Pure: times are passed in, in ms of the page's clock. */
 
+import { isObject } from "./json.js";
+
 const SEAM_MS = 250; // the same value may arrive a little earlier or later by the two ways
 const REPEAT_MS = 1500; // after a new connection the newest value is sent again
 const GAP_MS = 2000; // at least so long without a value is a gap
@@ -177,6 +179,3 @@ function entries(value) {
   const all = Object.entries(value);
   return all.slice(0, Array.isArray(value) ? LONGEST_LIST : 4 * MOST_FIELDS);
 }
-
-/** @param {unknown} value @returns {value is Record<string, unknown>} */
-const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);

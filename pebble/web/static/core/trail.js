@@ -1,5 +1,7 @@
 /** Where a component was, by its odometry: poses in metres, and the pieces of its trail. Pure. */
 
+import { isObject } from "./json.js";
+
 const PER_METRE = { mm: 1000, cm: 100, m: 1 };
 const FARTHEST = 1e5; // metres: what is farther away is no position
 const X = { x_mm: 1000, x_m: 1, x: 0 }; // name, and units per metre; 0: as the payload's unit says
@@ -64,5 +66,3 @@ function breaks(pose, before, ms) {
   if (ms > GAP_MS || (pose.run >= 0 && pose.run < before.run)) return true;
   return Math.hypot(pose.x - before.x, pose.y - before.y) > SLACK + (FASTEST * ms) / 1000;
 }
-
-const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);

@@ -19,14 +19,22 @@ export class Microphone {
     this.context = context;
     /** @type {MediaStream|null} */
     this.stream = null;
+    /** @type {MediaStreamAudioSourceNode|null} */
+    this.source = null;
     /** @type {AudioWorkletNode|null} */
     this.node = null;
+    /** @type {Promise<string>|null} */
+    this.opening = null;
     this.timer = 0;
   }
 
   /** Open it, which may ask the person first. @returns {Promise<string>} why it is not open; "" it is */
-  async open() {
+  open() {
     clearTimeout(this.timer);
+    return (this.opening ??= this.acquire().finally(() => (this.opening = null))); // of two, one would stay open
+  }
+
+  async acquire() {
     try {
       if (!this.node) {
         await this.context.audioWorklet.addModule(WORKLET);
@@ -34,19 +42,22 @@ export class Microphone {
         this.node.connect(this.context.destination); // what leads nowhere is not called; it plays nothing
       }
       if (!this.stream?.active) {
+        this.close();
         this.stream = await navigator.mediaDevices.getUserMedia(WANTED);
-        this.context.createMediaStreamSource(this.stream).connect(this.node);
+        this.source = this.context.createMediaStreamSource(this.stream);
+        this.source.connect(this.node);
       }
-      this.mute(false);
       return "";
     } catch (error) {
+      this.close();
       const { name, message } = /** @type {Error} */ (error);
       return PROBLEMS[name] ?? `The microphone cannot be opened: ${message}`;
     }
   }
 
-  /** @param {MessagePort} port of the worker that takes its samples */
+  /** Begin. @param {MessagePort} port of the worker that takes its samples */
   attach(port) {
+    this.mute(false);
     this.node?.port.postMessage({ port }, [port]);
   }
 
@@ -61,7 +72,8 @@ export class Microphone {
   close() {
     clearTimeout(this.timer);
     for (const track of this.stream?.getTracks() ?? []) track.stop();
-    this.stream = null;
+    this.source?.disconnect();
+    this.stream = this.source = null;
   }
 
   /** @param {boolean} muted */

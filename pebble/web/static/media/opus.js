@@ -59,8 +59,11 @@ export class OpusDecoder {
     /** @type {AudioDecoder} */
     const decoder = new AudioDecoder({
       output: (data) => {
-        if (decoder === this.decoder) this.take(data);
-        data.close();
+        try {
+          if (decoder === this.decoder) this.take(data);
+        } finally {
+          data.close();
+        }
       },
       error: () => {
         if (decoder !== this.decoder) return;
@@ -75,6 +78,7 @@ export class OpusDecoder {
   /** @param {AudioData} data */
   take(data) {
     const [head] = this.pending;
+    if (!head) return; // more than was asked for
     head.parts.push(interleaved(data, this.channels));
     head.rate = data.sampleRate;
     if (--head.left) return;

@@ -56,11 +56,6 @@ export class Playout {
     return { bufferedMs: Math.round(1000 * waiting), lost: lost + overflow, refused, encoding, received };
   }
 
-  close() {
-    this.opus.close();
-    this.port.close();
-  }
-
   /** Seconds of the loudspeaker's clock. */
   now() {
     return this.played / this.rate + Math.min(LONGEST_TICK_S, (performance.now() - this.tickedAt) / 1000);

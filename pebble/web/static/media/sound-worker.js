@@ -78,9 +78,17 @@ function take(payload) {
 function talk(message) {
   uplink?.close();
   uplink = new Uplink(message.port, message.rate, message.talk, (piece) => {
-    if (performance.now() - aliveAt > ALIVE_MS) end();
+    if (performance.now() - aliveAt > ALIVE_MS) giveUp();
     else if ((socket?.bufferedAmount ?? 0) < LATE_BYTES) send(piece);
   });
+}
+
+/** The page stands still: perhaps a key was released. */
+function giveUp() {
+  if (!uplink) return;
+  const answer = { talk: uplink.talk, on: false, why: "The page stood still: talk again" };
+  self.postMessage({ answer });
+  end();
 }
 
 function end() {

@@ -36,7 +36,7 @@ function Wizard({ pad }) {
   useModel(pads);
   useEffect(() => {
     if (!learning) return;
-    learning.take(pad);
+    learning.take(pad, performance.now());
     if (learning.step) return;
     pads.set(pad.id, learning.mapping());
     driver.interrupt(); // what is held now meant something else before

@@ -18,7 +18,7 @@ export function install(page) {
   driver.onAction = (id, phase) => doer.act(id, phase);
   driver.actions = new Actions(
     (id, phase) => driver.onAction(id, phase),
-    () => driver.ref !== "",
+    () => driver.ref !== "" && document.querySelector("dialog[open]") === null,
   );
   page.pads = pads;
   driver.mappingOf = (id) => pads.mappingOf(id);
@@ -92,6 +92,13 @@ class Wall {
   recover({ bye, isOld }) {
     if (!bye && !isOld) this.uselessSince = Infinity;
     else if (this.uselessSince === Infinity) this.uselessSince = performance.now();
-    else if (performance.now() - this.uselessSince > RELOAD_MS) location.reload();
+    else if (performance.now() - this.uselessSince > RELOAD_MS) this.reload();
+  }
+
+  /** Without an answer the browser would show a page of its own, and stay there. */
+  async reload() {
+    this.uselessSince = performance.now(); // of the next attempt
+    const answer = await fetch("/healthz", { cache: "no-store" }).catch(() => null);
+    if (answer?.ok) location.reload();
   }
 }

@@ -84,5 +84,7 @@ class Recorder {
 
   close() {
     for (const end of this.ends) end();
+    const { store, ref } = this;
+    for (const metric of store.metrics(ref)) if (metric.startsWith(PAST)) store.drop(ref, metric);
   }
 }

@@ -46,13 +46,12 @@ export class Sound extends Model {
     /** @type {Worker|null} */
     this.worker = null;
     this.timer = 0;
-    route.onChange(() => route.ref !== this.ref && this.leave());
-    connection.onChange(() => !connection.isOpen && this.silence());
+    route.onChange(() => {
+      if (route.ref === this.ref) return;
+      this.problem = "";
+      this.leave();
+    });
     connection.onChange(() => this.worker && connection.isOpen && connection.you.user !== this.name && this.leave());
-    for (const name of ["blur", "pagehide"]) addEventListener(name, () => this.interrupt());
-    document.addEventListener("freeze", () => this.interrupt());
-    document.addEventListener("visibilitychange", () => document.hidden && this.interrupt());
-    document.addEventListener("contextmenu", () => this.silence());
   }
 
   // -- listening
@@ -110,27 +109,36 @@ export class Sound extends Model {
   }
 
   async begin() {
-    if (this.talkReason()) return;
+    const why = this.talkReason();
+    if (why) return this.connection.show(`Not done: ${why}`);
     /** @type {Talk} */
     const talk = { number: ++this.talks, on: false };
+    const { ref } = this.route;
     this.talking = talk;
     this.problem = "";
+    const problem = await this.speak(talk, ref).catch((error) => `Talking has failed: ${error.message}`);
+    if (this.talking === talk && problem) this.silence(problem);
+    if (this.talking) return;
+    this.microphone?.close(); // it was released, perhaps to answer the browser's question
+    if (problem && this.route.ref === ref) this.problem = problem;
+    this.changed();
+  }
+
+  /** @param {Talk} talk @param {string} ref @returns {Promise<string>} why it cannot begin; "" it has, or has ended */
+  async speak(talk, ref) {
     const context = this.start();
     this.adjust();
-    if (!this.worker) this.connect(this.route.ref, null);
+    if (!this.worker) this.connect(ref, null);
     clearInterval(this.timer);
     this.timer = setInterval(() => this.step(), STEP_MS);
     this.changed();
-    this.microphone ??= new Microphone(context);
-    const problem = await this.microphone.open();
-    if (this.talking !== talk) this.microphone.release(); // released, perhaps to answer the browser's question
-    else if (problem) this.silence(problem);
-    else {
-      const { port1, port2 } = new MessageChannel();
-      this.microphone.attach(port2);
-      const message = { op: "talk", talk: talk.number, rate: context.sampleRate, port: port1 };
-      this.worker?.postMessage(message, [port1]);
-    }
+    const microphone = (this.microphone ??= new Microphone(context));
+    const problem = await microphone.open();
+    if (problem || this.talking !== talk) return problem;
+    const { port1, port2 } = new MessageChannel();
+    microphone.attach(port2);
+    this.worker?.postMessage({ op: "talk", talk: talk.number, rate: context.sampleRate, port: port1 }, [port1]);
+    return "";
   }
 
   /** While a talk lasts: its worker ends it unless the page shows that it runs; a dialog ends it, too. */
@@ -142,10 +150,11 @@ export class Sound extends Model {
     else if (this.talking) this.worker?.postMessage({ op: "alive" });
   }
 
-  /** The page has lost the keyboard, or is hidden: a release will not be seen. */
+  /** What ends a gesture ends a talk; where the page is hidden, or frozen, no timer would close the microphone. */
   interrupt() {
     this.held = false;
     this.silence();
+    this.microphone?.close();
   }
 
   /** End the talk. @param {string} [why] if the person did not */
@@ -169,7 +178,6 @@ export class Sound extends Model {
     this.microphone?.close();
     this.listening = false;
     this.disconnect();
-    this.problem = "";
     this.context?.suspend();
     this.changed();
   }

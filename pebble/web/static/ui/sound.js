@@ -27,7 +27,7 @@ export function SoundControls({ at }) {
       >
         <${Icon} name=${listening ? "halt" : "sound"} />${listening ? "Stop listening" : "Listen"}
       </button>
-      <${TalkButton} sound=${sound} />
+      <${TalkButton} sound=${sound} noListening=${noListening} />
       ${listening &&
       html`<button type="button" data-test="mute" aria-pressed=${muted} onClick=${() => sound.toggleMute()}>
         <${Icon} name=${muted ? "muted" : "sound"} />${muted ? "Muted" : "Mute"}<kbd>M</kbd>
@@ -52,7 +52,7 @@ function Reasons({ sound, noListening }) {
   ${noTalking && noTalking !== noListening && html`<${Why} id="why-talk">${noTalking}<//>`}`;
 }
 
-function TalkButton({ sound }) {
+function TalkButton({ sound, noListening }) {
   const why = sound.talking ? "" : sound.talkReason();
   const end = () => sound.talk(false);
   useEffect(() => end, []);
@@ -63,7 +63,7 @@ function TalkButton({ sound }) {
     data-test="talk"
     disabled=${why !== ""}
     aria-pressed=${Boolean(sound.talking)}
-    aria-describedby=${why ? (why === sound.listenReason() ? "why-listen" : "why-talk") : undefined}
+    aria-describedby=${why ? (why === noListening ? "why-listen" : "why-talk") : undefined}
     onPointerDown=${(event) => {
       if (event.button) return;
       event.currentTarget.setPointerCapture(event.pointerId);
@@ -88,7 +88,7 @@ function TalkButton({ sound }) {
 function words(sound, view, name) {
   const { talking, listening, stats } = sound;
   if (talking) return talking.on ? `${name} plays your voice.` : "One moment…";
-  if (!listening) return sound.problem;
+  if (sound.problem || !listening) return sound.problem;
   const muted = sound.muted ? "muted · " : "";
   if (!sound.open) return "Connecting…";
   if (view?.state === "refused") return `${name} refuses: ${view.why}`;

@@ -1,5 +1,9 @@
 // How values are written for people. Everything of a robot is text, whatever type it claims to be.
 
+import { isObject } from "../core/json.js";
+
+export { isObject };
+
 const time = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit", second: "2-digit" });
 const short = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit" });
 
@@ -33,9 +37,6 @@ export const roughly = (ms) => (ms < 120_000 ? `${Math.max(0, Math.round(ms / 10
 
 /** @param {unknown} value @param {number} digits @returns {string} "–" for what is no number */
 export const number = (value, digits) => (Number.isFinite(value) ? Number(value).toFixed(digits) : "–");
-
-/** @param {unknown} value @returns {value is Record<string, any>} */
-export const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);
 
 /** The payload without the envelope that most have. @param {unknown} payload @returns {any} */
 export const inner = (payload) => (isObject(payload) && "value" in payload ? payload.value : payload);

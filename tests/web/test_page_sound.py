@@ -1,0 +1,186 @@
+"""The page's microphone, its talks, the worker of sound and its decoder, with a browser that is made up; in Node.js."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.web.in_node import STATIC, evaluate
+
+# -- the microphone and talks: a question of the browser is answered by ``answer()`` or ``answer(error)``
+
+_BROWSER = """
+const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
+const questions = [];
+const streams = [];
+let sources = 0;
+let broken = "";
+const makeStream = () => {
+  const track = { enabled: true, live: true, stop() { this.live = false; } };
+  const stream = { track, getTracks: () => [track], get active() { return track.live; } };
+  streams.push(stream);
+  return stream;
+};
+const turn = () => new Promise((resolve) => setImmediate(resolve));
+const answer = async (error) => {
+  const { resolve, reject } = questions.shift();
+  error ? reject(error) : resolve(makeStream());
+  await turn();
+};
+const open = () => streams.filter((one) => one.active);
+const heard = () => open().filter((one) => one.track.enabled).length;
+define("window", globalThis);
+define("document", { querySelector: () => null });
+define("navigator", {
+  mediaDevices: { getUserMedia: () => new Promise((resolve, reject) => questions.push({ resolve, reject })) },
+});
+define("AudioWorkletNode", class { port = { postMessage() {} }; connect() {} });
+define("AudioContext", class {
+  audioWorklet = { addModule: async () => {} };
+  createGain() { return { gain: {}, connect() {} }; }
+  createMediaStreamSource() {
+    if (broken === "source") throw new Error("no source");
+    sources += 1;
+    return { connect() {}, disconnect: () => (sources -= 1) };
+  }
+  resume() {}
+  suspend() {}
+});
+const told = [];
+define("Worker", class {
+  constructor() { if (broken === "worker") throw new Error("no worker"); }
+  postMessage({ op, talk }) { if (op !== "alive") told.push(talk ? `${op} ${talk}` : op); }
+  terminate() {}
+});
+"""
+
+_SOUND = """
+const REF = "pebble/robots/goob";
+const changes = [];
+const route = { ref: REF, onChange: (fn) => changes.push(fn) };
+const go = (ref) => { route.ref = ref; changes.forEach((fn) => fn()); };
+const shown = [];
+const connection = { isOpen: true, may: () => true, you: { user: "anna" }, show: (text) => shown.push(text) };
+const store = new Store(undefined, (flush) => flush());
+store.set(REF, "capabilities", { value: { audio: { available: true } } });
+const sound = new Sound({ store, connection, route });
+const talk = async (on) => { sound.talk(on); await turn(); };
+"""
+
+
+def microphone(steps: str) -> Any:
+    imports = {"media/microphone.js": "Microphone"}
+    return evaluate(imports, f"{_BROWSER}const microphone = new Microphone(new AudioContext());\n{steps}")
+
+
+def sound(steps: str) -> Any:
+    imports = {"ui/sound-model.js": "Sound", "core/store.js": "Store"}
+    return evaluate(imports, f"{_BROWSER}{_SOUND}{steps}\nsound.leave();")
+
+
+def test_a_microphone_that_is_opened_twice_at_a_time_is_opened_once() -> None:
+    steps = """const both = [microphone.open(), microphone.open()]; await turn();
+    result = [questions.length]; await answer(); result.push(await Promise.all(both), streams.length);
+    microphone.close(); result.push(open().length, sources);"""
+    assert microphone(steps) == [1, ["", ""], 1, 0, 0]
+
+
+def test_a_microphone_that_cannot_be_joined_is_given_back_and_the_next_attempt_begins_anew() -> None:
+    steps = """broken = "source"; const first = microphone.open(); await turn(); await answer();
+    result = [await first, open().length];
+    broken = ""; const second = microphone.open(); await turn(); await answer();
+    result.push(await second, open().length, sources); microphone.close();"""
+    assert microphone(steps) == ["The microphone cannot be opened: no source", 0, "", 1, 1]
+
+
+def test_a_device_that_was_taken_away_leaves_no_source() -> None:
+    steps = """for (let i = 0; i < 3; i++) {
+      const opened = microphone.open(); await turn(); await answer(); await opened;
+      streams.at(-1).track.live = false;
+    }
+    result = sources;"""
+    assert microphone(steps) == 1
+
+
+def test_a_talk_uses_the_microphone_which_is_muted_until_the_next_one() -> None:
+    steps = """await talk(true); await answer(); result = [heard()];
+    await talk(false); result.push(open().length, heard());
+    await talk(true); result.push(heard(), questions.length, [...told]);"""
+    assert sound(steps) == [1, 1, 0, 1, 0, ["open", "talk 1", "end", "talk 2"]]
+
+
+def test_a_question_that_is_answered_during_the_next_talk_is_of_that_talk() -> None:
+    steps = """await talk(true); await talk(false); await talk(true); await answer();
+    result = [heard(), streams.length, told.at(-1), sound.talking?.number];"""
+    assert sound(steps) == [1, 1, "talk 2", 2]
+
+
+@pytest.mark.parametrize("end", ["await talk(false)", "sound.interrupt()", "go('')"])
+def test_a_microphone_that_is_granted_after_the_talk_is_given_back(end: str) -> None:
+    assert sound(f"await talk(true); {end}; await answer(); result = [open().length, told.includes('talk 1')];") == [
+        0, False,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("before", ["", "await talk(false);"])
+def test_what_interrupts_a_gesture_closes_the_microphone(before: str) -> None:
+    steps = f"await talk(true); await answer(); {before} sound.interrupt(); result = [open().length, sound.talking];"
+    assert sound(steps) == [0, None]
+
+
+def test_why_a_talk_has_failed_is_known_until_the_next_one_or_another_component() -> None:
+    steps = """const denied = () => Object.assign(new Error("no"), { name: "NotAllowedError" });
+    await talk(true); await answer(denied()); result = [sound.problem, sound.talking];
+    sound.endedAt = -Infinity; sound.step(); result.push(sound.problem !== "");
+    await talk(false); await talk(true); result.push(sound.problem);
+    await talk(false); await answer(denied()); result.push(sound.problem !== "");
+    go("pebble/robots/minilamp"); result.push(sound.problem);"""
+    why = "The microphone is blocked: allow it for this page in the browser"
+    assert sound(steps) == [why, None, True, "", True, ""]
+
+
+def test_a_talk_that_cannot_begin_is_no_talk() -> None:
+    steps = "broken = 'worker'; await talk(true); result = [sound.talking, sound.problem, questions.length];"
+    assert sound(steps) == [None, "Talking has failed: no worker", 0]
+
+
+def test_a_key_that_cannot_talk_shows_why() -> None:
+    steps = "connection.may = () => false; await talk(true); result = [shown, sound.talking];"
+    assert sound(steps) == [["Not done: Log in as driver to talk"], None]
+
+
+# -- the worker
+
+
+def test_a_page_that_stood_still_learns_that_its_talk_has_ended() -> None:
+    steps = """const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
+    const said = [];
+    define("self", { postMessage: (message) => said.push(message) });
+    define("location", { protocol: "http:", host: "127.0.0.1" });
+    define("WebSocket", class { static OPEN = 1; });
+    let now = 0;
+    performance.now = () => now;
+    await import(given);
+    self.onmessage({ data: { op: "open", ref: "pebble/robots/goob", port: null, rate: 48_000 } });
+    const port = { close() {} };
+    self.onmessage({ data: { op: "talk", talk: 3, rate: 16_000, port } });
+    const feed = () => port.onmessage({ data: new Float32Array(1024) });
+    feed(); now = 900; feed(); result = [said.length]; now = 1100; feed(); result.push(said);"""
+    worker = (STATIC / "media" / "sound-worker.js").as_uri()
+    assert evaluate({}, steps, worker) == [
+        0, [{"answer": {"talk": 3, "on": False, "why": "The page stood still: talk again"}}],
+    ]  # fmt: skip
+
+
+def test_more_sound_than_was_asked_for_is_left_out_and_given_back() -> None:
+    steps = """let output; let given_back = 0;
+    globalThis.AudioDecoder = class { constructor(parts) { output = parts.output; } configure() {} };
+    const packets = [];
+    const decoder = new OpusDecoder((packet) => packets.push(packet), () => {});
+    decoder.decoder = decoder.open(1);
+    output({ close: () => (given_back += 1) });
+    decoder.pending = [{ sound: {}, left: 1, parts: [], rate: 0 }];
+    try { output({ close: () => (given_back += 1), numberOfFrames: -1 }); } catch {}
+    result = [given_back, packets.length];"""
+    assert evaluate({"media/opus.js": "OpusDecoder"}, steps) == [2, 0]
