@@ -150,14 +150,14 @@ def test_an_unreadable_certificate_and_the_missing_user_are_named_at_once(
 ) -> None:
     web = {"host": "0.0.0.0", "tls": {"certificate": "server.pem", "key": "server.key"}, "people": "people.sqlite"}
     assert run("web", config_file(tmp_path, web_interface=web, **BROKER)) == 1
-    assert [line.partition(":")[0] for line in run.err.removeprefix("pebble: ").splitlines()] == [
+    assert [line.removeprefix("pebble: ").partition(":")[0] for line in run.err.splitlines()] == [
         "web_interface.tls.certificate", "web_interface.people",
     ]  # fmt: skip
 
 
 def test_the_help_shows_the_command_line_that_people_use(run: Run) -> None:
     assert run("web", "--help") == 0
-    assert run.out.split("\n\n")[0].strip() == "Usage: pebble web [OPTIONS] [CONFIG]"
+    assert run.out.split("\n\n")[0].strip().upper() == "USAGE: PEBBLE WEB [OPTIONS] [CONFIG]"
     assert run("web", "user", "add", "--help") == 0
     assert "Usage: pebble web user add" in run.out
 

@@ -46,6 +46,8 @@ def speech(rate: int, seconds: float = PERIOD_S) -> npt.NDArray[np.float64]:
 
 def at_rate(samples: npt.NDArray[np.int16], rate: int) -> npt.NDArray[np.float64]:
     """16 kHz, mono, at another rate."""
+    if not len(samples):
+        return np.zeros(0)
     return Resampler(RATE, rate, 1).feed(samples.reshape(-1, 1))[:, 0].astype(float)
 
 

@@ -277,7 +277,7 @@ def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser) ->
         opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.act(pebble.driver.ref, 'reboot') }")
         opened.page.keyboard.press("Control+Space")
         assert opened.until(lambda: bool(canned.sent("estop")), 2)
-        assert {message["op"] for message in canned.received} <= {"hello", "watch", "stop", "estop"}
+        assert {message["op"] for message in canned.received} <= {"hello", "watch", "read-logs", "stop", "estop"}
         assert [message["token"] for message in canned.sent("hello")] == [""]
 
 
