@@ -84,7 +84,7 @@ class Decoder:
 
     def __init__(self) -> None:
         self.kind = self.interface = self.sequence = self.size = 0
-        self.buffer = bytearray(_LIMIT)  # the payload is from 13 to ``size``, until the next byte
+        self.data = bytearray(_LIMIT)  # the payload is from 13 to ``size``, until the next byte
         self._length = 0
 
     def take(self, byte: int) -> bool:
@@ -92,7 +92,7 @@ class Decoder:
         length = self._length
         if byte:
             if length < _LIMIT:
-                self.buffer[length] = byte
+                self.data[length] = byte
             self._length += length <= _LIMIT  # one more than fits: too long
             return False
         self._length = 0
@@ -100,30 +100,30 @@ class Decoder:
 
     def _unstuff(self, size: int) -> int:
         """Decode in place; returns the decoded length, 0 if a run exceeds the frame."""
-        buffer = self.buffer
+        data = self.data
         source = target = 0
         while source < size:
-            code = buffer[source]
+            code = data[source]
             after = source + code
             if after > size:
                 return 0
             while source + 1 < after:
                 source += 1
-                buffer[target] = buffer[source]
+                data[target] = data[source]
                 target += 1
             source = after
             if code < _LONGEST_RUN and source < size:
-                buffer[target] = 0
+                data[target] = 0
                 target += 1
         return target
 
     def _parse(self, size: int) -> bool:
         """Check and parse a decoded frame; ``size`` is that of all before the CRC."""
-        buffer = self.buffer
-        if size < _HEADER_SIZE or buffer[0] != _VERSION:
+        data = self.data
+        if size < _HEADER_SIZE or data[0] != _VERSION:
             return False
-        if crc16(buffer, size) != buffer[size] | buffer[size + 1] << 8:
+        if crc16(data, size) != data[size] | data[size + 1] << 8:
             return False
         self.size = size
-        _, self.kind, _, self.interface, self.sequence, _ = struct.unpack_from(_HEADER, buffer, 0)
+        _, self.kind, _, self.interface, self.sequence, _ = struct.unpack_from(_HEADER, data, 0)
         return True

@@ -52,7 +52,7 @@ class Robot(Described):
 
     def command(self) -> bytes:
         frame = self.decoder
-        interface, data = frame.interface, bytes(frame.buffer[_HEADER_SIZE : frame.size])
+        interface, data = frame.interface, bytes(frame.data[_HEADER_SIZE : frame.size])
         index = interface // 2
         if not interface & 1 or index >= len(self._relays):
             return b"unknown_interface"
