@@ -46,15 +46,19 @@ class EventBuffer:
             self._lost_at = self._clock()
 
     def send(self, message: Message) -> None:
-        with self._lock:
-            self._append(message)
-            if self._lost_at is None or self._transport.state is not State.CONNECTED:
-                self._drain()  # Zenoh accepts messages while the hub is away
+        self.hold(message)
+        self.resume()
 
     def hold(self, message: Message) -> None:
-        """Store ``message`` until the next :meth:`flush`."""
+        """Store ``message`` until the next :meth:`resume` or :meth:`flush`."""
         with self._lock:
             self._append(message)
+
+    def resume(self) -> None:
+        """Send what waits, in order, unless a new connection has to be flushed first."""
+        with self._lock:
+            if self._lost_at is None or self._transport.state is not State.CONNECTED:
+                self._drain()  # Zenoh accepts messages while the hub is away
 
     def flush(self) -> None:
         """The connection is up (again): send what may have been lost with the last one, then what waits."""

@@ -180,10 +180,13 @@ class Forwarder:
         return forward
 
     def _hold_event(self, side: Side, subject: Subject, message: Message) -> Drop:
-        if self.gate is Gate.WAITING and _is_event(subject, message):
-            self._events[side.other].hold(message)
-            return Drop.HELD
-        return Drop.CLOSED
+        if self.gate is Gate.SHUT or not _is_event(subject, message):
+            return Drop.CLOSED
+        events = self._events[side.other]
+        events.hold(message)
+        if self.gate is not Gate.WAITING:  # it was opened or shut meanwhile, perhaps before this event was there
+            (events.resume if self.gate is Gate.OPEN else events.clear)()
+        return Drop.HELD
 
     def _pass_retained(self, side: Side, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
         with self._lock:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from pebble.forwarding import loopback_filter as loopback_filter
@@ -253,6 +255,41 @@ class TestEventBuffer:
         wire.up = True
         self.publish(events, 2)
         assert wire.sent == [b"1", b"2"]
+
+
+class TestGate:
+    """An event that arrives while the gate opens or shuts: what was waiting may have been sent, or cleared, already."""
+
+    @pytest.fixture
+    def remote(self) -> Wire:
+        return Wire()
+
+    @pytest.fixture
+    def forwarder(self, remote: Wire) -> Forwarder:
+        transports = {LOCAL: Wire(), REMOTE: remote}
+        return Forwarder(Subjects(make_config()), TABLE_A1, transports, winner=REMOTE, clock=Clock())
+
+    def receive(self, forwarder: Forwarder, monkeypatch: pytest.MonkeyPatch, change: Callable[[], None]) -> None:
+        """Receive an event, and ``change`` the gate just before it waits."""
+        events = forwarder._events[REMOTE]
+        hold = events.hold
+
+        def hold_late(message: Message) -> None:
+            change()
+            hold(message)
+
+        monkeypatch.setattr(events, "hold", hold_late)
+        forwarder.receive(LOCAL, Message(f"{BASE}/outgoing/weather", b"1", QoS.DELIVERED))
+
+    def test_it_is_sent(self, forwarder: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.receive(forwarder, monkeypatch, forwarder.open)
+        assert remote.sent == [b"1"]
+
+    def test_it_is_not_sent_later(self, forwarder: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.receive(forwarder, monkeypatch, forwarder.shut)
+        forwarder.rearm()
+        forwarder.open()
+        assert remote.sent == []
 
 
 class TestStops:

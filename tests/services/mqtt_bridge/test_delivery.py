@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count, product
 from pathlib import Path
 from typing import Any, Final
@@ -159,10 +159,12 @@ class ZenohEnd(End):
 
     def __init__(self, folder: Path) -> None:
         self._hub = HubProcess(folder / "run").start()
-        self.address = {"kind": "zenoh", "run_dir": str(self._hub.settings.run_dir)}
+        # a machine that stands still for the usual two seconds would make live messages late, and they would be dropped
+        self._settings = replace(self._hub.settings, lease_ms=5000)
+        self.address = {"kind": "zenoh", "run_dir": str(self._settings.run_dir), "lease_ms": self._settings.lease_ms}
 
     def client(self, base: str) -> Client:
-        return Client(create("zenoh", f"{base}-{next(_numbers)}", self._hub.settings), base)
+        return Client(create("zenoh", f"{base}-{next(_numbers)}", self._settings), base)
 
     def leave(self) -> None:
         self._hub.kill()
