@@ -29,6 +29,13 @@ SIZES: dict[Size, tuple[int, int]] = {
 _OPEN_S = 40.0
 _VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
   pebbleViolation(`${event.violatedDirective} ${event.blockedURI}`))"""
+#: The pixels of a canvas, RGBA. Of a copy: Chromium complains of a canvas that is drawn on and often read.
+PIXELS = """const pixelsOf = (canvas) => {
+  const { width, height } = canvas;
+  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  return copy.getImageData(0, 0, width, height).data;
+};"""
 _HIDE = """(hidden) => {
   Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
   const state = hidden ? "hidden" : "visible";

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser
 
-from tests.web.browser import Tab, tab
+from tests.web.browser import PIXELS, Tab, tab
 from tests.web.canned import CannedServer, State, Value, serving
 from tests.web.states import GOOB, STATES, at, changed, devices, liveness, outlet
 
@@ -143,10 +143,9 @@ def test_values_have_their_unit_and_a_line_of_the_last_minute(cards: Tab) -> Non
     reading = cards.test("reading-lux")
     reading.click()
     assert reading.get_attribute("aria-expanded") == "true"
-    drawn = """() => { const canvas = document.querySelector('[data-test="spark"]');
-      return canvas.width > 100 && canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data
-        .some((byte) => byte > 0); }"""
-    assert cards.until(lambda: cards.page.evaluate(drawn))
+    drawn = """() => { PIXELS const canvas = document.querySelector("[data-test=spark]");
+      return canvas.width > 100 && pixelsOf(canvas).some((byte) => byte > 0); }"""
+    assert cards.until(drawn.replace("PIXELS", PIXELS))
     assert "last minute" in str(cards.test("spark").get_attribute("aria-label"))
     assert cards.until(lambda: "/s" in cards.test("mcu-out-glow").inner_text())
     reading.click()

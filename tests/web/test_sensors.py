@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser
 
-from tests.web.browser import Tab, tab
+from tests.web.browser import PIXELS, Tab, tab
 from tests.web.canned import CannedServer, State, serving
 from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, at, changed, fleet, liveness, with_stream
 
@@ -84,27 +84,29 @@ def drawings(opened: Tab, what: str, ms: int) -> int:
 # -- plots
 
 #: Columns of a plot with its first line's colour, as shares of the width.
-_LINE = """(name) => {
+_LINE = """(name) => { PIXELS
   const figure = document.querySelector(`[data-test="${name}"]`);
   const canvas = figure?.querySelector("canvas");
   if (!canvas) return [];
   const wanted = getComputedStyle(figure).getPropertyValue("--line-0").trim();
   const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
-  const { data, width } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  const [data, width] = [pixelsOf(canvas), canvas.width];
   const columns = new Set();
   for (let i = 0; i < data.length; i += 4) {
     const near = Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) < 90;
     if (near && data[i + 3] > 128) columns.add(((i / 4) % width) / width);
   }
   return [...columns].sort((a, b) => a - b);
-}"""
+}""".replace("PIXELS", PIXELS)
 
 
 def line(opened: Tab, name: str, begin: float = 0.2, end: float = 1.0) -> int:
     return sum(begin <= column < end for column in opened.page.evaluate(_LINE, name))
 
 
-@pytest.mark.parametrize("name", ["plot-battery", "plot-attitude", "plot-rates", "plot-acceleration", "plot-touch"])
+@pytest.mark.parametrize(
+    "name", ["plot-battery", thorough("plot-attitude"), thorough("plot-rates"), "plot-acceleration", "plot-touch"]
+)
 def test_a_plot_shows_what_was_before_and_goes_on(sensors: Tab, name: str) -> None:
     see(sensors, name)
     assert sensors.until(lambda: line(sensors, name, 0.25, 0.5) > 10), "the past"
@@ -232,12 +234,12 @@ def test_no_payload_breaks_a_card(server: CannedServer, browser: Browser, metric
 # -- map
 
 #: Where the component's arrow and its trail are drawn: counts of the accent colour in the middle, and everywhere.
-_TRAIL = """() => {
+_TRAIL = """() => { PIXELS
   const canvas = document.querySelector("[data-test=map]");
   const wanted = getComputedStyle(canvas).getPropertyValue("--accent").trim();
   const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
   const { width, height } = canvas;
-  const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+  const data = pixelsOf(canvas);
   const found = { middle: 0, all: 0 };
   for (let i = 0; i < data.length; i += 4) {
     if (Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) > 60) continue;
@@ -246,7 +248,7 @@ _TRAIL = """() => {
     if (Math.hypot(x, y) < 14) found.middle++;
   }
   return found;
-}"""
+}""".replace("PIXELS", PIXELS)
 
 
 def trail(opened: Tab) -> dict[str, int]:
@@ -347,12 +349,15 @@ PICTURE, INK = (255, 0, 255), (77, 243, 255)
 
 def assert_a_square_in_the_middle(opened: Tab, pixel: float = 1.0) -> None:
     """Its corners are a quarter and three quarters of what is seen of the picture; ``pixel``: of the line."""
-    assert opened.until(lambda: area(seen(opened), INK) is not None)
-    pixels = seen(opened)
-    picture, square = area(pixels, PICTURE), area(pixels, INK)
-    assert picture is not None
-    assert square is not None
-    left, top, right, bottom = picture
+    areas: list[Any] = []
+
+    def are_both_seen() -> bool:
+        pixels = seen(opened)
+        areas[:] = area(pixels, PICTURE), area(pixels, INK)
+        return None not in areas
+
+    assert opened.until(are_both_seen)
+    (left, top, right, bottom), square = areas
     assert (right - left) / (bottom - top) == pytest.approx(640 / 360, rel=0.01)
     width, height = right - left, bottom - top
     expected = (left + width / 4, top + height / 4, right - width / 4, bottom - height / 4)
@@ -377,7 +382,6 @@ def test_what_is_drawn_over_a_picture_is_where_it_belongs(
 ) -> None:
     with showing(server, browser, OVERLAYS, size, **options) as opened:
         opened.page.evaluate(_PLAIN)
-        assert opened.until(lambda: area(seen(opened), PICTURE) is not None)
         assert_a_square_in_the_middle(opened, options.get("device_scale_factor", 1))
         assert opened.complaints() == []
 
@@ -398,8 +402,8 @@ def test_overlays_vanish_half_a_second_after_the_last(server: CannedServer, brow
     with showing(server, browser, replace(OVERLAYS, repeated={"web/liveness": 1.0})) as opened:
         assert opened.until("!!document.querySelector('[data-test=overlays-canvas]')")
         opened.page.evaluate(SET, ["video-overlays", {"shapes": [[[0.2, 0.2], [0.8, 0.8]]]}])
-        inked = """() => { const one = document.querySelector("[data-test=overlays-canvas]");
-          return one.getContext("2d").getImageData(0, 0, one.width, one.height).data.some((value) => value > 0); }"""
+        canvas = 'document.querySelector("[data-test=overlays-canvas]")'
+        inked = f"() => {{ {PIXELS} return pixelsOf({canvas}).some((value) => value > 0); }}"
         assert opened.until(inked, 1)
         began = time.monotonic()
         assert opened.until(lambda: not opened.page.evaluate(inked), 3)
