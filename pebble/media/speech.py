@@ -5,6 +5,7 @@ Syllables of voiced harmonics under three formants, some with a hiss before them
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -37,6 +38,7 @@ class Speech:
         return np.repeat(mono[:, None], self.channels, axis=1)
 
 
+@lru_cache(maxsize=4)  # it takes a tenth of a second
 def _period(rate: int) -> NDArray[np.int16]:
     edges = [rate * PERIOD_S * number // _SYLLABLES for number in range(_SYLLABLES + 1)]
     sound = np.zeros(edges[-1], np.float32)
@@ -51,7 +53,9 @@ def _period(rate: int) -> NDArray[np.int16]:
         if hissing > 0.5:
             _add_hiss(part[: int(_HISS_S * rate)], number)
     loudest = float(np.abs(sound).max())
-    return np.asarray(sound * (_PEAK / loudest), np.int16)
+    period = np.asarray(sound * (_PEAK / loudest), np.int16)
+    period.flags.writeable = False
+    return period
 
 
 def _voice(count: int, rate: int, formants: tuple[int, ...], pitch_hz: float, glide: float) -> NDArray[np.float32]:

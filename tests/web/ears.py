@@ -7,6 +7,7 @@ import time
 import wave
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ RECORDED = """() => {
 }"""
 
 
+@lru_cache(maxsize=4)
 def speech(rate: int, seconds: float = PERIOD_S) -> npt.NDArray[np.float64]:
     """The speech of robots and people in tests, at any rate."""
     return at_rate(Speech(RATE).samples(0, int(seconds * RATE)), rate)
@@ -116,7 +118,14 @@ def compared(played: npt.NDArray[np.float64], rate: int, *, envelopes: bool = Fa
 
 
 def talks(opened: Tab) -> bool:
-    """Hold the button until the server takes the voice."""
-    opened.test("talk").hover()
-    opened.page.mouse.down()
-    return opened.until(lambda: state(opened) == "goob plays your voice.")
+    """Hold the button until the server takes the voice; again, if a busy machine has ended the talk, as it should."""
+    for _ in range(3):
+        assert opened.until(opened.test("talk").is_enabled)  # the talk of another page may not be over yet
+        opened.test("talk").hover()
+        opened.page.mouse.down()
+        if opened.until(lambda: state(opened) == "goob plays your voice.", 8):
+            return True
+        print(f"no talk: {state(opened)}")  # noqa: T201
+        opened.page.mouse.up()
+        opened.page.wait_for_timeout(200)
+    return False

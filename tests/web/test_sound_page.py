@@ -72,6 +72,7 @@ def test_the_robots_sound_is_played(browser: Browser, served: Served, robot: Sou
         assert opened.errors + opened.violations == []
 
 
+@pytest.mark.thorough  # tests of a whole robot play it each time
 def test_opus_is_played(browser: Browser, served: Served, robot: SoundRobot) -> None:
     with page_of(browser, served, "phone") as opened:
         opened.test("listen").click()
@@ -129,6 +130,7 @@ def test_a_voice_reaches_the_robot(browser: Browser, served: Served, robot: Soun
         assert opened.errors + opened.violations == []
 
 
+@pytest.mark.thorough
 def test_a_voice_that_the_browser_filters_reaches_the_robot(
     browser: Browser, served: Served, robot: SoundRobot
 ) -> None:
@@ -151,17 +153,37 @@ INTERRUPTIONS: dict[str, Callable[[Tab], Any]] = {
     "pointer": lambda opened: opened.page.evaluate(
         """() => document.querySelector('[data-test=talk]').dispatchEvent(new PointerEvent('lostpointercapture'))"""
     ),
+}
+UNDONE: dict[str, Callable[[Tab], Any]] = {
+    "hidden": lambda opened: opened.hide(hidden=False),
+    "dialog": lambda opened: opened.page.evaluate("document.querySelector('dialog[open]').remove()"),
+}
+
+
+def test_what_ends_a_gesture_ends_a_talk(browser: Browser, served: Served, robot: SoundRobot) -> None:
+    with page_of(browser, served) as opened:
+        for how, interrupt in INTERRUPTIONS.items():
+            robot.voice.clear()
+            assert talks(opened), how
+            assert opened.until(partial(_has, robot, 5)), how
+            interrupt(opened)
+            assert falls_silent(opened, robot), how
+            UNDONE.get(how, bool)(opened)
+            opened.page.mouse.up()
+
+
+GONE: dict[str, Callable[[Tab], Any]] = {
     "frozen": lambda opened: opened.freeze(),
     "elsewhere": lambda opened: opened.page.evaluate("pebble.route.go('')"),
 }
 
 
-@pytest.mark.parametrize("how", INTERRUPTIONS)
-def test_what_ends_a_gesture_ends_a_talk(browser: Browser, served: Served, robot: SoundRobot, how: str) -> None:
+@pytest.mark.parametrize("how", GONE)
+def test_a_talk_ends_with_its_screen(browser: Browser, served: Served, robot: SoundRobot, how: str) -> None:
     with page_of(browser, served) as opened:
         assert talks(opened)
         assert opened.until(lambda: len(robot.voice) > 5)
-        INTERRUPTIONS[how](opened)
+        GONE[how](opened)
         assert falls_silent(opened, robot)
 
 
