@@ -141,6 +141,21 @@ def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str,
         assert published(op(**fields), {section.partition(".")[0]: odd}).topic == usual
 
 
+@pytest.mark.parametrize(
+    "section",
+    [
+        {"system": {"service_restart": {"flag_topic": f"{BASE}/incoming/flags/again"}}},
+        {"system": {"service-restart": {"flag_topic": f"{BASE}/incoming/flags/again"}}},
+        {"system": {"service_restart": {"topic": f"{BASE}/incoming/flags/again"}}},
+        {"service_restart": {"flag_topic": f"{BASE}/incoming/flags/again"}},
+    ],
+    ids=["ours", "with a dash", "topic", "at the top"],
+)
+def test_spellings_of_where_an_action_goes(section: dict[str, Any]) -> None:
+    assert published(op("action", name="service-restart"), section).topic == f"{BASE}/incoming/flags/again"
+    assert published(op("action", name="reboot"), section).topic == f"{BASE}/incoming/flags/reboot"
+
+
 @pytest.mark.parametrize("fields", [fields for fields, _, _, _ in PUBLISHED], ids=str)
 def test_which_right_is_needed(fields: dict[str, Any]) -> None:
     right = robot_commands.right(op(**fields))
@@ -246,7 +261,7 @@ def test_what_was_asked_is_in_the_audit_but_no_lights_and_sounds(
     def found() -> list[str]:
         return [f"{one.what}: {one.detail}" for one in served.app.state.audit.read(100) if one.ref == robot.base]
 
-    assert until(lambda: len(found()) == len(PUBLISHED) - 6, 5), found()
+    assert until(lambda: len(found()) == len(PUBLISHED) - 6), (found(), page.refused, page.closed)
     assert found()[1:4] == [
         "autonomy: file follow, config {}",
         "autonomy: file , config {}",
@@ -374,34 +389,31 @@ def test_a_script_starts_beside_a_person_only_where_it_gives_way(
         assert until(lambda: len(asked_of(robot)) == (2 if arbitrates else 1), 3)
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"tag": "autonomy", "file": "x", "config": {str(number): number for number in range(201)}},
-        {"tag": "autonomy", "file": "x", "config": {"a": {"b": 1}}},
-        {"tag": "autonomy", "file": "x", "config": {"a": "b" * 17_000}},
-        {"tag": "autonomy", "file": "x" * 201},
-        {"tag": "soundboard", "file": "x" * 1001},
-        {"tag": "lights", "r": 1.5},
-        {"tag": "lights", "r": "1"},
-        {"tag": "lights", "period": 0.01},
-        {"tag": "action", "name": "shutdown"},
-        {"tag": "outlet", "outlet": "a/b", "on": True},
-        {"tag": "outlet", "outlet": "a\x01", "on": True},
-        {"tag": "outlet", "outlet": "o1", "on": 1},
-        {"tag": "mcu", "uid": "#", "name": "led", "value": {}},
-        {"tag": "mcu", "uid": "a", "name": "led", "value": {"x": "text"}},
-    ],
-    ids=lambda fields: str(fields)[:60],
-)
-def test_what_is_beyond_the_limits_ends_the_connection(
-    served: Served, robot: RecordingRobot, fields: dict[str, Any]
-) -> None:
-    with served.page() as page:
-        assert page.knows(robot.base)
-        ask(page, robot.base, **fields)
-        assert until(lambda: page.closed, 3)
-        assert asked_of(robot) == []
+BEYOND: list[Fields] = [
+    {"tag": "autonomy", "file": "x", "config": {str(number): number for number in range(201)}},
+    {"tag": "autonomy", "file": "x", "config": {"a": {"b": 1}}},
+    {"tag": "autonomy", "file": "x", "config": {"a": "b" * 17_000}},
+    {"tag": "autonomy", "file": "x" * 201},
+    {"tag": "soundboard", "file": "x" * 1001},
+    {"tag": "lights", "r": 1.5},
+    {"tag": "lights", "r": "1"},
+    {"tag": "lights", "period": 0.01},
+    {"tag": "action", "name": "shutdown"},
+    {"tag": "outlet", "outlet": "a/b", "on": True},
+    {"tag": "outlet", "outlet": "a\x01", "on": True},
+    {"tag": "outlet", "outlet": "o1", "on": 1},
+    {"tag": "mcu", "uid": "#", "name": "led", "value": {}},
+    {"tag": "mcu", "uid": "a", "name": "led", "value": {"x": "text"}},
+]
+
+
+def test_what_is_beyond_the_limits_ends_the_connection(served: Served, robot: RecordingRobot) -> None:
+    for fields in BEYOND:
+        with served.page() as page:
+            assert page.knows(robot.base)
+            ask(page, robot.base, **fields)
+            assert until(lambda page=page: page.closed), fields
+            assert asked_of(robot) == [], fields
 
 
 def test_the_broker_is_down(broker: Broker, page: Page, robot: RecordingRobot) -> None:
