@@ -258,16 +258,17 @@ def test_every_op_is_attacked() -> None:
     assert set(ops(GOOB)) == {kind.__struct_config__.tag for kind in get_args(m.FromPage)}
 
 
-@pytest.mark.parametrize("op", sorted(set(ops(GOOB)) - FOR_VIEWERS))
-def test_a_viewer_may_not(hall: Hall, broker: Broker, driver: Page, everything: Everything, op: str) -> None:
-    base = f"pebble/robots/viewed-{op}"
+def test_a_viewer_may_not(hall: Hall, broker: Broker, driver: Page, everything: Everything) -> None:
+    base, asked = "pebble/robots/viewed", sorted(set(ops(GOOB)) - FOR_VIEWERS)
     with RecordingRobot(broker.port, base) as robot, hall.page("viewer") as page:
         assert page.knows(base)
         assert page.ready()
         before = dict(driver.state)
-        page.send(op, **ops(base)[op])
-        assert until(lambda: page.refused)
-        assert [(one["cmd"], one["why"]) for one in page.refused] == [(op, "The role viewer may not do this")]
+        for op in asked:
+            page.send(op, **ops(base)[op])
+        assert until(lambda: len(page.refused) >= len(asked)), page.refused
+        why = "The role viewer may not do this"
+        assert [(one["cmd"], one["why"]) for one in page.refused] == [(op, why) for op in asked]
         assert not page.closed
         time.sleep(0.2)
         assert robot.received == []

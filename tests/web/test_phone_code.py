@@ -37,7 +37,7 @@ def _read(opened: Tab) -> str:
     return str(text)
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("theme", [pytest.param("light", marks=pytest.mark.thorough), "dark"])
 def test_the_code_has_the_address_of_this_screen_and_nothing_else(
     browser: Browser, canned: CannedServer, theme: Theme
 ) -> None:
