@@ -210,8 +210,7 @@ class CannedServer:
             now = time.monotonic()
             metrics = {metric for metric, at in due.items() if now >= at}
             due |= {metric: now + state.repeated[metric] for metric in metrics}
-            values = [value for value in state.values(_now()) if value[1] in metrics]
-            if values:
+            if metrics and (values := [value for value in state.values(_now()) if value[1] in metrics]):
                 await self._send(websocket, _state(values))
 
     async def _send_series(self, websocket: WebSocket, state: State, watched: str) -> None:
