@@ -27,6 +27,7 @@ SIZES: dict[Size, tuple[int, int]] = {
     "small": (320, 640),
 }
 _OPEN_S = 40.0
+_LOOK_MS = 20  # between two looks: each costs three programs a millisecond
 _VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
   pebbleViolation(`${event.violatedDirective} ${event.blockedURI}`))"""
 #: The pixels of a canvas, RGBA. Of a copy: Chromium complains of a canvas that is drawn on and often read.
@@ -72,7 +73,7 @@ class Tab:
         while not (self.page.evaluate(condition) if isinstance(condition, str) else condition()):
             if time.monotonic() > end:
                 return False
-            self.page.wait_for_timeout(10)  # not time.sleep: Playwright handles events meanwhile
+            self.page.wait_for_timeout(_LOOK_MS)  # not time.sleep: Playwright handles events meanwhile
         return True
 
     def test(self, name: str) -> Any:
