@@ -32,7 +32,8 @@ LESS := $(if $(PEBBLE_THOROUGH),, and not thorough)
 # What checks no times: it uses what whole robots leave of the processors.
 COMPUTING := tests/config tests/contract tests/media tests/motion tests/perception tests/robot/test_lockstep.py \
 	$(addprefix tests/bench/test_,compare.py plots.py ratios.py report.py results.py) \
-	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py types.py vm.py) \
+	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
+	$(addprefix tests/firmware/test_,types.py vm.py) \
 	$(addprefix tests/web/test_,card_models.py driving_lockstep.py jitter.py log_lines.py manifest.py page_actions.py) \
 	$(addprefix tests/web/test_,page_core.py page_driver.py page_operating.py page_sound.py page_sources.py recent.py) \
 	$(addprefix tests/web/test_,series.py store.py types.py)
