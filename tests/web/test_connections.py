@@ -243,7 +243,7 @@ def test_connections_are_limited_and_the_next_one_is_served_when_one_ends(serve:
         get(client)
     for _ in range(20):
         assert is_closed(serving.connect())
-    assert serving.listener.refused == 20
+    assert until(lambda: serving.listener.refused == 20)
     assert serving.listener.connections == 3
     clients[0].close()
     assert until(lambda: serving.listener.connections == 2)
