@@ -1,4 +1,4 @@
-// Runs one module after another, each in a thread of its own, since to start Node.js takes 20 times as long.
+// Runs one module after another, each in a thread of its own, since to start Node.js takes longer than most of them.
 // In: a line of JSON for each, its source. Out: a line of JSON, what it has sent to its parent, or its error.
 
 import { createInterface } from "node:readline";
