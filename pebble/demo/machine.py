@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 
 _STAT = Path("/proc/stat")
-_SAMPLES = 3000  # five minutes
+_SAMPLES = 750  # five minutes
 _SLICE_S = 0.4  # shorter ones say little, at 100 ticks a second
 _LEAST_IDLE, _MOST_TAKEN = 0.06, 0.12  # shares of all processors
 _IDLE, _IOWAIT, _STEAL, _FIELDS = 3, 4, 7, 8  # of the first line of /proc/stat, man 5 proc_stat
@@ -45,15 +45,17 @@ class Machine:
         except (OSError, ValueError, IndexError):  # another system
             return
 
-    def overloaded(self, began: float, ended: float) -> str:
+    def overloaded(self, began: float, ended: float, *, on_average: bool = False) -> str:
         """Why what was measured between these times (monotonic) may be late, in words; empty: no reason."""
         self.sample()
-        return overloaded(list(self._samples), began, ended)
+        return overloaded(list(self._samples), began, ended, on_average=on_average)
 
 
-def overloaded(samples: list[Sample], began: float, ended: float) -> str:
-    """The worst slice of that time decides, since a deadline is missed in one. Pure."""
+def overloaded(samples: list[Sample], began: float, ended: float, *, on_average: bool = False) -> str:
+    """The worst slice of that time decides, since a deadline is missed in one; of a rate, the whole time. Pure."""
     slices = [(before, after) for before, after in pairwise(samples) if before.at < ended and after.at > began]
+    if on_average and slices:
+        slices = [(slices[0][0], slices[-1][1])]
     shares = [
         ((after.taken - before.taken) / total, (after.idle - before.idle) / total)
         for before, after in slices

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from types import FrameType
 from typing import NamedTuple
 
@@ -97,7 +98,7 @@ def _run_demo(
     operator.connect()
     counting = [robot.name for robot in testbed.robots if robot.has_counter]
     machine = Machine()
-    media_check = MediaCheck(testbed.remote_port, counting, machine.overloaded)
+    media_check = MediaCheck(testbed.remote_port, counting, partial(machine.overloaded, on_average=True))
     try:
         with View(console, operator, media_check, testbed.robots, ending, url) as view:
             if not _discovered(operator, view, ending):

@@ -130,6 +130,7 @@ class Operator:
         self._send(STOP, self._begin("disconnecting", robots))
 
     def _until_right(self, name: str, act: Callable[[], None]) -> None:
+        """Once, and again while its assessment leaves ``name`` in ``again``."""
         for _ in range(_MOST_TIMES):
             act()
             end = time.monotonic() + _ASSESSED_S

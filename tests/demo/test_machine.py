@@ -40,6 +40,11 @@ def test_only_slices_of_that_time_count(began: float, ended: float, counts: bool
     assert bool(overloaded(samples((50, 0), (0, 0), (50, 0)), began, ended)) is counts
 
 
+def test_of_a_rate_the_whole_time_decides() -> None:
+    assert overloaded(samples((50, 0), (0, 0), (50, 0)), 10.0, 20.0, on_average=True) == ""
+    assert "0% were idle" in overloaded(samples((0, 0), (0, 0), (1, 0)), 10.0, 20.0, on_average=True)
+
+
 def test_this_machine_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     machine, before = Machine(), time.monotonic()
     machine.sample()

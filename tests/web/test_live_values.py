@@ -29,3 +29,12 @@ def test_a_value_that_stops_becomes_late_and_the_next_one_is_fresh(browser: Brow
         opened.page.evaluate(SEND, [GOOB, 1])
         assert opened.until(lambda: level.inner_text() == "7.00 V", 1), level.inner_text()
         assert opened.until(lambda: level.inner_text() == "7.00 V 0 s old", 3), level.inner_text()
+
+
+def test_the_state_of_an_earlier_connection_allows_no_driving(browser: Browser) -> None:
+    state = replace(STATES["driving"], repeated={})
+    reason = "pebble.driver.reason()?.code"
+    with serving(state) as server, tab(browser, server.url + state.path) as opened:
+        assert opened.until(f"window.pebble && {reason} === undefined", 10)
+        # another server answers, and what it knows comes a moment later
+        assert opened.page.evaluate(f"pebble.driver.socket.welcome(pebble.driver.socket.you), {reason}") == "server"

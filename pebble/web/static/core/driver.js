@@ -109,7 +109,7 @@ export class Driver {
     const broker = this.store.get("", "web/broker")?.value;
     return {
       name: this.ref.split("/").pop() ?? "",
-      open: this.socket.state === "open",
+      open: this.socket.state === "open" && !this.socket.outdated, // what is known is of the last connection
       broker: broker?.problem ?? "",
       reload: this.reload(),
       drives: this.socket.you?.drives !== false,
