@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
-from pebble.contract.identity import Direction, parse_topic
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP
+from pebble.contract.identity import parse_topic
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
-from pebble.web.robots import Component, own_topic
+from pebble.web.robots import Component, names
 
 MAX_STOPS = 64  # that are being sent at once; beyond, the oldest is no longer sent
 MAX_EACH = 16  # of them by one user: the stops of another one are not ended by too many
@@ -145,7 +146,7 @@ def _owner(owner: str, estop: RobotEstop) -> m.OwnerState:
 
 
 def _own(topic: str, sender: StopSender) -> bool:
-    """Whether it is an incoming topic of a robot that is being stopped: capabilities may name another robot's."""
+    """Whether a robot that is being stopped may have this topic: capabilities may name another robot's, or a flag."""
     address = parse_topic(topic)
     base = "" if address is None else address.identity.base
-    return base in sender.robots and own_topic(base, topic, Direction.INCOMING)
+    return base in sender.robots and any(names(base, topic, channel) for channel in (ESTOP, DRIVE, AUTONOMY_COMMAND))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import time
 
-from pebble.contract import ONLINE, codec
+import pytest
+
+from pebble.contract import CAPABILITIES, ESTOP, ONLINE, codec
 from pebble.contract.payloads import Heartbeat
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
@@ -28,6 +31,17 @@ def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
     assert stops.user(FIRST) is None
     assert A in stops.changed
     assert stops.view(RobotEstop(A)).sending == ""
+
+
+@pytest.mark.parametrize("topic", [f"{B}/incoming/drive-values", f"{A}/incoming/flags/reboot", f"{A}/outgoing/status"])
+def test_a_stop_sends_zeros_only_to_what_may_drive_this_robot(topic: str) -> None:
+    capabilities = json.dumps({"value": {"drive": {"available": True, "topic": topic}}}).encode()
+    stops = Stops()
+    stops.press(A, FIRST, by="ann", why="", now=0.0, known=[])
+    stops.receive(Message(CAPABILITIES.topic(A), capabilities), 0.0)
+    topics = {message.topic for now in (0.0, 1.0) for message in stops.tick(now)}
+    assert ESTOP.topic(A) in topics
+    assert topic not in topics
 
 
 def test_a_component_that_was_forgotten_is_shown_again_by_its_heartbeat() -> None:
