@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import pytest
 
 from pebble.contract import CAPABILITIES, ESTOP, ONLINE, codec
-from pebble.contract.payloads import Heartbeat
+from pebble.contract.payloads import Capabilities, Heartbeat
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.runtime.robot_estop import RobotEstop
@@ -35,7 +34,8 @@ def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
 
 @pytest.mark.parametrize("topic", [f"{B}/incoming/drive-values", f"{A}/incoming/flags/reboot", f"{A}/outgoing/status"])
 def test_a_stop_sends_zeros_only_to_what_may_drive_this_robot(topic: str) -> None:
-    capabilities = json.dumps({"value": {"drive": {"available": True, "topic": topic}}}).encode()
+    value = {"estop": {"available": True, "owners": ["motion"]}, "drive": {"available": True, "topic": topic}}
+    capabilities = codec.encode(CAPABILITIES, Capabilities(t=1, value=value))
     stops = Stops()
     stops.press(A, FIRST, by="ann", why="", now=0.0, known=[])
     stops.receive(Message(CAPABILITIES.topic(A), capabilities), 0.0)
