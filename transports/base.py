@@ -253,13 +253,21 @@ class Transport(ABC):
             subscription._join(max(0.0, deadline - time.monotonic()))
 
     def publish(
-        self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False, urgent: bool = False
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        qos: QoS = QoS.LATEST,
+        retain: bool = False,
+        urgent: bool = False,
+        remember: bool = True,
     ) -> bool:
         """Publish one message; return whether it was accepted.
 
         A live message is refused while there is no connection, and never delivered late. A retained one is accepted
         unless the transport is closed: its newest value is stored, for at most 10,000 topics, and sent when the
-        connection is back (T4). ``urgent`` gives commands and flags priority where the backend can. Raises
+        connection is back (T4). ``remember`` False: it is not stored here, because others change it as well; without a
+        connection it is refused. ``urgent`` gives commands and flags priority where the backend can. Raises
         TransportError for a topic that is not allowed.
         """
         check_topic(topic)
@@ -271,11 +279,11 @@ class Transport(ABC):
                 self.counters.add("refused")
                 return False
             accepted = self._send(message, urgent)
-            if retain:
+            if retain and remember:
                 self._remember(message, sent=accepted and self._state is State.CONNECTED)
             # "parked" is the published name of the counter of pending messages.
-            self.counters.add("sent" if accepted else "parked" if retain else "refused")
-            return accepted or retain
+            self.counters.add("sent" if accepted else "parked" if retain and remember else "refused")
+            return accepted or (retain and remember)
 
     def subscribe(
         self,

@@ -58,10 +58,15 @@ class Broker:
         """Call ``watcher`` when the connection is made or lost."""
         self._watchers.append(watcher)
 
-    def publish(self, topic: str, payload: bytes, *, retain: bool = False, qos: QoS = QoS.DELIVERED) -> bool:
-        """Publish now, ahead of streams; False if there is no connection, or no topic may be called so."""
+    def publish(
+        self, topic: str, payload: bytes, *, retain: bool = False, remember: bool = True, qos: QoS = QoS.DELIVERED
+    ) -> bool:
+        """Publish now, ahead of streams; False if there is no connection, or no topic may be called so.
+
+        ``remember`` False: what is retained belongs to whoever publishes it next; a broker that has lost it, has.
+        """
         try:
-            return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
+            return self.transport.publish(topic, payload, qos=qos, retain=retain, urgent=True, remember=remember)
         except TransportError as error:  # parts of topics come from robots and pages: what else is due must go on
             log.warning("not published: %s", error)
             return False

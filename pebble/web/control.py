@@ -31,6 +31,7 @@ FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with
 CHECK_S = 5.0  # between two looks at whether the session still exists
 _WATCH_COST = 20  # it subscribes to so many topics
+_NOTED_PER_S, _NOTED_BURST = 0.2, 60.0  # entries of one page in the audit: its other entries must not be lost by them
 _WAITING = 64  # messages that wait to be sent, besides the state
 _RELOAD = "This page is older than the server: reload it"
 
@@ -57,12 +58,14 @@ class Control:
         self._interest = Interest(lambda: self._wake.set())
         self._wake = asyncio.Event()
         self._pace = Pace(time.monotonic())
+        self._noted = Pace(time.monotonic(), _NOTED_PER_S, _NOTED_BURST)  # of what is asked of robots, in the audit
         self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
         self._drives = True
         self._why_not = ""  # why this page may not drive at all
         self._reads_logs = False
         self._logs_sent = "", 0  # the origin and number of the last line
         self._logs_due = False  # whether the page has received the part before
+        self._large_due = False  # and the last large value
         self._series: deque[str] = deque()  # metrics of the watched component whose past is still to be sent
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
@@ -176,7 +179,7 @@ class Control:
         match op:
             case m.Echo():
                 self._tab.clock.echo(op.n, op.t, clock())
-                self._logs_due = True
+                self._logs_due = self._large_due = True
                 self._post_series()
             case m.DriveOp():
                 self._drive(op)
@@ -212,15 +215,17 @@ class Control:
         """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""
         if not self._may(robot_commands.right(op), op):
             return
-        if why := self._server.refuses(op):
+        if why := (self._why_not if robot_commands.moves(op) else "") or self._server.refuses(op):
             self._refuse(op, why)
             return
         message = robot_commands.publication(op, self._server.robots.topic)
-        if not self._server.broker.publish(message.topic, message.payload, retain=message.retain, qos=message.qos):
+        if not self._server.broker.publish(
+            message.topic, message.payload, retain=message.retain, remember=False, qos=message.qos
+        ):
             self._refuse(op, "The server cannot reach the broker")
             return
         self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
-        if not isinstance(op, m.LightsOp | m.SoundboardOp):
+        if not isinstance(op, m.LightsOp | m.SoundboardOp) and self._noted.allows(time.monotonic()):
             self._audit(_tag(op), op.ref, detail=_detail(op))
 
     def _drive(self, op: m.DriveOp) -> None:
@@ -351,9 +356,9 @@ class Control:
             await self._websocket.send_text(encode(self._waiting.popleft()))
         drivers = {one for one in self._interest.dirty if one[1] == "web/driver"}
         self._interest.dirty -= drivers
-        values = self._server.robots.take(self._interest, now) + tuple(
-            (ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers
-        )
+        found, large = self._server.robots.take(self._interest, now, large=self._large_due)
+        self._large_due = self._large_due and not large
+        values = found + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
         gone, self._interest.gone = tuple(self._interest.gone), set()
         if values or gone:
             await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))

@@ -95,8 +95,12 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     async def _run(self) -> None:
         try:
-            while not self._over():
-                await self._step()
+            while self.viewers or not self._closing:
+                while not self._over():
+                    await self._step()
+                await self._source.withdraw()
+                if self._closing or not self.viewers:  # else one has come meanwhile
+                    return
         finally:
             await self._source.withdraw()
             self._end()

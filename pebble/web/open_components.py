@@ -82,10 +82,14 @@ class OpenComponents:
 
     def close(self, ref: str) -> None:
         """A page has closed it."""
+        self._broker.loop.call_later(_KEEP_S, self._closed, ref)
+
+    def _closed(self, ref: str) -> None:
+        """Some time later: whoever loads the page anew finds everything."""
         self._pages[ref] -= 1
         if not self._pages[ref]:
             del self._pages[ref]
-            self._broker.loop.call_later(_KEEP_S, self.update, ref)
+            self.update(ref)
 
     def update(self, ref: str) -> None:
         """Its capabilities, or the pages that have it open, may have changed."""
@@ -101,8 +105,6 @@ class OpenComponents:
         try:
             done = self._subscriptions.setdefault(ref, {})
             while True:
-                if not done:
-                    self._show_flags(ref, FlagsView())  # those that were removed meanwhile do not arrive
                 wanted = self._wanted[ref] = self._filters(ref) if ref in self._pages else {}
                 for filter_ in [filter_ for filter_ in done if filter_ not in wanted]:
                     await self._broker.unsubscribe(done.pop(filter_))
@@ -113,6 +115,8 @@ class OpenComponents:
                         if filter_ not in failed:
                             failed.add(filter_)
                             log.warning("%s is not received: %s", filter_, error)
+                if wanted and self._broker.connected:
+                    self._show_flags(ref, self._flags.get(ref, FlagsView()))  # those that are not set do not arrive
                 if not wanted:
                     if ref in self._pages:  # opened again meanwhile
                         continue
@@ -177,9 +181,17 @@ class OpenComponents:
 
     def _forget_flags(self) -> None:
         """They arrive again with the next connection, except those that are removed meanwhile."""
-        if not self._broker.connected:
-            for ref in list(self._flags):
-                self._show_flags(ref, FlagsView())
+        if self._broker.connected:
+            self._broker.loop.call_later(_STEP_S, self._show_all_flags)
+            return
+        for ref in list(self._flags):
+            del self._flags[ref]
+            self._robots.remove_server_metric(ref, _FLAGS_METRIC)
+
+    def _show_all_flags(self) -> None:
+        if self._broker.connected:
+            for ref in self._subscriptions:
+                self._show_flags(ref, self._flags.get(ref, FlagsView()))
 
     def _filters(self, ref: str) -> dict[str, _Carried]:
         """Every channel's own topic, flags, what capabilities and manifests name, and overlays of its picture."""

@@ -21,15 +21,15 @@ class Restarts:
         self._counts: dict[str, int] = {}
         self._times: dict[str, deque[int]] = {}
 
-    def receive(self, status: bytes, now_ms: int) -> bool:
-        """Take a status; whether any service has restarted since the last one."""
+    def receive(self, status: bytes, now_ms: int, *, dated: bool = True) -> bool:
+        """Take a status; whether any service has restarted since the last one. ``dated`` False: of any time."""
         found = False
         for name, count in _counts(status).items():
             before = self._counts.get(name, count)
             if name not in self._counts and len(self._counts) >= MAX_SERVICES:
                 continue
             self._counts[name] = count  # a robot that was restarted counts from 0
-            if count > before:
+            if count > before and dated:
                 times = self._times.setdefault(name, deque(maxlen=MAX_TIMES))
                 times.extend([now_ms] * min(count - before, MAX_TIMES))
                 found = True

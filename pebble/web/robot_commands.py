@@ -28,6 +28,7 @@ class _Command(NamedTuple):
 
 
 _ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
+_DESCRIBE = c.MCU_DESCRIBE.metric.rpartition("/")[2]  # on this topic bridges ask each other whose device it is
 _FLAGS = {flag.metric.removeprefix("flags/"): (flag, section) for section, flag in FLAGS.items()}
 
 
@@ -46,8 +47,15 @@ def ends(op: m.RobotOp) -> bool:
     return False
 
 
+def moves(op: m.RobotOp) -> bool:
+    """Whether something may move, or be switched on, because of it: not over a connection that may not drive."""
+    return isinstance(op, m.AutonomyOp | m.McuOp | m.OutletOp) and not ends(op)
+
+
 def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     """Why a component with these capabilities is not asked this; empty if it is, also where they do not mention it."""
+    if isinstance(op, m.McuOp) and op.name == _DESCRIBE:
+        return f"{op.name} is no command of a microcontroller"
     command = _command(op)
     offered = section_of(capabilities, command.section) if command.section else {}
     kind = command.key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}

@@ -50,6 +50,7 @@ from pebble.web.restarts import Restarts
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 500, 200, 64 * 1024
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
+LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_BYTES = 32 * 1024 * 1024  # of all values together
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _SERVERS = "servers"  # the type of other servers of this page: they are no components to be shown
@@ -180,14 +181,24 @@ class Robots:
         found = self._find(ref, metric)
         return None if found is None else found.raw
 
-    def take(self, interest: Interest, now: float) -> tuple[tuple[str, str, Any, float], ...]:
-        """What this page has not received yet, None for what was removed; it counts as received from now on."""
+    def take(
+        self, interest: Interest, now: float, *, large: bool
+    ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
+        """What this page has not received yet, None for what was removed; it counts as received from now on.
+
+        With it, whether there is a large value among them: one if it may be ``large``, the others wait.
+        """
         dirty, interest.dirty = interest.dirty, set()
-        found = ((ref, metric, self._find(ref, metric)) for ref, metric in dirty)
-        return tuple(
-            (ref, metric, None, 0.0) if one is None else (ref, metric, one.raw, 1000 * (now - one.at))
-            for ref, metric, one in found
-        )
+        taken, has_large = [], False
+        for ref, metric in dirty:
+            one = self._find(ref, metric)
+            if one is not None and len(bytes(one.raw)) > LARGE_BYTES:
+                if has_large or not large:
+                    interest.dirty.add((ref, metric))
+                    continue
+                has_large = True
+            taken.append((ref, metric, None, 0.0) if one is None else (ref, metric, one.raw, 1000 * (now - one.at)))
+        return tuple(taken), has_large
 
     def _find(self, ref: str, metric: str) -> _Value | None:
         if metric.startswith("web/"):
@@ -346,7 +357,9 @@ class Robots:
             component.aliases[metric] = _aliases(message.payload)
         elif channel is ONLINE or channel in SYNONYMS:
             self._heartbeat(component, message, now)
-        elif channel is STATUS and component.restarts.receive(message.payload, int(1000 * time.time())):
+        elif channel is STATUS and component.restarts.receive(
+            message.payload, int(1000 * time.time()), dated=not message.retain
+        ):
             self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
 
     def _heartbeat(self, component: Component, message: Message, now: float) -> None:

@@ -183,10 +183,10 @@ class Server:
         component = self.robots.components.get(op.ref)
         if component is None:
             return "unknown component"
+        if robot_commands.ends(op):
+            return "" if self.broker.connected else "The server cannot reach the broker"
         if problem := self.broker.problem:
             return f"The server cannot reach the broker: {problem}"
-        if robot_commands.ends(op):
-            return ""
         if component.online(time.monotonic()) is False and not isinstance(op, m.FlagOp):  # the broker remembers flags
             return f"{component.name} is silent"
         why = robot_commands.refusal(op, component.capabilities)

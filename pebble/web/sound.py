@@ -121,8 +121,10 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         now = time.monotonic()
         if talk <= page.over:
             return
+        self._release(now)
+        if talk <= page.over:
+            return
         if self._talk is None or page is not self._talker or talk != self._talk.number:
-            self._release(now)
             if why := self._why_not(page):
                 page.answer(talk, on=False, why=why)
                 return
@@ -152,14 +154,21 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
             return f"The role {page.session.role} may not do this"
         if self._talker is not None and self._talker is not page:
             return f"{self._talker.session.user} is talking"
+        return self._unheard() or refusal(self.ref, self._robots.capabilities(self.ref), "audio")
+
+    def _unheard(self) -> str:
+        """Why the robot would not hear it now; empty if it does."""
         if problem := self._broker.problem:
             return f"The server cannot reach the broker: {problem}"
-        return refusal(self.ref, self._robots.capabilities(self.ref), "audio")
+        component = self._robots.components.get(self.ref)
+        if component is not None and component.online(time.monotonic()) is False:
+            return f"{component.name} is silent"
+        return ""
 
     def _release(self, now: float) -> None:
         """End a talk of which nothing comes any more."""
         if self._talk is not None and self._talk.is_over(now):
-            self._interrupt(f"No sound came for {SILENT_S:g} s")
+            self._interrupt(f"No sound came in time for {SILENT_S:g} s")
 
     def _interrupt(self, why: str) -> None:
         """End a talk, and tell its page why."""
@@ -179,8 +188,9 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         self._release(time.monotonic())
         capabilities = self._robots.capabilities(self.ref)
         self._why = refusal(self.ref, capabilities, "audio")
+        if why := self._why or self._unheard():
+            self._interrupt(why)
         if self._why:
-            self._interrupt(self._why)
             await self._source.withdraw()
         elif self.viewers:
             await self._source.follow(capabilities, best(offered(capabilities, "audio"), self._listening()))

@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
-from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP
-from pebble.contract.identity import parse_topic
+from pebble.contract.identity import Direction, parse_topic
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
-from pebble.web.robots import Component, names
+from pebble.web.robots import Component, own_topic
 
 MAX_STOPS = 64  # that are being sent at once; beyond, the oldest is no longer sent
 MAX_EACH = 16  # of them by one user: the stops of another one are not ended by too many
@@ -146,7 +145,10 @@ def _owner(owner: str, estop: RobotEstop) -> m.OwnerState:
 
 
 def _own(topic: str, sender: StopSender) -> bool:
-    """Whether a robot that is being stopped may have this topic: capabilities may name another robot's, or a flag."""
+    """Whether it is an incoming topic of a robot that is being stopped: capabilities may name another robot's.
+
+    Also one that the contract calls otherwise: a stop does no harm there, and it may be what drives this robot.
+    """
     address = parse_topic(topic)
     base = "" if address is None else address.identity.base
-    return base in sender.robots and any(names(base, topic, channel) for channel in (ESTOP, DRIVE, AUTONOMY_COMMAND))
+    return base in sender.robots and own_topic(base, topic, Direction.INCOMING)

@@ -10,7 +10,7 @@ RATE: Final = 16_000  # Hz, mono, s16le
 PIECES_PER_S: Final = 50
 SAMPLES: Final = RATE // PIECES_PER_S
 PIECE_BYTES: Final = 2 * SAMPLES
-SILENT_S: Final = 1.0  # without a piece, after which a talk is over
+SILENT_S: Final = 1.0  # without a piece that is in time, after which a talk is over
 LATE_S: Final = 0.3  # what a stalled connection has held back longer than that is not played
 _DRIFT_S: Final = 2e-5  # a piece: the clock of a page's microphone may be slow by a thousandth
 
@@ -20,15 +20,17 @@ class Talk:
 
     def __init__(self, number: int, now: float) -> None:
         self.number = number  # of that page's connection
-        self._received_at = now
+        self._received_at = now  # of the last piece that was in time
         self._least = float("inf")  # the smallest lateness of its pieces
 
     def takes(self, piece: int, now: float) -> bool:
         """Whether this piece, counted from 0 by the page's microphone, is in time."""
         late = now - piece / PIECES_PER_S
         self._least = min(self._least + _DRIFT_S, late)
+        if late - self._least > LATE_S:
+            return False
         self._received_at = now
-        return late - self._least <= LATE_S
+        return True
 
     def is_over(self, now: float) -> bool:
         return now - self._received_at > SILENT_S

@@ -408,6 +408,23 @@ def test_T09_running_clients_restore_their_retained_state(net: Net, base: str) -
     assert until(lambda: len(received.messages) == 2, 2.0)
 
 
+def test_T09_what_is_not_to_be_remembered_is_sent_once(net: Net, base: str) -> None:
+    setter, received = net.client("setter"), Received()
+    assert setter.publish(f"{base}/flag", b"by setter", qos=DELIVERED, retain=True, remember=False)
+    assert setter.publish(f"{base}/own", b"kept", qos=DELIVERED, retain=True)
+    drained(setter, setter, base)
+    net.client("early").subscribe(f"{base}/flag", received)
+    assert received.until(b"by setter")
+    with reconnecting(setter):
+        net.stop_network(forget=True)
+        assert until(lambda: setter.state is State.CONNECTING)
+        net.start_network()
+    later = Received()
+    net.client("late").subscribe(f"{base}/+", later)
+    assert later.until(b"kept")
+    assert {message.topic for message in later.messages} == {f"{base}/own"}
+
+
 def test_T09_only_what_changed_during_the_outage_is_sent(net: Net, base: str) -> None:
     retainer, received = net.client("keeper"), Received()
     retainer.publish(f"{base}/same", b"1", qos=DELIVERED, retain=True)

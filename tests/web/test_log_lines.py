@@ -96,6 +96,14 @@ def test_restarts_are_dated_when_they_are_seen() -> None:
     assert seen.view().times["a"] == (4000, 6000)
 
 
+def test_restarts_in_a_status_of_any_age_are_not_dated() -> None:
+    seen = Restarts()
+    assert not seen.receive(status(a=3), 1000)
+    assert not seen.receive(status(a=8), 2000, dated=False)  # the broker was away meanwhile
+    assert seen.receive(status(a=9), 3000)
+    assert seen.view().times == {"a": (3000,)}
+
+
 def test_only_the_newest_restarts_of_some_services_are_remembered() -> None:
     seen = Restarts()
     names = [f"s{number}" for number in range(MAX_SERVICES + 10)]

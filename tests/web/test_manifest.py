@@ -222,6 +222,7 @@ def test_a_sparkline_has_the_last_minute() -> None:
       const history = [];
       for (let at = 0; at <= 90_000; at += 100) remember(history, { receivedAt: at, value: { value: { x: at } } });
       remember(history, { receivedAt: 95_000, value: "odd" });
+      remember(history, { receivedAt: 95_500, value: { value: { x: { toString: 0 } } } });
       const points = series(history, "x");
       return [points.length, points[0][0], points.at(-1)];
     })()"""

@@ -97,6 +97,15 @@ def test_a_space_bar_that_is_held_stops_again_and_again_but_on_a_button_once() -
     assert driver(steps.format(more="{ target: { matches: (one) => one.includes('button') } }")) == ["stop", "ended"]
 
 
+def test_a_space_bar_switches_what_has_the_focus_as_well() -> None:
+    steps = """let prevented = 0;
+    const on = (selector) => key("Space", {
+      target: { matches: (all) => all.split(", ").includes(selector) }, preventDefault: () => prevented++ });
+    on("input[type=checkbox]"); on("button"); const pressed = prevented; on("div");
+    await null; result = [pressed, prevented, done.filter((one) => one === "stop").length];"""
+    assert driver(steps) == [0, 1, 3]
+
+
 # -- gamepads
 
 

@@ -12,11 +12,13 @@ from typing import Any
 import msgspec
 import pytest
 
+from pebble.contract import CAPABILITIES, codec
+from pebble.contract.payloads import Capabilities
 from pebble.fleet.roles import Role, rights
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web import messages as m
 from pebble.web import robot_commands
-from pebble.web.robots import Robots
+from pebble.web.robots import Interest, Robots
 from tests.support import Broker, until
 from tests.web.attacker import Hall
 from tests.web.served import Page, RecordingRobot, Served, now_ms
@@ -285,6 +287,25 @@ def test_nothing_is_asked_of_an_unknown_component(page: Page, robot: RecordingRo
     assert asked_of(robot) == []
 
 
+def test_without_driving_nothing_is_moved_or_switched_on(served: Served, robot: RecordingRobot) -> None:
+    moving = [fields for fields, *_ in PUBLISHED if robot_commands.moves(op(**fields))]
+    assert {fields["tag"] for fields in moving} == {"autonomy", "mcu", "outlet"}
+    with served.page(version="old") as page:
+        assert page.knows(robot.base)
+        for fields in moving:
+            ask(page, robot.base, **fields)
+        assert all("reload" in why for why in refusals(page, len(moving)))
+        ask(page, robot.base, "autonomy", file="")
+        ask(page, robot.base, "outlet", outlet="o1", on=False)
+        assert until(lambda: len(asked_of(robot)) == 2, 3), asked_of(robot)
+
+
+def test_no_command_passes_for_a_question_of_the_bridges(page: Page, robot: RecordingRobot) -> None:
+    ask(page, robot.base, "mcu", uid="u1", name="describe", value={"has": True, "from": True})
+    assert "no command" in refusals(page)[0]
+    assert asked_of(robot) == []
+
+
 def test_a_silent_robot_is_asked_nothing_but_to_end_and_its_flags(page: Page, robot: RecordingRobot) -> None:
     robot.silent()
     assert until(lambda: page.value(robot.base, "web/liveness", "online") is False, 4)
@@ -356,6 +377,26 @@ def test_a_long_list_of_clips_is_passed_on(page: Page, robot: RecordingRobot) ->
     page.send("watch", ref=robot.base)
     robot.publish("soundboard-files", {"files": files, "timestamp": 1.0}, retain=True)
     assert until(lambda: page.value(robot.base, "soundboard-files", "files") == files, 5)
+
+
+def test_large_values_are_sent_one_at_a_time() -> None:
+    robots, interest = Robots(), Interest(lambda: None)
+    robots.join(interest)
+    for name in ("a", "b"):
+        topic = f"pebble/robots/{name}/outgoing/capabilities"
+        robots.receive(Message(topic, codec.encode(CAPABILITIES, Capabilities(t=1, value={"x": "y" * 20_000}))), 0.0)
+    robots.set_server_metric("", "web/broker", {"connected": True})
+
+    def taken(*, large: bool) -> tuple[set[str], bool]:
+        values, had = robots.take(interest, 1.0, large=large)
+        return {ref.rpartition("/")[2] for ref, metric, *_ in values if metric == "capabilities"}, had
+
+    assert taken(large=False) == (set(), False)
+    first, had = taken(large=True)
+    assert had
+    assert taken(large=False) == (set(), False)
+    assert (first | taken(large=True)[0], len(first)) == ({"a", "b"}, 1)
+    assert taken(large=True) == (set(), False)
 
 
 def test_a_stopped_robot_starts_no_script_but_may_end_one(page: Page, robot: RecordingRobot) -> None:

@@ -199,6 +199,7 @@ def test_the_range_of_values_has_room(low: str, high: str, least: str, shown: li
         ("{ x_m: 1.5, y_m: -0.5, z_m: 0, yaw_rad: 0.5 }", [1.5, -0.5, 0.5]),
         ("{ value: { x_mm: 0, y_mm: 0, heading_deg: 180 } }", [0, 0, 3.14159]),
         ("{ value: { x_mm: 0, y_mm: 0 } }", [0, 0, 0]),
+        ("{ value: { x: 1500, y: 0 }, unit: { toString: 0 } }", [1.5, 0, 0]),
     ],
 )
 def test_poses_of_all_producers(payload: str, found: list[float]) -> None:
@@ -216,6 +217,7 @@ def test_poses_of_all_producers(payload: str, found: list[float]) -> None:
         "{ value: { x_mm: '1', y_mm: 2 } }",
         "{ value: { x_mm: 1e300, y_mm: 0 } }",
         "{ value: [1, 2] }",
+        "{ value: { x: {} }, unit: { toString: 0 } }",
     ],
 )
 def test_what_is_no_pose(payload: str) -> None:

@@ -314,7 +314,7 @@ async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound(monk
     async with serving(robot) as server:
         bob, eve = server.open(Page(), user="bob"), server.open(Page(), user="eve")
         await bob.speak(1, 3)
-        await until(lambda: bob.talks[-1:] == [{"talk": 1, "on": False, "why": "No sound came for 1 s"}])
+        await until(lambda: bob.talks[-1:] == [{"talk": 1, "on": False, "why": "No sound came in time for 1 s"}])
         await until(lambda: server.view.talker == "")
         monkeypatch.setattr("pebble.web.talk.SILENT_S", 60.0)
         bob.send_piece(1, 3, bytes(PIECE_BYTES))
@@ -395,6 +395,14 @@ def test_what_a_stalled_connection_held_back_is_not_played() -> None:
     assert all(talk.takes(number, 10 + number / PIECES_PER_S + 0.02) for number in range(150, 200))
     assert not talk.is_over(10 + 200 / PIECES_PER_S)
     assert talk.is_over(10 + 200 / PIECES_PER_S + SILENT_S + 0.1)
+
+
+def test_a_talk_of_which_everything_is_late_is_over() -> None:
+    talk = Talk(1, 0.0)
+    assert talk.takes(0, 10.0)
+    lost = 10.0 + LATE_S + 0.1  # the page's microphone has skipped so much
+    assert not any(talk.takes(number, lost + number / PIECES_PER_S) for number in range(1, 60))
+    assert talk.is_over(lost + 60 / PIECES_PER_S)
 
 
 def test_a_microphone_whose_clock_is_slow_works_for_an_hour() -> None:

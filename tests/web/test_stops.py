@@ -32,8 +32,8 @@ def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
     assert stops.view(RobotEstop(A)).sending == ""
 
 
-@pytest.mark.parametrize("topic", [f"{B}/incoming/drive-values", f"{A}/incoming/flags/reboot", f"{A}/outgoing/status"])
-def test_a_stop_sends_zeros_only_to_what_may_drive_this_robot(topic: str) -> None:
+@pytest.mark.parametrize("topic", [f"{B}/incoming/drive-values", f"{A}/outgoing/status"])
+def test_a_stop_sends_zeros_only_to_topics_of_its_own_robot(topic: str) -> None:
     value = {"estop": {"available": True, "owners": ["motion"]}, "drive": {"available": True, "topic": topic}}
     capabilities = codec.encode(CAPABILITIES, Capabilities(t=1, value=value))
     stops = Stops()

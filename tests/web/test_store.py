@@ -39,6 +39,16 @@ def test_subscribers_of_a_metric_are_called_once_for_many_changes() -> None:
     assert run(steps) == [["m"], ["m", "m"]]
 
 
+def test_a_subscriber_that_fails_keeps_no_other_from_being_called() -> None:
+    steps = """process.on("uncaughtException", (error) => calls.push(error.message));
+    store.subscribe("a", "m", () => { throw new Error("bad"); });
+    store.subscribe("b", "m", () => calls.push("b"));
+    store.set("a", "m", 1); store.set("b", "m", 2); frame();
+    await new Promise((done) => setTimeout(done, 1));
+    result = calls;"""
+    assert run(steps) == ["b", "bad"]
+
+
 def test_a_subscription_ends() -> None:
     steps = """
     const end = store.subscribe("a", "m", () => calls.push("m"));

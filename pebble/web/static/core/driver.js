@@ -6,6 +6,7 @@ import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
 
 const SUSPENDED_MS = 500; // between the wall clock and the page's own
 const TWICE_MS = 600; // Escape, pressed twice
+const PRESSED = "button, [role=button], summary, a, input[type=checkbox], input[type=radio]"; // by the space bar, too
 const TYPING = "input:not([type=range]):not([type=checkbox]):not([type=radio]), select, textarea, [contenteditable]";
 
 export class Driver {
@@ -236,14 +237,14 @@ export class Driver {
     }
     if (event.target.matches?.(TYPING)) return;
     if (event.code === "Space") {
-      const button = event.target.matches?.("button, [role=button], summary, a");
+      const button = event.target.matches?.(PRESSED);
       if (!button) event.preventDefault();
       if (!button || !event.repeat) this.space(); // a button that is held by it stays held
     } else if (event.ctrlKey || event.altKey || event.metaKey) {
       // a shortcut of the browser
     } else if (DRIVE_KEYS.has(event.code) && this.ref && !isOwn(event)) {
-      event.preventDefault();
       if (document.querySelector("dialog[open]")) return;
+      event.preventDefault();
       this.inputs.keyDown(event.code, event.repeat || isOld(event.timeStamp));
       this.update();
     } else if (!isOld(event.timeStamp) && this.actions?.keyDown(event)) event.preventDefault();
@@ -344,5 +345,5 @@ function isMeta(event) {
 
 /** Arrows move a slider that has the focus; letters drive also then. */
 function isOwn(event) {
-  return event.code.startsWith("Arrow") && event.target.matches?.("input[type=range], input[type=radio]");
+  return event.code.startsWith("Arrow") && event.target.matches?.("input[type=range], input[type=radio], [data-arrows]");
 }

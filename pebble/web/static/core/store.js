@@ -169,7 +169,13 @@ export class Store {
     this.changed = new Set();
     const due = new Set();
     for (const key of changed) for (const fn of this.subscribers.get(key) ?? []) due.add(fn);
-    for (const fn of due) fn();
+    for (const fn of due) {
+      try {
+        fn();
+      } catch (error) {
+        queueMicrotask(() => { throw error; }); // is reported, and the others are called
+      }
+    }
   }
 }
 

@@ -25,7 +25,7 @@ const GAP_MS = 5000; // after that without a pose, the way between is not known
 export function poseOf(payload) {
   const value = isObject(payload?.value) ? payload.value : payload;
   if (!isObject(value)) return null;
-  const unit = PER_METRE[String(payload.unit ?? value.unit ?? "mm").toLowerCase()] ?? 1000;
+  const unit = PER_METRE[[payload.unit, value.unit].find((one) => typeof one === "string")?.toLowerCase() ?? "mm"] ?? 1000;
   const x = length(value, X, unit);
   const y = length(value, Y, unit);
   if (x === null || y === null) return null;

@@ -1,6 +1,6 @@
 // Which script of a robot runs, since when, and why none can be started. Robots may report anything.
 
-import { sectionOf, whyNot } from "./why-not.js";
+import { sectionOf, whyNotMoved } from "./why-not.js";
 import { inner, isObject, nameOf } from "./words.js";
 
 const MOST_DEPENDENCIES = 16;
@@ -64,7 +64,7 @@ export function handDriven({ store }, ref) {
 
 /** @param {any} page its services @param {string} ref @returns {string} why no script can be started; "" one can */
 export function whyNotStarted(page, ref) {
-  const why = whyNot(page, ref, "autonomy");
+  const why = whyNotMoved(page, ref, "autonomy");
   if (why) return why;
   if (page.store.get(ref, "web/liveness")?.value.online !== true) return `${nameOf(ref)} has not been seen yet`;
   const stop = page.store.get(ref, "web/estop")?.value;

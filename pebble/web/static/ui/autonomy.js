@@ -102,6 +102,10 @@ function Starter({ at, page, entry, status, script }) {
   const why = whyNotStarted(page, at) || (script ? whyNotSent(form) : "Choose a script first");
   const { by, waits } = handDriven(page, at);
   const note = by && waits ? `${by} driving: the script will wait` : "";
+  const restore = (event) => {
+    event.currentTarget.closest(".card-body").querySelector("select").focus(); // the button vanishes
+    change(new Map(), version + 1);
+  };
   const change = (next, drawn = version) => {
     set({ texts: next, version: drawn });
     remember(at, script.file, next);
@@ -132,7 +136,7 @@ function Starter({ at, page, entry, status, script }) {
         >${startWords(status, script)}<//
       >
       ${texts.size > 0 &&
-      html`<button type="button" data-test="restore-all" onClick=${() => change(new Map(), version + 1)}>
+      html`<button type="button" data-test="restore-all" onClick=${restore}>
         All defaults
       </button>`}
     </div>

@@ -1,7 +1,19 @@
 // All components at a glance: who is there, who drives, what is stopped.
 
 import { RouteLink, Liveness } from "./header.js";
-import { html, useEffect, useMetric, useModel, useNodes, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
+import {
+  Boundary,
+  html,
+  useEffect,
+  useMetric,
+  useModel,
+  useNodes,
+  usePage,
+  useRefs,
+  useState,
+  useTick,
+  useValue,
+} from "./hooks.js";
 import { Offers, Route, WATCHES } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import {
@@ -29,7 +41,9 @@ export function Fleet() {
   useTick(1000); // robots come and go
   const refs = useRefs();
   const [filter, setFilter] = useState("");
-  const cards = useNodes((ref) => html`<li key=${ref}><${FleetCard} at=${ref} /></li>`);
+  const cards = useNodes(
+    (ref) => html`<li key=${ref}><${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} /><//></li>`,
+  );
   const online = refs.filter((ref) => isPresent(store, ref));
   const away = refs.filter((ref) => !isPresent(store, ref) && !settings.forgotten.has(ref));
   useEffect(() => {
@@ -75,7 +89,10 @@ function isPresent(store, ref) {
 }
 
 function sorted(store, refs, by) {
-  const level = (ref) => Number(inner(store.get(ref, "charging-level")?.value) ?? Infinity);
+  const level = (ref) => {
+    const value = inner(store.get(ref, "charging-level")?.value);
+    return typeof value === "number" ? value : Infinity;
+  };
   const robotsFirst = (ref) => `${typeOf(ref) === "robots" ? 0 : 1} ${nameOf(ref)}`;
   const keys = { name: robotsFirst, type: (ref) => `${typeOf(ref)} ${nameOf(ref)}`, battery: level };
   const key = keys[by] ?? robotsFirst;
@@ -214,7 +231,7 @@ function DriverFact({ at, offers, online }) {
 function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
   if (!online || !status?.running) return null;
-  return html`<li class="fact"><${Icon} name="script" />script: ${String(status.file ?? "?")}</li>`;
+  return html`<li class="fact"><${Icon} name="script" />script: ${plain(status.file ?? "?")}</li>`;
 }
 
 /** In a word or two, what a component reports that is no robot. */

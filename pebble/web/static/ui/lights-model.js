@@ -89,7 +89,7 @@ export class Lights extends Model {
       if (answer?.op === "done") {
         this.passed = state;
         this.save();
-      } else if (answer && n === this.n && !this.pacer.waiting) {
+      } else if ((answer || !connection.isOpen) && n === this.n && !this.pacer.waiting) {
         this.restore();
       }
       if (answer || !connection.isOpen) end();

@@ -120,6 +120,7 @@ function Lines({ view, lines }) {
     aria-live="off"
     aria-label="Log lines"
     tabindex="0"
+    data-arrows
     ref=${box}
     onScroll=${scrolled}
   >

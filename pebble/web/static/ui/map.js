@@ -6,6 +6,9 @@ import { Gone, isGone } from "./parts.js";
 import { recorderOf } from "./recorder.js";
 import { number } from "./words.js";
 
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+const ARROW_PX = 24;
+
 const LIMITS = { spanMs: 3_600_000, most: 4000, differs };
 const SOURCES = { "wheel-odometry": "by its wheels", "localization-pose": "in its map" };
 const STEP_MS = 100; // between two drawings
@@ -35,7 +38,8 @@ export function Odometry({ at }) {
   if (view.current) view.current.gone = gone;
   const words = poseWords(series.newest);
   return html`<div class="map">
-    <canvas ref=${canvas} class="map-canvas" role="img" aria-label="Trail of the odometry" data-test="map"></canvas>
+    <canvas ref=${canvas} class="map-canvas" role="img" tabindex="0" data-arrows data-test="map"
+      aria-label="Trail of the odometry; arrow keys move it"></canvas>
     <p class="map-words" data-test="map-pose">
       ${gone && series.newest ? html`<${Gone} age=${age}>${words}<//>` : words}
     </p>
@@ -118,6 +122,12 @@ class View {
       if (!event.ctrlKey && !event.metaKey) return; // the page scrolls; a pinch on a trackpad comes with ctrlKey
       event.preventDefault();
       this.zoom(2 ** (-event.deltaY / 200));
+    });
+    on("keydown", (event) => {
+      const way = ARROWS[event.code];
+      if (!way || event.ctrlKey || event.altKey || event.metaKey) return;
+      event.preventDefault();
+      this.move(-ARROW_PX * way[0], -ARROW_PX * way[1]);
     });
     let mouse = { x: 0, y: 0 };
     on("pointerdown", (event) => {

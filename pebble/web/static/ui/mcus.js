@@ -5,13 +5,13 @@ import { html, useMetric, useOnline, usePage, useRef, useState, useTick, useValu
 import { command, fieldOf, range, readManifest, step, text, unsendable } from "./manifest.js";
 import { Icon, Why, isGone } from "./parts.js";
 import { Spark, remember } from "./spark.js";
-import { useReasons, whyNot } from "./why-not.js";
+import { useReasons, whyNotMoved } from "./why-not.js";
 import { clockTime, plain, roughly } from "./words.js";
 
 const MOST = 16;
 
 export function Mcus({ at, offers }) {
-  const why = whyNot(useReasons(at), at);
+  const why = whyNotMoved(useReasons(at), at);
   const uids = offers.metrics
     .map((metric) => /^mcu\/([^/]+)\/describe$/.exec(metric)?.[1])
     .filter(Boolean)

@@ -3,7 +3,7 @@
 import { isLevel, useAnswer } from "./asking.js";
 import { html, useEffect, useMetric, useOnline, useState, useTick } from "./hooks.js";
 import { Why } from "./parts.js";
-import { useReasons, whyNot, whyNotEnd } from "./why-not.js";
+import { useReasons, whyNotEnd, whyNotMoved } from "./why-not.js";
 import { inner, isObject } from "./words.js";
 
 const MOST = 64;
@@ -12,7 +12,7 @@ const CONFIRMED_MS = 3000;
 
 export function Outlets({ at, offers }) {
   const page = useReasons(at);
-  const why = whyNot(page, at);
+  const why = whyNotMoved(page, at);
   const all = outletsOf(offers);
   return html`${why && html`<${Why} id="why-outlets">${why}<//>`}
     <ul class="outlets">
@@ -72,7 +72,7 @@ function Outlet({ at, id, name, controls, page }) {
   const words = report.on === true ? "on" : report.on === false ? "off" : "unknown";
   const on = !(waits && !late ? asked.on : report.on === true); // what the next press asks
   const own = obstacle(name, controls, report, on);
-  const common = on ? whyNot(page, at) : whyNotEnd(page);
+  const common = on ? whyNotMoved(page, at) : whyNotEnd(page);
   const press = () => ask({ on, at: performance.now(), n: page.commands.switchOutlet(at, name, on) });
   const why = [common && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
   return html`<li class="outlet">

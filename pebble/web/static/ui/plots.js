@@ -30,7 +30,10 @@ export function Plots({ at }) {
         key=${plot.id}
         plot=${plot}
         ...${parts}
-        onRemove=${() => change(added.filter((one) => one.id !== plot.id))}
+        onRemove=${(event) => {
+          event.currentTarget.closest(".plots").querySelector("select").focus();
+          change(added.filter((one) => one.id !== plot.id));
+        }}
       />`,
     )}
     <div class="plot-tools">

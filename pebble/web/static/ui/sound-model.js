@@ -64,10 +64,10 @@ export class Sound extends Model {
     this.muted = false;
     this.problem = "";
     const { ref } = this.route;
-    const context = this.start();
-    this.adjust();
-    this.changed();
     try {
+      const context = this.start();
+      this.adjust();
+      this.changed();
       this.speaker ??= makeSpeaker(context);
       const { node, attach } = await this.speaker;
       node.connect(/** @type {GainNode} */ (this.gain));

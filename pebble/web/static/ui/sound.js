@@ -56,6 +56,9 @@ function TalkButton({ sound, noListening }) {
   const why = sound.talking ? "" : sound.talkReason();
   const end = () => sound.talk(false);
   useEffect(() => end, []);
+  useEffect(() => {
+    if (why) end(); // the end of a press on a button that is off is not reported
+  }, [why]);
   const isKey = (event) => event.code === "Space" || event.code === "Enter";
   return html`<button
     type="button"

@@ -23,8 +23,9 @@ export function remember(history, entry) {
 /** The numbers of one field, oldest first. @param {Point[]} history @param {string} name @returns {[number, number][]} */
 export function series(history, name) {
   return history
-    .map(({ at, value }) => /** @type {[number, number]} */ ([at, Number(fieldOf(value, name))]))
-    .filter(([, number]) => Number.isFinite(number));
+    .map(({ at, value }) => ({ at, value: fieldOf(value, name) }))
+    .filter(({ value }) => typeof value === "boolean" || Number.isFinite(value))
+    .map(({ at, value }) => /** @type {[number, number]} */ ([at, Number(value)]));
 }
 
 /**

@@ -80,7 +80,7 @@ function Media({ at, online }) {
       ([name, report]) => html`<div key=${name}>
         <dt>${name.replaceAll("_", " ")}</dt>
         <dd class=${report?.last_error ? "bad" : ""}>
-          ${online ? "" : "was: "}${report?.last_error ? `✖ ${report.last_error}` : mediaWords(report)}
+          ${online ? "" : "was: "}${report?.last_error ? `✖ ${plain(report.last_error)}` : mediaWords(report)}
         </dd>
       </div>`,
     );
@@ -88,7 +88,7 @@ function Media({ at, online }) {
 
 function mediaWords(report) {
   if (!isObject(report)) return plain(report);
-  return report.running ? String(report.doing ?? "running") : "rests";
+  return report.running ? plain(report.doing ?? "running") : "rests";
 }
 
 function Services({ at, view }) {

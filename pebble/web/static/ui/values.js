@@ -1,7 +1,8 @@
 // Everything that was received of a component, whatever its type: a group of lines for each metric.
 
-import { html, useMetric, useMetrics, useState, useTick } from "./hooks.js";
+import { html, useMetric, useMetrics, useOnline, useState, useTick } from "./hooks.js";
 import { Lines } from "./lines.js";
+import { isGone } from "./parts.js";
 import { plain, roughly } from "./words.js";
 
 const MOST = 120;
@@ -21,10 +22,12 @@ export function Values({ at }) {
 function Metric({ at, metric }) {
   useTick(1000);
   const entry = useMetric(at, metric);
+  const online = useOnline(at);
   const [open, show] = useState(false);
   if (!entry) return null;
   const { lines, omitted } = new Lines(entry.value);
-  const rate = entry.period > 0 ? `${plain(Number((1000 / entry.period).toPrecision(2)))}/s · ` : "";
+  const gone = isGone(entry, online);
+  const rate = entry.period > 0 && !gone ? `${plain(Number((1000 / entry.period).toPrecision(2)))}/s · ` : "";
   const count = lines.length + omitted;
   const all = () => html`<ul>
     ${lines.map(
@@ -38,7 +41,7 @@ function Metric({ at, metric }) {
     <summary>${count} lines</summary>
     ${open && all()}
   </details>`;
-  return html`<div data-test=${`value-${metric}`}>
+  return html`<div class=${gone ? "dim" : ""} data-test=${`value-${metric}`}>
     <dt>${metric} <small>${rate}${roughly(entry.age)} ago</small></dt>
     <dd>${count > SHORT ? details() : all()}</dd>
   </div>`;

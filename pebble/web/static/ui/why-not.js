@@ -13,7 +13,7 @@ const ROLES = { drive: "driver", system: "maintainer" }; // the least that have 
  */
 export function whyNotEnd({ store, connection }, right = "drive") {
   if (!connection.isOpen) return "No connection to the server";
-  if (store.get("", "web/broker")?.value.problem) return "The server cannot reach the broker";
+  if (store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
   return connection.may(right) ? "" : `Log in as ${ROLES[right]} to use this`;
 }
 
@@ -26,10 +26,20 @@ export function whyNot(page, ref, section = "", right = "drive") {
   const why = whyNotEnd(page, right);
   if (why) return why;
   const { store } = page;
+  if (store.get("", "web/broker")?.value.problem) return "The server cannot reach the broker";
   if (store.get(ref, "web/liveness")?.value.online === false) return `${nameOf(ref)} is silent`;
   return sectionOf(store.get(ref, "capabilities")?.value, section).controls === false
     ? `${nameOf(ref)} takes no such commands`
     : "";
+}
+
+/**
+ * Why nothing that moves or is switched on by it can be asked for; "" it can.
+ * @param {Services} page @param {string} ref @param {string} [section] @returns {string}
+ */
+export function whyNotMoved(page, ref, section = "") {
+  const why = whyNot(page, ref, section);
+  return why || (page.connection.you?.drives === false ? "Needs https: this connection is not encrypted" : "");
 }
 
 /** @param {unknown} capabilities payload @param {string} name @returns {Record<string, any>} empty if there is none */
