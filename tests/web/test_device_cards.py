@@ -13,6 +13,8 @@ from tests.web.browser import PIXELS, Tab, tab
 from tests.web.canned import CannedServer, State, Value, serving
 from tests.web.states import GOOB, STATES, at, changed, devices, liveness, outlet
 
+pytestmark = pytest.mark.page
+
 O2 = "outlets/o2/status"
 
 

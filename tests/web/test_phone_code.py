@@ -13,6 +13,8 @@ from tests.web.browser import Tab, Theme, chromium, tab
 from tests.web.canned import CannedServer, serving
 from tests.web.states import GOOB_PATH, STATES
 
+pytestmark = pytest.mark.page
+
 HOST = "lab-pc.test"
 
 
@@ -37,7 +39,7 @@ def _read(opened: Tab) -> str:
     return str(text)
 
 
-@pytest.mark.parametrize("theme", [pytest.param("light", marks=pytest.mark.thorough), "dark"])
+@pytest.mark.parametrize("theme", ["light", "dark"])
 def test_the_code_has_the_address_of_this_screen_and_nothing_else(
     browser: Browser, canned: CannedServer, theme: Theme
 ) -> None:

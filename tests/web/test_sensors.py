@@ -20,6 +20,8 @@ from tests.web.browser import PIXELS, Tab, tab
 from tests.web.canned import CannedServer, State, serving
 from tests.web.states import GOOB, MINE, SENSORS, STATES, STREAM, at, changed, fleet, liveness, with_stream
 
+pytestmark = pytest.mark.page
+
 #: Counts how often each canvas is drawn: before anything is drawn, it is cleared.
 COUNT = """
 window.drawn = { plots: 0, map: 0 };
@@ -34,11 +36,6 @@ CanvasRenderingContext2D.prototype.fillText = function (...text) {
   return write.apply(this, text);
 };
 """
-
-
-def thorough(*values: Any) -> Any:
-    """A case that runs in make thorough only."""
-    return pytest.param(*values, marks=pytest.mark.thorough)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +102,7 @@ def line(opened: Tab, name: str, begin: float = 0.2, end: float = 1.0) -> int:
 
 
 @pytest.mark.parametrize(
-    "name", ["plot-battery", thorough("plot-attitude"), thorough("plot-rates"), "plot-acceleration", "plot-touch"]
+    "name", ["plot-battery", pytest.param("plot-attitude"), pytest.param("plot-rates"), "plot-acceleration", "plot-touch"]
 )
 def test_a_plot_shows_what_was_before_and_goes_on(sensors: Tab, name: str) -> None:
     see(sensors, name)
@@ -189,7 +186,6 @@ def test_a_plot_is_added_remembered_and_removed(server: CannedServer, browser: B
         assert opened.complaints() == []
 
 
-@pytest.mark.thorough
 def test_uplot_is_fetched_with_the_plots_only(server: CannedServer, browser: Browser) -> None:
     fetched = (
         "performance.getEntriesByType('resource').map((one) => one.name).filter((one) => /uPlot/.test(one)).length"
@@ -286,7 +282,6 @@ def test_the_map_is_moved_zoomed_and_centred(sensors: Tab) -> None:
     assert sensors.until(lambda: trail(sensors)["middle"] > 30)
 
 
-@pytest.mark.thorough
 def test_one_finger_scrolls_the_page_and_two_zoom_the_map(server: CannedServer, browser: Browser) -> None:
     with showing(server, browser, SENSORS, "phone") as opened:
         opened.test("tab-sensors").click()
@@ -370,11 +365,11 @@ OVERLAYS = STATES["overlays"]
 @pytest.mark.parametrize(
     ("size", "options"),
     [
-        thorough("desktop", {"viewport": {"width": 1280, "height": 800}}),
+        pytest.param("desktop", {"viewport": {"width": 1280, "height": 800}}),
         ("desktop", {"viewport": {"width": 1100, "height": 560}}),  # bars on both sides of the picture
-        thorough("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
+        pytest.param("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
         ("phone", {}),
-        thorough("landscape", {}),
+        pytest.param("landscape", {}),
     ],
 )
 def test_what_is_drawn_over_a_picture_is_where_it_belongs(
@@ -410,7 +405,6 @@ def test_overlays_vanish_half_a_second_after_the_last(server: CannedServer, brow
         assert time.monotonic() - began < 1.5
 
 
-@pytest.mark.thorough
 def test_overlays_are_switched_off_and_stay_so(server: CannedServer, browser: Browser) -> None:
     with showing(server, browser, OVERLAYS) as opened:
         opened.test("overlays").click()
@@ -480,9 +474,9 @@ def test_an_address_that_is_newer_than_the_page_needs_a_reload(server: CannedSer
 @pytest.mark.parametrize(
     "address",
     [
-        thorough("javascript:parent.ran = 1"),
-        thorough("data:text/html,x"),
-        thorough("http://user:secret@localhost/"),
+        pytest.param("javascript:parent.ran = 1"),
+        pytest.param("data:text/html,x"),
+        pytest.param("http://user:secret@localhost/"),
         "http://127.0.0.1:{port}/stream",
     ],
 )
@@ -496,7 +490,6 @@ def test_what_may_not_be_shown_is_not(server: CannedServer, browser: Browser, ad
         assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0
 
 
-@pytest.mark.thorough
 def test_another_component_whose_picture_is_shown_offers_its_stream(server: CannedServer, browser: Browser) -> None:
     tower = "pebble/towers/tower-1"
     values = changed(

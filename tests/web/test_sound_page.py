@@ -29,6 +29,8 @@ from tests.web.ears import (
 from tests.web.served import Served
 from tests.web.sound_robot import REF, SoundRobot
 
+pytestmark = pytest.mark.page
+
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
@@ -72,7 +74,6 @@ def test_the_robots_sound_is_played(browser: Browser, served: Served, robot: Sou
         assert opened.errors + opened.violations == []
 
 
-@pytest.mark.thorough  # tests of a whole robot play it each time
 def test_opus_is_played(browser: Browser, served: Served, robot: SoundRobot) -> None:
     with page_of(browser, served, "phone") as opened:
         opened.test("listen").click()
@@ -130,7 +131,6 @@ def test_a_voice_reaches_the_robot(browser: Browser, served: Served, robot: Soun
         assert opened.errors + opened.violations == []
 
 
-@pytest.mark.thorough
 def test_a_voice_that_the_browser_filters_reaches_the_robot(
     browser: Browser, served: Served, robot: SoundRobot
 ) -> None:
