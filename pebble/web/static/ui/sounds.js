@@ -80,7 +80,7 @@ function Clips({ at, page, sounds, why }) {
       value=${filter}
       onInput=${(event) => sounds.set({ filter: event.currentTarget.value })}
     />
-    <div class="clips" data-test="clips">
+    <div class="clips" data-test="clips" role="group" aria-label="Clips" tabindex="0" data-arrows>
       ${shown.folders.map(
         ([folder, names]) => html`<section key=${folder} aria-label=${folder ? plain(folder) : "clips"}>
           ${folder && html`<h3>${plain(folder)}</h3>`}
