@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection test-robots test-computing
+.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -38,21 +38,27 @@ COMPUTING := tests/config tests/contract tests/media tests/motion tests/percepti
 	$(addprefix tests/web/test_,page_core.py page_driver.py page_operating.py page_sound.py page_sources.py recent.py) \
 	$(addprefix tests/web/test_,series.py store.py types.py)
 # Files with tests of whole robots, to collect no others; those that take longest come first.
-ROBOTS = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' \
+ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' \
 	tests/services tests/robot/test_faults.py tests | grep --invert-match tests/test_demo.py | awk '!seen[$$0]++')
+PAGES = $(filter tests/web/%,$(ALONE))
 
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
 	@echo "pebble: tests"
 	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) \
 		$(addprefix tests/,web transports services commands scripts script robot launcher) tests
-	@echo "pebble: whole robots and serial lines, three at a time because these tests check deadlines; beside them what only computes"
-	@$(MAKE) --no-print-directory --jobs=2 test-robots test-computing
+	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines; beside them one with a page"
+	@echo "pebble: in Chromium, and what only computes"
+	@$(MAKE) --no-print-directory --jobs=3 test-robots test-pages test-computing
 	@echo "pebble: the demo, whose robots need all processors"
 	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
 
 test-robots:
-	@$(TESTS) --numprocesses 3 -m "alone and not page$(LESS)" $(ROBOTS)
+	@$(TESTS) --numprocesses 2 -m "alone and not page$(LESS)" $(filter-out $(PAGES),$(ALONE))
+
+test-pages:
+	@$(VENV) tools/run_tests.py -m "alone and not page$(LESS)" $(PAGES) >.venv/pages.log 2>&1 || { cat .venv/pages.log; exit 1; }
+	@echo "pebble: pages at whole robots: $$(tail -n 1 .venv/pages.log)"
 
 test-computing:
 	@nice -n 19 $(TESTS) --numprocesses 2 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \

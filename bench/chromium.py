@@ -13,6 +13,15 @@ from pebble.errors import PebbleError
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+#: Of several lists the last one counts, so this has what Playwright switches off, too. The popups of the address bar
+#: are pages of their own for each window: without them it opens in 0.28 s instead of 0.39 (Chromium 156, measured).
+_WITHOUT = (
+    *("WebUIOmniboxPopup", "WebUIOmniboxAimPopup", "WebUIOmniboxFullPopup", "OmniboxPopupWebUI"),
+    *("AvoidUnnecessaryBeforeUnloadCheckSync", "DestroyProfileOnBrowserClose", "HttpsUpgrades", "LensOverlay"),
+    *("HttpsFirstBalancedModeAutoEnable", "MediaRouter", "PaintHolding", "ThirdPartyStoragePartitioning"),
+    *("AvoidCorsURLLoaderRestartOnRedirect", "OptimizationHints", "NetworkTimeServiceQuerying", "AimEnabled"),
+    "PreconnectToSearch",
+)
 FLAGS = (
     "--no-sandbox",
     "--disable-gpu",
@@ -22,6 +31,7 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
     "--autoplay-policy=no-user-gesture-required",
+    "--disable-features=" + ",".join(_WITHOUT),
 )
 
 
