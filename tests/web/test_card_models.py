@@ -506,7 +506,8 @@ MAINTAINER = "Log in as maintainer to use this"
         ("page.connection.may = () => true", ["", "", ""]),
         ("page.connection.may = () => false", ["Log in as driver to use this"] * 2 + [MAINTAINER]),
         ('values[ref]["web/liveness"].online = false', ["", "goob is silent", MAINTAINER]),
-        ('values[""]["web/broker"].problem = "x"', ["The server cannot reach the broker"] * 3),
+        ('values[""]["web/broker"].problem = "x"', ["", "The server cannot reach the broker", MAINTAINER]),
+        ('values[""]["web/broker"].connected = false', ["The server cannot reach the broker"] * 3),
         ("page.connection.isOpen = false", ["No connection to the server"] * 3),
     ],
 )

@@ -32,6 +32,7 @@ const open = () => streams.filter((one) => one.active);
 const heard = () => open().filter((one) => one.track.enabled).length;
 define("window", globalThis);
 define("document", { querySelector: () => null });
+define("matchMedia", () => ({ matches: false }));
 define("navigator", {
   mediaDevices: { getUserMedia: () => new Promise((resolve, reject) => questions.push({ resolve, reject })) },
 });
@@ -61,7 +62,9 @@ const changes = [];
 const route = { ref: REF, onChange: (fn) => changes.push(fn) };
 const go = (ref) => { route.ref = ref; changes.forEach((fn) => fn()); };
 const shown = [];
-const connection = { isOpen: true, may: () => true, you: { user: "anna" }, show: (text) => shown.push(text) };
+const connection = {
+  isOpen: true, may: () => true, you: { user: "anna" }, show: (text) => shown.push(text), onChange() {},
+};
 const store = new Store(undefined, (flush) => flush());
 store.set(REF, "capabilities", { value: { audio: { available: true } } });
 const sound = new Sound({ store, connection, route });

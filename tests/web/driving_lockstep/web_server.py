@@ -86,11 +86,18 @@ class BrokerConnection(Connection):
         return super().open(0.0)
 
     def publish(
-        self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False, urgent: bool = False
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        qos: QoS = QoS.LATEST,
+        retain: bool = False,
+        urgent: bool = False,
+        remember: bool = True,
     ) -> bool:
         if topic.endswith(f"/{DRIVE.metric}"):
             payload = codec.encode(DRIVE, self.rewrite(topic, codec.decode(DRIVE, payload)))
-        return super().publish(topic, payload, qos=qos, retain=retain, urgent=urgent)
+        return super().publish(topic, payload, qos=qos, retain=retain, urgent=urgent, remember=remember)
 
 
 class ServerSocket:
