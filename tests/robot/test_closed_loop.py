@@ -56,7 +56,7 @@ def check(found: Samples) -> None:
 def test_it_follows_a_tag(rig: WorldRig) -> None:
     found = followed(rig, Start(distance=1.1, beside=15.0, off=20.0), stay_s=1.0)
     latency = sorted(found.pop("latency"))
-    assert latency[len(latency) // 2] < 250.0  # others use this machine, too; 60 ms on an idle one
+    assert latency[len(latency) // 2] < 250.0  # generous: others may use this machine
     check(found)
 
 

@@ -70,7 +70,7 @@ def test_retained_commands_at_the_remote_broker(unstarted: Rig) -> None:
 def assert_still_untouched(rig: Rig) -> None:
     """Nothing happened, not even after a live command that followed the retained ones has been carried out."""
     began = time.monotonic()
-    for _ in range(10):  # a heartbeat may arrive before the robot has subscribed to commands
+    for _ in range(10):  # one was missed when others took most of the machine; why is not known
         rig.operator.send("incoming/lights-flash", {"g": 0.5})
         if until(lambda: any(entry.line[:1] == "F" for entry in rig.mcu.entries(began)), 1):
             break
