@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection test-robots test-pages test-computing
+.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection test-running test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -42,16 +42,19 @@ ALONE = $(shell grep --recursive --files-with-matches --include=test_*.py 'mark\
 	tests/services tests/robot/test_faults.py tests | grep --invert-match tests/test_demo.py | awk '!seen[$$0]++')
 PAGES = $(filter tests/web/%,$(ALONE))
 
+# What only computes, as little as possible in the way, uses what the others leave, from the beginning to the end.
 test: check
 	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
+	@$(MAKE) --no-print-directory --jobs=2 test-computing test-running
+	@echo "pebble: the demo, whose robots need all processors"
+	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
+
+test-running:
 	@echo "pebble: tests"
 	@$(TESTS) --numprocesses 6 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING)) \
 		$(addprefix tests/,web transports services commands scripts script robot launcher) tests
-	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines; beside them one with a page"
-	@echo "pebble: in Chromium, and what only computes"
-	@$(MAKE) --no-print-directory --jobs=3 test-robots test-pages test-computing
-	@echo "pebble: the demo, whose robots need all processors"
-	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
+	@echo "pebble: whole robots and serial lines, two at a time because these tests check deadlines, beside them one with a page"
+	@$(MAKE) --no-print-directory --jobs=2 test-robots test-pages
 
 test-robots:
 	@$(TESTS) --numprocesses 2 -m "alone and not page$(LESS)" $(filter-out $(PAGES),$(ALONE))

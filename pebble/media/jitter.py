@@ -21,6 +21,7 @@ _BEHIND_LIMIT: Final = 5  # packets in a row that seem old: the sender restarted
 _GAP_LIMIT: Final = 1000  # of missing packets that count as lost
 _BYTES_LIMIT: Final = 4_000_000  # that wait, whatever the number of packets
 _PIECE_S: Final = 0.02  # what is concealed at a time, so that a late packet is soon played
+_ROUNDING_S: Final = 1e-6  # of sums of durations
 _FADE_S: Final = 0.005  # back from concealed sound, and over what was left out
 _DELAY_LIMIT_S: Final = 0.2  # a caller that takes this late does not have to catch up
 
@@ -226,7 +227,7 @@ class JitterBuffer:
     def _play(self, number: int, now: float) -> Chunk | None:
         received = self._decode(number)
         excess = self._depth.excess(self.waiting_s, now)
-        if received is not None and excess > len(received.samples) / received.rate:
+        if received is not None and excess > len(received.samples) / received.rate - _ROUNDING_S:
             received = self._leave_out(received, excess)
         if received is None:
             return self._conceal(self._budget_s)
@@ -252,7 +253,7 @@ class JitterBuffer:
     def _leave_out(self, received: ReceivedSound, excess: float) -> ReceivedSound:
         """The packet to play after leaving out ``excess`` seconds, its beginning faded over from ``received``."""
         newest, left = received, excess
-        while self._waiting and left > len(newest.samples) / newest.rate:
+        while self._waiting and left > len(newest.samples) / newest.rate - _ROUNDING_S:
             left -= len(newest.samples) / newest.rate
             newest = self._decode(self._first()) or newest
             self.counters.add("skipped")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import threading
 import time
 import wave
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, partial
@@ -17,10 +19,13 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from pebble.demo.media_assessment import best_match, envelope
+from pebble.demo.testbed import LinuxRobot
 from pebble.media.pcm import Resampler
 from pebble.media.speech import PERIOD_S, Speech
+from pebble.simulation.loudspeaker import playbacks
 from tests.web.browser import Tab
 from tests.web.sound_robot import REF
+from tests.web.stage import Stage
 
 RATE = 16_000
 _SURE = 0.96  # more than any test needs
@@ -80,8 +85,11 @@ def fake_microphone(voice: Path) -> tuple[str, ...]:
 def listener(origin: str, can: str) -> Iterator[None]:
     """Another page that listens."""
     url = f"{origin.replace('http', 'ws')}/ws/sound?ref={REF}&can={can}"
-    with connect(url, origin=Origin(origin), max_size=None):
+    with connect(url, origin=Origin(origin), max_size=None) as socket:
+        reading = threading.Thread(target=deque, args=(socket, 0), name="listener")  # who reads nothing is sent no more
+        reading.start()
         yield
+    reading.join()
 
 
 def state(opened: Tab) -> str:
@@ -106,6 +114,14 @@ def is_played(opened: Tab, needed: float, *, envelopes: bool, within: float = 20
 def recorded(page: Any) -> npt.NDArray[np.float64]:
     """What was played since ``TAP``, at the rate of the page's sound."""
     return np.frombuffer(base64.b64decode(page.evaluate(RECORDED)), "<i2").astype(float)
+
+
+def played(stage: Stage) -> npt.NDArray[np.float64]:
+    """What its loudspeaker has played of a voice, at 48 kHz."""
+    robot = stage.robots["goob"]
+    assert isinstance(robot, LinuxRobot)
+    pcm = b"".join(one.frames() for one in playbacks(robot.voice))
+    return at_rate(np.frombuffer(pcm, "<i2"), 48_000)
 
 
 def compared(played: npt.NDArray[np.float64], rate: int, *, envelopes: bool = False) -> float:

@@ -76,22 +76,6 @@ def test_what_a_service_logs_is_on_the_page_and_can_be_filtered(at_goob: Console
     assert at_goob.tab.until(lambda: text not in shown(at_goob), 2)
 
 
-def test_a_flag_is_retained_at_the_broker(at_goob: Console, robots: Stage, wire: Wire) -> None:
-    topic = "goob/incoming/flags/mqtt-audio"
-    flag = lambda: at_goob.state("web/flags")["mqtt_audio"]
-    at_goob.test("flag-mqtt-audio").check()
-    assert at_goob.tab.until(lambda: wire.last(topic) == {"value": True}, 3)
-    assert at_goob.tab.until(lambda: flag() is True, 3), (flag(), wire.all(topic))
-    later = Wire(robots)
-    assert at_goob.tab.until(lambda: later.last(topic) == {"value": True}, 3)
-    later.close()
-    wire.publish(topic, {"value": False}, retain=True)  # another operator
-    assert at_goob.tab.until(lambda: flag() is False, 3), (flag(), wire.all(topic))
-    assert at_goob.tab.until(lambda: not at_goob.test("flag-mqtt-audio").is_checked(), 3)
-    wire.publish(topic, None, retain=True)
-    assert at_goob.tab.until(lambda: flag() is None, 3)
-
-
 def child(robots: Stage, name: str) -> int:
     """The pid of a service of goob; 0 if it does not run."""
     launcher = robots.robots["goob"].launcher

@@ -187,3 +187,39 @@ def test_more_sound_than_was_asked_for_is_left_out_and_given_back() -> None:
     try { output({ close: () => (given_back += 1), numberOfFrames: -1 }); } catch {}
     result = [given_back, packets.length];"""
     assert evaluate({"media/opus.js": "OpusDecoder"}, steps) == [2, 0]
+
+
+def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_afterwards() -> None:
+    """Packets come evenly; the worker stands still twice, then for a minute it does not."""
+    steps = """let now = 0;
+    performance.now = () => now;
+    const RATE = 16_000;
+    const port = { waiting: 0, postMessage({ left }) { this.waiting += left.length; } };
+    const playout = new Playout(port, RATE);
+    let played = 0;
+    let removed = 0;
+    let sequence = 0;
+    const run = (seconds, works = true) => {
+      for (const end = now + 1000 * seconds; now < end; now += 4) {
+        const pulled = Math.min(64, port.waiting);
+        port.waiting -= pulled;
+        removed += pulled;
+        played += 64;
+        if (now % 20 === 0) {
+          const samples = new Int16Array(320);
+          const sound = { samples, rate: RATE, channels: 1, encoding: "pcm", sequence: ++sequence, capturedMs: now };
+          playout.buffer.put(sound, playout.now());
+        }
+        if (works && now % 8 === 0) port.onmessage({ data: { played, removed } });
+      }
+      return Math.round(1000 * playout.lead);
+    };
+    const stats = () => playout.stats().bufferedMs;
+    result = [run(5)];
+    run(0.1, false);
+    run(1);
+    run(0.1, false);
+    result.push(run(1));
+    const many = stats();
+    result.push(run(60), stats() < many);"""
+    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20, True]

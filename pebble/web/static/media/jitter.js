@@ -7,6 +7,7 @@ const NUMBERS = 0xffff_ffff; // 1 to 0xFFFFFFFF: 0 is not used
 const BEHIND_LIMIT = 5; // packets in a row that seem old: the sender restarted, and its clock went back
 const GAP_LIMIT = 1000; // of missing packets that count as lost
 const BYTES_LIMIT = 4_000_000;
+const ROUNDING_S = 1e-6; // of sums of durations
 const PIECE_S = 0.02; // what is concealed at a time
 const FADE_S = 0.005;
 const DELAY_LIMIT_S = 0.2; // a caller that takes this late does not have to catch up
@@ -219,7 +220,7 @@ export class JitterBuffer {
   play(number, now) {
     let sound = /** @type {Samples|null} */ (this.pop(number));
     const excess = this.depth.excess(this.waitingS, now);
-    if (sound && excess > secondsOf(sound)) sound = this.leaveOut(sound, excess);
+    if (sound && excess > secondsOf(sound) - ROUNDING_S) sound = this.leaveOut(sound, excess);
     if (!sound) return this.conceal(this.budget);
     const samples = this.concealed && this.last ? fadedIn(sound) : sound.samples;
     this.last = sound;
@@ -239,7 +240,7 @@ export class JitterBuffer {
   /** What to play after leaving out so much; it begins as ``sound`` does. @param {Samples} sound @param {number} excess seconds */
   leaveOut(sound, excess) {
     let newest = sound;
-    for (let left = excess; this.waiting.size && left > secondsOf(newest); this.counters.skipped++) {
+    for (let left = excess; this.waiting.size && left > secondsOf(newest) - ROUNDING_S; this.counters.skipped++) {
       left -= secondsOf(newest);
       newest = this.pop(this.first()) ?? newest;
     }

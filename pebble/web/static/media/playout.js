@@ -5,9 +5,10 @@ import { OpusDecoder } from "./opus.js";
 import { Resampler } from "./resampler.js";
 import { pcmOf, unpack } from "./sound-packet.js";
 
-const TARGET_MS = 40; // in the jitter buffer, and more if packets come unevenly
-const LEAD_S = 0.03; // at the loudspeaker: what the worker and its messages may be late; more on a slow machine
+const TARGET_MS = 20; // in the jitter buffer, and more if packets come unevenly
+const LEAD_S = 0.02; // at the loudspeaker: what the worker and its messages may be late; more on a slow machine
 const LEAD_STEP_S = 0.01;
+const CALM_S = 10; // without being late before the lead is lowered by one step
 const LONGEST_LEAD_S = 0.12;
 const SLACK_S = 0.01;
 const LONGEST_TICK_S = 0.1; // the loudspeaker has stopped if it says nothing for so long
@@ -27,6 +28,7 @@ export class Playout {
     this.played = this.removed = this.pushed = 0; // samples of each channel; played: with silence
     this.tickedAt = performance.now();
     this.lead = LEAD_S;
+    this.calmSince = this.tickedAt;
     this.received = this.refused = 0;
     this.encoding = "";
     this.format = "";
@@ -66,6 +68,7 @@ export class Playout {
     this.played = played;
     this.removed = removed;
     this.tickedAt = performance.now();
+    if (this.tickedAt - this.calmSince >= 1000 * CALM_S) this.leadBy(-LEAD_STEP_S);
     while (this.pushed - this.removed < (this.lead + SLACK_S) * this.rate) {
       const { playing } = this.buffer;
       const chunk = this.buffer.take(this.now());
@@ -77,8 +80,14 @@ export class Playout {
 
   /** Nothing waits at the loudspeaker. @param {boolean} late because this worker was late */
   begin(late) {
-    if (late) this.lead = Math.min(LONGEST_LEAD_S, this.lead + LEAD_STEP_S);
+    if (late) this.leadBy(LEAD_STEP_S);
     this.push(new Float32Array(Math.round(this.lead * this.rate)));
+  }
+
+  /** @param {number} seconds more, or less */
+  leadBy(seconds) {
+    this.lead = Math.max(LEAD_S, Math.min(this.lead + seconds, LONGEST_LEAD_S));
+    this.calmSince = this.tickedAt;
   }
 
   /** @param {Float32Array} left @param {Float32Array} [right] */
