@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser
 
-from pebble.simulation.loudspeaker import playbacks
+from pebble.simulation.loudspeaker import Playback, playbacks
 from pebble.transports import Message, MqttSettings, create
 from tests.web.console import Console, Wire, console
 from tests.web.stage import Stage
@@ -93,18 +93,22 @@ def test_lights_reach_the_mcu(goob: Console, stage: Stage) -> None:
 
 
 def test_a_clip_is_played_and_stopped(goob: Console, stage: Stage, reports: Reports) -> None:
+    name = "signals/two-tone.wav"
+
+    def played() -> list[Playback]:
+        return [one for one in playbacks(Path(stage.folder_of_logs) / "goob" / "played") if one.file.endswith(name)]
+
+    before = len(played())
     goob.uncover("clip")
     goob.test("repeat").check()
     goob.test("sound-filter").fill("two-tone")
     goob.test("clip").click()
-    name = "signals/two-tone.wav"
     assert goob.tab.until(lambda: reports.last("soundboard-status").get("file") == name, 5)
     assert goob.tab.until(lambda: name in goob.test("playing").inner_text(), 3)
+    assert goob.tab.until(lambda: len(played()) >= before + 2, 10)  # it is repeated
     goob.test("stop-sound").click()
     assert goob.tab.until(lambda: reports.last("soundboard-status")["playing"] is False, 5)
-    played = [one for one in playbacks(Path(stage.folder_of_logs) / "goob" / "played") if one.file.endswith(name)]
-    assert played
-    assert played[-1].stopped
+    assert goob.tab.until(lambda: all(one.ended_ns for one in played()), 2)
     goob.test("repeat").uncheck()
 
 
