@@ -15,7 +15,7 @@ help:
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
 	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
-	@echo "make page-tests       every state, card, interruption and finger at the operator page in Chromium, ten minutes"
+	@echo "make page-tests       every state, card, interruption and finger at the operator page in Chromium, 20 minutes"
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
@@ -71,7 +71,7 @@ test-computing:
 thorough:
 	@PEBBLE_THOROUGH=1 $(MAKE) --no-print-directory test
 
-# Every state of the operator page on every size, every interruption, and fingers.
+# Every state of the operator page on every size, every card, its sound, every interruption, and fingers.
 page-tests: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto chromium=chromium
 	@$(VENV) tools/run_tests.py -m page tests/web

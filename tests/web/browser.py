@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, CDPSession, Page
+from playwright.sync_api import Browser, BrowserContext, CDPSession, Locator, Page
 
 from pebble.bench import chromium as program
 
@@ -75,6 +75,16 @@ class Tab:
                 return False
             self.page.wait_for_timeout(_LOOK_MS)  # not time.sleep: Playwright handles events meanwhile
         return True
+
+    def uncover(self, name: str, within: float = 20.0) -> Locator:
+        """The control of this name, once it is shown; on a phone it is behind one of the tabs."""
+        found, end = self.page.locator(f'[data-test="{name}"]:visible'), time.monotonic() + within
+        while time.monotonic() < end:
+            for press in (lambda: None, *(one.click for one in self.page.locator(".tabs button:visible").all())):
+                press()
+                if self.until(lambda: found.count(), 0.3):
+                    return found
+        raise AssertionError(f"the page shows no {name}")
 
     def test(self, name: str) -> Any:
         """The locator of the elements with this ``data-test``."""

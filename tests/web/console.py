@@ -67,14 +67,7 @@ class Console:
         return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, box["width"]
 
     def uncover(self, name: str) -> Locator:
-        """The control of this name, once it is shown; on a phone it is behind one of the tabs."""
-        end = time.monotonic() + _READY_S
-        while time.monotonic() < end:
-            for press in (lambda: None, *(one.click for one in self.page.locator(".tabs button:visible").all())):
-                press()
-                if self.tab.until(lambda: self.test(name).count(), 0.3):
-                    return self.test(name)
-        raise AssertionError(f"the page shows no {name}")
+        return self.tab.uncover(name)
 
     @property
     def reason(self) -> str:

@@ -101,6 +101,7 @@ def test_the_help_ends_a_gesture_and_leaves_stop_in_reach(at_benjr: Console, wir
     assert at_benjr.tab.until(lambda: wire.latched("benjr"), 2)
     at_benjr.page.keyboard.press("?")
     assert at_benjr.tab.until("document.querySelector('dialog[open]') === null", 2)
+    assert at_benjr.because("stopped", within=5)
     at_benjr.take()
     assert at_benjr.press_anew()
 

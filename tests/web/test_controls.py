@@ -276,6 +276,7 @@ def test_a_second_tab_stops_by_the_space_bar_and_takes_over_by_a_hold(
 # -- pictures
 
 
+@pytest.mark.page
 def test_the_camera_runs_while_its_picture_is_shown(browser: Browser, stage: Stage, wire: Wire) -> None:
     with console(browser, stage, "fred") as robot, used(robot):
         assert robot.tab.until(lambda: wire.camera("fred"), 5)
@@ -297,6 +298,7 @@ def test_the_camera_runs_while_its_picture_is_shown(browser: Browser, stage: Sta
         assert wire.last("fred/incoming/flags/mqtt-video") == {"value": True}
 
 
+@pytest.mark.page
 def test_a_robot_shows_the_picture_of_another_which_must_be_new(at_lamp: Console, stage: Stage, wire: Wire) -> None:
     at_lamp.page.evaluate(
         "([ref, source]) => window.pebble.commands.setPictureFrom(ref, source)", [at_lamp.ref, stage.ref("goob")]
@@ -320,6 +322,7 @@ def test_a_robot_shows_the_picture_of_another_which_must_be_new(at_lamp: Console
     assert at_lamp.tab.until("window.pebble.video.ref === ''", 3)
 
 
+@pytest.mark.page
 def test_full_screen_has_stop_and_can_be_left(browser: Browser, stage: Stage, wire: Wire) -> None:
     with console(browser, stage, "goob", theme="dark") as robot, used(robot):
         robot.test("full-screen").click()
@@ -357,6 +360,7 @@ def test_the_fleet_stops_robots_and_never_starts_a_camera(browser: Browser, stag
         assert fleet.complaints() == []
 
 
+@pytest.mark.page
 def test_an_offline_robot_can_be_forgotten_until_it_is_back(browser: Browser, stage: Stage, wire: Wire) -> None:
     wire.publish("old/outgoing/online", Heartbeat(t=1_700_000_000_000, online=False), retain=True)
     with tab(browser, stage.url) as fleet:
@@ -369,6 +373,7 @@ def test_an_offline_robot_can_be_forgotten_until_it_is_back(browser: Browser, st
     wire.publish("old/outgoing/online", None, retain=True)
 
 
+@pytest.mark.page
 def test_the_settings_change_the_colours_and_end_a_gesture(at_lamp: Console) -> None:
     colour = "getComputedStyle(document.body).backgroundColor"
     light = at_lamp.page.evaluate(colour)

@@ -14,6 +14,8 @@ from tests.support import Broker
 from tests.web.browser import Tab, tab
 from tests.web.served import RecordingRobot, Served
 
+pytestmark = pytest.mark.page
+
 BASE = "pebble/robots/recorder"
 CAPABILITIES = {
     "drive": {"available": True, "controls": True},  # it does not arbitrate

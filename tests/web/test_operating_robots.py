@@ -15,9 +15,10 @@ from pebble.fleet.audit import Audit
 from tests.web.console import Console, Wire, console, used
 from tests.web.stage import Stage
 
-pytestmark = pytest.mark.alone  # deadlines are checked
+pytestmark = [pytest.mark.alone, pytest.mark.page]  # deadlines are checked
 
 SERVICE = "soundboard_handler"
+_RESTARTED = r"Restart Pebble: asked \d\d:\d\d:\d\d; heartbeat gone \d\d:\d\d:\d\d; back \d\d:\d\d:\d\d"
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +121,7 @@ def test_a_restart_is_asked_gone_and_back_and_moves_nothing(
             at_goob.hold_button("ask-hold")
             assert driver.rests(3)
             outcome = at_goob.test("outcome")
-            words = r"Restart Pebble: asked \d\d:\d\d:\d\d; heartbeat gone \d\d:\d\d:\d\d; back \d\d:\d\d:\d\d"
-            assert at_goob.tab.until(lambda: re.search(words, outcome.inner_text()), 15), outcome.inner_text()
+            assert at_goob.tab.until(lambda: re.search(_RESTARTED, outcome.inner_text()), 15), outcome.inner_text()
             assert driver.stays_at_rest()  # its key is still held
             assert driver.state("web/driver")["you"] is True
             assert driver.because("release", "picture", "", within=3)
@@ -147,3 +147,15 @@ def test_troubles_of_another_robot_are_listed(at_goob: Console, robots: Stage, w
     assert re.fullmatch(r"■ minilamp was stopped by eve \d\d:\d\d", newest[1])
     at_goob.page.locator(".notice-link").first.click()
     assert at_goob.tab.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
+
+
+def test_a_phone_restarts_a_robot_and_reads_its_logs(browser: Browser, robots: Stage, wire: Wire) -> None:
+    with console(browser, robots, "goob", "phone") as phone:
+        phone.uncover("service-restart").click()
+        phone.hold_button("ask-hold")
+        outcome = phone.test("outcome")
+        assert phone.tab.until(lambda: re.search(_RESTARTED, outcome.inner_text()), 15), outcome.inner_text()
+        wire.publish("goob/incoming/soundboard-command", {"action": "dance"})
+        phone.uncover("log-lines")
+        assert phone.tab.until(lambda: "neither plays nor stops: 'dance'" in shown(phone), 5), shown(phone)
+        assert phone.tab.complaints() == []

@@ -11,6 +11,8 @@ from tests.web.browser import tab
 from tests.web.canned import CannedServer, serving
 from tests.web.states import STATES
 
+pytestmark = pytest.mark.page
+
 SCREEN = "**/ui/robot.js"
 LATER = "fleet", "cards", "drive", "stick", "video", "settings"
 HERE = r"performance.getEntriesByType('resource').map((one) => one.name.match(/(\w+).js$/)?.[1])"

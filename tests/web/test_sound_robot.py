@@ -16,7 +16,7 @@ from pebble.contract.packets import Sound
 from pebble.media.pcm import Resampler
 from pebble.transports import Message, MqttSettings, create
 from tests.support import until
-from tests.web.browser import chromium, tab
+from tests.web.browser import Size, chromium, tab
 from tests.web.ears import (
     PLAIN_MICROPHONE,
     compared,
@@ -31,7 +31,7 @@ from tests.web.ears import (
 )
 from tests.web.stage import Stage
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.page]
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +53,17 @@ def goob() -> Iterator[Stage]:
         yield running
 
 
-def test_a_page_plays_the_robots_sound_and_the_robot_the_voice(goob: Stage, browser: Browser) -> None:
-    with tab(browser, goob.robot_url("goob"), script=PLAIN_MICROPHONE) as opened:
-        opened.test("listen").click()
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_a_page_plays_the_robots_sound_and_the_robot_the_voice(goob: Stage, browser: Browser, size: Size) -> None:
+    before = len(played(goob))
+    voice = lambda: played(goob)[before:]
+    with tab(browser, goob.robot_url("goob"), size, script=PLAIN_MICROPHONE) as opened:
+        opened.uncover("listen").click()
         assert opened.until(lambda: "ms buffered · opus" in state(opened), 20)
         assert is_played(opened, 0.9, envelopes=True)
         assert talks(opened)
-        assert opened.until(lambda: len(played(goob)) > 2 * 48_000, 20)
-        assert opened.until(lambda: compared(played(goob), 48_000) > 0.9, 20)
+        assert opened.until(lambda: len(voice()) > 2 * 48_000, 20)
+        assert opened.until(lambda: compared(voice(), 48_000) > 0.9, 20)
         opened.page.mouse.up()
         assert opened.errors + opened.violations == []
 
