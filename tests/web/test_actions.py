@@ -315,5 +315,6 @@ def test_it_stops_robots_and_never_drives(browser: Browser, stage: Stage, wire: 
 @pytest.mark.thorough
 def test_after_an_update_it_loads_itself_again(browser: Browser, stage: Stage) -> None:
     with _watching(browser, stage.url) as opened:
-        opened.page.evaluate("() => { window.before = true; pebble.connection.version = 'old' }")
+        with opened.page.expect_navigation(timeout=12_000):
+            opened.page.evaluate("() => { window.before = true; pebble.connection.version = 'old' }")
         assert opened.until("window.before === undefined && !!window.pebble?.connection.you", 12)
