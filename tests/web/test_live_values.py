@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 from playwright.sync_api import Browser
 
 from tests.web.browser import tab
 from tests.web.canned import serving
 from tests.web.states import GOOB, STATES
+
+pytestmark = pytest.mark.page
 
 SEND = """async ([ref, count]) => {
   for (let i = 0; i < count; i++) {

@@ -12,6 +12,8 @@ from tests.support import Broker
 from tests.web.attacker import PASSWORDS, Hall
 from tests.web.browser import Tab, tab
 
+pytestmark = pytest.mark.page
+
 
 @pytest.fixture
 def hall(broker: Broker, tmp_path: Path) -> Iterator[Hall]:

@@ -16,6 +16,8 @@ from tests.web.browser import Tab, tab
 from tests.web.picture_robot import REF, VIDEO, PictureRobot, capabilities
 from tests.web.served import Served
 
+pytestmark = pytest.mark.page
+
 # A page of its own, so that nothing else of ours runs in it; its policy (CSP) is that of every page.
 SHOW = """async ([media, can]) => {
   const { Pictures } = await import(media);
