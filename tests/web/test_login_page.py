@@ -57,6 +57,7 @@ def test_too_many_tries_are_explained(hall: Hall, browser: Browser) -> None:
 def test_it_leads_to_no_other_site(hall: Hall, browser: Browser) -> None:
     with tab(browser, f"{hall.served.origin}/login") as opened:
         for target in ("//evil.test", "https://evil.test", "/r/\\\\evil.test", "javascript:alert(1)", "/login", ""):
+            opened.page.goto("about:blank")  # what is open would notice that it is logged out, and go to the login
             opened.context.clear_cookies()
             opened.page.goto(f"{hall.served.origin}/login?next={target}")
             log_in(opened, "viewer", PASSWORDS["viewer"])
