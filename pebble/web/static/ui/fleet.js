@@ -181,7 +181,7 @@ function FleetCard({ at }) {
     ${(settings.thumbnails || WATCHES) && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
-      <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} />
+      <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
       <${ScriptFact} at=${at} online=${connection.isOpen} />
       ${typeOf(at) !== "robots" && html`<${StatusFact} at=${at} />`}
       ${estop?.latched &&
@@ -217,12 +217,12 @@ function BatteryFact({ at, online }) {
   </li>`;
 }
 
-function DriverFact({ at, offers, online }) {
+function DriverFact({ at, offers, online, stopped }) {
   const view = useValue(at, "web/driver");
   if (!online) return null;
   if (!offers.known && !offers.drives) return null;
   if (!offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>`;
-  if (!view?.by) return html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
+  if (!view?.by) return stopped ? null : html`<li class="fact dim"><${Icon} name="wheel" />free to drive</li>`;
   return html`<li class="fact">
     <${Icon} name="wheel" />${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}
   </li>`;

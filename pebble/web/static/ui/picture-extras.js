@@ -97,7 +97,7 @@ export function Tools({ source, wanted }) {
   const save = () => snapshot(video, store, source).catch((error) => connection.show(`Not saved: ${error.message}`));
   return html`${video.info &&
   !video.stream &&
-  html`<button type="button" data-test="snapshot" onClick=${save}><${Icon} name="down" />Snapshot</button>`}
+  html`<button type="button" data-test="snapshot" onClick=${save}><${Icon} name="save" />Snapshot</button>`}
   ${drawn &&
   html`<label class="check overlay-switch"
     ><input

@@ -36,7 +36,7 @@ export function span(ms) {
 export const roughly = (ms) => (ms < 120_000 ? `${Math.max(0, Math.round(ms / 1000))} s` : span(ms));
 
 /** @param {unknown} value @param {number} digits @returns {string} "–" for what is no number */
-export const number = (value, digits) => (Number.isFinite(value) ? Number(value).toFixed(digits) : "–");
+export const number = (value, digits) => (Number.isFinite(value) ? Number(value).toFixed(digits).replace(/^-(?=[0.]+$)/, "") : "–");
 
 /** The payload without the envelope that most have. @param {unknown} payload @returns {any} */
 export const inner = (payload) => (isObject(payload) && "value" in payload ? payload.value : payload);
