@@ -389,3 +389,10 @@ def test_hostile_packets() -> None:
     counted = storm(1, 3000).counters.snapshot()
     assert counted["refused"] > 300
     assert counted["packets"] > 300
+
+
+def test_exactly_one_packet_too_many_is_left_out() -> None:
+    buffer = JitterBuffer(target_ms=40)
+    played = play(buffer, [(max(0.0, 0.02 * (index - 1) - 0.005), packet(index)) for index in range(100)])
+    assert buffer.counters["skipped"] == 1
+    assert len(played.real) == 99

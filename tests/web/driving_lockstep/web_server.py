@@ -14,7 +14,6 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
-from pebble.transports import QoS
 from pebble.web import broker, control, robots, server
 from pebble.web.settings import WebSettings
 from tests.robot.lockstep.network import Connection, Network
@@ -85,19 +84,10 @@ class BrokerConnection(Connection):
     def open(self, timeout: float = 0.0) -> Any:
         return super().open(0.0)
 
-    def publish(
-        self,
-        topic: str,
-        payload: bytes,
-        *,
-        qos: QoS = QoS.LATEST,
-        retain: bool = False,
-        urgent: bool = False,
-        remember: bool = True,
-    ) -> bool:
+    def publish(self, topic: str, payload: bytes, **options: Any) -> bool:
         if topic.endswith(f"/{DRIVE.metric}"):
             payload = codec.encode(DRIVE, self.rewrite(topic, codec.decode(DRIVE, payload)))
-        return super().publish(topic, payload, qos=qos, retain=retain, urgent=urgent, remember=remember)
+        return super().publish(topic, payload, **options)
 
 
 class ServerSocket:
