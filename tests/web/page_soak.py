@@ -1,8 +1,9 @@
 """Four robots, a tab each, for an hour: is memory flat, and does no page complain? ``python -m tests.web.page_soak``.
 
 Each tab shows a robot with all its cards and plays its sound; one after another drives. Once a minute: memory of the
-server's process, and of each tab after its garbage was collected. The last quarter of the time is compared with the
-second one, in which everything has been loaded and all buffers of the pages are filling or full.
+server's process, of each tab's script after its garbage was collected, and of Chromium's processes of pages, where
+their workers and pictures are. The last quarter of the time is compared with the second one, in which everything has
+been loaded and all buffers of the pages are filling or full.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
+from playwright.sync_api import CDPSession
 from rich.console import Console as Terminal
 from rich.table import Table
 
@@ -32,27 +34,30 @@ Samples = dict[str, list[float]]  # MB, by what was measured
 
 
 @contextmanager
-def pages() -> Iterator[tuple[Stage, list[Console]]]:
+def pages() -> Iterator[tuple[Stage, CDPSession, list[Console]]]:
     """A page of each robot, with every card open and its sound on."""
     with Stage() as stage, program.chromium() as browser, ExitStack() as stack:
         opened = [stack.enter_context(console(browser, stage, name)) for name in ROBOTS]
         for one in opened:
             assert one.tab.until(lambda one=one: one.state("capabilities") is not None, 30), one.name  # type: ignore[misc]
             one.page.wait_for_timeout(2000)
-            for heading in one.page.locator(".card [aria-expanded=false]").all():
-                heading.click()
+            closed = one.page.locator(".card [aria-expanded=false]").first  # cards, and the lines of values
+            while closed.count():
+                closed.click()
             listen = one.test("listen")
             if listen.count() and listen.is_enabled():
                 listen.click()
-        yield stage, opened
+        yield stage, browser.new_browser_cdp_session(), opened
 
 
-def measure(stage: Stage, opened: list[Console], samples: Samples) -> None:
+def measure(stage: Stage, browser: CDPSession, opened: list[Console], samples: Samples) -> None:
     """Append the memory of now."""
     samples.setdefault("server", []).append(pss_mb(stage.server.program.pid))
     for one in opened:
         for what, value in memory(one.tab).items():
             samples.setdefault(f"{one.name}: {what}", []).append(value)
+    processes = browser.send("SystemInfo.getProcessInfo")["processInfo"]
+    samples.setdefault("all tabs", []).append(sum(pss_mb(one["id"]) for one in processes if one["type"] == "renderer"))
 
 
 def memory(tab: Tab) -> dict[str, float]:
@@ -89,13 +94,16 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0)
     minutes = parser.parse_args().minutes
     terminal, samples, drives = Terminal(), dict[str, list[float]](), list[bool]()
-    with pages() as (stage, opened):
+    with pages() as (stage, browser, opened):
         began = time.monotonic()
         while (passed := time.monotonic() - began) < 60 * minutes:
             drives.append(drive(opened[len(drives) % len(opened)]))
-            measure(stage, opened, samples)
+            measure(stage, browser, opened, samples)
             heaps = " ".join(f"{one.name} {samples[f'{one.name}: heap'][-1]:.1f}" for one in opened)
-            terminal.print(f"{passed / 60:5.1f} min, server {samples['server'][-1]:.1f} MB, {heaps}", highlight=False)
+            terminal.print(
+                f"{passed / 60:5.1f} min, server {samples['server'][-1]:.1f} MB, tabs {samples['all tabs'][-1]:.0f}, {heaps}",
+                highlight=False,
+            )
             opened[0].page.wait_for_timeout(max(0.0, 1000 * (_PERIOD_S * len(drives) - (time.monotonic() - began))))
         complaints = [f"{one.name}: {text}" for one in opened for text in (*one.tab.complaints(), *one.tab.console)]
     table = Table("what", "first", "lowest", "highest", "last", "change", title=f"{minutes:.0f} minutes")
