@@ -49,6 +49,16 @@ class Liveness:
         """Of the newest heartbeat; correct only if both clocks are synchronised, as on one machine."""
         return self._latencies[-1] if self._latencies else None
 
+    @property
+    def average_latency_s(self) -> float | None:
+        """Of the last ten heartbeats."""
+        return _mean(self._latencies)
+
+    @property
+    def interval_s(self) -> float | None:
+        """Between heartbeats: the mean of the last ten."""
+        return _mean(self._intervals)
+
     def age_s(self, now: float) -> float | None:
         return None if self.received_at is None else now - self.received_at
 
@@ -56,10 +66,14 @@ class Liveness:
         """None while there are too few heartbeats to decide."""
         if self.reported_offline:
             return False
-        if self.received_at is None or len(self._intervals) < 2 or not self._latencies:
+        interval, latency = self.interval_s, self.average_latency_s
+        if self.received_at is None or len(self._intervals) < 2 or interval is None or latency is None:
             return None
-        window = max(2 * sum(self._intervals) / len(self._intervals), 4 * sum(self._latencies) / len(self._latencies))
-        return now - self.received_at <= window
+        return now - self.received_at <= max(2 * interval, 4 * latency)
+
+
+def _mean(values: deque[float]) -> float | None:
+    return sum(values) / len(values) if values else None
 
 
 class DiscoveredRobot:

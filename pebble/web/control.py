@@ -205,11 +205,22 @@ class Control:
             case m.PictureFromOp():
                 if self._may("drive", op):
                     self._server.picture_from(op.ref, op.source)
+            case m.StreamAddressOp():
+                self._stream_address(op)
             case m.Hello():
                 raise Leave("hello comes only once", again=True)
             case _:
                 self._command(op)
         self._wake.set()
+
+    def _stream_address(self, op: m.StreamAddressOp) -> None:
+        """For everybody, and of any host: hence only by those who look after robots."""
+        if not self._may("system", op):
+            return
+        if why := self._server.stream_address(op.ref, op.url):
+            self._refuse(op, why)
+        else:
+            self._audit(_tag(op), op.ref, detail=op.url)
 
     def _command(self, op: m.RobotOp) -> None:
         """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""

@@ -135,6 +135,13 @@ class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
     source: Ref
 
 
+class StreamAddressOp(_FromPage, frozen=True, kw_only=True, tag="stream-address"):
+    """Offer the stream at ``url`` on the page of this component, for everybody; "" is the one that it reports."""
+
+    ref: Ref
+    url: Annotated[str, Meta(max_length=500)]
+
+
 class _Asked(_FromPage, frozen=True, kw_only=True):
     """What is asked of a robot; it is answered with Done or Refused."""
 
@@ -204,7 +211,7 @@ RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | A
 
 FromPage: TypeAlias = (
     Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp
-    | PictureFromOp | RobotOp
+    | PictureFromOp | StreamAddressOp | RobotOp
 )  # fmt: skip
 
 
@@ -311,7 +318,9 @@ class Liveness(Struct, frozen=True, kw_only=True):
 
     online: bool | None  # None: not known yet
     silent_s: float | None  # since its last sign of life; None: only retained messages were received
-    latency_ms: float | None
+    latency_ms: float | None  # of the newest heartbeat
+    average_latency_ms: float | None  # of the last ten
+    interval_ms: float | None  # between heartbeats: the mean of the last ten
     whole_seconds: bool  # its clock counts whole seconds: latency says nothing
 
 
@@ -389,6 +398,12 @@ class PictureFrom(Struct, frozen=True, kw_only=True):
     source: str
 
 
+class StreamAddress(Struct, frozen=True, kw_only=True):
+    """``web/stream-address``: of the stream that was entered for this component; "" is the one that it reports."""
+
+    url: str
+
+
 class FlagsView(Struct, frozen=True, kw_only=True):
     """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none."""
 
@@ -410,6 +425,7 @@ SERVER_METRICS: dict[str, type] = {
     "web/picture": PictureView,
     "web/sound": SoundView,
     "web/picture-from": PictureFrom,
+    "web/stream-address": StreamAddress,
     "web/flags": FlagsView,
     "web/restarts": RestartsView,
     "web/broker": BrokerView,

@@ -1,4 +1,7 @@
-"""The streams that robots serve themselves, over WebRTC for example: which origins the page may show in a frame."""
+"""The streams that robots serve themselves, over WebRTC for example, and others that were entered for them.
+
+They decide which origins the page may show in a frame.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ _URL: Final = re.compile(
 )
 
 
-def origin(url: object, own_host: str) -> str:
+def origin(url: object, own_host: str = "") -> str:
     """Scheme, host and port of a stream that may be shown; empty if it may not.
 
     Not of the page's own host, on whatever port: a browser sends the cookie of the login there as well.
@@ -35,10 +38,10 @@ def origin(url: object, own_host: str) -> str:
 
 
 def origins(robots: Robots, ref: str, own_host: str) -> list[str]:
-    """Of all that robots report now; those for the page of ``ref`` first."""
+    """Of all that robots report now, or that were entered for them; those for the page of ``ref`` first."""
     found: dict[str, None] = {}
     for one in (ref, robots.sources.get(ref, ref), *robots.components):
-        if allowed := origin(_reported(robots, one), own_host):
+        if allowed := origin(robots.streams.get(one) or _reported(robots, one), own_host):
             found[allowed] = None
         if len(found) == MAX_ORIGINS:
             break

@@ -120,11 +120,12 @@ class Component:
         self.liveness.heartbeat(now, wall - t_ms / 1000, online=online)
 
     def view(self, now: float) -> m.Liveness:
-        latency = self.liveness.latency_s
         return m.Liveness(
             online=self.online(now),
             silent_s=self.liveness.age_s(now),
-            latency_ms=None if latency is None else 1000 * latency,
+            latency_ms=_ms(self.liveness.latency_s),
+            average_latency_ms=_ms(self.liveness.average_latency_s),
+            interval_ms=_ms(self.liveness.interval_s),
             whole_seconds=len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps),
         )
 
@@ -132,6 +133,10 @@ class Component:
         """Whether it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
         drive = self.capabilities.get("drive")
         return isinstance(drive, dict) and drive.get("available") is True and drive.get("controls") is not False
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1000 * seconds
 
 
 class Interest:
@@ -155,6 +160,7 @@ class Robots:
         self.logs: dict[str, LogLines] = {}  # of watched components
         self.recent = Recent()
         self.sources: dict[str, str] = {}  # the components whose pictures are shown on the pages of others
+        self.streams: dict[str, str] = {}  # addresses that people have entered, by component
         self._server: dict[tuple[str, str], _Value] = {}
         self._bytes = 0
 

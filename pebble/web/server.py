@@ -28,6 +28,7 @@ from pebble.web.broker import Broker
 from pebble.web.driving import Command, Driving
 from pebble.web.media import MediaHub
 from pebble.web.open_components import OpenComponents
+from pebble.web.robot_streams import origin
 from pebble.web.robots import FLEET, SYNONYMS, Component, Robots, section_of
 from pebble.web.settings import WebSettings
 from pebble.web.sound import SoundHub
@@ -41,6 +42,7 @@ _ANNOUNCE_S = 1.0
 _RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
 _ANNOUNCED = 64  # robots in one announcement
 _ESTOP_METRIC = "web/estop"
+_STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
 
 
 def clock() -> float:
@@ -58,6 +60,7 @@ class Server:
         self.id = f"{self.name}-{secrets.token_hex(2)}"
         self.broker = Broker(settings.broker)
         self.robots, self.stops, self.driving = Robots(), Stops(), Driving(self.id)
+        self.robots.streams.update(people.all(_STREAM_ADDRESS))
         self.media = MediaHub(self.broker, self.robots)
         self.sound = SoundHub(self.broker, self.robots, self._note_talk)
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
@@ -219,6 +222,23 @@ class Server:
         self.open_components.update(ref)  # what is drawn over the picture comes from there
         self.robots.set_server_metric(ref, "web/picture-from", m.PictureFrom(source=source))
 
+    def stream_address(self, ref: str, url: str) -> str:
+        """Offer the stream at ``url`` on the page of ``ref``, for everybody; "" is the one that it reports.
+
+        Returns why not; empty if it is done.
+        """
+        if ref not in self.robots.components:
+            return "unknown component"
+        if url and not origin(url):
+            return "No stream: an address begins with http:// or https://, and has no login"
+        self.people.set(_STREAM_ADDRESS + ref, url)
+        self.robots.streams[ref] = url
+        self._show_stream_address(ref)
+        return ""
+
+    def _show_stream_address(self, ref: str) -> None:
+        self.robots.set_server_metric(ref, "web/stream-address", m.StreamAddress(url=self.robots.streams.get(ref, "")))
+
     # -- what is open
 
     def watch(self, ref: str) -> None:
@@ -226,6 +246,7 @@ class Server:
         if _is_base(ref):
             self.open_components.open(ref)
             self._show_picture_from(ref)
+            self._show_stream_address(ref)
 
     def unwatch(self, ref: str) -> None:
         """A page has closed it."""

@@ -82,6 +82,10 @@ def drive(one: Console) -> bool:
     return moved and one.rests()
 
 
+def _is_memory(what: str) -> bool:
+    return not what.endswith(("nodes", "listeners"))
+
+
 def change(values: list[float]) -> float:
     """Of the median of the last quarter since the second one; 0: none."""
     quarter = max(1, len(values) // 4)
@@ -99,11 +103,8 @@ def main() -> int:
         while (passed := time.monotonic() - began) < 60 * minutes:
             drives.append(drive(opened[len(drives) % len(opened)]))
             measure(stage, browser, opened, samples)
-            heaps = " ".join(f"{one.name} {samples[f'{one.name}: heap'][-1]:.1f}" for one in opened)
-            terminal.print(
-                f"{passed / 60:5.1f} min, server {samples['server'][-1]:.1f} MB, tabs {samples['all tabs'][-1]:.0f}, {heaps}",
-                highlight=False,
-            )
+            newest = ", ".join(f"{what} {values[-1]:.1f}" for what, values in samples.items() if _is_memory(what))
+            terminal.print(f"{passed / 60:5.1f} min, MB: {newest}", highlight=False)
             opened[0].page.wait_for_timeout(max(0.0, 1000 * (_PERIOD_S * len(drives) - (time.monotonic() - began))))
         complaints = [f"{one.name}: {text}" for one in opened for text in (*one.tab.complaints(), *one.tab.console)]
     table = Table("what", "first", "lowest", "highest", "last", "change", title=f"{minutes:.0f} minutes")

@@ -55,7 +55,8 @@ def capabilities(kind: str, *, video: bool = True, drive: bool = True) -> dict[s
 
 
 def liveness(online: bool | None = True, silent_s: float | None = 0.1, **more: Any) -> dict[str, Any]:
-    return {"online": online, "silent_s": silent_s, "latency_ms": 42.0, "whole_seconds": False} | more
+    heartbeats = {"latency_ms": 42.0, "average_latency_ms": 48.0, "interval_ms": 250.0, "whole_seconds": False}
+    return {"online": online, "silent_s": silent_s} | heartbeats | more
 
 
 def driver(by: str = "", device: str = "", *, you: bool = False, server: str = "") -> dict[str, Any]:

@@ -238,6 +238,7 @@ def ops(ref: str) -> dict[str, dict[str, Any]]:
         "estop-reset": {"ref": ref, "owners": [OWNER]},
         "encoding": {"ref": ref, "encoding": "json"},
         "picture-from": {"ref": ref, "source": GOOB},
+        "stream-address": {"ref": ref, "url": "http://camera.local/"},
         "lights": {"ref": ref, "r": 1},
         "soundboard": {"ref": ref, "file": "horn.wav"},
         "autonomy": {"ref": ref, "file": "follow"},

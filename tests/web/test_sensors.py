@@ -489,6 +489,33 @@ def test_what_may_not_be_shown_is_not(server: CannedServer, browser: Browser, ad
         assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0
 
 
+def test_an_address_that_was_entered_is_shown_instead(server: CannedServer, browser: Browser) -> None:
+    entered = at(GOOB, "web/stream-address", {"url": f"{STREAM}/stream"})
+    state = replace(OWN, values=changed(fleet, MINE, with_stream("http://other.local/"), entered))
+    with showing(server, browser, state) as opened:
+        opened.test("open-stream").click()
+        assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
+
+
+def test_an_address_is_entered_and_taken_back(server: CannedServer, browser: Browser) -> None:
+    url = "http://camera.local:8889/cam"
+    with showing(server, browser, STATES["driving"]) as opened:
+        opened.test("stream-address").click()
+        use, address = opened.test("set-stream"), opened.test("stream-url")
+        assert use.is_disabled()
+        address.fill("javascript:alert(1)")
+        assert "only http://" in opened.page.locator("#why-stream-address").inner_text()
+        assert use.is_disabled()
+        address.fill(f" {url} ")
+        use.click()
+        assert opened.until(lambda: [one["url"] for one in server.sent("stream-address")] == [url])
+        entered = at(GOOB, "web/stream-address", {"url": url})
+        server.show(replace(STATES["driving"], values=changed(fleet, MINE, entered)))
+        opened.test("unset-stream").click()
+        assert opened.until(lambda: server.sent("stream-address")[-1]["url"] == "")
+        assert opened.complaints() == []
+
+
 def test_another_component_whose_picture_is_shown_offers_its_stream(server: CannedServer, browser: Browser) -> None:
     tower = "pebble/towers/tower-1"
     values = changed(

@@ -81,6 +81,12 @@ export interface PictureFromOp {
   source: string;
 }
 
+export interface StreamAddressOp {
+  op: "stream-address";
+  ref: string;
+  url: string;
+}
+
 export interface LightsOp {
   op: "lights";
   n?: number;
@@ -232,6 +238,8 @@ export interface Liveness {
   online: boolean | null;
   silent_s: number | null;
   latency_ms: number | null;
+  average_latency_ms: number | null;
+  interval_ms: number | null;
   whole_seconds: boolean;
 }
 
@@ -277,6 +285,10 @@ export interface PictureFrom {
   source: string;
 }
 
+export interface StreamAddress {
+  url: string;
+}
+
 export interface FlagsView {
   remote_mirror?: boolean | null;
   mqtt_audio?: boolean | null;
@@ -300,11 +312,12 @@ export interface Metrics {
   "web/picture": PictureView;
   "web/sound": SoundView;
   "web/picture-from": PictureFrom;
+  "web/stream-address": StreamAddress;
   "web/flags": FlagsView;
   "web/restarts": RestartsView;
   "web/broker": BrokerView;
 }
 
-export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
+export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | StreamAddressOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
 
 export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Series | Bye;

@@ -1,4 +1,4 @@
-/** The stream that a robot serves itself: whether its address may be shown in a frame of the page. Pure. */
+/** The stream that a robot serves itself, or that was entered for it: whether the page may show it in a frame. Pure. */
 
 const KEYS = ["webrtc_url", "webrtcUrl", "url"]; // robots of the original use all of them
 const LONGEST = 500;
@@ -21,10 +21,10 @@ export function reported(status) {
 export function refusal(address, page) {
   const url = parsed(address);
   if (!url || url.username || url.password || url.port === "0") {
-    return "The robot reports an address that is not shown: only http and https are, without a login";
+    return "This address is not shown: only http:// and https:// are, without a login";
   }
   if (bare(url.hostname) === bare(page.hostname)) {
-    return "The robot reports an address on this page's own host, to which browsers would send your login";
+    return "This address is on the page's own host, to which browsers would send your login";
   }
   if (page.protocol === "https:" && url.protocol === "http:" && !isLoopback(url.hostname)) return MIXED;
   return "";

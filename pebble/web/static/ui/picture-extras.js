@@ -1,9 +1,10 @@
 // What belongs to a picture besides it: what robots draw over it, snapshots, and the robot's own stream.
 
-import { MIXED, refusal, reported } from "../core/stream.js";
+import { MIXED, refusal } from "../core/stream.js";
 import { html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "./hooks.js";
 import { Model, read, write } from "./models.js";
 import { Icon, Why } from "./parts.js";
+import { useStream } from "./video.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../media/overlays.js";
 import { nameOf } from "./words.js";
 
@@ -28,7 +29,7 @@ export function Layer({ source }) {
   const { video, driver } = usePage();
   useModel(video);
   useModel(switches);
-  const address = reported(useValue(source, "status"));
+  const address = useStream(source);
   const moved = video.stream !== "" && address !== "" && address !== video.stream;
   useEffect(() => {
     if (moved) show(video, driver, "");
@@ -131,11 +132,11 @@ export function fileName(source, ms) {
   return `${nameOf(source).replace(/[^\w.-]/g, "_")}-${day}T${time}.png`;
 }
 
-/** Open the stream that the robot serves by itself, and what to know of it. */
+/** Open the stream that the robot serves by itself, or that was entered for it, and what to know of it. */
 function Stream({ source, wanted }) {
   const { video, driver } = usePage();
   const [blocked, block] = useState(""); // the address that the page's policy refused
-  const address = reported(useValue(source, "status"));
+  const address = useStream(source);
   useEffect(() => {
     const violated = (event) => {
       if (event.effectiveDirective !== "frame-src") return;
@@ -172,7 +173,7 @@ function Stream({ source, wanted }) {
     ${refused === MIXED &&
     html`<a class="button" href=${address} target="_blank" rel="noopener noreferrer">Open it in another tab</a>`}
     ${blocked === address &&
-    html`<p class="why" role="status">The robot reports this address only since the page was loaded.</p>
+    html`<p class="why" role="status">This address is known only since the page was loaded.</p>
       <button type="button" data-test="reload-stream" onClick=${() => location.reload()}>Reload</button>`}
   </div>`;
 }

@@ -1,6 +1,7 @@
 // How the pictures of a component come, and where from.
 
-import { html, usePage, useRefs, useTick, useValue } from "./hooks.js";
+import { refusal } from "../core/stream.js";
+import { html, usePage, useRefs, useState, useTick, useValue } from "./hooks.js";
 import { Offers } from "./models.js";
 import { Why } from "./parts.js";
 import { Extra } from "./video.js";
@@ -37,19 +38,20 @@ export function PictureSettings({ at, source, offers, video }) {
     >
     <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
     ${why && html`<${Why} id="why-picture">${why}<//>`}
+    <${StreamAddress} key=${source} source=${source} />
   </div>`;
 }
 
-/** For a component without a camera: another one may look at it. */
+/** For a component without a camera: another one may look at it, or a stream of any other program. */
 export function NoCamera({ at, offers }) {
   const page = useReasons(at);
-  if (useCameras(at).length === 0) return null;
   const why = whyNotEnd(page);
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   return html`<section class="no-camera picture-settings" aria-label="Picture">
     <p>${nameOf(at)} has no camera.</p>
     <${PictureFrom} at=${at} source=${at} offers=${offers} more=${more} />
     ${why && html`<${Why} id="why-picture">${why}<//>`}
+    <${StreamAddress} source=${at} />
   </section>`;
 }
 
@@ -69,6 +71,48 @@ function PictureFrom({ at, source, offers, more }) {
       ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
     </select></label
   >`;
+}
+
+/** Enter the address of a stream, for everybody: of a camera that is beside the robot, for example. */
+function StreamAddress({ source }) {
+  const page = useReasons(source);
+  const current = useValue(source, "web/stream-address")?.url ?? "";
+  const [typed, type] = useState(/** @type {string | null} */ (null)); // null: as it is
+  const address = (typed ?? current).trim();
+  const why = whyNotEnd(page, "system") || (address && refusal(address, location));
+  const set = (url) => {
+    page.commands.setStreamAddress(source, url);
+    type(null);
+  };
+  return html`<details class="stream-address">
+    <summary data-test="stream-address">Stream from another address</summary>
+    <form
+      onSubmit=${(event) => {
+        event.preventDefault();
+        if (!why && address) set(address);
+      }}
+    >
+      <label class="field"
+        ><span>Address</span
+        ><input
+          type="text"
+          inputmode="url"
+          autocapitalize="off"
+          spellcheck="false"
+          placeholder="http://camera.local:8889/cam"
+          data-test="stream-url"
+          value=${typed ?? current}
+          aria-describedby=${why ? "why-stream-address" : undefined}
+          onInput=${(event) => type(event.currentTarget.value)}
+      /></label>
+      <button data-test="set-stream" disabled=${Boolean(why) || !address || address === current}>Use it</button>
+      ${current &&
+      html`<button type="button" data-test="unset-stream" disabled=${whyNotEnd(page, "system") !== ""} onClick=${() => set("")}>
+        Use it no more
+      </button>`}
+      ${why && html`<${Why} id="why-stream-address">${why}<//>`}
+    </form>
+  </details>`;
 }
 
 function useCameras(at) {

@@ -1,12 +1,11 @@
 // One component: its picture, how to drive it, and its cards; on a desktop, a phone, and a phone that lies.
 
-import { reported } from "../core/stream.js";
 import { CARDS, TABS, VOICE } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
 import { CardView, Offers } from "./models.js";
 import { Card, Icon, Part } from "./parts.js";
-import { NoCamera, PictureSettings, Stage, useVideo } from "./video.js";
+import { NoCamera, PictureSettings, Stage, useStream, useVideo } from "./video.js";
 import { nameOf, typeOf } from "./words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
@@ -14,7 +13,7 @@ export function Robot({ at, layout, drawer, onPanel }) {
   const [view] = useState(() => new CardView(at));
   useModel(view);
   const source = useValue(at, "web/picture-from")?.source || at;
-  const stream = reported(useValue(at, "status")); // its own
+  const stream = useStream(at);
   const hasVideo = offers.hasVideo || source !== at || stream !== "";
   const known = useKnown(at);
   const video = useVideo(at, hasVideo && known ? source : "");

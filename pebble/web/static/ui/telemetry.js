@@ -38,12 +38,14 @@ function Heartbeat({ at }) {
   if (!view) return null;
   const age = view.silent_s === null ? null : 1000 * view.silent_s + entry.age;
   const ago = age < 1500 ? "within the last second" : `${roughly(age)} ago`;
-  const seen = age === null ? "none since the server started" : ago;
+  const every = view.interval_ms ? `, every ${span(view.interval_ms)}` : "";
+  const seen = age === null ? "none since the server started" : `${ago}${every}`;
+  const average = view.average_latency_ms ?? null;
   const late = view.whole_seconds
     ? "unknown: its clock counts whole seconds"
     : view.latency_ms === null
       ? "–"
-      : span(view.latency_ms);
+      : `${span(view.latency_ms)}${average === null ? "" : `, on average ${span(average)}`}`;
   return html`<div>
       <dt>Heartbeat</dt>
       <dd class=${view.online === false ? "bad" : ""}>${seen}</dd>

@@ -1,5 +1,6 @@
 // The live picture: how old it is, how it comes, and where from.
 
+import { reported } from "../core/stream.js";
 import { VOICE } from "./cards.js";
 import {
   Boundary,
@@ -23,6 +24,12 @@ const EXTRAS = styled(() => import("./picture-extras.js"), "picture.css");
 export function Extra({ part, what, source, ...props }) {
   const { body } = usePart(EXTRAS);
   return body && html`<${Boundary} key=${source} what=${what}><${body[part]} source=${source} ...${props} /><//>`;
+}
+
+/** The address of its own stream: what was entered, else what it reports; "" none. @param {string} at */
+export function useStream(at) {
+  const own = reported(useValue(at, "status"));
+  return useValue(at, "web/stream-address")?.url || own;
 }
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
