@@ -18,11 +18,13 @@ from enum import Enum
 from typing import NamedTuple
 
 from pebble.contract import ESTOP, Kind
+from pebble.forwarding.admission import Admission
 from pebble.forwarding.event_buffer import EventBuffer
 from pebble.forwarding.loopback_filter import LoopbackFilter
 from pebble.forwarding.reconciliation import Reconciliation, Resolution
 from pebble.forwarding.routing import URGENT, Drop, Forward, Rules, Side, route
 from pebble.forwarding.subjects import Subject, Subjects
+from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.counters import Counters
 
@@ -36,6 +38,7 @@ _RETAINED_S = 0.05
 #: A broker sends few retained messages at a time, so over a slow link the last ones arrive long after the first. While
 #: others with the retain flag keep arriving, a stop with it counts as an old one, but not for longer than this.
 _RETAINED_STOPS_S = 10.0
+_LOGGED = 200  # characters of a topic
 _MAX_WAITING = 4096  # retained messages that wait for the gate to open
 
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
@@ -79,6 +82,8 @@ class Forwarder:
         self._winner, self._on_value, self._clock = winner, on_value, clock
         self._lock = threading.RLock()
         self._reconciliation = Reconciliation(winner)
+        self._admission = Admission()
+        self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
         self._events = {side: EventBuffer(transports[side], self.counters, clock=clock) for side in Side}
         self._loopback = {side: LoopbackFilter(clock) for side in Side}
@@ -167,6 +172,10 @@ class Forwarder:
         forward = route(self._rules, side, subject, message, mirroring=self._may_mirror())
         if isinstance(forward, Drop) or subject is None:
             return forward if isinstance(forward, Drop) else Drop.FOREIGN
+        refused = self._admission.refuse(side, subject, message)
+        if refused is not None:
+            self._quiet_log.warning(refused.name, "%s is not forwarded: %s", message.topic[:_LOGGED], refused.value)
+            return refused
         if self._is_echo(side, subject, message):
             return Drop.ECHO
         if forward.retain:

@@ -34,6 +34,8 @@ class Drop(Enum):
     ONE_WAY = "goes the other way only"
     NOT_MIRRORED = "passes only while remote-mirror is on"
     # found by the forwarder
+    TOO_LARGE = "larger than a message to a robot may be"
+    TOO_MANY = "one more unknown flag than a robot stores"
     ECHO = "our own, sent back by the broker"
     KNOWN = "the other side has this value"
     OVERRULED = "the other side's value counts"

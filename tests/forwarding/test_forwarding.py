@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
+from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.forwarding import loopback_filter as loopback_filter
+from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS, Admission
 from pebble.forwarding.event_buffer import RESEND_S, EventBuffer
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.loopback_filter import EXPIRY_S, LoopbackFilter
@@ -74,6 +76,42 @@ class TestLoopbackFilter:
             for number in range(loopback_filter.TOPICS, 2 * loopback_filter.TOPICS)
         )
         assert len(loopback) == 0
+
+
+class TestAdmission:
+    SUBJECTS = Subjects(make_config())
+
+    def refuse(self, admission: Admission, topic: str, payload: bytes = b"1", side: Side = REMOTE) -> Drop | None:
+        subject = self.SUBJECTS[f"{BASE}/{topic}"]
+        assert subject is not None
+        return admission.refuse(side, subject, Message(f"{BASE}/{topic}", payload, retain=True))
+
+    def test_unknown_flags_are_bounded_and_a_removed_one_makes_room(self) -> None:
+        admission = Admission()
+        first = [f"incoming/flags/f{number}" for number in range(MAX_UNKNOWN_FLAGS)]
+        assert [self.refuse(admission, topic) for topic in first] == [None] * MAX_UNKNOWN_FLAGS
+        assert self.refuse(admission, "incoming/flags/more") is Drop.TOO_MANY
+        assert [self.refuse(admission, topic, b"2") for topic in first] == [None] * MAX_UNKNOWN_FLAGS
+        assert self.refuse(admission, "incoming/flags/mqtt-video") is None  # of the contract
+        assert self.refuse(admission, "incoming/flags/f7", b"") is None
+        assert self.refuse(admission, "incoming/flags/more") is None
+        assert self.refuse(admission, "incoming/flags/f7") is Drop.TOO_MANY
+
+    def test_flags_of_the_robot_itself_are_always_admitted_and_count(self) -> None:
+        admission = Admission()
+        for number in range(MAX_UNKNOWN_FLAGS + 5):
+            assert self.refuse(admission, f"incoming/flags/f{number}", side=LOCAL) is None
+        assert self.refuse(admission, "incoming/flags/f1") is None
+        assert self.refuse(admission, "incoming/flags/more") is Drop.TOO_MANY
+
+    @pytest.mark.parametrize("topic", ["drive-values", "flags/reboot", "flags/mqtt-video", "flags/mine", "mine"])
+    def test_messages_to_a_robot_are_bounded_in_size(self, topic: str) -> None:
+        admission = Admission()
+        assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES)) is None
+        assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES + 1)) is Drop.TOO_LARGE
+
+    def test_what_a_robot_sends_is_not(self) -> None:
+        assert self.refuse(Admission(), "outgoing/map", bytes(MAX_COMMAND_BYTES + 1), side=LOCAL) is None
 
 
 class TestReconciliation:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS
 from pebble.forwarding.forwarder import Gate
 from pebble.transports import State
 from tests.services.mqtt_bridge.bridge_rig import Client, MqttRig, Quiet, gate_of
@@ -103,6 +104,22 @@ def storm(*voices: tuple[Client, str, list[bytes]], seconds: float = 2.0, retain
         for (client, suffix, _), payload in zip(voices, payloads, strict=True):
             client.publish(suffix, payload, retain=retain)
         time.sleep(max(0.0, began + number * seconds / len(rounds) - time.monotonic()))
+
+
+class TestPlanted:
+    def test_retained_flags_of_strangers_cost_the_robot_neither_memory_nor_its_commands(
+        self, brokers: tuple[Broker, Broker], spare: Broker, rigs: Rigs
+    ) -> None:
+        rig = rigs(at(brokers[0]), at(spare))
+        for number in range(3000):
+            rig.remote.publish(f"incoming/flags/f{number}", b"x" * 100, qos=0, retain=True)
+        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
+        rig.start()
+        assert until(lambda: rig.local.payloads(VIDEO_FLAG) == [TRUE])
+        rig.remote.publish(DRIVE, b'{"x": 0, "z": 0.5}')
+        assert until(lambda: rig.local.on(DRIVE))
+        Quiet(rig.local, rig.remote).wait()
+        assert len({one.topic for one in rig.local.seen if "/flags/f" in one.topic}) == MAX_UNKNOWN_FLAGS
 
 
 class TestStorms:
