@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import time
 from collections.abc import Sequence
 
 from pebble.config import Config
@@ -40,7 +39,7 @@ class Launcher:
         _check_runs_here(config)
         self._config = config
         self._environment = _inherited_environment()
-        self._reactor = Reactor()
+        self._reactor = Reactor(on_stall=_log_stall)
         self._supervisors = [self._supervise(program) for program in (programs(config) if table is None else table)]
         self._on_demand = OnDemand(self._reactor, self._supervisors)
         self._features = Features(lambda: self._status.capabilities_changed())
@@ -129,12 +128,12 @@ class Launcher:
         """Stop stage by stage. Each has its own share of the timeout, so a hung process cannot starve later stages."""
         log.info("stopping")
         self._status.stopping()
-        end = time.monotonic() + self._config.services.launcher.shutdown_timeout_seconds
+        end = self._reactor.now() + self._config.services.launcher.shutdown_timeout_seconds
         stages = sorted(Stage, reverse=True)
         for index, stage in enumerate(stages):
             if stage is Stage.ANNOUNCER:
                 self._status.publish_last()
-            share_s = (end - time.monotonic()) / (len(stages) - index)
+            share_s = (end - self._reactor.now()) / (len(stages) - index)
             in_stage = [supervisor for supervisor in self._supervisors if supervisor.program.stage is stage]
             self._stop_stage(in_stage, max(0.0, share_s))
 
@@ -168,6 +167,10 @@ def _check_runs_here(config: Config) -> None:
     if config.path is None:
         raise ConfigError("the robot's processes read its config from a file, and this one has none")
     check_kinds(config)
+
+
+def _log_stall(seconds: float) -> None:
+    log.warning("stood still for %.1f s (suspended, or too busy a machine): this time counts for no limit", seconds)
 
 
 def _running(supervisors: Sequence[ProcessSupervisor]) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-import time
 from collections.abc import Iterable
 
 from pebble.launcher.process_supervisor import ProcessSupervisor
@@ -60,13 +59,13 @@ class OnDemand:
         """A program has ended: what it requested may run on for a while, but not for ever."""
         if not program.may_request or not self.requested:
             return
-        due = time.monotonic() + OUTLIVE_S
+        due = self._reactor.now() + OUTLIVE_S
         for name in self.requested:
             self._until.setdefault(name, due)
         self._reactor.at(due, self._expire)
 
     def _expire(self) -> None:
-        now = time.monotonic()
+        now = self._reactor.now()
         for name in [name for name, due in self._until.items() if due <= now]:
             del self._until[name]
             log.warning("%s: the program that requested it has ended, and the request was not repeated", name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum, auto
@@ -101,7 +100,7 @@ class ProcessSupervisor:
 
     def start(self) -> None:
         self._lines, self._notes = _splitter(), _splitter()
-        self.policy.started(time.monotonic())
+        self.policy.started(self._reactor.now())
         try:
             self._child = child = self._spawn(self.program)
         except OSError as error:
@@ -142,7 +141,7 @@ class ProcessSupervisor:
     def _handle_notes(self, data: bytes) -> None:
         for line in map(text_of, self._notes.feed(data)):
             if line == "ALIVE":
-                self.policy.alive(time.monotonic())
+                self.policy.alive(self._reactor.now())
             elif line == "READY":
                 self._ready()
             elif line:
@@ -151,7 +150,7 @@ class ProcessSupervisor:
     def _ready(self) -> None:
         if self.state is not State.RUNNING:  # too late
             return
-        self.policy.ready(time.monotonic())
+        self.policy.ready(self._reactor.now())
         self._check_at(self.policy.stuck_at)  # from now on signs of life come more often
         self._on_change()
 
@@ -163,7 +162,7 @@ class ProcessSupervisor:
     # -- the timer
 
     def _start_after_request(self) -> None:
-        wait_s = self.policy.request_delay_s(time.monotonic())
+        wait_s = self.policy.request_delay_s(self._reactor.now())
         if wait_s > 0:
             self._start_in(wait_s)
         else:
@@ -178,7 +177,7 @@ class ProcessSupervisor:
         self._timer = self._reactor.at(due, self._check_alive)
 
     def _check_alive(self) -> None:
-        if time.monotonic() < self.policy.stuck_at:
+        if self._reactor.now() < self.policy.stuck_at:
             self._check_at(self.policy.stuck_at)
             return
         log.error("%s gives no sign of life: killed", self.program.name)
@@ -241,7 +240,7 @@ class ProcessSupervisor:
 
     def _restart(self, how: str) -> None:
         was_in_crash_loop = self.policy.in_crash_loop
-        wait_s = self.policy.exited(time.monotonic(), how)
+        wait_s = self.policy.exited(self._reactor.now(), how)
         self._start_in(wait_s)
         name = self.program.name
         if not self.policy.in_crash_loop:

@@ -13,16 +13,37 @@ from typing import Any, Self
 from pebble.runtime.timers import Timer, Timers
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+_TURN_S = 1.0  # the longest wait of one turn
+_STALL_S = 2.0  # a turn that takes this much longer: the process was frozen, as a suspended machine's, or starved
 
 Job = Callable[[], None]
 
 
 class Reactor:
-    """Calls jobs when a descriptor can be read or a time has come. For one thread only."""
+    """Calls jobs when a descriptor can be read or a time has come. For one thread only.
 
-    def __init__(self) -> None:
+    Its clock does not run while this process stands still, because what it waits for then stands still, too, as a
+    rule. ``on_stall(seconds)`` is called afterwards.
+    """
+
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, *, on_stall: Callable[[float], None] = lambda _seconds: None
+    ) -> None:
         self._selector = selectors.DefaultSelector()
         self._timers = Timers()
+        self._clock, self._on_stall = clock, on_stall
+        self._stood_still_s = 0.0
+        self._read: float | None = None  # when the clock was last read; None while nothing runs
+
+    def now(self) -> float:
+        """The time by this reactor's clock, in seconds."""
+        now = self._clock()
+        if self._read is not None:
+            before, self._read = self._read, now
+            if now - before > _TURN_S + _STALL_S:
+                self._stood_still_s += now - before - _TURN_S  # it goes on: a starved launcher still ends what hangs
+                self._on_stall(now - before)
+        return now - self._stood_still_s
 
     def watch(self, descriptor: int, job: Job) -> None:
         """Call ``job`` whenever ``descriptor`` has something to read, until :meth:`forget`."""
@@ -32,35 +53,38 @@ class Reactor:
         self._selector.unregister(descriptor)
 
     def at(self, due: float, job: Job) -> Timer:
-        """Call ``job`` at ``due`` on ``time.monotonic()``."""
+        """Call ``job`` at ``due`` on :meth:`now`."""
         return self._timers.add(due, job)
 
     def after(self, seconds: float, job: Job) -> Timer:
-        return self._timers.add(time.monotonic() + seconds, job)
+        return self._timers.add(self.now() + seconds, job)
 
     def every(self, seconds: float, job: Job) -> Timer:
-        return self._timers.add(time.monotonic() + seconds, job, period=seconds)
+        return self._timers.add(self.now() + seconds, job, period=seconds)
 
     def run_until(self, condition: Callable[[], bool], timeout: float | None = None) -> bool:
         """Work until ``condition()`` holds; False when ``timeout`` seconds have passed without it."""
-        end = None if timeout is None else time.monotonic() + timeout
-        while not condition():
-            now = time.monotonic()
-            if end is not None and now >= end:
-                return False
-            self._turn(self._timers.wait(now), None if end is None else end - now)
-        return True
+        end = None if timeout is None else self.now() + timeout
+        self._read = self._clock()
+        try:
+            while not condition():
+                now = self.now()
+                if end is not None and now >= end:
+                    return False
+                self._turn(self._timers.wait(now), None if end is None else end - now)
+            return True
+        finally:
+            self._read = None
 
     def close(self) -> None:
         self._selector.close()
 
     def _turn(self, *waits: float | None) -> None:
         """Read descriptors before timers run: a timer that checks for signs of life must know those that have come."""
-        limited = [wait for wait in waits if wait is not None]
-        for key, _ in self._selector.select(min(limited) if limited else None):
+        for key, _ in self._selector.select(min([_TURN_S, *(wait for wait in waits if wait is not None)])):
             if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()
-        self._timers.run_due(time.monotonic())
+        self._timers.run_due(self.now())
 
 
 class StopSignals:

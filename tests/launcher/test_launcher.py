@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,25 @@ def test_a_stuck_child_is_killed_and_started_again(launch: Launch) -> None:
     assert len(robot.events("bridge", "start")) == 1
     assert until(lambda: any("serial gives no sign of life: killed" in one["message"] for one in robot.logs()))
     assert until(lambda: robot.services()["serial"]["last_exit"] == "stuck, killed")
+
+
+def test_a_robot_that_stood_still_as_a_whole_goes_on_with_the_same_processes(launch: Launch) -> None:
+    robot = launch(("serial", "good", DEVICE), ("bridge", "good", CONNECTION), options=("hasty",))
+    assert robot.ready("serial", "bridge", "announcer")
+    children = robot.children()
+    everything = [robot.process.pid, *children.values()]
+    for pid in everything:
+        os.kill(pid, signal.SIGSTOP)
+    time.sleep(3.5)  # longer than a hasty launcher waits for a sign of life
+    os.kill(robot.process.pid, signal.SIGCONT)
+    assert until(lambda: re.search("stood still|sign of life", robot.stderr()), 20), "no child runs yet"
+    assert "sign of life" not in robot.stderr()
+    for pid in everything:
+        os.kill(pid, signal.SIGCONT)
+    ready = len(robot.events("serial", "ready"))
+    os.kill(children["serial"], signal.SIGKILL)
+    assert until(lambda: len(robot.events("serial", "ready")) > ready, 20)
+    assert {**robot.children(), "serial": 0} == {**children, "serial": 0}
 
 
 def test_what_a_child_started_ends_with_it(launch: Launch) -> None:
