@@ -1,7 +1,9 @@
 """One robot's config. docs/configuration.md lists every key; configs/schema.json tells editors."""
 
 from pebble.config.config import Config as Config
+from pebble.config.config import config_of_process as config_of_process
 from pebble.config.config import default_run_folder as default_run_folder
+from pebble.config.config import hand_over as hand_over
 from pebble.config.config import load as load
 from pebble.config.config import parse as parse
 from pebble.config.config import resolved as resolved

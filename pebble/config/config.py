@@ -102,6 +102,22 @@ def load(path: Path | str, env: Mapping[str, str] = os.environ) -> Config:
     return _config(raw, path, path.parent, env)
 
 
+_handed_over: Config | None = None
+
+
+def hand_over(config: Config) -> None:
+    """Make ``config`` that of this process: the launcher does so in its children, which are forks of it."""
+    global _handed_over
+    _handed_over = config
+
+
+def config_of_process(path: Path | str) -> Config:
+    """The config that the launcher read from ``path`` when the robot started; without a launcher, as :func:`load`."""
+    if _handed_over is not None and _handed_over.path == Path(path).absolute():
+        return _handed_over
+    return load(path)
+
+
 def parse(raw: dict[str, Any], *, folder: Path, env: Mapping[str, str]) -> Config:
     """The same from plain data. ``folder`` is where relative paths start, ``env`` the environment for passwords."""
     return _config(raw, None, folder.absolute(), env)

@@ -10,9 +10,8 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
-from pebble.config import load
+from pebble.config import config_of_process
 from pebble.contract import WHEEL_ODOMETRY
 from pebble.errors import PebbleError
 from pebble.launcher.announcer_pipe import Envelope, next_envelope
@@ -125,7 +124,7 @@ def main(arguments: list[str]) -> int:
         log.error("usage: python -m pebble.launcher.announcer CONFIG, with envelopes from the launcher on stdin")
         return 2
     try:
-        config = load(Path(arguments[0]))
+        config = config_of_process(arguments[0])
     except PebbleError as error:
         log.error("%s", error)
         return 1

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import NoReturn
 
+from pebble.config import Config
 from pebble.launcher.forked import become
 from pebble.launcher.programs import Program
 
@@ -21,13 +22,14 @@ class Child:
     on. ``stdin`` stays the caller's. Forks: only for a process with one thread and without sessions. Raises OSError.
     """
 
-    def __init__(self, program: Program, environment: Mapping[str, str], *, stdin: int) -> None:
+    def __init__(self, program: Program, environment: Mapping[str, str], config: Config, *, stdin: int) -> None:
         opened: list[int] = []
         try:
             self.notes, notes_end = _pipe(opened)
             self.output, output_end = _pipe(opened)
             os.set_blocking(output_end, True)
-            self.pid = _fork(lambda: become(program, environment, stdin=stdin, output=output_end, notes=notes_end))
+            descriptors = {"stdin": stdin, "output": output_end, "notes": notes_end}
+            self.pid = _fork(lambda: become(program, environment, config, **descriptors))
             self._reaped = False
             self.exited = self._watch_exit()
         except OSError:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import NoReturn
 
+from pebble.config import Config, hand_over
 from pebble.launcher.programs import Program
 from pebble.runtime.parent import NOTIFY_FD, die_with_launcher
 
@@ -22,8 +23,12 @@ _NOTES = 3  # the descriptor of READY and ALIVE, next after stdin, stdout and st
 _PR_SET_NAME, _NAME_BYTES = 15, 15
 
 
-def become(program: Program, environment: Mapping[str, str], *, stdin: int, output: int, notes: int) -> NoReturn:
+def become(
+    program: Program, environment: Mapping[str, str], config: Config, *, stdin: int, output: int, notes: int
+) -> NoReturn:
     """Run ``program`` with these descriptors and no others, and exit with its code. Call right after the fork.
+
+    The program gets ``config`` as it is: its file may have changed since.
 
     Expects all signals blocked. Never returns or raises: the frames below belong to the launcher. They must stay,
     too, because closing an object of theirs would close a descriptor that by then belongs to another.
@@ -35,6 +40,7 @@ def become(program: Program, environment: Mapping[str, str], *, stdin: int, outp
         _arrange_descriptors(stdin, output, notes)
         _reset_signals()
         _forget_launcher({**environment, NOTIFY_FD: str(_NOTES)})
+        hand_over(config)
         _run(program)
 
     try:

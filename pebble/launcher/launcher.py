@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pebble.config import Config
 from pebble.errors import ConfigError
 from pebble.launcher.child import Child
+from pebble.launcher.config_watch import ConfigWatch
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
@@ -23,6 +24,7 @@ from pebble.runtime.connections import check_kinds
 from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
 
+_CONFIG_POLL_S = 2.0
 _REAP_S = 2.0  # the kernel needs this long at most to end what was killed
 
 log = logging.getLogger(__name__)
@@ -45,6 +47,7 @@ class Launcher:
         self._features = Features(lambda: self._status.capabilities_changed())
         self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features)
         self._logs = LogForwarder(self._status.publish_log, config.services.launcher.logs)
+        self._config_watch = ConfigWatch(config)
         self._signals = StopSignals(self._kill_all)
 
     def run(self) -> int:
@@ -78,6 +81,7 @@ class Launcher:
                 supervisor.start()
         for warning in self._config.warnings:
             log.warning("%s", warning)
+        self._reactor.every(_CONFIG_POLL_S, self._config_watch.poll)
         self._status.start()
 
     def _supervise(self, program: Program) -> ProcessSupervisor:
@@ -110,7 +114,7 @@ class Launcher:
         announcer = program.reads_announcer_pipe
         stdin = self._status.connect_announcer() if announcer else os.open(os.devnull, os.O_RDONLY)
         try:
-            return Child(program, self._environment_of(program), stdin=stdin)
+            return Child(program, self._environment_of(program), self._config, stdin=stdin)
         finally:
             os.close(stdin)
 
@@ -165,7 +169,7 @@ def _check_runs_here(config: Config) -> None:
             " `pebble flash` brings its firmware onto it, `pebble sim` runs it without one"
         )
     if config.path is None:
-        raise ConfigError("the robot's processes read its config from a file, and this one has none")
+        raise ConfigError("the robot's processes know its config by its file, and this one has none")
     check_kinds(config)
 
 

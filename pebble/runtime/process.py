@@ -6,11 +6,10 @@ import logging
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 from msgspec.structs import replace
 
-from pebble.config import Config, load
+from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
 from pebble.runtime.connections import local_transport
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
@@ -38,7 +37,7 @@ def run(
     instance = arguments[1] if len(arguments) == 2 else ""
     set_up_logging("INFO")
     try:
-        config = load(Path(arguments[0]))
+        config = config_of_process(arguments[0])
         program = f"{service_class.name}:{instance}" if instance else service_class.name
         logging.getLogger().setLevel(config.log_level_of(program))
         view = view_of(config, instance)

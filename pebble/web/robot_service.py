@@ -6,9 +6,8 @@ import asyncio
 import logging
 import signal
 import sys
-from pathlib import Path
 
-from pebble.config import load
+from pebble.config import config_of_process
 from pebble.errors import PebbleError
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
@@ -25,7 +24,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("usage: python -m pebble.web.robot_service CONFIG\n")
         return 2
     try:
-        config = load(Path(arguments[0]))
+        config = config_of_process(arguments[0])
         logging.getLogger().setLevel(config.log_level_of("web_handler"))
         settings = ready_settings_of(config)
         require_packages()

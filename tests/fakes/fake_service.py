@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+from pebble.config import config_of_process
 from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests, requested_encoding
 
 WORDS = """12:00:00 [WARNING] mind the gap
@@ -123,6 +124,8 @@ def main() -> None:
         note(f"env:{os.environ.get('MARK', '')}:{Path.cwd().name.replace(' ', '-')}:{requested_encoding()}")
     if behaviour == "environment":
         note("systemd:" + str("NOTIFY_SOCKET" in os.environ))
+    if behaviour == "configured":
+        note("config:" + config_of_process(Path(sys.argv[3]).with_name("rover.json")).base)
     if behaviour == "talker":
         sys.stderr.write(WORDS)
         sys.stdout.write("x" * 100_000 + "\n")

@@ -103,6 +103,16 @@ def test_a_killed_child_is_started_again_at_once(launch: Launch) -> None:
     assert len(robot.events("bridge", "start")) == 1
 
 
+def test_a_child_that_starts_again_gets_the_config_of_its_launcher(launch: Launch) -> None:
+    robot = launch(("serial", "configured", DEVICE))
+    assert robot.ready("serial")
+    robot.config.write_text('{"robot": {"id": "another"}, "transport": {"kin')
+    os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
+    assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
+    assert len(robot.events("serial", f"config:{BASE}")) == 2
+    assert until(lambda: f"{robot.config} has changed" in robot.stderr(), 20)
+
+
 def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:
     robot = launch(("serial", "crash", DEVICE), ("bridge", "good", CONNECTION), restart_delay_seconds=0)
     assert until(lambda: robot.states().get("serial") == "failed", 20)
