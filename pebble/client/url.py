@@ -32,7 +32,11 @@ def _zenoh(path: str) -> ZenohSettings:
     if not path:
         raise UrlError("--url zenoh: names no run directory; `pebble check CONFIG` shows a robot's")
     run_dir = Path(path).expanduser().absolute()
-    if not run_dir.is_dir():
+    try:
+        is_there = run_dir.is_dir()
+    except OSError as error:
+        raise UrlError(f"--url zenoh:{path}: {error.strerror}: run this as the user of the robot") from None
+    if not is_there:
         raise UrlError(f"--url zenoh:{path}: there is no such directory, is the robot up?")
     return ZenohSettings(run_dir=run_dir, client=True)
 

@@ -40,7 +40,7 @@ def test_a_password_in_a_url_is_refused_and_not_repeated(url: str) -> None:
 
 @pytest.mark.parametrize(
     "url", ["", "broker", "mqtt:broker", "http://broker", "mqtt://", "mqtt://broker:99999", "mqtt://broker/a/topic",
-            "zenoh:", "zenoh:/nowhere/at/all"],
+            "zenoh:", "zenoh:/nowhere/at/all", "zenoh:/tmp/" + 300 * "x"],
 )  # fmt: skip
 def test_other_urls_are_refused(url: str) -> None:
     with pytest.raises(UrlError):
