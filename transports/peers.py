@@ -9,10 +9,15 @@ for the newcomer, so that of any two at least one waits for the other.
 from __future__ import annotations
 
 import fcntl
+import logging
 import os
+import stat
+from contextlib import suppress
 from pathlib import Path
 
 from pebble.errors import TransportError
+
+log = logging.getLogger(__name__)
 
 _SOCKET_PATH_LIMIT = 108  # bytes, sizeof(sun_path): a longer path cannot be bound
 _OWNER_BYTES = 200
@@ -34,18 +39,43 @@ def check_socket_path(path: Path) -> None:
 
 
 def prepare_run_dir(run_dir: Path) -> None:
-    """Make ``run_dir`` for this user alone, if it is missing. Raises TransportError if it cannot contain a socket."""
+    """As :func:`make_private`, for a folder of sockets. Raises TransportError also if it cannot contain one."""
     check_socket_path(run_dir / f"{new_name()}.sock")
     if any(character in str(run_dir) for character in _RESERVED):
         raise TransportError(f"transport.run_dir {run_dir} must not contain any of {_RESERVED}")
+    make_private(run_dir)
+
+
+def make_private(run_dir: Path, *, close: bool = False) -> None:
+    """Make ``run_dir`` for this user alone, if it is missing; ``close`` takes an existing one away from others.
+
+    Raises TransportError for a folder in which others may write: that is control over the robot, or over what its
+    programs see, and in /tmp another user may have created these names first.
+    """
     try:
-        run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        run_dir.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if run_dir.parent.stat().st_uid not in (os.getuid(), 0):
+            raise TransportError(f"transport.run_dir {run_dir}: the folder it is in belongs to another user")
+        run_dir.mkdir(mode=0o700, exist_ok=True)
+        found = run_dir.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
+            raise TransportError(
+                f"transport.run_dir {run_dir} is not a folder of this user: "
+                "run this as the user of the robot, or remove what is there"
+            )
+        if close and found.st_mode & 0o077 and not found.st_mode & stat.S_ISVTX:
+            run_dir.chmod(0o700)
+        elif found.st_mode & 0o022:
+            raise TransportError(f"transport.run_dir {run_dir}: others may write there, name a folder of this user")
     except OSError as error:
-        raise TransportError(f"transport.run_dir {run_dir} cannot be made: {error.strerror}") from None
+        raise TransportError(f"transport.run_dir {run_dir} cannot be used: {error.strerror}") from None
 
 
 class FileLock:
-    """An exclusive lock on a file. The kernel releases it when the process ends."""
+    """An exclusive lock on a file. The kernel releases it when the process ends.
+
+    Taking one raises TransportError if there can be no such file.
+    """
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self.path = path
@@ -67,7 +97,7 @@ class FileLock:
     @classmethod
     def _get(cls, path: Path, how: int) -> FileLock:
         while True:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            descriptor = _open_lock(path)
             try:
                 fcntl.flock(descriptor, how)
             except BlockingIOError:
@@ -78,9 +108,12 @@ class FileLock:
             os.close(descriptor)  # removed between open and flock
 
     def write(self, text: bytes) -> None:
-        """Replace what is in the file."""
-        os.truncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, text, 0)
+        """Replace what is in the file. A full disk leaves zeros, as many: the lock counts, the text is for people."""
+        try:
+            os.truncate(self._descriptor, len(text))  # needs no space
+            os.pwrite(self._descriptor, text, 0)
+        except OSError as error:
+            log.warning("%s cannot be written: %s", self.path, error.strerror)
 
     def release(self, *, remove: bool = True) -> None:
         """Release the lock; ``remove`` deletes the file."""
@@ -142,20 +175,32 @@ def _is_at(path: Path, descriptor: int) -> bool:
         return False
 
 
+def _open_lock(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        remedy = "remove it" if os.path.lexists(path) else "make room there"
+        raise TransportError(
+            f"{path} cannot be locked: {error.strerror}; {remedy}, or set transport.run_dir to another folder"
+        ) from None
+
+
 def _owner_if_running(path: Path) -> str | None:
     """What the owner of the lock file wrote; None, and its files removed, if it does not run any more."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except FileNotFoundError:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError:  # removed meanwhile, or no lock file
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        return os.pread(descriptor, _OWNER_BYTES, 0).decode(errors="replace")
+        text = os.pread(descriptor, _OWNER_BYTES, 0)
+        return (text.strip(b"\0") or (text[:1] and b"?")).decode(errors="replace")
     else:
         if _is_at(path, descriptor):  # else it was removed, and a new process may have the name
             _clear_socket(path.with_suffix(".sock"))
-            path.unlink(missing_ok=True)
+            with suppress(OSError):  # a folder
+                path.unlink()
         return None
     finally:
         os.close(descriptor)

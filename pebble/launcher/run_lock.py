@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import stat
 from pathlib import Path
 from typing import Self
 
 from pebble.errors import PebbleError
 from pebble.runtime.parent import LAUNCHER_LOCK
-from pebble.transports.peers import FileLock
+from pebble.transports.peers import FileLock, make_private
 
 
 class RunLock:
@@ -24,10 +23,10 @@ class RunLock:
         self._lock: FileLock | None = None
 
     def take(self) -> Self:
-        _make_private(self._run_dir)
+        make_private(self._run_dir, close=True)
         self._lock = FileLock.take(self.path)
         if self._lock is None:
-            holder = self.path.read_text(errors="replace").strip()
+            holder = self.path.read_text(errors="replace").strip("\0\n") or "(unknown)"
             raise PebbleError(
                 f"{self._robot} already runs: process {holder} holds {self.path}; end it there with Ctrl-C"
             )
@@ -45,19 +44,3 @@ class RunLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
-
-
-def _make_private(run_dir: Path) -> None:
-    """Write access here is control over the robot, and in /tmp another user may have created these names first."""
-    try:
-        run_dir.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if run_dir.parent.stat().st_uid not in (os.getuid(), 0):
-            raise PebbleError(f"transport.run_dir {run_dir}: the folder it is in belongs to another user")
-        run_dir.mkdir(mode=0o700, exist_ok=True)
-        found = run_dir.lstat()
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
-            raise PebbleError(f"transport.run_dir {run_dir} is not a folder of this user")
-        if found.st_mode & 0o077:
-            run_dir.chmod(0o700)
-    except OSError as error:
-        raise PebbleError(f"transport.run_dir {run_dir} cannot be used: {error.strerror}") from None

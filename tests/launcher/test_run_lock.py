@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 from pebble.errors import PebbleError
 from pebble.launcher.run_lock import RunLock
+from pebble.runtime.parent import LAUNCHER_LOCK
 
 
 def test_the_folder_is_made_for_this_user_alone(tmp_path: Path) -> None:
@@ -29,6 +31,30 @@ def test_a_second_lock_names_the_holder(tmp_path: Path) -> None:
         assert str(refused.value) == f"{fact}; end it there with Ctrl-C"
     with RunLock(tmp_path, "x/y/z"):
         pass
+
+
+def test_a_full_disk_does_not_keep_a_robot_from_starting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", full)
+    refused = pytest.raises(PebbleError, match=r"x/y/z already runs: process \(unknown\) holds")
+    with RunLock(tmp_path, "x/y/z"), refused:
+        RunLock(tmp_path, "x/y/z").take()
+
+
+def test_what_is_in_the_place_of_the_lock_is_named(tmp_path: Path) -> None:
+    (tmp_path / LAUNCHER_LOCK).mkdir()
+    with pytest.raises(PebbleError, match=f"{LAUNCHER_LOCK} cannot be locked: Is a directory; remove it"):
+        RunLock(tmp_path, "x/y/z").take()
+
+
+def test_a_folder_for_everybody_is_not_closed(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run").chmod(0o1777)
+    with pytest.raises(PebbleError, match="others may write there, name a folder of this user"):
+        RunLock(tmp_path / "run", "x/y/z").take()
+    assert (tmp_path / "run").stat().st_mode & 0o7777 == 0o1777
 
 
 def test_a_link_laid_out_for_us_is_refused(tmp_path: Path) -> None:

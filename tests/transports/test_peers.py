@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from pebble.errors import TransportError
+from pebble.transports import ZenohSettings, create
+from pebble.transports.frames import FrameReader, FrameWriter
 from pebble.transports.peers import FileLock, PeerRegistry, prepare_run_dir
+from pebble.transports.zenoh.hub import ZenohHub
 from tests.support import ROOT
 
 SIT = """
@@ -76,3 +82,58 @@ def test_a_longer_socket_path_is_an_error_that_names_the_setting(tmp_path: Path)
     with pytest.raises(TransportError, match=r"too long for a unix socket .*transport.run_dir"):
         prepare_run_dir(run_dir)
     assert not run_dir.exists()
+
+
+USERS: dict[str, Callable[[Path], object]] = {
+    "peer": lambda folder: create("zenoh", "peer", ZenohSettings(run_dir=folder)).open(0.0),
+    "client": lambda folder: create("zenoh", "client", ZenohSettings(run_dir=folder, client=True)).open(0.0),
+    "hub": lambda folder: ZenohHub(ZenohSettings(run_dir=folder)).open(),
+    "reader": lambda folder: FrameReader(folder, "camera").open(),
+    "writer": lambda folder: FrameWriter(folder, "camera", slots=2, capacity=100).open(),
+}
+
+
+@pytest.mark.parametrize("use", USERS.values(), ids=USERS)
+def test_a_folder_that_another_user_made_is_used_by_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], object]
+) -> None:
+    (tmp_path / "run").mkdir(mode=0o700)
+    monkeypatch.setattr(os, "getuid", lambda: (tmp_path / "run").stat().st_uid + 1)
+    with pytest.raises(TransportError, match=f"{tmp_path}/run(:| is not) .* user"):
+        use(tmp_path / "run")
+
+
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run").chmod(0o770)
+    with pytest.raises(TransportError, match="others may write there"):
+        prepare_run_dir(tmp_path / "run")
+    assert (tmp_path / "run").stat().st_mode & 0o777 == 0o770, "it may be any folder, and not a robot's"
+
+
+def test_a_full_disk_keeps_nobody_from_being_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    registry = PeerRegistry(tmp_path)
+    lock = registry.register("first")
+    monkeypatch.setattr(os, "pwrite", full)
+    lock.ready()
+    assert registry.ready() == {lock.name: "?"}
+    lock.release()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_lock_file_is_nobody(tmp_path: Path) -> None:
+    (tmp_path / "folder.seat").mkdir()
+    os.mkfifo(tmp_path / "pipe.seat")
+    (tmp_path / "link.seat").symlink_to(tmp_path / "nowhere")
+    assert PeerRegistry(tmp_path).sockets() == []
+
+
+def test_a_lock_that_cannot_be_made_is_one_line_with_a_remedy(tmp_path: Path) -> None:
+    (tmp_path / "lock").mkdir()
+    with pytest.raises(TransportError, match="/lock cannot be locked: Is a directory; remove it, or set "):
+        FileLock.take(tmp_path / "lock")
+    with pytest.raises(TransportError, match="File name too long; make room there, or set "):
+        FileLock.take(tmp_path / ("x" * 300))

@@ -21,6 +21,7 @@ from pebble.transports.frames import reclaim, shared_memory, views
 from pebble.transports.frames.frame import Frame, FrameInfo, decode
 from pebble.transports.frames.reclaim import WriterMemory
 from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_reading
+from pebble.transports.peers import prepare_run_dir
 from pebble.transports.wakeup import Wakeup
 from pebble.transports.zenoh.session import check_process, close_at_exit
 
@@ -69,7 +70,8 @@ class FrameReader:
     # -- opening and closing
 
     def open(self) -> Self:
-        """Raises TransportError in a folder that cannot contain a socket."""
+        """Raises TransportError in a folder that cannot contain a socket, or is not this user's."""
+        prepare_run_dir(self._folder)
         with self._changing:
             self._closed = False
             self._latest.reopen()
