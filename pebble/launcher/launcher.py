@@ -56,7 +56,7 @@ class Launcher:
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
         own_records = OwnRecords(self._logs, self._config.log_level_of("launcher"))
-        with RunLock(self._config.run_dir(), self._config.base), self._signals, own_records:
+        with _run_lock(self._config), self._signals, own_records:
             try:
                 self._start()
                 self._reactor.run_until(self._stop_requested)
@@ -171,6 +171,10 @@ def _check_runs_here(config: Config) -> None:
     if config.path is None:
         raise ConfigError("the robot's processes know its config by its file, and this one has none")
     check_kinds(config)
+
+
+def _run_lock(config: Config) -> RunLock:
+    return RunLock(config.run_dir(), config.base, config.path or config.folder)
 
 
 def _log_stall(seconds: float) -> None:

@@ -1,8 +1,12 @@
-"""One launcher per robot: the run directory and the lock file in it."""
+"""One launcher per robot: the run directory with the lock file in it, and a name that other launchers find."""
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import os
+import socket
+import struct
 from pathlib import Path
 from typing import Self
 
@@ -10,17 +14,23 @@ from pebble.errors import PebbleError
 from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.transports.peers import FileLock, make_private
 
+_PEER = struct.Struct("3i")  # SO_PEERCRED: process, user, group
+
 
 class RunLock:
     """Makes the run directory for this user alone and holds its lock; the kernel releases it however the process ends.
 
-    Raises PebbleError when another process holds the lock, or when the directory cannot be trusted.
+    A second lock is independent of the environment, which determines the run directory: an abstract socket, of which
+    there is one on a machine for a robot and the config file it is started from.
+
+    Raises PebbleError when another process holds a lock, or when the directory cannot be trusted.
     """
 
-    def __init__(self, run_dir: Path, robot: str) -> None:
-        self._run_dir, self._robot = run_dir, robot
+    def __init__(self, run_dir: Path, robot: str, config: Path) -> None:
+        self._run_dir, self._robot, self._config = run_dir, robot, config
         self.path = run_dir / LAUNCHER_LOCK
         self._lock: FileLock | None = None
+        self._name: socket.socket | None = None
 
     def take(self) -> Self:
         make_private(self._run_dir, close=True)
@@ -30,11 +40,19 @@ class RunLock:
             raise PebbleError(
                 f"{self._robot} already runs: process {holder} holds {self.path}; end it there with Ctrl-C"
             )
+        try:
+            self._name = _take_name(self._robot, self._config)
+        except PebbleError:
+            self.release()
+            raise
         self._lock.write(f"{os.getpid()}\n".encode())
         return self
 
     def release(self) -> None:
-        """Release the lock. The file stays, with the process id of the last launcher."""
+        """Release the locks. The file stays, with the process id of the last launcher."""
+        if self._name is not None:
+            self._name.close()
+            self._name = None
         if self._lock is not None:
             self._lock.release(remove=False)
             self._lock = None
@@ -44,3 +62,32 @@ class RunLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
+
+
+def _take_name(robot: str, config: Path) -> socket.socket:
+    digest = hashlib.sha256(os.fsencode(config.resolve()) + b"\0" + robot.encode()).hexdigest()
+    name = f"\0pebble up {digest[:32]}"
+    taken = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        taken.bind(name)
+        taken.listen()
+    except OSError as error:
+        taken.close()
+        if error.errno != errno.EADDRINUSE:
+            raise PebbleError(f"{robot} cannot be locked: {error.strerror}") from None
+        raise PebbleError(
+            f"{robot} already runs from {config}, with another run directory: {_holder(name)}; end that one first"
+        ) from None
+    return taken
+
+
+def _holder(name: str) -> str:
+    """Which process listens there, for people; it does not answer."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        try:
+            asking.connect(name)
+        except OSError:  # it has ended meanwhile, or many have asked
+            return "another process"
+        process, user, _ = _PEER.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+    return f"process {process} of user {user}"

@@ -255,7 +255,7 @@ def test_the_lock_of_a_killed_launcher_is_free_at_once(launch: Launch) -> None:
     robot.process.wait(10)
     try:
         assert not gone(pid)
-        with RunLock(robot.run_dir, BASE):
+        with RunLock(robot.run_dir, BASE, robot.config):
             pass
     finally:
         os.kill(pid, signal.SIGKILL)

@@ -12,24 +12,42 @@ from pebble.runtime.parent import LAUNCHER_LOCK
 
 
 def test_the_folder_is_made_for_this_user_alone(tmp_path: Path) -> None:
-    with RunLock(tmp_path / "a" / "b", "x/y/z") as lock:
+    with RunLock(tmp_path / "a" / "b", "x/y/z", tmp_path / "robot.json") as lock:
         assert (tmp_path / "a" / "b").stat().st_mode & 0o777 == 0o700
         assert lock.path.read_text() == f"{os.getpid()}\n"
 
 
 def test_an_open_folder_of_ours_is_closed(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir(mode=0o755)
-    with RunLock(tmp_path / "run", "x/y/z"):
+    with RunLock(tmp_path / "run", "x/y/z", tmp_path / "robot.json"):
         assert (tmp_path / "run").stat().st_mode & 0o777 == 0o700
 
 
 def test_a_second_lock_names_the_holder(tmp_path: Path) -> None:
-    with RunLock(tmp_path, "x/y/z") as lock:
+    with RunLock(tmp_path, "x/y/z", tmp_path / "robot.json") as lock:
         with pytest.raises(PebbleError) as refused:
-            RunLock(tmp_path, "x/y/z").take()
+            RunLock(tmp_path, "x/y/z", tmp_path / "robot.json").take()
         fact = f"x/y/z already runs: process {os.getpid()} holds {lock.path}"
         assert str(refused.value) == f"{fact}; end it there with Ctrl-C"
-    with RunLock(tmp_path, "x/y/z"):
+    with RunLock(tmp_path, "x/y/z", tmp_path / "robot.json"):
+        pass
+
+
+def test_another_run_directory_does_not_make_another_robot(tmp_path: Path) -> None:
+    config, link = tmp_path / "robot.json", tmp_path / "link.json"
+    link.symlink_to(config)
+    with RunLock(tmp_path / "by systemd", "x/y/z", config):
+        with pytest.raises(PebbleError) as refused:
+            RunLock(tmp_path / "by a shell", "x/y/z", link).take()
+        fact = (
+            f"x/y/z already runs from {link}, with another run directory: process {os.getpid()} of user {os.getuid()}"
+        )
+        assert str(refused.value) == f"{fact}; end that one first"
+        with RunLock(tmp_path / "by a shell", "x/y/another", config):
+            pass
+        with RunLock(tmp_path / "by a shell", "x/y/z", tmp_path / "other.json"):
+            pass
+    with RunLock(tmp_path / "by a shell", "x/y/z", link):
         pass
 
 
@@ -39,21 +57,21 @@ def test_a_full_disk_does_not_keep_a_robot_from_starting(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(os, "pwrite", full)
     refused = pytest.raises(PebbleError, match=r"x/y/z already runs: process \(unknown\) holds")
-    with RunLock(tmp_path, "x/y/z"), refused:
-        RunLock(tmp_path, "x/y/z").take()
+    with RunLock(tmp_path, "x/y/z", tmp_path / "robot.json"), refused:
+        RunLock(tmp_path, "x/y/z", tmp_path / "robot.json").take()
 
 
 def test_what_is_in_the_place_of_the_lock_is_named(tmp_path: Path) -> None:
     (tmp_path / LAUNCHER_LOCK).mkdir()
     with pytest.raises(PebbleError, match=f"{LAUNCHER_LOCK} cannot be locked: Is a directory; remove it"):
-        RunLock(tmp_path, "x/y/z").take()
+        RunLock(tmp_path, "x/y/z", tmp_path / "robot.json").take()
 
 
 def test_a_folder_for_everybody_is_not_closed(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run").chmod(0o1777)
     with pytest.raises(PebbleError, match="others may write there, name a folder of this user"):
-        RunLock(tmp_path / "run", "x/y/z").take()
+        RunLock(tmp_path / "run", "x/y/z", tmp_path / "robot.json").take()
     assert (tmp_path / "run").stat().st_mode & 0o7777 == 0o1777
 
 
@@ -61,10 +79,10 @@ def test_a_link_laid_out_for_us_is_refused(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "run").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(PebbleError, match="is not a folder of this user"):
-        RunLock(tmp_path / "run", "x/y/z").take()
+        RunLock(tmp_path / "run", "x/y/z", tmp_path / "robot.json").take()
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(PebbleError, match=f"transport.run_dir {tmp_path}/file/run cannot be used: File exists"):
-        RunLock(tmp_path / "file" / "run", "x/y/z").take()
+        RunLock(tmp_path / "file" / "run", "x/y/z", tmp_path / "robot.json").take()
