@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from pebble.errors import PebbleError
 
 def main() -> int:
     """The entry point; returns the exit code."""
+    _open_missing_streams()
     try:
         code = _run(sys.argv[1:])
         sys.stdout.flush()
@@ -28,6 +30,15 @@ def main() -> int:
         discard_output(sys.stdout)
         return 1
     return code
+
+
+def _open_missing_streams() -> None:
+    """Read from and write to nothing where the caller has closed a standard stream (``pebble up robot.json >&-``)."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free one: that of this stream
+            os.set_inheritable(descriptor, True)
+            setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8"))
 
 
 def _run(arguments: list[str]) -> int:

@@ -14,7 +14,7 @@ import pytest
 
 from pebble.commands import app
 from tests.commands.command_line import Run, config_file, program
-from tests.support import ROOT, until
+from tests.support import ROOT, free_port, until
 
 GROUP = ("list", "echo", "pub", "hz", "bw")
 
@@ -116,6 +116,19 @@ def test_up_loads_nothing_that_a_running_robot_does_not_need(tmp_path: Path) -> 
 def test_up_refuses_a_robot_that_runs_on_its_own_mcu(run: Run, tmp_path: Path) -> None:
     assert run("up", config_file(tmp_path, robot={"id": "benjr", "platform": "esp8266"})) == 1
     assert "runs on its own MCU" in run.err
+
+
+@pytest.mark.parametrize("closed", ["<&- 2>&-", ">&-", "<&- >&- 2>&-"])
+def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> None:
+    config = config_file(
+        tmp_path, transport={"kind": "mqtt", "run_dir": str(tmp_path / "run")}, local_mqtt={"port": free_port()}
+    )
+    command = [sys.executable, "-m", "pebble.cli", "up", str(config)]
+    with subprocess.Popen(["sh", "-c", f'exec "$@" {closed}', "sh", *command], cwd=ROOT) as robot:
+        children = Path(f"/proc/{robot.pid}/task/{robot.pid}/children")
+        assert until(lambda: robot.poll() is not None or children.read_text(), 30)
+        robot.terminate()
+        assert robot.wait(20) == 0
 
 
 def test_a_reader_that_goes_away_is_no_error() -> None:
