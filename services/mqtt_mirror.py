@@ -207,12 +207,12 @@ class MqttMirror(Service):
             if self._probes.see(message.payload):
                 self._shut()
         elif self._is_fresh(message):
-            self.post(self._suspect, newest_of="suspect")
+            self.post_message(ONLINE, self._suspect, newest_of="suspect")
 
     def _shut(self) -> None:
         if self._forwarder.gate is not Gate.SHUT:
             self._forwarder.shut()
-            self.post(self._broker_is_remote)
+            self.post_message(BRIDGE_PROBE, self._broker_is_remote)
 
     def _is_fresh(self, message: Message) -> bool:
         """Whether a heartbeat is current: a retained one may be old. Its sender uses the same clock."""

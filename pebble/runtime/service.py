@@ -147,8 +147,15 @@ class Service:
         return channel in self._handled and self._handled[channel].refused
 
     def post(self, job: Callable[[], None], *, newest_of: str | None = None) -> None:
-        """Run ``job`` on the service's thread. With ``newest_of``, a waiting job of that name is replaced."""
+        """Run ``job`` on the service's thread. With ``newest_of``, a waiting job of that name is replaced.
+
+        A failure ends the service: this is for what its device and its connections require.
+        """
         self._inbox.post(job, newest_of=newest_of)
+
+    def post_message(self, channel: Channel, job: Callable[[], None], *, newest_of: str | None = None) -> None:
+        """Like :meth:`post`, for what a message on ``channel`` requires: a failure is counted as that of a handler."""
+        self._inbox.post(lambda: self._attempt(channel, job), newest_of=newest_of)
 
     def post_first(self, job: Callable[[], None]) -> None:
         """Run ``job`` before everything that waits. It is never dropped, so at most one of a kind may wait."""
@@ -242,12 +249,15 @@ class Service:
     def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
         """Call the handler, unless the command has waited so long, in a hung or suspended process, that it is stale.
 
-        Only commands that newer ones replace are dropped. A handler that fails on a message is counted, and
-        the service goes on: a retained message would end it again after each restart.
+        Only commands that newer ones replace are dropped.
         """
         if channel.kind is Kind.COMMAND and channel.newest and self.clock() - arrived > WAIT_LIMIT_S:
             self.count_late(channel)
             return
+        self._attempt(channel, method)
+
+    def _attempt(self, channel: Channel, method: Callable[[], None]) -> None:
+        """What fails on a message is counted, and the service goes on: a retained one would end it again and again."""
         try:
             method()
         except Exception:  # noqa: BLE001 - a message comes from another process, and must not end this one

@@ -210,7 +210,7 @@ class MqttBridge(Service):
         if self._heartbeat is not None and message.topic == self._heartbeat.topic:
             if self._heartbeat.is_ours(message) and self._forwarder.gate is Gate.OPEN:
                 # one broker after all, or another program's heartbeat of the same millisecond
-                self.post(self._same_broker.send_again, newest_of="suspect")
+                self.post_message(BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))
@@ -219,9 +219,9 @@ class MqttBridge(Service):
         if self._same_broker.proves_same_broker(message):
             if self._forwarder.gate is not Gate.SHUT:
                 self._forwarder.shut()
-                self.post(self._disable)
+                self.post_message(BRIDGE_PROBE, self._disable)
         elif self._same_broker.is_request(message):
-            self.post(self._same_broker.answer_request, newest_of="request")
+            self.post_message(BRIDGE_PROBE, self._same_broker.answer_request, newest_of="request")
 
     def _on_remote(self, epoch: int, message: Message) -> None:
         if epoch != self._remote_epoch or self._private.is_known(message.topic):
@@ -255,7 +255,7 @@ class MqttBridge(Service):
         self._forwarder.mirroring = self._boolean(REMOTE_MIRROR, payload)
 
     def _on_media_flag(self, flag: Channel, payload: bytes) -> None:
-        self.post(partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
+        self.post_message(flag, partial(self._media.allow, flag, self._boolean(flag, payload)), newest_of=flag.metric)
 
     def _on_media_request(self, channel: Channel, payload: bytes) -> None:
         try:
@@ -263,11 +263,11 @@ class MqttBridge(Service):
         except PayloadError as error:
             self._refuse(channel, error)
         else:
-            self.post(partial(self._media.request, channel, request), newest_of=channel.metric)
+            self.post_message(channel, partial(self._media.request, channel, request), newest_of=channel.metric)
 
     def _on_action(self, channel: Channel, payload: bytes) -> None:
         if self._boolean(channel, payload):
-            self.post(partial(self._run_action, channel), newest_of=channel.metric)
+            self.post_message(channel, partial(self._run_action, channel), newest_of=channel.metric)
 
     def _boolean(self, channel: Channel, payload: bytes) -> bool:
         """The value of a boolean control; an empty payload (a removed flag) and a malformed one are false."""

@@ -196,6 +196,18 @@ def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: p
     assert robot.error is None
 
 
+def test_what_a_message_requires_ends_nothing_either(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> None:
+        raise RuntimeError("the reaction failed")
+
+    robot.start()
+    robot.service.post_message(MQTT_VIDEO, fail, newest_of="reaction")
+    assert until(lambda: robot.service.counters["handler_errors"] == 1)
+    robot.service.post_message(MQTT_VIDEO, lambda: robot.service.seen.append("reacted"))
+    assert robot.saw("reacted")
+    assert [record.message for record in caplog.records] == ["failed on a message on flags/mqtt-video (1 so far)"]
+
+
 @pytest.mark.parametrize("timer", ["every", "call_at", "post"])
 def test_a_timer_or_a_reader_that_fails_ends_the_service_safely(timer: str) -> None:
     def fail() -> None:

@@ -321,8 +321,7 @@ class DescribedBridge(SerialService):
                 return
             if manifest.protocol != PROTOCOL or manifest.device_uid != uid:
                 return
-        handle = partial(self._receive_manifest, uid, manifest, message.retain)
-        self.post(partial(self._handle, MCU_DESCRIBE, handle, self.clock()))
+        self.post_message(MCU_DESCRIBE, partial(self._receive_manifest, uid, manifest, message.retain))
 
     def _receive_manifest(self, uid: str, manifest: McuManifest | None, retained: bool) -> None:
         now = self.clock()

@@ -451,6 +451,17 @@ class TestActions:
         rig.local.publish("incoming/flags/service-restart", b"true")
         assert until(lambda: ran(tmp_path) == ["service_restart"])
 
+    def test_one_that_fails_in_the_bridge_ends_nothing(
+        self, rig: MemoryRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        bridge = rig.bridge(**recorders(tmp_path))
+        with monkeypatch.context() as broken:
+            broken.setattr(bridge._actions, "request", lambda _channel: 1 / 0)
+            rig.remote.publish("incoming/flags/reboot", b"true")
+            assert until(lambda: bridge.counters["handler_errors"] == 1)
+        rig.remote.publish("incoming/flags/git-pull", b"true")
+        assert until(lambda: ran(tmp_path) == ["git_pull"])
+
     @pytest.mark.parametrize("no", [b"false", b'{"value": false}', b"1", b'"true"', b"null", b"", b"[true]", b"\xff"])
     def test_nothing_but_true_runs(self, rig: MemoryRig, tmp_path: Path, no: bytes) -> None:
         rig.bridge(**recorders(tmp_path))
