@@ -41,7 +41,7 @@ class Launcher:
         _check_runs_here(config)
         self._config = config
         self._environment = _inherited_environment()
-        self._reactor = Reactor(on_stall=_log_stall)
+        self._reactor = Reactor(on_stall=self._stood_still)
         self._supervisors = [self._supervise(program) for program in (programs(config) if table is None else table)]
         self._on_demand = OnDemand(self._reactor, self._supervisors)
         self._features = Features(lambda: self._status.capabilities_changed())
@@ -123,6 +123,10 @@ class Launcher:
         own = {LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
         return {**self._environment, **program.environment, **own}
 
+    def _stood_still(self, seconds: float) -> None:
+        self._status.stood_still()
+        log.warning("stood still for %.1f s (suspended, or too busy a machine): this time counts for no limit", seconds)
+
     # -- stopping
 
     def _stop_requested(self) -> bool:
@@ -175,10 +179,6 @@ def _check_runs_here(config: Config) -> None:
 
 def _run_lock(config: Config) -> RunLock:
     return RunLock(config.run_dir(), config.base, config.path or config.folder)
-
-
-def _log_stall(seconds: float) -> None:
-    log.warning("stood still for %.1f s (suspended, or too busy a machine): this time counts for no limit", seconds)
 
 
 def _running(supervisors: Sequence[ProcessSupervisor]) -> list[str]:

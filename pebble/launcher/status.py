@@ -75,6 +75,11 @@ class StatusPublisher:
         if launcher.enabled and launcher.logs.enabled:
             self._pipe.record(self._message(LOGS, record))
 
+    def stood_still(self) -> None:
+        """systemd's clock has run on."""
+        if self._systemd.watchdog_period_s is not None:
+            self._systemd.watchdog()
+
     def stopping(self) -> None:
         self._systemd.stopping()
 

@@ -135,19 +135,27 @@ def test_a_stuck_child_is_killed_and_started_again(launch: Launch) -> None:
     assert until(lambda: robot.services()["serial"]["last_exit"] == "stuck, killed")
 
 
-def test_a_robot_that_stood_still_as_a_whole_goes_on_with_the_same_processes(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), ("bridge", "good", CONNECTION), options=("hasty",))
-    assert robot.ready("serial", "bridge", "announcer")
-    children = robot.children()
-    everything = [robot.process.pid, *children.values()]
-    for pid in everything:
-        os.kill(pid, signal.SIGSTOP)
-    time.sleep(3.5)  # longer than a hasty launcher waits for a sign of life
-    os.kill(robot.process.pid, signal.SIGCONT)
-    assert until(lambda: re.search("stood still|sign of life", robot.stderr()), 20), "no child runs yet"
-    assert "sign of life" not in robot.stderr()
-    for pid in everything:
-        os.kill(pid, signal.SIGCONT)
+def test_a_robot_that_stood_still_as_a_whole_goes_on_with_the_same_processes(launch: Launch, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "systemd"))
+        systemd.settimeout(20)
+        robot = launch(
+            *(("serial", "good", DEVICE), ("bridge", "good", CONNECTION)),
+            options=("hasty",),
+            env={"NOTIFY_SOCKET": str(tmp_path / "systemd"), "WATCHDOG_USEC": "1200000000"},  # its next turn is far off
+        )
+        assert robot.ready("serial", "bridge", "announcer")
+        children = robot.children()
+        everything = [robot.process.pid, *children.values()]
+        for pid in everything:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(3.5)  # longer than a hasty launcher waits for a sign of life
+        os.kill(robot.process.pid, signal.SIGCONT)
+        assert until(lambda: re.search("stood still|sign of life", robot.stderr()), 20), "no child runs yet"
+        assert "sign of life" not in robot.stderr()
+        for pid in everything:
+            os.kill(pid, signal.SIGCONT)
+        assert "WATCHDOG=1" in iter(lambda: systemd.recv(1000).decode(), ""), "systemd's clock has run on"
     ready = len(robot.events("serial", "ready"))
     os.kill(children["serial"], signal.SIGKILL)
     assert until(lambda: len(robot.events("serial", "ready")) > ready, 20)
