@@ -39,6 +39,8 @@ class ConfigWatch:
             return None if load(self._config.path or "") == self._config else ""
         except ConfigError as error:
             return f"; its next start would fail: {error.problems[0]}"
+        except Exception as error:  # noqa: BLE001 - nothing that is in a file may end a running robot
+            return f"; its next start would fail: {error}"
 
 
 def _version(path: Path | None) -> tuple[int, ...]:

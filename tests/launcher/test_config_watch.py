@@ -37,7 +37,7 @@ def test_a_change_is_one_warning_once_the_file_is_at_rest(file: Path, caplog: py
     watch = ConfigWatch(load(file))
     assert polls(watch, caplog) == []
     file.write_text('{"robot"')
-    assert polls(watch, caplog, 1) == [], "somebody may still be writing it"
+    assert polls(watch, caplog, 1) == [], "an editor may still be writing it"
     write(file, log_level="DEBUG")
     (warning,) = polls(watch, caplog)
     assert warning == f"{file} has changed: the robot goes on with what it read when it started, until its next start"
@@ -53,7 +53,16 @@ def test_what_means_the_same_is_no_change(file: Path, caplog: pytest.LogCaptureF
     assert polls(watch, caplog) == []
 
 
-@pytest.mark.parametrize("text", ["{", '{"robot": {"id": "rover"}, "robt": 1, "serv": 2}', None])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        '{"robot": {"id": "rover"}, "robt": 1, "serv": 2}',
+        '{"robot": {"id": "rover"}, "deep": ' + '{"a":' * 700 + "1" + "}" * 701,
+        None,
+    ],
+    ids=["torn", "misspelt", "deep", "removed"],
+)
 def test_a_file_that_cannot_be_used_any_more_is_said_to_be_so(
     file: Path, text: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
