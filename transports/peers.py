@@ -68,7 +68,9 @@ def make_private(run_dir: Path, *, close: bool = False) -> None:
         elif found.st_mode & 0o022:
             raise TransportError(f"transport.run_dir {run_dir}: others may write there, name a folder of this user")
     except OSError as error:
-        raise TransportError(f"transport.run_dir {run_dir} cannot be used: {error.strerror}") from None
+        raise TransportError(
+            f"transport.run_dir {run_dir} cannot be used: {error.strerror}; name another folder"
+        ) from None
 
 
 class FileLock:
