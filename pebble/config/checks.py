@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
-from pebble.config.transport import Mqtt, Tls
+from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
 from pebble.config.web import WebInterface, WebMqtt, WebTls
@@ -31,6 +31,22 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
     return root
+
+
+def _transport(reader: Reader, transport: TransportSection, path: Path) -> TransportSection:
+    """Who may connect to a Zenoh robot from other machines is decided by certificates alone."""
+    encrypted = next((one for one in transport.listen if one.startswith(("tls/", "quic/"))), None)
+    if transport.kind != "zenoh" or encrypted is None:
+        return transport
+    if not transport.tls.enabled:
+        reader.notes.doubt((*path, "tls", "enabled"), f"must be true, {encrypted} needs certificates")
+    elif transport.tls.ca_cert is None:
+        reader.notes.doubt(
+            (*path, "tls", "ca_cert"),
+            f"is missing: without it anybody may connect to {encrypted}; "
+            "write the authority that signs the certificates of those who may",
+        )
+    return transport
 
 
 def _services(reader: Reader, services: Services, path: Path) -> Services:
@@ -181,6 +197,7 @@ def _table(*rows: tuple[type[Any], Callable[[Reader, Any, Path], Any]]) -> Mappi
 #: By the class of a section, subclasses included.
 CHECKS = _table(
     (Root, _root),
+    (TransportSection, _transport),
     (Services, _services),
     (MqttBridge, _bridge),
     (SerialBridges, _serial),

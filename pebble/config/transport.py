@@ -51,7 +51,10 @@ class RemoteMqtt(Mqtt, frozen=True, kw_only=True):
 class ZenohSection(Section, frozen=True, kw_only=True):
     """Where a Zenoh session listens and connects, beyond the robot's own processes."""
 
-    listen: Annotated[tuple[Endpoint, ...], doc("Zenoh endpoints to listen on, for other machines.")] = ()
+    listen: Annotated[
+        tuple[Endpoint, ...],
+        doc("Zenoh endpoints to listen on, for other machines; `tls/` and `quic/` need tls.ca_cert."),
+    ] = ()
     connect: Annotated[tuple[Endpoint, ...], doc("Zenoh endpoints to connect to.")] = ()
     tls: Annotated[Tls, doc("Certificates for `tls/` and `quic/` endpoints.")] = Tls()
     lease_ms: Annotated[

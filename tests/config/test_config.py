@@ -478,6 +478,22 @@ class TestMistakes:
             "services.mqtt_bridge.remote.listen",
         ]
 
+    @pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7447", "quic/[::]:7447"])
+    def test_a_robot_that_listens_for_other_machines_names_who_signs_their_certificates(
+        self, endpoint: str, tmp_path: Path
+    ) -> None:
+        transport = {"kind": "zenoh", "listen": ["tcp/127.0.0.1:7447", endpoint]}
+        assert only_problem(at("transport", transport)).startswith(
+            f"transport.tls.enabled: must be true, {endpoint} needs"
+        )
+        (tmp_path / "file").write_text("text")
+        tls = {"enabled": True, "client_cert": "file", "client_key": "file"}
+        assert only_problem(at("transport", transport | {"tls": tls}), folder=tmp_path).startswith(
+            f"transport.tls.ca_cert: is missing: without it anybody may connect to {endpoint}"
+        )
+        read(at("transport", transport | {"tls": tls | {"ca_cert": "file"}}), folder=tmp_path)
+        read(at("transport", transport | {"kind": "mqtt"}))
+
     def test_ten_mistakes_are_reported_in_one_run(self, tmp_path: Path) -> None:
         raw = json.loads(ORIGINAL.read_text())
         services = raw["services"]

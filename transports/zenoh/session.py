@@ -30,7 +30,8 @@ BLOCK_MS = 300  # a publish waits this long for a receiver that accepts nothing;
 _CONNECT_TIMEOUT_MS = 2000
 # Zenoh accepts this only as a whole.
 _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
-_SAFE_SCHEMES = ("tls/", "quic/", "unixsock-stream/")
+_TLS_SCHEMES = ("tls/", "quic/")
+_SAFE_SCHEMES = (*_TLS_SCHEMES, "unixsock-stream/")
 _LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
 
 
@@ -100,8 +101,15 @@ def _check_endpoint(name: str, endpoint: str, tls: TlsSettings | None) -> None:
         return
     if not endpoint.startswith(_SAFE_SCHEMES):
         raise TransportError(f"transport.{name}: {endpoint} leaves this machine unencrypted: use tls/host:port")
-    if not endpoint.startswith("unixsock") and tls is None:
+    if not endpoint.startswith(_TLS_SCHEMES):
+        return
+    if tls is None:
         raise TransportError(f"transport.{name}: {endpoint} needs transport.tls")
+    if name == "listen" and tls.ca_cert is None:
+        raise TransportError(
+            f"transport.listen: without transport.tls.ca_cert anybody may connect to {endpoint}: "
+            "name the authority that signs the certificates of those who may"
+        )
 
 
 def _tls(tls: TlsSettings | None) -> dict[str, Any]:

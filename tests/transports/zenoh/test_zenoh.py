@@ -521,7 +521,9 @@ def _tls(name: str) -> TlsSettings:
         ({"run_dir": Path("/tmp") / ("x" * 100)}, "transport.run_dir"),
         ({"run_dir": Path("/tmp/a?b")}, "transport.run_dir"),
         ({"run_dir": Path("/proc/nowhere")}, "transport.run_dir"),
-        ({"listen": ("tls/nonsense",), "tls": TlsSettings()}, "zenoh"),
+        ({"listen": ("tls/0.0.0.0:7447",), "tls": TlsSettings()}, "without transport.tls.ca_cert anybody"),
+        ({"listen": ("quic/0.0.0.0:7447",), "tls": TlsSettings()}, "without transport.tls.ca_cert anybody"),
+        ({"listen": ("tls/nonsense",), "tls": TlsSettings(ca_cert=CERTIFICATES / "ca.crt")}, "zenoh"),
     ],
 )
 def test_settings_that_can_never_work_are_refused(tmp_path: Path, changes: dict[str, Any], complaint: str) -> None:
