@@ -1,18 +1,25 @@
-"""The hub's memory on disk: torn ends, damage, growth and full disks."""
+"""The hub's memory on disk: torn ends, damage, growth, and disks that are full or missing."""
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
-from pebble.errors import TransportError
 from pebble.transports.zenoh.hub import journal as journal_module
 from pebble.transports.zenoh.hub.journal import Journal
 from tests.support import until
 
 RECORDS = [b"one", b"", b"\x00" * 5000, b"four"]
+
+
+class Clock:
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
 
 
 def written(path: Path, records: list[bytes]) -> None:
@@ -24,7 +31,9 @@ def written(path: Path, records: list[bytes]) -> None:
 
 
 def read(path: Path) -> list[bytes]:
-    return list(Journal(path).load())
+    records = Journal(path).load()
+    assert records is not None
+    return records
 
 
 def test_what_was_appended_is_loaded_in_order(tmp_path: Path) -> None:
@@ -47,7 +56,9 @@ def test_every_torn_end_leaves_what_was_whole(tmp_path: Path) -> None:
         assert read(path) == [b"first", b"second"][: (size >= boundary) + (size == len(whole))]
 
 
-def test_damage_ends_the_journal_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_damage_ends_the_journal_with_a_warning_and_what_follows_is_set_aside(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "journal"
     written(path, RECORDS)
     data = bytearray(path.read_bytes())
@@ -55,6 +66,10 @@ def test_damage_ends_the_journal_with_a_warning(tmp_path: Path, caplog: pytest.L
     path.write_bytes(data)
     assert read(path) == RECORDS[:2]
     assert f"journal {path} is damaged at byte" in caplog.text
+    aside = tmp_path / "journal.bad"
+    assert data.endswith(aside.read_bytes())
+    assert len(aside.read_bytes()) > 5000
+    assert aside.stat().st_mode & 0o777 == 0o600
 
 
 def test_it_asks_for_a_rewrite_when_it_has_grown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,10 +77,14 @@ def test_it_asks_for_a_rewrite_when_it_has_grown(tmp_path: Path, monkeypatch: py
     path = tmp_path / "journal"
     journal = Journal(path)
     journal.rewrite([b"start"])
-    asked = [journal.append(b"x" * 20) for _ in range(5)]
+    asked = []
+    for _ in range(5):
+        journal.append(b"x" * 20)
+        asked.append(journal.rewrite_due)
     assert asked == [False] * 4 + [True]
     journal.rewrite([b"all"])
-    assert not journal.append(b"more")
+    journal.append(b"more")
+    assert not journal.rewrite_due
     journal.close()
     assert read(path) == [b"all", b"more"]
 
@@ -81,19 +100,81 @@ def test_it_reaches_the_disk_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     journal.close()
 
 
-def test_a_full_disk_ends_the_journal_and_nothing_else(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal")
-    journal.rewrite([b"x"])
+def test_after_a_moment_of_full_disk_everything_is_written_again(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    clock, path = Clock(), tmp_path / "journal"
+    journal = Journal(path, clock=clock)
+    journal.rewrite([b"old"])
     assert journal._file is not None
     with Path("/dev/full").open("wb") as full:
         os.dup2(full.fileno(), journal._file)
-    assert not journal.append(b"lost")
-    assert not journal.append(b"lost")
-    assert caplog.text.count("nothing more will be stored") == 1
+    for _ in range(2):
+        journal.append(b"new")
+    assert caplog.text.count("No space left on device") == 1
+    assert (journal.rewrite_due, journal.wait_s) == (False, 30)
+    clock.now += 30
+    assert (journal.rewrite_due, journal.wait_s) == (True, 0)
+    journal.rewrite([b"new"])
+    journal.append(b"later")
+    assert not journal.rewrite_due
+    journal.close()
+    assert read(path) == [b"new", b"later"]
+
+
+def test_a_disk_that_fails_to_sync_is_tried_again(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_descriptor: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    clock = Clock()
+    monkeypatch.setattr(journal_module, "SYNC_S", 0.01)
+    journal = Journal(tmp_path / "journal", clock=clock)
+    journal.rewrite([])
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "fdatasync", fail)
+        journal.append(b"x")
+        assert until(lambda: "Input/output error" in caplog.text)
+    clock.now += 30
+    assert journal.rewrite_due
     journal.close()
 
 
+def test_a_rewrite_that_fails_leaves_the_file_as_it_was_and_takes_no_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    clock, path = Clock(), tmp_path / "journal"
+    journal = Journal(path, clock=clock)
+    journal.rewrite([b"one"])
+    monkeypatch.setattr(os, "fdatasync", fail)
+    for _ in range(2):
+        journal.rewrite([b"one", b"two"])
+    assert caplog.text.count("No space left on device") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["journal"]
+    journal.append(b"three")
+    assert not journal.rewrite_due
+    journal.close()
+    assert read(path) == [b"one", b"three"]
+
+
 @pytest.mark.parametrize("path", ["/proc/nowhere/journal", "/dev/null/journal"])
-def test_a_place_that_cannot_be_written_is_an_error(path: str) -> None:
-    with pytest.raises(TransportError, match="journal"):
-        Journal(Path(path)).rewrite([])
+def test_a_place_that_cannot_be_written_is_tried_again(path: str, caplog: pytest.LogCaptureFixture) -> None:
+    clock = Clock()
+    journal = Journal(Path(path), clock=clock)
+    assert not journal.load()
+    journal.rewrite([])
+    journal.append(b"not stored")
+    assert caplog.text.count(path) == 1
+    clock.now += 30
+    assert journal.rewrite_due
+    journal.close()
+
+
+def test_a_file_that_cannot_be_read_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    path.mkdir()
+    assert Journal(path).load() is None

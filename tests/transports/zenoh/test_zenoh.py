@@ -25,6 +25,8 @@ from pebble.transports import Message, QoS, State, TlsSettings, Transport, Zenoh
 from pebble.transports.zenoh import transport as zenoh_transport
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub import ZenohHub
+from pebble.transports.zenoh.hub import journal as hub_journal
+from pebble.transports.zenoh.hub.store import HubStore, Retained, StoredWill
 from tests.support import ROOT, free_port, until
 from tests.transports.zenoh_net import HubProcess
 
@@ -437,6 +439,61 @@ def test_the_journal_forgives_a_torn_end(remembering: Robot) -> None:
     remembering.client("late").subscribe("state/+", received.append)
     assert until(lambda: len(received) == 8)
     assert {m.topic: m.payload for m in received} == {f"state/{number}": b"x" * number for number in range(1, 9)}
+
+
+def _is_a_file(disk: Path) -> None:
+    disk.touch()
+
+
+def _holds_a_folder_instead(disk: Path) -> None:
+    (disk / "journal").mkdir(parents=True)
+
+
+@pytest.mark.parametrize("fail", [_is_a_file, _holds_a_folder_instead])
+def test_a_hub_starts_without_its_journal_and_tries_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, fail: Callable[[Path], None]
+) -> None:
+    monkeypatch.setattr(hub_journal, "RETRY_S", 0.2)
+    caplog.set_level("INFO")
+    disk = tmp_path / "disk"
+    settings = ZenohSettings(run_dir=tmp_path / "run", journal=disk / "journal")
+    remember(disk / "journal", {"old": b"1", "state": b"1"})
+    disk.rename(tmp_path / "away")
+    fail(disk)
+    hub = ZenohHub(settings).open()
+    try:
+        with create("zenoh", "writer", settings) as writer:
+            assert writer.publish("state", b"2", qos=DELIVERED, retain=True)
+            assert until(lambda: retained_of(hub) == {"state": b"2"})
+            disk.rename(tmp_path / "broken")
+            (tmp_path / "away").rename(disk)
+            assert until(lambda: retained_of(hub) == {"old": b"1", "state": b"2"})
+            assert until(lambda: "is written again" in caplog.text)
+        assert [record.levelname for record in caplog.records].count("ERROR") == 1
+    finally:
+        hub.close()
+    assert recalled(disk / "journal") == {"old": b"1", "state": b"2"}
+
+
+def remember(path: Path, values: dict[str, bytes]) -> None:
+    """Write the journal of an earlier hub."""
+    earlier = hub_journal.Journal(path)
+    stamp = wire.Stamp(DELIVERED, 1, "somebody")
+    earlier.rewrite(wire.encode(Retained(topic, value, stamp)) for topic, value in values.items())
+    earlier.close()
+
+
+def recalled(path: Path) -> dict[str, bytes]:
+    """What the next hub would load."""
+    store = HubStore()
+    for record in hub_journal.Journal(path).load() or []:
+        store.apply(msgspec.msgpack.decode(record, type=Retained | StoredWill))
+    return {one.key: one.payload for one in store.retained()}
+
+
+def retained_of(hub: ZenohHub) -> dict[str, bytes]:
+    assert hub._worker is not None
+    return {one.key: one.payload for one in hub._worker._store.retained()}
 
 
 # -- nothing open to the world

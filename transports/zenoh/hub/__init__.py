@@ -11,6 +11,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ class ZenohHub:
         self._token: zenoh.LivelinessToken | None = None
 
     def open(self) -> ZenohHub:
-        """Start. Raises TransportError if the run directory has a hub already, or it or the journal cannot be used."""
+        """Start. Raises TransportError if the run directory has a hub already, or cannot be used."""
         run_dir = self._settings.run_dir
         prepare_run_dir(run_dir)
         self._lock = FileLock.take(run_dir / "hub.lock")
@@ -97,6 +98,7 @@ class HubWorker:
     def __init__(self, name: str, journal: Journal | None, counters: Counters) -> None:
         self._name, self._journal, self._counters = name, journal, counters
         self._store = HubStore()
+        self._recalled = False  # the records of the journal
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
         self._alive_clients: set[str] = set()
         self._will_due: dict[str, float] = {}  # when to publish a will, by client
@@ -105,7 +107,7 @@ class HubWorker:
         self._session: zenoh.Session | None = None
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
         if journal is not None:
-            self._load_journal(journal)
+            self._write_journal(journal)
 
     def serve(self, session: zenoh.Session) -> None:
         self._session = session
@@ -142,6 +144,8 @@ class HubWorker:
                 pass
             self._answer_waiting()
             self._publish_due_wills()
+            if self._journal is not None and self._journal.rewrite_due:
+                self._do(partial(self._write_journal, self._journal))
 
     def _do(self, task: _Task) -> None:
         try:
@@ -154,8 +158,11 @@ class HubWorker:
             log.exception("the hub failed on one of its tasks")
 
     def _pause(self) -> float | None:
-        deadlines = [*self._will_due.values(), *(until for until, _, _ in self._waiting_queries)]
-        return max(0.0, min(deadlines) - time.monotonic()) if deadlines else None
+        now = time.monotonic()
+        pauses = [due - now for due in (*self._will_due.values(), *(until for until, _, _ in self._waiting_queries))]
+        if self._journal is not None:
+            pauses.append(self._journal.wait_s)
+        return max(0.0, min(pauses)) if pauses else None
 
     # -- retained messages
 
@@ -268,18 +275,34 @@ class HubWorker:
     # -- store and journal
 
     def _apply(self, record: Record) -> None:
-        if self._store.apply(record) and self._journal is not None and self._journal.append(wire.encode(record)):
-            self._journal.rewrite(map(wire.encode, self._store.records()))
+        if self._store.apply(record) and self._journal is not None:
+            self._journal.append(wire.encode(record))
 
-    def _load_journal(self, journal: Journal) -> None:
-        decode = msgspec.msgpack.Decoder(Record).decode
-        for data in journal.load():
+    def _write_journal(self, journal: Journal) -> None:
+        """Write all records anew, together with those of an earlier hub: these are read once, as soon as they can be.
+
+        Never before: the file would be lost.
+        """
+        self._recalled = self._recalled or self._recall(journal)
+        if self._recalled:
+            journal.rewrite(map(wire.encode, self._store.records()))
+
+    def _recall(self, journal: Journal) -> bool:
+        loaded = journal.load()
+        if loaded is None:
+            return False
+        earlier, decode = HubStore(), msgspec.msgpack.Decoder(Record).decode
+        for data in loaded:
             try:
-                self._store.apply(decode(data))
+                earlier.apply(decode(data))
             except msgspec.DecodeError as error:
                 log.warning("journal %s has a record of another kind: %s", journal.path, error)
-        journal.rewrite(map(wire.encode, self._store.records()))
-        self._will_due = dict.fromkeys(self._store.wills(), time.monotonic() + RETURN_S)
+        for record in self._store.records():
+            earlier.apply(record)  # newer
+        self._store = earlier
+        due = time.monotonic() + RETURN_S
+        self._will_due |= dict.fromkeys(self._store.wills() - self._alive_clients - self._will_due.keys(), due)
+        return True
 
 
 def _payload(query: zenoh.Query) -> bytes:

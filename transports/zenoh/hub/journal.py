@@ -1,8 +1,8 @@
-"""An append-only file that stores records across restarts, and tolerates a torn end.
+"""An append-only file that stores records across restarts, and tolerates a torn end and a disk that fails for a while.
 
 Each record is framed by its length and CRC. It reaches the operating system when it is written, so it survives the
 death of this process; it reaches the disk within about a second (``SYNC_S``), so a power cut costs at most that. The
-file is rewritten when it has grown to several times the size of its current records.
+file is rewritten when it has grown to several times the size of its current records, and after a failure of its disk.
 """
 
 from __future__ import annotations
@@ -11,84 +11,118 @@ import logging
 import os
 import struct
 import threading
+import time
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
-
-from pebble.errors import TransportError
 
 log = logging.getLogger(__name__)
 
 SYNC_S = 1.0
+RETRY_S = 30.0  # after a failure of the disk
 _FRAME = struct.Struct(">II")  # bytes of the record, its CRC
 _MAX_RECORD = 128 << 20
 _SLACK_BYTES = 1 << 20  # growth that is never worth a rewrite
 _GROWTH = 4  # times the size after the last rewrite
+_NEVER = float("inf")
 
 
 class Journal:
-    """Use: ``load()`` once, then ``rewrite()`` with the current records, then ``append()``, then ``close()``."""
+    """Use: ``load()`` and ``rewrite()`` with the current records, then ``append()``, finally ``close()``.
 
-    def __init__(self, path: Path) -> None:
+    A disk that is full, missing or cannot be written is no error of the caller: one line in the log says so, and
+    ``rewrite_due`` says when to try again. Until then nothing, or only a part, is stored.
+    """
+
+    def __init__(self, path: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
         self.path = path
+        self._clock = clock
         self._file: int | None = None
         self._size = self._base = 0
+        self._due = _NEVER  # when to rewrite
+        self._failing = False
         self._dirty = threading.Event()
         self._closing = threading.Event()
         self._lock = threading.Lock()  # the file may be replaced while the syncer uses it
         self._syncer: threading.Thread | None = None
 
-    def load(self) -> Iterator[bytes]:
-        """The records of the last run, oldest first, up to the first damaged one. Raises TransportError."""
+    @property
+    def rewrite_due(self) -> bool:
+        """Whether it is time to ``rewrite``: the file has grown, or its disk failed a while ago."""
+        return self._clock() >= self._due
+
+    @property
+    def wait_s(self) -> float:
+        """How long ``rewrite_due`` need not be checked."""
+        return min(RETRY_S, max(0.0, self._due - self._clock()))
+
+    def load(self) -> list[bytes] | None:
+        """The records of the last run, oldest first, up to the first damaged one; None while they cannot be read.
+
+        What follows the damage is set aside in ``<path>.bad``.
+        """
         try:
             data = self.path.read_bytes()
         except FileNotFoundError:
-            return
+            return []
         except OSError as error:
-            raise TransportError(f"journal {self.path}: {error.strerror}") from None
-        yield from _records(data, self.path)
+            self._fail(error)
+            return None
+        records, end = _records(data)
+        if end < len(data):
+            bad = self.path.with_name(self.path.name + ".bad")
+            log.warning("journal %s is damaged at byte %d of %d: the rest goes to %s", self.path, end, len(data), bad)
+            with suppress(OSError):
+                os.close(_written(bad, data[end:]))
+        return records
 
     def rewrite(self, records: Iterable[bytes]) -> None:
-        """Replace the file by ``records``, all or nothing. Raises TransportError if that is impossible."""
+        """Replace the file by ``records``, all or nothing."""
         framed = b"".join(map(_framed, records))
-        self._base = self._size  # if this fails it is not tried again at once
         try:
             descriptor = self._replaced_by(framed)
         except OSError as error:
-            raise TransportError(f"journal {self.path}: {error.strerror}") from None
+            self._fail(error)
+            return
         self._release()
         with self._lock:
             self._file = descriptor
         self._size = self._base = len(framed)
+        self._due = _NEVER
+        if self._failing:
+            self._failing = False
+            log.info("journal %s is written again", self.path)
         self._start_syncer()
 
     def _replaced_by(self, data: bytes) -> int:
         fresh = self.path.with_name(self.path.name + ".new")
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        descriptor = _written(fresh, data)
         try:
-            _write_all(descriptor, data)
             os.fdatasync(descriptor)
             fresh.replace(self.path)
         except OSError:
             os.close(descriptor)
+            fresh.unlink(missing_ok=True)
             raise
         return descriptor
 
-    def append(self, record: bytes) -> bool:
-        """Append ``record``; return whether it is time to ``rewrite``. A full disk ends the journal."""
+    def append(self, record: bytes) -> None:
+        """Append ``record``; after a failure the next ``rewrite`` has to store it."""
         if self._file is None:
-            return False
+            return
         framed = _framed(record)
         try:
             _write_all(self._file, framed)
         except OSError as error:
-            log.error("journal %s ends here, nothing more will be stored: %s", self.path, error.strerror)
-            self._release()
-            return False
+            self._release()  # what follows a torn record would not be read
+            self._fail(error)
+            return
         self._size += len(framed)
         self._dirty.set()
-        return self._size > _GROWTH * self._base + _SLACK_BYTES
+        if self._due == _NEVER and self._size > _GROWTH * self._base + _SLACK_BYTES:
+            self._due = self._clock()
 
     def close(self) -> None:
         self._closing.set()
@@ -96,6 +130,18 @@ class Journal:
         if self._syncer is not None:
             self._syncer.join()
         self._release()
+
+    def _fail(self, error: OSError) -> None:
+        """Try again later; say so once."""
+        self._due = self._clock() + RETRY_S
+        if not self._failing:
+            self._failing = True
+            log.error(
+                "journal %s: %s; a restart of the hub loses retained messages; tried again every %.0f s",
+                self.path,
+                error.strerror,
+                RETRY_S,
+            )
 
     def _start_syncer(self) -> None:
         if self._syncer is None:
@@ -111,7 +157,15 @@ class Journal:
             with self._lock:
                 copy = os.dup(self._file) if self._file is not None else None
             if copy is not None:
-                _flush(copy)
+                self._flush(copy)
+
+    def _flush(self, descriptor: int) -> None:
+        try:
+            os.fdatasync(descriptor)
+        except OSError as error:
+            self._fail(error)
+        finally:
+            os.close(descriptor)
 
     def _release(self) -> None:
         with self._lock:
@@ -120,15 +174,14 @@ class Journal:
                 self._file = None
 
 
-def _records(data: bytes, path: Path) -> Iterator[bytes]:
+def _records(data: bytes) -> tuple[list[bytes], int]:
+    """The whole records at the beginning of ``data``, and where they end."""
+    records: list[bytes] = []
     at = 0
-    while at < len(data):
-        record = _record_at(data, at)
-        if record is None:
-            log.warning("journal %s is damaged at byte %d of %d: the rest is ignored", path, at, len(data))
-            return
-        yield record
+    while (record := _record_at(data, at)) is not None:
+        records.append(record)
         at += _FRAME.size + len(record)
+    return records, at
 
 
 def _record_at(data: bytes, at: int) -> bytes | None:
@@ -144,16 +197,19 @@ def _framed(record: bytes) -> bytes:
     return _FRAME.pack(len(record), zlib.crc32(record)) + record
 
 
+def _written(path: Path, data: bytes) -> int:
+    """A descriptor of a new file with ``data``, for this user alone; it is removed again if it cannot be written."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    try:
+        _write_all(descriptor, data)
+    except OSError:
+        os.close(descriptor)
+        path.unlink(missing_ok=True)
+        raise
+    return descriptor
+
+
 def _write_all(descriptor: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
         view = view[os.write(descriptor, view) :]
-
-
-def _flush(descriptor: int) -> None:
-    try:
-        os.fdatasync(descriptor)
-    except OSError as error:
-        log.error("the journal cannot be written to its disk: %s", error.strerror)
-    finally:
-        os.close(descriptor)
