@@ -46,3 +46,4 @@ class ZenohSettings:
     lease_ms: int = 2000
     client: bool = False  # a short-lived tool: connects to the hub only, opens no socket of its own
     journal: Path | None = None  # where the hub stores retained messages and wills; only the hub reads it
+    reserved: tuple[str, ...] = ()  # topics below these have room of their own in the hub

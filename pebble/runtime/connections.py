@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from pebble.config import Config, Mqtt, RemoteConnection, Tls
+from pebble.contract import OUTGOING
 from pebble.errors import ConfigError, TransportError
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
 
@@ -86,6 +87,7 @@ def hub_settings(config: Config) -> ZenohSettings:
         tls=tls_settings(transport.tls),
         lease_ms=transport.lease_ms,
         journal=transport.journal,
+        reserved=(f"{config.base}/{OUTGOING}",),
     )
 
 

@@ -212,8 +212,9 @@ class ZenohTransport(Transport):
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
-        """Store the will at the hub and send what the hub lacks, until it lacks nothing."""
+        """Store the will at the hub and send what the hub lacks, until it lacks nothing that it has room for."""
         end = time.monotonic() + HUB_ANSWER_S
+        sent: set[str] = set()
         while time.monotonic() < end:
             with self._publishing:
                 hello = wire.Hello(self._name, self._retained_count, self._wire_will(), self._digests())
@@ -221,8 +222,9 @@ class ZenohTransport(Transport):
             if not answers:
                 return False
             lacking = {key_to_topic(key) for answer in answers for key in wire.decode_keys(answer)}
-            if not self._send_lacking(session, lacking):
+            if not self._send_lacking(session, lacking - sent):  # it had no room for what it lacks again
                 return True
+            sent |= lacking
         return False
 
     def _wire_will(self) -> wire.Will | None:

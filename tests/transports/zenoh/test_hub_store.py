@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from pebble.transports import QoS
 from pebble.transports.zenoh.hub import store as hub_store
@@ -65,17 +66,56 @@ def test_its_records_make_an_equal_store() -> None:
     assert (copy.retained(), copy.wills(), copy.will("client")) == (made.retained(), {"client"}, WILL)
 
 
-def test_it_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Room for 100 bytes, 40 of them reserved."""
     monkeypatch.setattr(hub_store, "MAX_BYTES", 100)
+    monkeypatch.setattr(hub_store, "RESERVED_BYTES", 40)
+    monkeypatch.setattr(hub_store, "_OVERHEAD", 0)
     monkeypatch.setattr(hub_store, "MAX_WILLS", 1)
+
+
+@pytest.mark.usefixtures("small")
+def test_what_has_no_room_is_refused_and_leaves_the_others_and_its_own_older_value(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     made = store(retained("a", bytes(90)), retained("b", bytes(20)), retained("a", bytes(95)))
-    assert [record.key for record in made.retained()] == ["a"]
-    made.apply(retained("a", bytes(100)))
-    assert made.retained() == []  # better none than an old one
-    made.apply(retained("b", bytes(99)))
-    assert [record.key for record in made.retained()] == ["b"]
+    assert [len(record.payload) for record in made.retained()] == [95]
+    assert not made.apply(retained("a", bytes(100)))
+    assert [len(record.payload) for record in made.retained()] == [95]
+    assert made.apply(retained("a", b""))
+    assert made.apply(retained("b", bytes(99)))
+    made.apply(StoredWill("first", replace(WILL, payload=b"")))
+    assert (made.wills(), made.refused) == (set(), 3)
+    made.apply(retained("b", b""))
     made.apply(StoredWill("first", WILL))
     made.apply(StoredWill("second", WILL))
-    assert made.wills() == {"first"}
-    assert made.refused == 3
+    assert (made.wills(), made.refused) == ({"first"}, 4)
     assert "no room for the retained message of b" in caplog.text
+
+
+@pytest.mark.usefixtures("small")
+def test_what_others_store_leaves_the_reserved_room() -> None:
+    made = HubStore(("robot/outgoing/",))
+    for number in range(10):
+        made.apply(retained(f"robot/incoming/{number}", bytes(10)))
+    made.apply(StoredWill("stranger", Will("elsewhere", bytes(40), QoS.DELIVERED, True)))
+    assert len(made.retained()) == 2
+    assert made.wills() == set()
+    assert made.apply(retained("robot/outgoing/state", bytes(20)))
+    assert not made.apply(retained("robot/outgoing/state", bytes(90)))
+    made = store(*made.records())
+    assert len(made.retained()) == 3
+
+
+@pytest.mark.usefixtures("small")
+def test_the_reserved_may_use_all_room_and_return_it() -> None:
+    made = HubStore(("robot/outgoing/",))
+    state = retained("robot/outgoing/state", bytes(80))
+    assert made.apply(state)
+    assert not made.apply(retained("robot/incoming/x", b"1"))
+    assert made.apply(retained(state.key, b"1"))
+    assert made.apply(retained("robot/incoming/x", bytes(40)))
+    assert not made.apply(retained("robot/incoming/y", bytes(20)))
+    assert made.apply(retained("robot/incoming/x", b""))
+    assert made.apply(retained("robot/incoming/y", bytes(40)))

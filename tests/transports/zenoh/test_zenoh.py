@@ -26,6 +26,7 @@ from pebble.transports.zenoh import transport as zenoh_transport
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub import ZenohHub
 from pebble.transports.zenoh.hub import journal as hub_journal
+from pebble.transports.zenoh.hub import store as hub_store
 from pebble.transports.zenoh.hub.store import HubStore, Retained, StoredWill
 from tests.support import ROOT, free_port, until
 from tests.transports.zenoh_net import HubProcess
@@ -494,6 +495,27 @@ def recalled(path: Path) -> dict[str, bytes]:
 def retained_of(hub: ZenohHub) -> dict[str, bytes]:
     assert hub._worker is not None
     return {one.key: one.payload for one in hub._worker._store.retained()}
+
+
+def test_a_client_connects_to_a_hub_that_has_no_room_for_all_it_retains(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = ZenohSettings(run_dir=tmp_path, reserved=("robot/outgoing",))
+    hub = ZenohHub(settings).open()
+    try:
+        with create("zenoh", "client", settings) as client:
+            for topic, size in (("robot/incoming/x", 5000), ("robot/outgoing/x", 4000)):
+                assert client.publish(topic, bytes(size), qos=DELIVERED, retain=True)
+            assert until(lambda: len(retained_of(hub)) == 2)
+            hub.close()
+            assert until(lambda: client.state is not State.CONNECTED)
+            monkeypatch.setattr(hub_store, "MAX_BYTES", 10_000)
+            monkeypatch.setattr(hub_store, "RESERVED_BYTES", 5_000)
+            hub = ZenohHub(settings).open()
+            assert until(lambda: client.state is State.CONNECTED)
+            assert retained_of(hub).keys() == {"robot/outgoing/x"}
+    finally:
+        hub.close()
 
 
 # -- nothing open to the world

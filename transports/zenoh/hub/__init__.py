@@ -81,7 +81,8 @@ class ZenohHub:
     def _start(self, run_dir: Path) -> None:
         journal = None if self._settings.journal is None else Journal(self._settings.journal)
         siblings = PeerRegistry(run_dir).sockets()  # they would connect within 0.5 s; we connect at once
-        self._worker = HubWorker(self.name, journal, self.counters)
+        store = HubStore(tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved))
+        self._worker = HubWorker(self.name, store, journal, self.counters)
         try:
             config = session_config(self._settings, "router", listen=[run_dir / HUB_SOCKET], connect=siblings)
             self._session = open_session(config)
@@ -95,9 +96,8 @@ class ZenohHub:
 class HubWorker:
     """One thread and one queue for all messages and queries of the hub, so that the order of arrival decides (T8)."""
 
-    def __init__(self, name: str, journal: Journal | None, counters: Counters) -> None:
-        self._name, self._journal, self._counters = name, journal, counters
-        self._store = HubStore()
+    def __init__(self, name: str, store: HubStore, journal: Journal | None, counters: Counters) -> None:
+        self._name, self._store, self._journal, self._counters = name, store, journal, counters
         self._recalled = False  # the records of the journal
         self._received: dict[str, int] = {}  # how many retained messages have arrived, by client
         self._alive_clients: set[str] = set()
@@ -291,7 +291,7 @@ class HubWorker:
         loaded = journal.load()
         if loaded is None:
             return False
-        earlier, decode = HubStore(), msgspec.msgpack.Decoder(Record).decode
+        earlier, decode = self._store.empty(), msgspec.msgpack.Decoder(Record).decode
         for data in loaded:
             try:
                 earlier.apply(decode(data))

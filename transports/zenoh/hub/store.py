@@ -7,12 +7,15 @@ from collections.abc import Iterator
 
 import msgspec
 
+from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
 
 log = logging.getLogger(__name__)
 
-MAX_BYTES = 64 << 20  # of retained keys and payloads together
+MAX_BYTES = 64 << 20  # of retained messages and wills together
+RESERVED_BYTES = 16 << 20  # of them, for keys that are reserved: other clients cannot fill these
 MAX_WILLS = 1000
+_OVERHEAD = 400  # bytes of Python's objects for one record, about
 
 
 class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
@@ -34,13 +37,22 @@ Record = Retained | StoredWill
 
 
 class HubStore:
-    """The newest retained message of every key and the wills of running clients, bounded in bytes and in number."""
+    """The newest retained message of every key and the wills of running clients, bounded in bytes and in number.
 
-    def __init__(self) -> None:
+    What has no room is refused, and changes nothing. A part of the room is for keys that begin with one of
+    ``reserved``.
+    """
+
+    def __init__(self, reserved: tuple[str, ...] = ()) -> None:
         self.refused = 0  # records there was no room for
+        self._reserved = reserved
         self._retained: dict[str, Retained] = {}
         self._wills: dict[str, Will] = {}
-        self._bytes = 0
+        self._bytes = {True: 0, False: 0}  # by whether the key is reserved
+
+    def empty(self) -> HubStore:
+        """An empty one with the same room."""
+        return HubStore(self._reserved)
 
     def apply(self, record: Record) -> bool:
         """Store a record; False if it changes nothing or there is no room."""
@@ -80,24 +92,39 @@ class HubStore:
         return retained.stamp.origin == name and digest(retained.payload) != own
 
     def _store_retained(self, record: Retained) -> bool:
-        before = self._retained.pop(record.key, None)
-        grown = _size(record) if record.payload else 0
-        shrunk = _size(before) if before is not None else 0
-        if grown and self._bytes - shrunk + grown > MAX_BYTES:
+        before = self._retained.get(record.key)
+        after = record if record.payload else None
+        if not self._resize(record.key, _size(after) - _size(before)):
             self._refuse(f"retained message of {record.key}")
-            grown = 0  # no value is better than an old one
-        elif grown:
+        elif after is None:
+            self._retained.pop(record.key, None)
+        else:
             self._retained[record.key] = record
-        self._bytes += grown - shrunk
         return before != self._retained.get(record.key)
 
     def _store_will(self, record: StoredWill) -> bool:
-        before = self._wills.pop(record.name, None)
-        if record.will is not None and len(self._wills) >= MAX_WILLS:
-            self._refuse(f"will of {record.name}")
-        elif record.will is not None:
-            self._wills[record.name] = record.will
-        return before != record.will
+        name, before, after = record.name, self._wills.get(record.name), record.will
+        if after is not None:
+            full = before is None and len(self._wills) >= MAX_WILLS
+            if full or not self._resize(topic_to_key(after.topic), _size(after)):
+                self._refuse(f"will of {name}")
+                return False
+            self._wills[name] = after
+        elif before is not None:
+            del self._wills[name]
+        if before is not None:
+            self._resize(topic_to_key(before.topic), -_size(before))
+        return before != after
+
+    def _resize(self, key: str, grown: int) -> bool:
+        """Account for ``grown`` bytes more, or less, of ``key``; False if there is no room for them."""
+        reserved = key.startswith(self._reserved)
+        if grown > 0:
+            full = sum(self._bytes.values()) + grown > MAX_BYTES
+            if full or (self._reserved and not reserved and self._bytes[False] + grown > MAX_BYTES - RESERVED_BYTES):
+                return False
+        self._bytes[reserved] += grown
+        return True
 
     def _refuse(self, what: str) -> None:
         self.refused += 1
@@ -105,5 +132,8 @@ class HubStore:
             log.error("no room for the %s: %d refused so far", what, self.refused)
 
 
-def _size(record: Retained) -> int:
-    return len(record.key) + len(record.payload)
+def _size(message: Retained | Will | None) -> int:
+    if message is None:
+        return 0
+    where = message.key if isinstance(message, Retained) else message.topic
+    return _OVERHEAD + len(where) + len(message.payload)
