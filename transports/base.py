@@ -9,7 +9,6 @@ import logging
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from enum import Enum, IntEnum
@@ -19,14 +18,18 @@ from typing import Self
 import msgspec
 
 from pebble.errors import TransportError
+from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.counters import Counters
 from pebble.transports.topics import check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
 
 QUEUE_LIMIT = 1000  # messages waiting for a slow handler before the oldest is dropped
+QUEUE_BYTES = 16 << 20  # the same, for their topics and payloads
 _OWN_LIMIT = 10_000  # retained topics a transport can send again; the names of topics may come from other programs
+_OWN_BYTES = 16 << 20  # the same, with their payloads
 _DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
+_DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
@@ -84,11 +87,11 @@ class Subscription:
         self.filter, self.qos, self.echo, self.direct = filter_, qos, echo, direct
         self.dropped = 0  # messages lost because the handler was too slow
         self.refused = False  # by the other end, on the newest connection; its transport sets it (T21)
-        self._transport, self._handler, self._limit = transport, handler, limit
+        self._transport, self._handler = transport, handler
         self._lock = threading.RLock()
         self._arrived = threading.Condition(self._lock)
-        self._queue: deque[Message] = deque()
-        self._delivered_topics: dict[str, None] = {}
+        self._queue = BoundedQueue[Message](limit, QUEUE_BYTES)
+        self._delivered_topics = BoundedTable[None](_DELIVERED_TOPICS_LIMIT, _DELIVERED_TOPICS_BYTES, lambda _: 0)
         self._closed = False
         self._warned_at = float("-inf")
         self._thread: threading.Thread | None = None
@@ -117,26 +120,19 @@ class Subscription:
             if retained and message.topic in self._delivered_topics:
                 self._transport.counters.add("stale")
                 return
-            self._note_delivered(message.topic)
+            if message.topic not in self._delivered_topics:
+                self._delivered_topics[message.topic] = None
             if self.direct:
                 self._call(message)
                 return
-            if len(self._queue) >= self._limit:
-                self._overflow(self._queue.popleft())
-            self._queue.append(message)
+            for lost in self._queue.append(message, len(message.topic) + len(message.payload)):
+                self._overflow(lost)
             self._arrived.notify()
 
     def renew(self) -> None:
         """Start a new connection: retained messages are delivered again."""
         with self._lock:
             self._delivered_topics.clear()
-
-    def _note_delivered(self, topic: str) -> None:
-        if topic in self._delivered_topics:
-            return
-        if len(self._delivered_topics) >= _DELIVERED_TOPICS_LIMIT:
-            self._delivered_topics.pop(next(iter(self._delivered_topics)))
-        self._delivered_topics[topic] = None
 
     def _overflow(self, lost: Message) -> None:
         self.dropped += 1
@@ -200,7 +196,8 @@ class Transport(ABC):
         self._subscriptions: list[Subscription] = []
         self._lock = threading.RLock()  # guards the list of subscriptions
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
-        self._own: dict[str, Message] = {}  # our newest retained message, by topic; empty payloads included
+        # Our newest retained message, by topic; empty payloads included.
+        self._own = BoundedTable[Message](_OWN_LIMIT, _OWN_BYTES, lambda message: len(message.payload))
         self._pending: dict[str, None] = {}  # topics in _own whose message is not sent yet, oldest first
         self._syncing = False  # guarded by _publishing
 
@@ -265,9 +262,9 @@ class Transport(ABC):
         """Publish one message; return whether it was accepted.
 
         A live message is refused while there is no connection, and never delivered late. A retained one is accepted
-        unless the transport is closed: its newest value is stored, for at most 10,000 topics, and sent when the
-        connection is back (T4). ``remember`` False: it is not stored here, because others change it as well; without a
-        connection it is refused. ``urgent`` gives commands and flags priority where the backend can. Raises
+        unless the transport is closed: its newest value is stored, for at most 10,000 topics and 16 MB, and sent when
+        the connection is back (T4). ``remember`` False: it is not stored here, because others change it as well;
+        without a connection it is refused. ``urgent`` gives commands and flags priority where the backend can. Raises
         TransportError for a topic that is not allowed.
         """
         check_topic(topic)
@@ -279,11 +276,11 @@ class Transport(ABC):
                 self.counters.add("refused")
                 return False
             accepted = self._send(message, urgent)
-            if retain and remember:
-                self._remember(message, sent=accepted and self._state is State.CONNECTED)
+            sent = accepted and self._state is State.CONNECTED
+            stored = retain and remember and self._remember(message, sent=sent)
             # "parked" is the published name of the counter of pending messages.
-            self.counters.add("sent" if accepted else "parked" if retain and remember else "refused")
-            return accepted or (retain and remember)
+            self.counters.add("sent" if accepted else "parked" if stored else "refused")
+            return accepted or stored
 
     def subscribe(
         self,
@@ -352,16 +349,19 @@ class Transport(ABC):
         for subscription in subscriptions:
             subscription.renew()
 
-    def _remember(self, message: Message, *, sent: bool) -> None:
-        if message.topic not in self._own and len(self._own) >= _OWN_LIMIT:
-            self.counters.add("forgotten")
-            return
-        self._own[message.topic] = message
+    def _remember(self, message: Message, *, sent: bool) -> bool:
+        """Store a retained message, to send it again; False, and no older one is sent again, if there is no room."""
         self._pending.pop(message.topic, None)
+        self._own.pop(message.topic, None)
+        if sent and not message.payload:
+            return True
+        if not self._own.has_room(message.topic, message):
+            self.counters.add("forgotten")
+            return False
+        self._own[message.topic] = message
         if not sent:
             self._pending[message.topic] = None
-        elif not message.payload:
-            del self._own[message.topic]
+        return True
 
     def _sync_retained(self, known: Collection[str]) -> None:
         """Send the pending retained messages, then our others that are not in ``known`` (T9)."""

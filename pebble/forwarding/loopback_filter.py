@@ -6,9 +6,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from hashlib import blake2b
 
 LIMIT = 2000  # messages of one topic that have not come back yet
-TOPICS = 4096  # with such messages; beyond it the oldest is dropped
+TOPICS = 4096  # with such messages; beyond it the oldest is dropped,
+MESSAGES = 20_000  # as it is beyond so many of all topics
 EXPIRY_S = 10.0  # an echo that has not arrived by then never will
 
 
@@ -18,7 +20,8 @@ class LoopbackFilter:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._out: dict[str, deque[tuple[float, bytes]]] = {}
+        self._out: dict[str, deque[tuple[float, bytes]]] = {}  # when, and a digest
+        self._messages = 0
 
     def __len__(self) -> int:
         """Topics with messages that have not come back yet."""
@@ -27,15 +30,20 @@ class LoopbackFilter:
     def expect(self, topic: str, payload: bytes) -> None:
         """Call before publishing: the echo may be faster than the return of the call."""
         with self._lock:
-            if topic not in self._out and len(self._out) >= TOPICS:
-                del self._out[next(iter(self._out))]
-            self._out.setdefault(topic, deque(maxlen=LIMIT)).append((self._clock(), payload))
+            out = self._out.setdefault(topic, deque())
+            out.append((self._clock(), _digest(payload)))
+            self._messages += 1
+            if len(out) > LIMIT:
+                self._drop_first(out)
+            while len(self._out) > TOPICS or self._messages > MESSAGES:
+                self._messages -= len(self._out.pop(next(iter(self._out))))
 
     def forget(self, topic: str) -> None:
         """The newest message on ``topic`` was not sent after all."""
         with self._lock:
             if self._out.get(topic):
                 self._out[topic].pop()
+                self._messages -= 1
                 self._tidy(topic)
 
     def is_echo(self, topic: str, payload: bytes) -> bool:
@@ -45,11 +53,12 @@ class LoopbackFilter:
             if not out:
                 return False
             while out and self._clock() - out[0][0] > EXPIRY_S:
-                out.popleft()
+                self._drop_first(out)
+            digest = _digest(payload)
             for index, (_, earlier) in enumerate(out):
-                if earlier == payload:
+                if earlier == digest:
                     for _ in range(index + 1):
-                        out.popleft()
+                        self._drop_first(out)
                     self._tidy(topic)
                     return True
             self._tidy(topic)
@@ -58,3 +67,11 @@ class LoopbackFilter:
     def _tidy(self, topic: str) -> None:
         if not self._out[topic]:
             del self._out[topic]
+
+    def _drop_first(self, out: deque[tuple[float, bytes]]) -> None:
+        out.popleft()
+        self._messages -= 1
+
+
+def _digest(payload: bytes) -> bytes:
+    return blake2b(payload, digest_size=16).digest()

@@ -15,8 +15,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 from pebble.forwarding.routing import Side
+from pebble.transports.bounds import BoundedTable
 
-TOPICS = 4096  # remembered; beyond it the oldest is dropped
+TOPICS = 4096  # remembered; beyond it the oldest is dropped,
+BYTES = 8 << 20  # as it is beyond this size of topics and values
 
 
 class Resolution(Enum):
@@ -40,9 +42,9 @@ class Reconciliation:
 
     def __init__(self, winner: Side) -> None:
         self._winner = winner
-        self._last: dict[str, LastValue] = {}
-        self._held: dict[str, bytes] = {}  # retained values of the other side, until the winner's have arrived
-        self._published: dict[Side, dict[str, bytes]] = {side: {} for side in Side}
+        self._last = BoundedTable[LastValue](TOPICS, BYTES, lambda last: len(last.payload))
+        self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # of the other side, until the winner's have arrived
+        self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
@@ -74,15 +76,14 @@ class Reconciliation:
             self._received[side].add(topic)
         resolution = self._resolve_retained(side, topic, payload) if retained else Resolution.PASS
         if resolution is Resolution.HOLD:
-            if topic in self._held or len(self._held) < TOPICS:
-                self._held[topic] = payload
+            self._held[topic] = payload
         elif resolution is Resolution.PASS:
             self._held.pop(topic, None)
             if side is self._winner:
                 self._overtaken.discard(topic)
             elif other_away and len(self._overtaken) < TOPICS:
                 self._overtaken.add(topic)
-            self._remember(topic, LastValue(payload, side))
+            self._last[topic] = LastValue(payload, side)
         return resolution
 
     def note_published(self, side: Side, topic: str, payload: bytes) -> None:
@@ -96,7 +97,7 @@ class Reconciliation:
         if side is self._winner:
             self._overtaken.clear()
             for topic, payload in self._held.items():
-                self._remember(topic, LastValue(payload, side.other))
+                self._last[topic] = LastValue(payload, side.other)
                 due.append((side, topic, payload))
             self._held.clear()
         fresh = {topic for _, topic, _ in due}
@@ -122,11 +123,3 @@ class Reconciliation:
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
         """Whether ``side`` lacks the newest value; it lacks no removal of what it never received."""
         return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload
-
-    def _remember(self, topic: str, last: LastValue) -> None:
-        if topic not in self._last and len(self._last) >= TOPICS:
-            oldest = next(iter(self._last))
-            del self._last[oldest]
-            for published in self._published.values():
-                published.pop(oldest, None)
-        self._last[topic] = last

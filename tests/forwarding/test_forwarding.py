@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 
 import pytest
@@ -75,6 +76,19 @@ class TestLoopbackFilter:
             loopback.is_echo(f"flag{number}", b"1")
             for number in range(loopback_filter.TOPICS, 2 * loopback_filter.TOPICS)
         )
+        assert len(loopback) == 0
+
+    def test_large_payloads_and_many_messages_take_little_memory(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(loopback_filter, "MESSAGES", 500)
+        loopback = LoopbackFilter(Clock())
+        tracemalloc.start()
+        for number in range(1000):
+            loopback.expect(f"flag{number // 100}", bytes(10_000 + number))
+        used, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert used < 200_000
+        assert not loopback.is_echo("flag0", bytes(10_099))
+        assert all(loopback.is_echo(f"flag{number // 100}", bytes(10_000 + number)) for number in range(500, 1000))
         assert len(loopback) == 0
 
 
@@ -193,6 +207,18 @@ class TestReconciliation:
         assert len(reconciliation.synchronize(REMOTE)) <= 2 * TOPICS
         assert len(reconciliation._last) <= TOPICS
         assert all(len(published) <= TOPICS for published in reconciliation._published.values())
+
+    def test_its_memory_is_bounded_in_bytes(self) -> None:
+        reconciliation = Reconciliation(REMOTE)
+        for number in range(40):
+            value = bytes(1 << 19)
+            reconciliation.receive(LOCAL, f"held/{number}", value, retained=True)
+            reconciliation.receive(REMOTE, f"known/{number}", value, retained=False)
+            reconciliation.note_published(LOCAL, f"known/{number}", value)
+        assert reconciliation.value("known/0") is None
+        assert reconciliation.value("known/39") == bytes(1 << 19)
+        assert len(reconciliation.synchronize(REMOTE)) < 40
+        assert all(len(published) < 20 for published in reconciliation._published.values())
 
 
 class TestProbes:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from pebble.transports import QoS
+import threading
+
+import pytest
+
+from pebble.transports import Message, QoS, base
 from pebble.transports.base import _OWN_LIMIT
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import until
@@ -21,3 +25,39 @@ def test_retained_topics_are_bounded_in_number() -> None:
         hub.start()
         assert until(lambda: len(received) == _OWN_LIMIT)
         assert "flag0" in received
+
+
+def test_retained_messages_are_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An older value is not sent again in place of a newer one that is too large to be stored."""
+    monkeypatch.setattr(base, "_OWN_BYTES", 1000)
+    hub = MemoryHub()
+    with MemoryTransport("bridge", hub) as bridge, MemoryTransport("late", hub) as late:
+        for topic, size in (("a", 400), ("b", 400), ("c", 400), ("a", 900), ("d", 500)):
+            assert bridge.publish(topic, bytes(size), qos=QoS.DELIVERED, retain=True)
+        assert bridge.counters["forgotten"] == 2
+        hub.stop(forget=True)
+        assert not bridge.publish("e", bytes(400), qos=QoS.DELIVERED, retain=True)
+        assert (bridge.counters["forgotten"], bridge.counters["refused"]) == (3, 1)
+        received: dict[str, int] = {}
+        late.subscribe("#", lambda message: received.update({message.topic: len(message.payload)}))
+        hub.start()
+        assert until(lambda: received == {"b": 400, "d": 500})
+
+
+def test_a_slow_handlers_queue_is_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base, "QUEUE_BYTES", 1000)
+    goes_on, received = threading.Event(), list[int]()
+
+    def handle(message: Message) -> None:
+        goes_on.wait(10)
+        received.append(message.payload[0])
+
+    with MemoryTransport("client", MemoryHub()) as client:
+        slow = client.subscribe("#", handle)
+        client.publish("t", bytes([0]), qos=QoS.DELIVERED)
+        assert until(lambda: client.counters["delivered"] == 1)
+        for number in range(1, 10):
+            client.publish("t", bytes([number]) * 300, qos=QoS.DELIVERED)
+        goes_on.set()
+        assert until(lambda: received == [0, 7, 8, 9])
+        assert slow.dropped == client.counters["dropped"] == 6

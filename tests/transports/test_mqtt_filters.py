@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import itertools
 import random
+import tracemalloc
+
+import pytest
 
 from pebble.transports import Message
+from pebble.transports.mqtt import filters
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, cover, overlap
 from pebble.transports.topics import matches
 
@@ -112,3 +116,18 @@ def test_a_new_connection_starts_afresh() -> None:
     own_filter.subscribe_again("#")
     own_filter.begin()
     assert not own_filter.is_repeat(retained(b"1"))
+
+
+def test_large_payloads_and_many_topics_take_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filters, "_LIMIT", 100)
+    own_filter = OwnMessageFilter()
+    tracemalloc.start()
+    for number in range(1000):
+        message = retained(bytes(100_000), f"flag{number}")
+        own_filter.note_own(message)
+        own_filter.is_repeat(message)
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert used < 500_000
+    assert own_filter.is_echo(retained(bytes(100_000), "flag999"))
+    assert not own_filter.is_echo(retained(bytes(100_000), "flag0"))

@@ -8,10 +8,13 @@ messages that it matches in excess are sorted out by exact matching on arrival.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from hashlib import blake2b
 
 from pebble.transports.base import Message
+from pebble.transports.bounds import BoundedTable
 
-_LIMIT = 65_536  # topics whose newest retained payload is remembered, per connection
+_LIMIT = 65_536  # topics whose newest retained payload is recognised, per connection
+_BYTES = 8 << 20  # the same, for their names and digests
 
 
 def overlap(one: str, other: str) -> bool:
@@ -79,8 +82,10 @@ class OwnMessageFilter:
     """
 
     def __init__(self) -> None:
-        self._own: dict[str, bytes] = {}  # our newest payload of a topic, until another client publishes another one
-        self._seen: dict[str, bytes] = {}  # the newest payload received, by topic
+        # Digests, by topic, of our newest payload until another client publishes another one,
+        self._own = BoundedTable[bytes](_LIMIT, _BYTES, len)
+        # and of the newest payload received.
+        self._seen = BoundedTable[bytes](_LIMIT, _BYTES, len)
         self._repeats: set[str] = set()  # topics whose retained message will come a second time
 
     def begin(self) -> None:
@@ -90,7 +95,7 @@ class OwnMessageFilter:
 
     def note_own(self, message: Message) -> None:
         """Remember a message that this client publishes."""
-        self._own[message.topic] = message.payload
+        self._own[message.topic] = _digest(message)
 
     def subscribe_again(self, filter_: str) -> None:
         """Expect the retained messages that ``filter_`` matches to be sent once more."""
@@ -98,18 +103,22 @@ class OwnMessageFilter:
 
     def is_echo(self, message: Message) -> bool:
         """Whether this is our own retained message, sent back because we subscribed."""
-        if self._own.get(message.topic) == message.payload:
+        if message.topic not in self._own:
+            return False
+        if self._own.get(message.topic) == _digest(message):
             return True
         self._own.pop(message.topic, None)  # another client has published since
         return False
 
     def is_repeat(self, message: Message) -> bool:
         """Whether this is a retained message that the broker sends again because of `subscribe_again`."""
-        seen = self._seen.pop(message.topic, None)
-        if len(self._seen) >= _LIMIT:
-            self._seen.pop(next(iter(self._seen)))
-        self._seen[message.topic] = message.payload
-        if seen != message.payload or message.topic not in self._repeats:
+        seen, digest = self._seen.get(message.topic), _digest(message)
+        self._seen[message.topic] = digest
+        if seen != digest or message.topic not in self._repeats:
             return False
         self._repeats.discard(message.topic)
         return True
+
+
+def _digest(message: Message) -> bytes:
+    return blake2b(message.payload, digest_size=16).digest()

@@ -11,14 +11,14 @@ import logging
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
 
 from pebble.errors import TransportError
-from pebble.transports.base import QUEUE_LIMIT, Message, QoS, State, Subscription, Transport
+from pebble.transports.base import QUEUE_BYTES, QUEUE_LIMIT, Message, QoS, State, Subscription, Transport
+from pebble.transports.bounds import BoundedQueue
 from pebble.transports.counters import Counters
 from pebble.transports.peers import PeerRegistry, PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
@@ -443,7 +443,7 @@ class LoopbackQueue:
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
         self._arrived = threading.Condition()
-        self._queue: deque[tuple[Subscription, Message]] = deque()
+        self._queue = BoundedQueue[tuple[Subscription, Message]](QUEUE_LIMIT, QUEUE_BYTES)
         self._thread: threading.Thread | None = None
         self._closed = False
 
@@ -451,10 +451,8 @@ class LoopbackQueue:
         with self._arrived:
             if self._closed:
                 return
-            if len(self._queue) >= QUEUE_LIMIT:
-                self._queue.popleft()
+            for _lost in self._queue.append((subscription, message), len(message.topic) + len(message.payload)):
                 self._counters.add("dropped")
-            self._queue.append((subscription, message))
             self._arrived.notify()
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="pebble-echo", daemon=True)
