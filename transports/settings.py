@@ -43,6 +43,7 @@ class ZenohSettings:
     listen: tuple[str, ...] = ()  # extra endpoints beyond the unix socket; never a default
     connect: tuple[str, ...] = ()
     tls: TlsSettings | None = None
+    allowed_names: tuple[str, ...] | None = None  # of certificates on tls/ and quic/; None: all that ca_cert signed
     lease_ms: int = 2000
     client: bool = False  # a short-lived tool: connects to the hub only, opens no socket of its own
     journal: Path | None = None  # where the hub stores retained messages and wills; only the hub reads it

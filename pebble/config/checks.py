@@ -17,6 +17,7 @@ from pebble.config.web import WebInterface, WebMqtt, WebTls
 from pebble.contract.identity import SERVERS
 
 _LATER = ("ros1_bridge",)
+_TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
 
 
@@ -35,7 +36,11 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
 
 def _transport(reader: Reader, transport: TransportSection, path: Path) -> TransportSection:
     """Who may connect to a Zenoh robot from other machines is decided by certificates alone."""
-    encrypted = next((one for one in transport.listen if one.startswith(("tls/", "quic/"))), None)
+    encrypted = next((one for one in transport.listen if one.startswith(_TLS)), None)
+    if transport.allowed_names is not None and not any(
+        one.startswith(_TLS) for one in (*transport.listen, *transport.connect)
+    ):
+        reader.notes.warning((*path, "allowed_names"), "has no effect: no tls/ or quic/ endpoint is listed")
     if transport.kind != "zenoh" or encrypted is None:
         return transport
     if not transport.tls.enabled:

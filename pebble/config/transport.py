@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.types import Endpoint, File, Password, Port, Section, Silence, doc
+from pebble.config.types import CommonName, Endpoint, File, Password, Port, Section, Silence, doc
 
 
 class Tls(Section, frozen=True, kw_only=True):
@@ -70,6 +70,13 @@ class TransportSection(ZenohSection, frozen=True, kw_only=True):
     kind: Annotated[str, doc('"mqtt", "zenoh", or the name of a transport that another package offers.')]
     run_dir: Annotated[File | None, doc("Folder of sockets and locks; unset: see above.")] = None
     state_dir: Annotated[File | None, doc("Folder of what survives a power cut; unset: see above.")] = None
+    allowed_names: Annotated[
+        tuple[CommonName, ...] | None,
+        doc(
+            "Names (CN) of the certificates that may connect by `tls/` and `quic/`, or be connected to; "
+            "unset: every one that tls.ca_cert signed."
+        ),
+    ] = None
     journal: Annotated[File | None, doc("File for a Zenoh robot's retained messages; unset: memory only.")] = None
     mqtt_mirror: Annotated[Mqtt | None, doc("Zenoh robots only: offer all topics on this MQTT broker, too.")] = None
 

@@ -85,6 +85,7 @@ def hub_settings(config: Config) -> ZenohSettings:
         listen=tuple(transport.listen),
         connect=tuple(transport.connect),
         tls=tls_settings(transport.tls),
+        allowed_names=transport.allowed_names,
         lease_ms=transport.lease_ms,
         journal=transport.journal,
         reserved=(f"{config.base}/{OUTGOING}",),

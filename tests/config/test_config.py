@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from pebble.config import Config, load, parse, resolved
 from pebble.contract import channel_of
 from pebble.errors import ConfigError
+from pebble.runtime.connections import hub_settings
 from pebble.transports.topics import check_topic
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -493,6 +494,21 @@ class TestMistakes:
         )
         read(at("transport", transport | {"tls": tls | {"ca_cert": "file"}}), folder=tmp_path)
         read(at("transport", transport | {"kind": "mqtt"}))
+
+    def test_the_names_of_certificates_that_may_connect(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("text")
+        names = {"kind": "zenoh", "allowed_names": ["anna", "base station"]}
+        endpoints = {"listen": ["tls/0.0.0.0:7447"], "tls": {"enabled": True, "ca_cert": "file"}}
+        config = read(at("transport", names | endpoints), folder=tmp_path)
+        assert (config.transport.allowed_names, config.warnings) == (("anna", "base station"), ())
+        assert hub_settings(config).allowed_names == ("anna", "base station")
+        assert read(at("transport", {"kind": "zenoh"})).transport.allowed_names is None
+        assert read(at("transport", names)).warnings == (
+            "transport.allowed_names: has no effect: no tls/ or quic/ endpoint is listed",
+        )
+        assert only_problem(at("transport", {"kind": "zenoh", "allowed_names": [""]})).startswith(
+            "transport.allowed_names[0]: must be the name in a certificate"
+        )
 
     def test_ten_mistakes_are_reported_in_one_run(self, tmp_path: Path) -> None:
         raw = json.loads(ORIGINAL.read_text())

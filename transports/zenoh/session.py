@@ -18,6 +18,7 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.settings import TlsSettings, ZenohSettings
+from pebble.transports.zenoh import wire
 
 # Zenoh reads this once, before the first session. By default connections are accepted, opened and read on separate
 # runtimes: a received message wakes a thread that only wakes another one. Measured with 1.10.2 (40 B at 200 Hz, round
@@ -33,6 +34,18 @@ _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor":
 _TLS_SCHEMES = ("tls/", "quic/")
 _SAFE_SCHEMES = (*_TLS_SCHEMES, "unixsock-stream/")
 _LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
+
+_MESSAGES = [
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+]
 
 
 class _Closable(Protocol):
@@ -73,6 +86,7 @@ def open_session(config: str) -> zenoh.Session:
 
 def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: list[Path]) -> dict[str, Any]:
     return {
+        **_access_control(settings.allowed_names),
         "mode": mode,
         "listen": {"endpoints": [*map(unix_endpoint, listen), *settings.listen]},
         "connect": {"endpoints": [*map(unix_endpoint, connect), *settings.connect], "retry": _RETRY},
@@ -126,6 +140,35 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
         link |= {f"{side}_{what}": path for side in ("listen", "connect") for what, path in own.items()}
         link["enable_mtls"] = tls.ca_cert is not None
     return {"tls": link}
+
+
+def _access_control(names: tuple[str, ...] | None) -> dict[str, Any]:
+    """Let connections of this machine do everything, and of those with a certificate the ones with these names.
+
+    Zenoh does not refuse the others, but drops whatever they send, and sends them nothing. It reads this once.
+    """
+    if names is None:
+        return {}
+    subjects: list[dict[str, Any]] = [{"id": "this machine", "link_protocols": ["unixsock-stream", "tcp"]}]
+    if names:
+        subjects.append({"id": "allowed", "link_protocols": ["tls", "quic"], "cert_common_names": list(names)})
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [
+                {
+                    "id": "everything",
+                    "permission": "allow",
+                    "flows": ["ingress", "egress"],
+                    "messages": _MESSAGES,
+                    "key_exprs": wire.ALL_KEYS,
+                }
+            ],
+            "subjects": subjects,
+            "policies": [{"rules": ["everything"], "subjects": [subject["id"] for subject in subjects]}],
+        }
+    }
 
 
 # -- forks and exits

@@ -24,6 +24,7 @@ UP = "@up/"  # + name: liveliness token of a hub
 LIVE = "@live/"  # + name: liveliness token of a client
 HELLO = "@hub/hello"  # query: name, digests of retained messages, will; the answer lists the keys the hub lacks
 BYE = "@hub/bye"  # query: remove my will, I have published it myself
+ALL_KEYS = ("**", *(f"{prefix}**" for prefix in (RETAINED, SYNC, UP, LIVE, "@hub/")))
 
 # How put() and get() treat a message. Not `express`: it is no faster here (64 B at 200 Hz: p50 108 against 112 us), and
 # it gives each message a batch of its own, so that 1.5 s of 200 Hz fill the queue to a stopped sibling.

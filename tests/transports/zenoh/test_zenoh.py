@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -22,6 +23,7 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.runtime.hub import run_hub
 from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
+from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh import transport as zenoh_transport
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub import ZenohHub
@@ -580,6 +582,45 @@ def test_two_robots_linked_by_tls_share_one_link_and_no_more(robot: Robot, tmp_p
         assert (b"stranger" in received.payloads, bystander.payloads) == (False, [b"end"])
     finally:
         other.end()
+
+
+@pytest.mark.parametrize("scheme", ["tls", "quic"])
+def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path, scheme: str) -> None:
+    """The others have the same authority, and are connected."""
+    endpoint = f"{scheme}/localhost:{free_port()}"
+    listening = {"listen": (endpoint,), "tls": _tls("server"), "allowed_names": ("client",)}
+    local = ZenohSettings(run_dir=tmp_path / "run")
+    elsewhere = ZenohSettings(run_dir=tmp_path / "other", connect=(endpoint,), client=True)
+    with contextlib.ExitStack() as stack:
+        hub = ZenohHub(replace(local, **listening)).open()
+        stack.callback(hub.close)
+        robot = stack.enter_context(create("zenoh", "robot", local))
+        received = Recorder(robot)
+        stranger = stack.enter_context(stranger_at(replace(elsewhere, tls=_tls("server"))))
+        overheard: list[str] = []
+        take = zenoh.handlers.Callback(lambda sample: overheard.append(str(sample.key_expr)), indirect=False)
+        stranger.declare_subscriber("**", take, allowed_origin=zenoh.Locality.REMOTE)
+        stranger.put("drive", b"stranger")
+        stamp = wire.Stamp(DELIVERED, 1, "stranger").pack()
+        stranger.put(wire.RETAINED + "parked", b"stranger", attachment=stamp)
+        assert list(stranger.get(wire.RETAINED + "**", timeout=0.5)) == []
+        guest = stack.enter_context(create("zenoh", "guest", replace(elsewhere, tls=_tls("client"))))
+        heard = Recorder(guest)
+        assert until(lambda: guest.publish("drive", b"guest", qos=DELIVERED) and b"guest" in received.payloads)
+        robot.publish("state", b"robot", qos=DELIVERED, retain=True)
+        assert until(lambda: b"robot" in heard.payloads and retained_of(hub) == {"state": b"robot"})
+        assert (overheard, b"stranger" in received.payloads) == ([], False)
+
+
+@contextlib.contextmanager
+def stranger_at(settings: ZenohSettings) -> Iterator[zenoh.Session]:
+    """A program that speaks Zenoh as it likes, connected to ``settings.connect``."""
+    session = zenoh_session.open_session(zenoh_session.session_config(settings, "client", listen=[], connect=[]))
+    try:
+        assert until(lambda: list(session.info.routers_zid()))
+        yield session
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
 
 
 def _tls(name: str) -> TlsSettings:
