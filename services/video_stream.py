@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 from pebble.errors import ConfigError, DeviceError
+from pebble.runtime.environment import child_environment
 from pebble.runtime.parent import tied_to_parent
 from pebble.runtime.process import run
 from pebble.runtime.service import Service, every
@@ -34,7 +35,7 @@ class VideoStream(Service):
             self._program = subprocess.Popen(
                 tied_to_parent(options.command),
                 cwd=options.cwd,
-                env={**os.environ, **options.env},
+                env=child_environment(options.env),
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # what it starts ends with it
             )

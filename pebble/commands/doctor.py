@@ -11,6 +11,7 @@ import typer
 
 from pebble.config import load
 from pebble.doctor import Finding, Level
+from pebble.runtime.environment import withhold
 
 _COLOURS = {Level.OK: typer.colors.GREEN, Level.WARN: typer.colors.YELLOW, Level.FAIL: typer.colors.RED}
 _INDENT = " " * 6
@@ -30,7 +31,10 @@ def doctor(
     from pebble.doctor.checks import run_checks  # of Linux only
 
     counts = dict.fromkeys(Level, 0)
-    for finding in run_checks(None if config is None else load(config)):
+    loaded = None if config is None else load(config)
+    if loaded is not None:
+        withhold(loaded.password_variables)
+    for finding in run_checks(loaded):
         counts[finding.level] += 1
         _print(finding)
     failed, warned = counts[Level.FAIL], counts[Level.WARN]

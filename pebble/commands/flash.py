@@ -17,6 +17,7 @@ from pebble.flash.boards import FIRMWARE, Firmware, firmware_named
 from pebble.flash.private import PrivateFiles, check_broker, private_files
 from pebble.flash.steps import FlashOptions, execute, show_steps
 from pebble.flash.tools import Tools
+from pebble.runtime.environment import withhold
 
 WIFI_PASSWORD = "PEBBLE_WIFI_PASSWORD"  # noqa: S105 - the name of an environment variable
 _OF_PLATFORM = {"esp32": "minilamp", "esp8266": "benjr"}
@@ -66,6 +67,7 @@ def flash(
         micropython=micropython,
         verify=verify,
     )
+    withhold((WIFI_PASSWORD, *(() if config is None else config.password_variables)))
     if dry_run:
         show_steps(options, Tools(), typer.echo)
         return 0

@@ -179,6 +179,7 @@ def _variable(reader: Reader, name: str, path: Path) -> str | None:
     if name not in reader.env:
         reader.notes.problem(path, f"the environment variable {name} is not set, set it before the start")
         return None
+    reader.password_variables[name] = None
     return reader.env[name]
 
 

@@ -36,6 +36,7 @@ class Config(Root, frozen=True, kw_only=True):
     warnings: tuple[str, ...]  # one line each
     run_folder: Path
     state_folder: Path
+    password_variables: tuple[str, ...]  # of the environment: those that passwords were read from
 
     @property
     def base(self) -> str:
@@ -140,6 +141,7 @@ def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -
         warnings=reader.notes.warning_lines(),
         run_folder=_run_folder(root, identity.base, env),
         state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
+        password_variables=tuple(reader.password_variables),
     )
 
 

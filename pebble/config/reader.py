@@ -24,6 +24,7 @@ class Reader:
 
     def __init__(self, folder: Path, env: Mapping[str, str], checks: Mapping[type[Section], Check]) -> None:
         self.folder, self.env, self.notes = folder, env, problems.Notes()
+        self.password_variables: dict[str, None] = {}  # those that were read, in order
         self._checks = checks
 
     def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
 from pebble.runtime.connections import local_transport
+from pebble.runtime.environment import withhold
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
 from pebble.runtime.service import Service
 
@@ -38,6 +39,7 @@ def run(
     set_up_logging("INFO")
     try:
         config = config_of_process(arguments[0])
+        withhold(config.password_variables)
         program = f"{service_class.name}:{instance}" if instance else service_class.name
         logging.getLogger().setLevel(config.log_level_of(program))
         view = view_of(config, instance)

@@ -25,7 +25,7 @@ from pebble.services.autonomy_manager.describe import (
     read_manifest,
     stamp,
 )
-from pebble.services.autonomy_manager.environment import environment
+from pebble.services.autonomy_manager.environment import environment, local_login
 from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting, form
 from pebble.services.autonomy_manager.script import Dependency, Script
 
@@ -116,6 +116,7 @@ class Catalogue:
             broken = self._answers.broken(name)
             described = _merged(described, answer or Description())
         settings = self._settings(name, section, described, ours=ours)
+        login = local_login(self._config) if ours or not section.arbitrate else {}  # the others get the gate's
         return Script(
             file=name,
             label=(section.display_name or described.label or name)[:_LONGEST_NAME],
@@ -123,7 +124,7 @@ class Catalogue:
             folder=section.cwd or folder,
             settings=settings,
             dependencies=_dependencies(name, section, described, ours=ours),
-            environment={**self._section.env, **section.env},
+            environment={**login, **self._section.env, **section.env},
             ours=ours,
             arbitrate=section.arbitrate,
             broken=broken,

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 
-from pebble.runtime.parent import ENCODING, LAUNCHER_PID, NOTIFY_FD, WANTED
+from pebble.config import Config
+from pebble.runtime.environment import child_environment
 from pebble.runtime.runs import CONFIG, RUN
-
-_LAUNCHERS = (ENCODING, LAUNCHER_PID, NOTIFY_FD, WANTED)  # between the launcher and this process
 
 
 def environment(*more: Mapping[str, str]) -> dict[str, str]:
     """This process's variables and ``more`` of them; later ones replace earlier ones."""
-    inherited = {name: value for name, value in os.environ.items() if name not in (*_LAUNCHERS, RUN, CONFIG)}
-    merged = {"PYTHONUNBUFFERED": "1", **inherited}  # else what it prints comes in blocks, long after the event
+    merged = {"PYTHONUNBUFFERED": "1", **child_environment()}  # else what it prints comes in blocks, long after
+    for name in (RUN, CONFIG):
+        merged.pop(name, None)
     for variables in more:
         merged |= variables
     return merged
+
+
+def local_login(config: Config) -> dict[str, str]:
+    """The variable with the password of the robot's own broker, for a script that connects to it itself."""
+    local = config.local_mqtt
+    if config.transport.kind != "mqtt" or local.password_env is None:
+        return {}
+    return {local.password_env: str(local.password or "")}

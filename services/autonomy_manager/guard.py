@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.errors import PebbleError
+from pebble.runtime.environment import child_environment
 
 # Each line of its input is the whole list, "TERM:123 KILL:456"; at the end of the input, this process has ended.
 # A process that is killed cannot do this itself, and the kernel's parent death signal reaches only a script's first
@@ -116,6 +117,7 @@ class Guard:
     def _start(self, read_end: int) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             ["sh", "-c", _PROGRAM],
+            env=child_environment(),
             stdin=read_end,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, cast
 
 from pebble.errors import DeviceError
+from pebble.runtime.environment import child_environment
 from pebble.runtime.parent import tied_to_parent
 
 SILENCE_S = 3.0  # without output: the device hangs
@@ -33,6 +34,7 @@ class CaptureProgram:
         try:
             self._process = subprocess.Popen(
                 tied_to_parent(command),
+                env=child_environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,

@@ -9,14 +9,18 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import IO, Final
 
 from pebble.config import MqttBridge, SystemControl
 from pebble.contract import GIT_PULL, REBOOT, SERVICE_RESTART, Channel
+from pebble.runtime.environment import child_environment
 
 log = logging.getLogger(__name__)
 
-_LINE_CHARS = 2048  # of a command's output, per log record
+#: Of one run's output that are saved; the rest is read and dropped.
+OUTPUT_BYTES: Final = 256 * 1024
+_CHUNK = 65536
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +39,19 @@ ACTIONS: Final = (
 
 
 class Action:
-    """Runs one command at a time, no more often than its cooldown allows. Not thread-safe."""
+    """Runs one command at a time, no more often than its cooldown allows. Not thread-safe.
 
-    def __init__(self, name: str, control: SystemControl, *, clock: Callable[[], float] = time.monotonic) -> None:
+    Operators read the log, and a command's words or output may hold a token: they stay in a file in ``folder``.
+    """
+
+    def __init__(
+        self, name: str, control: SystemControl, *, folder: Path, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.name, self.control = name, control
+        self._output = folder / f"{name.rpartition('/')[2]}.log"
         self._clock = clock
         self._ran_at: float | None = None
-        self._process: subprocess.Popen[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._warned = False
 
     def request(self) -> bool:
@@ -60,24 +70,22 @@ class Action:
         return self._start()
 
     def _start(self) -> bool:
-        log.warning("%s: running %s", self.name, " ".join(self.control.command))
+        log.warning("%s: running its command", self.name)
         try:
             self._process = subprocess.Popen(
                 self.control.command,
                 cwd=self.control.cwd,
-                env={**os.environ, **self.control.env},
+                env=child_environment(self.control.env),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
                 start_new_session=True,  # a command that restarts this process must survive its end
             )
         except OSError as error:
-            log.error("%s failed: %s", self.name, error)
+            log.error("%s failed: its command or cwd: %s", self.name, error.strerror)
             return False
         threading.Thread(
-            target=_follow, args=(self.name, self._process), name=f"action {self.name}", daemon=True
+            target=_follow, args=(self.name, self._process, self._output), name=f"action {self.name}", daemon=True
         ).start()
         return True
 
@@ -90,9 +98,10 @@ class Action:
 class SystemActions:
     """The whole table, for one robot's config."""
 
-    def __init__(self, section: MqttBridge, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, section: MqttBridge, *, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._actions = {
-            row.channel: Action(row.channel.metric, getattr(section, row.section), clock=clock) for row in ACTIONS
+            row.channel: Action(row.channel.metric, getattr(section, row.section), folder=folder, clock=clock)
+            for row in ACTIONS
         }
 
     def accepts_retained(self, channel: Channel) -> bool:
@@ -105,11 +114,28 @@ class SystemActions:
         return self._actions[channel].request()
 
 
-def _follow(name: str, process: subprocess.Popen[str]) -> None:
-    """Log the command's output and its exit code."""
+def _follow(name: str, process: subprocess.Popen[bytes], path: Path) -> None:
+    """Save the command's output, and log its exit code."""
     assert process.stdout is not None  # noqa: S101  (PIPE above)
+    where = f"is in {path}"
     with process.stdout as output:
-        while line := output.readline(_LINE_CHARS):
-            log.info("%s: %s", name, line.rstrip())
+        try:
+            _save(output, path)
+        except OSError as error:
+            where = f"is lost: {error.strerror}: {path}"
+        while output.read(_CHUNK):  # the command must not wait for a full pipe
+            pass
     code = process.wait()
-    log.log(logging.INFO if code == 0 else logging.ERROR, "%s ended with exit code %d", name, code)
+    log.log(
+        logging.INFO if code == 0 else logging.ERROR, "%s ended with exit code %d, its output %s", name, code, where
+    )
+
+
+def _save(output: IO[bytes], path: Path) -> None:
+    """Replace the file by the beginning of ``output``, as it is written. Raises OSError."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+    with os.fdopen(os.open(path, flags, 0o600), "wb", buffering=0) as file:
+        left = OUTPUT_BYTES
+        while left and (chunk := os.read(output.fileno(), min(left, _CHUNK))):
+            left -= file.write(chunk)

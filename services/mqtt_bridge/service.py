@@ -54,7 +54,7 @@ class MqttBridge(Service):
         self._local_subscriptions: list[Subscription] = []
         self._remote_subscriptions: list[Subscription] = []
         self._same_broker = SameBrokerProbe(self.config, self.transport, self._remote, self.clock)
-        self._actions = SystemActions(section, clock=self.clock)
+        self._actions = SystemActions(section, folder=self.config.state_dir(), clock=self.clock)
         self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), Notifier().request)
         self._private = PrivateTopics(self.config.base)
         self._subjects = Subjects(self.config)

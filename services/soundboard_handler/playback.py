@@ -16,6 +16,7 @@ from msgspec import Struct
 
 from pebble.config import Config
 from pebble.media.player import filled
+from pebble.runtime.environment import child_environment
 from pebble.runtime.parent import tied_to_parent
 from pebble.services.soundboard_handler.clips import Clip
 from pebble.services.soundboard_handler.feed import Feed
@@ -51,7 +52,7 @@ class Players(Struct, frozen=True):
             tied_to_parent(words),
             stdin=stdin,
             cwd=self.cwd,
-            env={**os.environ, **self.env},
+            env=child_environment(self.env),
             start_new_session=True,  # what the player starts is stopped with it
             **options,
         )

@@ -23,11 +23,14 @@ from tests.support import Child, gone, until
 STREAMER = """
 import os, subprocess, sys, time
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-print("streaming as", os.environ["STREAM_NAME"], flush=True)
+print("streaming as", os.environ["STREAM_NAME"], repr(os.environ["UPLINK"]), flush=True)
 open("pids.new", "w").write(f"{os.getpid()} {child.pid}")
 os.rename("pids.new", "pids")
 time.sleep(60)
 """
+
+
+REMOTE = {"host": "far", "username": "pit", "password_env": "UPLINK"}
 
 
 class Stream:
@@ -39,13 +42,13 @@ class Stream:
         raw = {
             "robot": {"id": "pitcam"},
             "transport": {"kind": "zenoh", "run_dir": str(folder / "run")},
-            "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}, "video_stream": section},
+            "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": REMOTE}, "video_stream": section},
         }
         config = folder / "pitcam.json"
         config.write_text(json.dumps(raw))
         self.process = Child(
             [sys.executable, "-m", "pebble.services.video_stream", str(config)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**os.environ, "UPLINK": "topsecret"},
         )  # fmt: skip
 
     def pids(self) -> list[int]:
@@ -71,7 +74,7 @@ def test_the_program_runs_and_ends_with_all_it_started(streaming: Stream) -> Non
     assert not any(gone(pid) for pid in pids)
     streaming.process.terminate()
     code, output = streaming.ended()
-    assert (code, "streaming as pit" in output) == (0, True)
+    assert (code, "streaming as pit ''" in output) == (0, True)
     assert until(lambda: all(gone(pid) for pid in pids), 5)
 
 

@@ -197,6 +197,21 @@ def test_what_another_python_runs_may_be_written_for_that(tmp_path: Path) -> Non
     assert scripts(tmp_path, scripts={"old": {"python": "python2"}})["old"].broken == ""
 
 
+def test_only_a_script_without_a_gate_gets_the_password_of_the_robots_broker(tmp_path: Path) -> None:
+    for name in ("foreign", "trusted"):
+        write(tmp_path, name)
+    raw = {
+        "robot": {"id": "rover"},
+        "local_mqtt": {"username": "rob", "password_env": "LOCAL"},
+        "services": {
+            "mqtt_bridge": {"remote_mqtt": {"username": "rob", "password_env": "UPLINK"}},
+            "autonomy_manager": {"autonomy_root": str(tmp_path), "scripts": {"trusted": {"arbitrate": False}}},
+        },
+    }
+    found = scanned(Catalogue(parse(raw, folder=tmp_path, env={"LOCAL": "near", "UPLINK": "topsecret"})))
+    assert {name: script.environment for name, script in found.items()} == {"foreign": {}, "trusted": {"LOCAL": "near"}}
+
+
 def test_the_list_is_bounded(tmp_path: Path) -> None:
     for number in range(MAX_SCRIPTS + 5):
         write(tmp_path, f"s{number:03}")

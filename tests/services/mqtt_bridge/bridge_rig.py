@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import threading
 import time
 from pathlib import Path
@@ -39,7 +40,7 @@ def make_config(
             "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}, **bridge},
         },
     }
-    return parse(raw, folder=Path.cwd(), env={})
+    return parse(raw, folder=Path.cwd(), env={"XDG_STATE_HOME": os.environ["XDG_STATE_HOME"]})
 
 
 class Client:

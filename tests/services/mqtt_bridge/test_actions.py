@@ -12,7 +12,7 @@ import pytest
 
 from pebble.config import SystemControl
 from pebble.contract import CHANNELS, Kind
-from pebble.services.mqtt_bridge.actions import ACTIONS, Action, SystemActions
+from pebble.services.mqtt_bridge.actions import ACTIONS, OUTPUT_BYTES, Action, SystemActions
 from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import until
 
@@ -46,9 +46,9 @@ def test_cooldowns_unless_configured(section: str, cooldown_s: float) -> None:
     assert getattr(make_config().services.mqtt_bridge, section).cooldown_seconds == cooldown_s
 
 
-def test_a_cooldown_begins_with_the_first_run_and_not_with_the_machine() -> None:
+def test_a_cooldown_begins_with_the_first_run_and_not_with_the_machine(tmp_path: Path) -> None:
     clock = Clock()
-    action = Action("reboot", control("pass", cooldown_seconds=30), clock=clock)
+    action = Action("reboot", control("pass", cooldown_seconds=30), folder=tmp_path, clock=clock)
     assert action.request()
     assert finished(action)
     clock.now = 29.9
@@ -58,8 +58,8 @@ def test_a_cooldown_begins_with_the_first_run_and_not_with_the_machine() -> None
     assert finished(action)
 
 
-def test_zero_is_a_cooldown() -> None:
-    action = Action("reboot", control("pass", cooldown_seconds=0.0), clock=Clock())
+def test_zero_is_a_cooldown(tmp_path: Path) -> None:
+    action = Action("reboot", control("pass", cooldown_seconds=0.0), folder=tmp_path, clock=Clock())
     for _ in range(3):
         assert action.request()
         assert finished(action)
@@ -67,7 +67,8 @@ def test_zero_is_a_cooldown() -> None:
 
 def test_refused_while_it_runs(tmp_path: Path) -> None:
     gate = tmp_path / "gate"
-    action = Action("git-pull", control(f"import os\nwhile not os.path.exists({str(gate)!r}): pass"), clock=Clock())
+    code = f"import os\nwhile not os.path.exists({str(gate)!r}): pass"
+    action = Action("git-pull", control(code), folder=tmp_path, clock=Clock())
     assert action.request()
     assert not action.request()
     gate.touch()
@@ -79,7 +80,8 @@ def test_refused_while_it_runs(tmp_path: Path) -> None:
 def test_runs_without_a_shell_in_its_folder_with_its_environment(tmp_path: Path) -> None:
     code = "import os, sys; open('said', 'w').write(os.environ['MARK'] + sys.argv[1])"
     words = (sys.executable, "-c", code, "; touch oops $MARK")
-    action = Action("git-pull", SystemControl(command=words, cwd=tmp_path, env={"MARK": "m"}), clock=Clock())
+    as_configured = SystemControl(command=words, cwd=tmp_path, env={"MARK": "m"})
+    action = Action("git-pull", as_configured, folder=tmp_path, clock=Clock())
     assert action.request()
     assert finished(action)
     assert (tmp_path / "said").read_text() == "m; touch oops $MARK"
@@ -88,33 +90,57 @@ def test_runs_without_a_shell_in_its_folder_with_its_environment(tmp_path: Path)
 
 def test_a_line_of_text_is_split_as_a_shell_would(tmp_path: Path) -> None:
     section = {"git_pull_control": {"command": f'{sys.executable} -c \'open("made here", "w")\'', "cwd": str(tmp_path)}}
-    actions = SystemActions(make_config(**section).services.mqtt_bridge)
+    actions = SystemActions(make_config(**section).services.mqtt_bridge, folder=tmp_path)
     assert actions.request(next(row.channel for row in ACTIONS if row.section == "git_pull_control"))
     assert until(lambda: (tmp_path / "made here").exists())
 
 
-def test_its_output_and_its_exit_code_are_logged(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    action = Action("git-pull", control("import sys; print('Already up to date.'); sys.exit(3)"), clock=Clock())
+def test_its_words_and_its_output_stay_in_a_file_on_the_robot(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    code = "import sys; print('pulls from https://deploy:ghp_TOKEN@git.example'); sys.exit(3)"
+    action = Action("flags/git-pull", control(code), folder=tmp_path / "state", clock=Clock())
     assert action.request()
-    assert until(lambda: "git-pull ended with exit code 3" in caplog.messages)
-    assert "git-pull: Already up to date." in caplog.messages
+    output = tmp_path / "state" / "git-pull.log"
+    assert until(lambda: f"flags/git-pull ended with exit code 3, its output is in {output}" in caplog.messages)
+    assert "TOKEN" not in caplog.text
+    assert output.read_text() == "pulls from https://deploy:ghp_TOKEN@git.example\n"
+    assert output.stat().st_mode & 0o777 == 0o600
 
 
-def test_a_missing_command_is_one_warning(caplog: pytest.LogCaptureFixture) -> None:
-    action = Action("reboot", SystemControl(), clock=Clock())
+def test_the_file_holds_the_newest_run_and_a_part_of_endless_output(tmp_path: Path) -> None:
+    action = Action("git-pull", control("print('x' * 1_000_000)", cooldown_seconds=0), folder=tmp_path, clock=Clock())
+    for _ in range(2):
+        assert action.request()
+        assert finished(action)
+        assert until(lambda: (tmp_path / "git-pull.log").stat().st_size == OUTPUT_BYTES)
+
+
+def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    (tmp_path / "state").touch()  # a file where the folder is expected
+    action = Action("git-pull", control("print('done')"), folder=tmp_path / "state", clock=Clock())
+    assert action.request()
+    assert until(lambda: "git-pull ended with exit code 0, its output is lost: File exists: " in caplog.text)
+
+
+def test_a_missing_command_is_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    action = Action("reboot", SystemControl(), folder=tmp_path, clock=Clock())
     assert [action.request() for _ in range(5)] == [False] * 5
     assert len([record for record in caplog.records if record.levelno == logging.WARNING]) == 1
 
 
-def test_a_program_that_is_not_there_is_an_error_and_no_more(caplog: pytest.LogCaptureFixture) -> None:
-    assert not Action("reboot", SystemControl(command=("/no/such/program",)), clock=Clock()).request()
-    assert "reboot failed" in caplog.text
+def test_a_program_that_is_not_there_is_an_error_that_does_not_quote_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    action = Action("reboot", SystemControl(command=("/no/such/TOKEN",)), folder=tmp_path, clock=Clock())
+    assert not action.request()
+    assert "reboot failed: its command or cwd: No such file or directory" in caplog.text
+    assert "TOKEN" not in caplog.text
 
 
-def test_leaves_no_thread_behind() -> None:
+def test_leaves_no_thread_behind(tmp_path: Path) -> None:
     before = threading.active_count()
-    action = Action("reboot", control("pass"), clock=Clock())
+    action = Action("reboot", control("pass"), folder=tmp_path, clock=Clock())
     assert action.request()
     assert finished(action)
     assert until(lambda: threading.active_count() == before)
