@@ -15,6 +15,7 @@ from typing import IO, Final
 from pebble.config import MqttBridge, SystemControl
 from pebble.contract import GIT_PULL, REBOOT, SERVICE_RESTART, Channel
 from pebble.runtime.environment import child_environment
+from pebble.runtime.rate_limit import RateLimitedLog
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ class Action:
         self._ran_at: float | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._warned = False
+        self._log = RateLimitedLog(log, period_s=2.0)  # all actions together: six lines a second
 
     def request(self) -> bool:
         """Run the command; False, with a log line, if that is refused."""
@@ -60,17 +62,17 @@ class Action:
             self._warn_of_missing_command()
             return False
         if self._process is not None and self._process.poll() is None:
-            log.warning("%s refused: it is still running", self.name)
+            self._log.warning("refused", "%s refused: it is still running", self.name)
             return False
         now = self._clock()
         if self._ran_at is not None and now - self._ran_at < self.control.cooldown_seconds:
-            log.warning("%s refused: it ran %.0f s ago", self.name, now - self._ran_at)
+            self._log.warning("refused", "%s refused: it ran %.0f s ago", self.name, now - self._ran_at)
             return False
         self._ran_at = now
         return self._start()
 
     def _start(self) -> bool:
-        log.warning("%s: running its command", self.name)
+        self._log.log("running", logging.WARNING, "%s: running its command", self.name)
         try:
             self._process = subprocess.Popen(
                 self.control.command,
@@ -82,12 +84,25 @@ class Action:
                 start_new_session=True,  # a command that restarts this process must survive its end
             )
         except OSError as error:
-            log.error("%s failed: its command or cwd: %s", self.name, error.strerror)
+            self._log.log("failed", logging.ERROR, "%s failed: its command or cwd: %s", self.name, error.strerror)
             return False
-        threading.Thread(
-            target=_follow, args=(self.name, self._process, self._output), name=f"action {self.name}", daemon=True
-        ).start()
+        threading.Thread(target=self._follow, args=(self._process,), name=f"action {self.name}", daemon=True).start()
         return True
+
+    def _follow(self, process: subprocess.Popen[bytes]) -> None:
+        """Save the command's output, and log its exit code."""
+        assert process.stdout is not None  # noqa: S101  (PIPE above)
+        where = f"is in {self._output}"
+        with process.stdout as output:
+            try:
+                _save(output, self._output)
+            except OSError as error:
+                where = f"is lost: {error.strerror}: {self._output}"
+            while output.read(_CHUNK):  # the command must not wait for a full pipe
+                pass
+        code = process.wait()
+        level = logging.INFO if code == 0 else logging.ERROR
+        self._log.log("ended", level, "%s ended with exit code %d, its output %s", self.name, code, where)
 
     def _warn_of_missing_command(self) -> None:
         if not self._warned:
@@ -112,23 +127,6 @@ class SystemActions:
     def request(self, channel: Channel) -> bool:
         """Run the command of ``channel``; False if it is refused."""
         return self._actions[channel].request()
-
-
-def _follow(name: str, process: subprocess.Popen[bytes], path: Path) -> None:
-    """Save the command's output, and log its exit code."""
-    assert process.stdout is not None  # noqa: S101  (PIPE above)
-    where = f"is in {path}"
-    with process.stdout as output:
-        try:
-            _save(output, path)
-        except OSError as error:
-            where = f"is lost: {error.strerror}: {path}"
-        while output.read(_CHUNK):  # the command must not wait for a full pipe
-            pass
-    code = process.wait()
-    log.log(
-        logging.INFO if code == 0 else logging.ERROR, "%s ended with exit code %d, its output %s", name, code, where
-    )
 
 
 def _save(output: IO[bytes], path: Path) -> None:

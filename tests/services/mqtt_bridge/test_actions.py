@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,24 @@ def test_a_program_that_is_not_there_is_an_error_that_does_not_quote_it(
     assert not action.request()
     assert "reboot failed: its command or cwd: No such file or directory" in caplog.text
     assert "TOKEN" not in caplog.text
+
+
+@pytest.mark.parametrize("command", [(sys.executable, "-c", "input()"), ("/no/such/program",)])
+@pytest.mark.parametrize("cooldown_s", [0, 1000])
+def test_a_flood_of_requests_is_a_few_lines_of_the_log(
+    command: tuple[str, ...], cooldown_s: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    controls = {
+        row.section: {"command": list(command), "cooldown_seconds": cooldown_s, "cwd": str(tmp_path)} for row in ACTIONS
+    }
+    actions = SystemActions(make_config(**controls).services.mqtt_bridge, folder=tmp_path)
+    threads, before = threading.active_count(), time.monotonic()
+    for _ in range(40):
+        for row in ACTIONS:
+            actions.request(row.channel)
+    assert until(lambda: threading.active_count() == threads)
+    assert len(caplog.records) <= 10 * max(1.0, time.monotonic() - before)
 
 
 def test_leaves_no_thread_behind(tmp_path: Path) -> None:
