@@ -16,26 +16,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.errors import TransportError
+from pebble.transports.socket_paths import check_socket_path
 
 log = logging.getLogger(__name__)
 
-_SOCKET_PATH_LIMIT = 108  # bytes, sizeof(sun_path): a longer path cannot be bound
 _OWNER_BYTES = 200
 _RESERVED = "?#;"  # these separate the parts of a Zenoh endpoint
-
-
-def fits_socket(path: Path) -> bool:
-    """Whether a unix socket can have this path."""
-    return len(os.fsencode(path)) < _SOCKET_PATH_LIMIT
-
-
-def check_socket_path(path: Path) -> None:
-    """Raise TransportError if ``path`` is too long for a unix socket."""
-    if not fits_socket(path):
-        raise TransportError(
-            f"{path} is too long for a unix socket (limit {_SOCKET_PATH_LIMIT - 1} bytes): "
-            "set transport.run_dir to a shorter path"
-        )
 
 
 def prepare_run_dir(run_dir: Path) -> None:

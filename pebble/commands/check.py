@@ -12,10 +12,10 @@ import typer
 from pebble.config import Config, Mqtt, RemoteConnection, load, resolved
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
-from pebble.errors import ConfigError
+from pebble.errors import ConfigError, TransportError
 from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
-from pebble.runtime.connections import check_kinds
+from pebble.runtime.connections import check_connections, tls_settings
 from pebble.runtime.process import view_of
 
 SCHEMA = "schema.json"  # in the folder of configs, so `configs/*.json` includes it
@@ -54,7 +54,8 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         return True
     try:
         config = load(path)
-        check_kinds(config)
+        check_connections(config)
+        _check_certificates(config)
     except ConfigError as error:
         for problem in error.problems:
             typer.echo(f"pebble: {path.name}: {problem}", err=True)
@@ -66,6 +67,32 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         typer.echo()
     _print(config, path)
     return True
+
+
+def _check_certificates(config: Config) -> None:
+    """Raise ConfigError for files and ciphers of TLS that a connection would refuse."""
+    bridge, transport = config.services.mqtt_bridge, config.transport
+    sections = {
+        "local_mqtt": config.local_mqtt.tls,
+        "transport": transport.tls,
+        "transport.mqtt_mirror": None if transport.mqtt_mirror is None else transport.mqtt_mirror.tls,
+        "services.mqtt_bridge.remote_mqtt": bridge.remote_mqtt.tls,
+        "services.mqtt_bridge.remote": None if bridge.remote is None else bridge.remote.tls,
+        "web_interface.mqtt": config.web_interface.mqtt.tls,
+    }
+    problems = []
+    for place, section in sections.items():
+        settings = None if section is None else tls_settings(section)
+        if settings is None:
+            continue
+        from pebble.transports.tls import make_context  # ssl, which few configs need
+
+        try:
+            make_context(settings)
+        except TransportError as error:
+            problems.append(f"{place}.{error}")
+    if problems:
+        raise ConfigError(problems)
 
 
 def _print(config: Config, path: Path) -> None:

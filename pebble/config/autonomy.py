@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pebble.config.types import EMPTY, File, HandlerTopics, Interval, Seconds, Section, ServiceSection, doc
+from pebble.config.types import EMPTY, File, HandlerTopics, Interval, Seconds, Section, ServiceSection, Variables, doc
 
 
 class ScriptArgument(Section, frozen=True, kw_only=True):
@@ -42,7 +42,7 @@ class Script(Section, frozen=True, kw_only=True):
         doc("Sign the drive commands of a script that does not sign them itself, so that people go first."),
     ] = True
     cwd: Annotated[File | None, doc("Folder to run it in; unset: its own.")] = None
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     args: Annotated[tuple[ScriptArgument, ...], doc("Its settings.")] = ()
     dependencies: Annotated[tuple[ScriptDependency, ...], doc("Scripts that must run too.")] = ()
 
@@ -60,6 +60,6 @@ class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
         Literal["resume", "stop"],
         doc("When a person drives: `resume` lets the script go on once the person has let go, `stop` ends it."),
     ] = "resume"
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
     scripts: Annotated[dict[str, Script], doc("Scripts by folder.")] = EMPTY

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
+from pebble.config.shared_topics import shared_topics
 from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
 from pebble.config.types import Secret
@@ -18,6 +19,7 @@ from pebble.contract.identity import SERVERS
 
 _LATER = ("ros1_bridge",)
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
+_LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
 
 
@@ -31,6 +33,9 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         reader.notes.problem(("robot", "type"), f'must not be "{SERVERS}": those are operators\' servers, not robots')
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
+    if not reader.notes.problems:
+        for path, other in shared_topics(root):
+            reader.notes.problem(path, f"is also the topic of {other.suffix}, choose another")
     return root
 
 
@@ -162,17 +167,27 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     if len(given) > 1:
         reader.notes.problem((*path, given[1]), f"is a second password beside {given[0]}, leave one of them")
         return mqtt
+    if mqtt.host and not _is_host(mqtt.host):
+        reader.notes.problem((*path, "host"), "must be a name or address: 1 to 63 characters between dots, 253 in all")
+    if mqtt.username is not None and len(mqtt.username.encode()) > _LONGEST_TEXT:
+        reader.notes.problem((*path, "username"), f"is longer than MQTT carries, {_LONGEST_TEXT} bytes")
     if given and mqtt.username is None:
         reader.notes.warning((*path, given[0]), "is not sent: there is no username")
+    password: str | None = mqtt.password
     if mqtt.password_env is not None:
-        return _with_password(mqtt, _variable(reader, mqtt.password_env, (*path, "password_env")))
-    if mqtt.password_file is not None:
-        return _with_password(mqtt, _contents(reader, mqtt.password_file, (*path, "password_file")))
-    return mqtt
+        password = _variable(reader, mqtt.password_env, (*path, "password_env"))
+    elif mqtt.password_file is not None:
+        password = _contents(reader, mqtt.password_file, (*path, "password_file"))
+    if password is None:
+        return mqtt
+    if len(password.encode()) > _LONGEST_TEXT:
+        reader.notes.problem((*path, *given), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
+    return replace(mqtt, password=Secret(password))
 
 
-def _with_password(mqtt: Mqtt, password: str | None) -> Mqtt:
-    return mqtt if password is None else replace(mqtt, password=Secret(password))
+def _is_host(text: str) -> bool:
+    """By its length, on which the system's resolver fails."""
+    return len(text) <= 253 and all(1 <= len(label) <= 63 for label in text.removesuffix(".").split("."))
 
 
 def _variable(reader: Reader, name: str, path: Path) -> str | None:

@@ -20,6 +20,7 @@ from pebble.config.types import (
     Section,
     ServiceSection,
     Topic,
+    Variables,
     doc,
 )
 from pebble.contract.encodings import SoundEncoding, VideoEncoding
@@ -76,7 +77,7 @@ class AvDaemon(ServiceSection, frozen=True, kw_only=True):
     restart_delay_seconds: Annotated[Seconds, doc("Wait before a failed device is opened again.")] = 2.0
     stop_timeout_seconds: Annotated[Seconds, doc("How long a device may take to close.")] = 5.0
     cwd: Annotated[File | None, doc("Folder to run in.")] = None
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     video: Annotated[CameraCapture, doc("Camera.")] = CameraCapture()
     audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
 
@@ -86,7 +87,7 @@ class VideoStream(ServiceSection, frozen=True, kw_only=True):
 
     command: Annotated[Command, doc("The program and its arguments, without a shell; required where enabled.")] = ()
     cwd: Annotated[File | None, doc("Folder to run in; unset: the launcher's.")] = None
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     webrtc_url: Annotated[str | None, doc("Where its pictures are shown; operator pages find it in the status.")] = None
 
 

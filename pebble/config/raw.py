@@ -12,6 +12,7 @@ from pebble.errors import ConfigError
 
 _SERVICES = tuple(name for name in Services.__struct_fields__ if isinstance(getattr(Services(), name), ServiceSection))
 _INTERVAL = "retained_publish_interval_seconds"
+_DEEPEST = 50  # levels: far more than any section has, and few enough for whatever reads it later
 
 
 class Pairs(list[tuple[str, Any]]):
@@ -56,6 +57,9 @@ def _hint(text: str, position: int) -> str:
 
 def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     """Make ``raw`` plain data: without comments; repeated keys and invalid values are problems."""
+    if len(path) > _DEEPEST:
+        notes.problem(path[:2], f"is nested more than {_DEEPEST} levels deep")
+        return None
     if isinstance(raw, dict):
         raw = Pairs(raw.items())
     if isinstance(raw, Pairs):
@@ -65,9 +69,9 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     if isinstance(raw, float) and not math.isfinite(raw):
         notes.problem(path, f"must be a number, not {raw}")
         return None
-    if isinstance(raw, str) and not _encodable(raw):
-        notes.problem(path, "holds half a character (a lone surrogate)")
-        return None
+    if isinstance(raw, str) and (flaw := _flaw(raw)):
+        notes.problem(path, f"holds {flaw}")
+        return ""
     return raw
 
 
@@ -76,18 +80,24 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
     for key, value in pairs:
         if key.startswith("//"):
             continue
+        if flaw := _flaw(key):
+            notes.problem(path, f"holds a key with {flaw}")
+            continue
         if key in data:
             notes.problem((*path, key), "occurs twice in one object, leave one of them")
         data[key] = plain(value, notes, (*path, key))
     return data
 
 
-def _encodable(text: str) -> bool:
+def _flaw(text: str) -> str:
+    """What no path, command, variable or message can hold; "" if there is nothing of it."""
+    if "\0" in text:
+        return "a NUL character (\\u0000), leave it out"
     try:
         text.encode()
     except UnicodeEncodeError:
-        return False
-    return True
+        return "half a character (a lone surrogate)"
+    return ""
 
 
 def inherit(raw: Any) -> Any:

@@ -73,7 +73,8 @@ class Reader:
         if get_origin(kind) is tuple:
             return self._list(get_args(kind)[0], raw, path)
         if get_origin(kind) is dict:
-            return self._map(get_args(kind)[1], raw, path)
+            name, item = get_args(kind)
+            return self._map(name, item, raw, path)
         if kind is Path:
             return self._path(raw, path) if isinstance(raw, str) else self._refuse(kind, metas, raw, path)
         if get_origin(kind) is Literal and isinstance(raw, str):
@@ -109,12 +110,13 @@ class Reader:
             self.notes.problem(path, f"cannot be split into words: {error}; write a list of words")
             return []
 
-    def _map(self, item: Any, raw: Any, path: problems.Path) -> Any:
+    def _map(self, name: Any, item: Any, raw: Any, path: problems.Path) -> Any:
         if not isinstance(raw, dict):
             self.notes.problem(path, f"must be an object {{…}}, not {_shown(raw)}")
             return _WRONG
         items = {key: self._value(item, value, (*path, key)) for key, value in raw.items()}
-        return {key: value for key, value in items.items() if value is not _WRONG}
+        named = {key: self._value(name, key, path) for key in raw}
+        return {key: value for key, value in items.items() if _WRONG not in (value, named[key])}
 
     def _refuse(self, kind: Any, metas: list[Meta], raw: Any, path: problems.Path) -> Any:
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)

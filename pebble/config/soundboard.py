@@ -4,7 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from pebble.config.types import EMPTY, Command, File, HandlerTopics, Seconds, Section, ServiceSection, doc
+from pebble.config.types import EMPTY, Command, File, HandlerTopics, Seconds, Section, ServiceSection, Variables, doc
 
 
 class Playback(Section, frozen=True, kw_only=True):
@@ -17,7 +17,7 @@ class Playback(Section, frozen=True, kw_only=True):
     stop_timeout: Annotated[Seconds, doc("How long the player may take to stop before it is killed.")] = 5.0
     scan_interval: Annotated[float, Meta(ge=1, le=86_400, description="Seconds between scans of the folder.")] = 10.0
     cwd: Annotated[File | None, doc("Folder to run the player in.")] = None
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     volume: Annotated[float, Meta(ge=0, le=1, description="1: as recorded; less: wav files are decoded, too.")] = 1.0
 
 

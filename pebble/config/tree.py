@@ -21,6 +21,7 @@ from pebble.config.types import (
     Section,
     ServiceSection,
     Topic,
+    Variables,
     doc,
 )
 from pebble.config.web import WebHandler, WebInterface
@@ -113,7 +114,7 @@ class SystemControl(Section, frozen=True, kw_only=True):
 
     command: Annotated[Command, doc("The program and its arguments; unset: the flag does nothing.")] = ()
     cwd: Annotated[File | None, doc("Folder to run it in; unset: the service's own.")] = None
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 0.0
     ignore_retained: Annotated[bool, doc("Refuse a retained request, because it is stale.")] = True
 
@@ -149,11 +150,11 @@ class MediaControl(Section, frozen=True, kw_only=True):
     }
 
     stop_timeout: Annotated[Seconds, doc("How long a media program may take to stop before it is killed.")] = 10.0
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
-    publisher_env: Annotated[dict[str, str], doc("Environment variables to add for the audio publisher.")] = field(
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
+    publisher_env: Annotated[Variables, doc("Environment variables to add for the audio publisher.")] = field(
         default_factory=dict
     )
-    receiver_env: Annotated[dict[str, str], doc("Environment variables to add for the audio receiver.")] = field(
+    receiver_env: Annotated[Variables, doc("Environment variables to add for the audio receiver.")] = field(
         default_factory=dict
     )
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from msgspec import Meta, field
 
 from pebble.config.transport import Mqtt
-from pebble.config.types import EMPTY, Count, File, Level, LogLevel, Port, Section, ServiceSection, doc
+from pebble.config.types import EMPTY, Count, File, Level, LogLevel, Port, Section, ServiceSection, Variables, doc
 
 HostName = Annotated[
     str,
@@ -17,7 +17,7 @@ HostName = Annotated[
 class WebHandler(ServiceSection, frozen=True, kw_only=True):
     """Runs the operator page on the robot; `web_interface` sets it up. It needs `pip install 'pebble-robot[web]'`."""
 
-    env: Annotated[dict[str, str], doc("Environment variables to add.")] = EMPTY
+    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
 
 
 class WebMqtt(Mqtt, frozen=True, kw_only=True):

@@ -42,6 +42,8 @@ def probe(settings: MqttSettings, *, login: bool, timeout_s: float = 3.0) -> Pro
                 return ProbeResult(code=code, connect_ms=connect_ms, expires=expires)
     except TransportError as error:
         return ProbeResult(problem=str(error))
+    except UnicodeError:  # a label that is too long as it travels
+        return ProbeResult(problem=f"{settings.host} is no name of a host")
     except OSError as error:  # TLS failures are some of these
         return ProbeResult(problem=getattr(error, "reason", None) or error.strerror or str(error))
 

@@ -24,12 +24,11 @@ from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
 from pebble.errors import PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
-from pebble.transports.peers import fits_socket
 from pebble.transports.settings import MqttSettings
+from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
 from pebble.web.extra import require_packages
 from pebble.web.from_config import settings_of
 
-_LONGEST_SOCKET = "0123456789abcdef.sock"
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set
 _SOON_S = 14 * 86400
@@ -186,7 +185,7 @@ def _owner(path: Path) -> int | None:
 
 def run_directory(path: Path, uid: int) -> Finding:
     what = "run directory"
-    if not fits_socket(path / _LONGEST_SOCKET):
+    if not fits_socket(path / FRAMES_SOCKET):
         return Finding(
             Level.FAIL, what, f"{path} is too long for unix sockets", "set transport.run_dir to a shorter path"
         )

@@ -20,7 +20,7 @@ from pebble.launcher.restart_policy import RestartPolicy
 from pebble.launcher.run_lock import RunLock
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.launcher.status import StatusPublisher
-from pebble.runtime.connections import check_kinds
+from pebble.runtime.connections import check_connections
 from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
 
@@ -174,7 +174,7 @@ def _check_runs_here(config: Config) -> None:
         )
     if config.path is None:
         raise ConfigError("the robot's processes know its config by its file, and this one has none")
-    check_kinds(config)
+    check_connections(config)
 
 
 def _run_lock(config: Config) -> RunLock:

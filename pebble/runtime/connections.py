@@ -8,6 +8,7 @@ from pebble.config import Config, Mqtt, RemoteConnection, Tls
 from pebble.contract import OUTGOING
 from pebble.errors import ConfigError, TransportError
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
+from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 
@@ -17,8 +18,8 @@ def local_transport(config: Config, name: str, *, will: Message | None = None, a
     return create(config.transport.kind, f"{config.base}-{name}", local_settings(config, as_published), will=will)
 
 
-def check_kinds(config: Config) -> None:
-    """Raise ConfigError for a transport that is not installed: only the machine where the robot runs can know."""
+def check_connections(config: Config) -> None:
+    """Raise ConfigError for what only the machine where the robot runs can know: installed transports, long paths."""
     remote = config.services.mqtt_bridge.remote
     places = {"transport.kind": config.transport.kind}
     if remote is not None:
@@ -29,8 +30,20 @@ def check_kinds(config: Config) -> None:
             check_kind(kind)
         except TransportError as error:
             problems.append(f"{place}: {error}")
+    socket = _longest_socket(config)
+    if socket is not None and not fits_socket(config.run_dir() / socket):
+        problems.append(
+            f"transport.run_dir: {config.run_dir()} is too long for the sockets in it, set it to a shorter path"
+        )
     if problems:
         raise ConfigError(problems)
+
+
+def _longest_socket(config: Config) -> str | None:
+    """The longest name of a socket in the run directory; None: this robot has none."""
+    if config.services.av_daemon.enabled:
+        return FRAMES_SOCKET
+    return PEER_SOCKET if config.transport.kind == "zenoh" else None
 
 
 def local_settings(config: Config, as_published: bool = False) -> Any:

@@ -25,6 +25,34 @@ def test_check_knows_which_transports_there_are(run: Run, tmp_path: Path) -> Non
     assert "mqtt" in run.err
 
 
+def test_check_reads_the_certificates(run: Run, tmp_path: Path) -> None:
+    for name in ("ca.pem", "me.pem", "me.key"):
+        (tmp_path / name).write_text("junk")
+    bridge = {"remote_mqtt": {"host": "broker.example", "tls": {"enabled": True, "ciphers": "NO-SUCH"}}}
+    transport = {"kind": "zenoh", "tls": {"enabled": True, "client_cert": "me.pem", "client_key": "me.key"}}
+    tls = {"enabled": True, "ca_cert": "ca.pem"}
+    path = config_file(tmp_path, local_mqtt={"tls": tls}, transport=transport, services={"mqtt_bridge": bridge})
+    assert run("check", path) == 1
+    assert [line.split(": ")[2] for line in run.err.splitlines()] == [
+        "local_mqtt.tls.ca_cert",
+        "transport.tls.client_cert",
+        "services.mqtt_bridge.remote_mqtt.tls.ciphers",
+    ]
+    assert f"local_mqtt.tls.ca_cert: {tmp_path / 'ca.pem'} cannot be used: " in run.err
+
+
+@pytest.mark.parametrize(("transport", "services"), [("zenoh", {}), ("mqtt", {"av_daemon": {"enabled": True}})])
+def test_check_and_up_refuse_a_run_directory_that_is_too_long(
+    run: Run, tmp_path: Path, transport: str, services: dict[str, object]
+) -> None:
+    run_dir = tmp_path / ("u" * 100)
+    path = config_file(tmp_path, transport={"kind": transport, "run_dir": str(run_dir)}, services=services)
+    for command in ("check", "up"):
+        assert run(command, path) == 1
+        assert f"transport.run_dir: {run_dir} is too long for the sockets in it, set it to a shorter path" in run.err
+    assert not run_dir.exists()
+
+
 def test_all_of_our_configs_can_be_checked_at_once(run: Run) -> None:
     assert run("check", *sorted((ROOT / "configs").glob("*.json"))) == 0
     assert run.err == "pebble: schema.json: the JSON Schema of configs, not a config\n"

@@ -389,7 +389,16 @@ class TestMistakes:
             ("local_mqtt.host", 5, "must be text, not 5"),
             ("local_mqtt.tls.ca_cert", 5, "must be a path, not 5"),
             ("local_mqtt.password_file", "~nobody-at-all/x", '"~nobody-at-all/x" names a home folder that'),
-            ("local_mqtt.password_file", "a\x00b", "'/nowhere/a\\x00b' does not hold text"),
+            ("local_mqtt.password_file", "a\x00b", "holds a NUL character (\\u0000), leave it out"),
+            ("transport.run_dir", "a\x00b", "holds a NUL character"),
+            ("transport.journal", "a\x00b", "holds a NUL character"),
+            ("services.mqtt_bridge.reboot_control.command", "a\x00b", "holds a NUL character"),
+            ("services.av_daemon.env", {"A\x00B": ""}, "holds a key with a NUL character"),
+            ("services.av_daemon.env", {"A=B": "c"}, 'must be the name of a variable, without =, not "A=B"'),
+            ("services.autonomy_manager.env", {"": "c"}, 'must be the name of a variable, without =, not ""'),
+            ("services.mqtt_bridge.audio_control.publisher_env", {"=": "c"}, "must be the name of a variable"),
+            ("local_mqtt.username", "ü" * 40_000, "is longer than MQTT carries, 65535 bytes"),
+            ("local_mqtt.password", "ü" * 40_000, "holds more than MQTT carries, 65535 bytes"),
             ("transport.kind", 5, "must be text, not 5"),
             ("services.defaults.retained_publish_interval_seconds", 0, "must be a number above 0"),
             ("services.defaults.retained_publish_interval_seconds", float("nan"), "must be a number, not nan"),
@@ -539,6 +548,12 @@ class TestMistakes:
         ]
 
 
+def _nested(levels: int) -> str:
+    return (
+        '{"robot": {"id": "a"}, "transport": {"kind": "x", "settings": ' + '{"a":' * levels + "1" + "}" * levels + "}}"
+    )
+
+
 class TestFiles:
     @pytest.mark.parametrize(
         ("text", "expected"),
@@ -547,6 +562,7 @@ class TestFiles:
             ('{"a": 1,\n // no\n "b": 2}', "a comment is a key that starts with //"),
             ("", "robot.json: line 1, column 1: not JSON"),
             ("[" * 100_000, "robot.json: nested too deeply"),
+            *((_nested(levels), "transport.settings: is nested more than 50 levels deep") for levels in (60, 600, 900)),
             ('{"a": ' + "9" * 5000 + "}", "robot.json: not JSON: Exceeds the limit"),
             ("[]", "(the whole file): must be an object {…}, not a list"),
             ('{"robot": {"id": "a", "id": "b"}}', "robot.id: occurs twice in one object"),

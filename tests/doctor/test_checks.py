@@ -205,6 +205,8 @@ def test_a_server_that_is_no_broker_is_a_problem() -> None:
         assert "timed out" in probe(settings, login=True, timeout_s=0.2).problem
     wrong_file = MqttSettings(host="127.0.0.1", port=free_port(), tls=TlsSettings(ca_cert=Path("/nowhere/ca.pem")))
     assert probe(wrong_file, login=True).problem != ""
+    unknown = MqttSettings(host="ü" * 60, port=free_port())
+    assert probe(unknown, login=True).problem.endswith("is no name of a host")
 
 
 def test_the_connect_packet_follows_the_mqtt_specification() -> None:

@@ -13,8 +13,8 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.frames.reclaim import WriterMemory, writer_memory
-from pebble.transports.peers import check_socket_path
 from pebble.transports.settings import ZenohSettings
+from pebble.transports.socket_paths import check_socket_path
 from pebble.transports.zenoh.session import open_session, session_config
 
 #: What Zenoh maps and locks for its own bookkeeping, in every process that shares memory (1.10.2), in bytes.

@@ -1,0 +1,55 @@
+"""Finds the keys of a config that give a channel the topic of another one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import reduce
+from typing import Any
+
+from pebble.config.problems import Path
+from pebble.config.tree import Root, SerialBridge
+from pebble.contract import CHANNELS, Channel
+from pebble.contract.identity import Identity
+
+_SERIAL = ("services", "serial_mcu_bridge")
+
+
+def shared_topics(root: Root) -> Iterator[tuple[Path, Channel]]:
+    """Each key whose topic is that of another channel, too, with that channel.
+
+    Several serial lines may share the topics of one channel: all of them obey a drive command.
+    """
+    base = Identity(root.robot.system, root.robot.type, root.robot.id).base
+    renamed: list[tuple[str, Path, Channel]] = []
+    owners: dict[str, Channel] = {}
+    for channel in CHANNELS:
+        for path, topic in _keys(channel, root):
+            if topic is not None:
+                renamed.append((topic, path, channel))
+            elif not channel.is_pattern:
+                owners[channel.topic(base)] = channel
+    for topic, path, channel in renamed:
+        owner = owners.setdefault(topic, channel)
+        if owner is not channel:
+            yield path, owner
+
+
+def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
+    """The keys that may rename the channel, one for each serial line, and the topics there; None: its own topic."""
+    if channel.override is None:
+        yield (), None
+        return
+    keys = tuple(channel.override.topic.split("."))
+    if keys[:2] != _SERIAL:
+        yield keys, _at(root, keys)
+        return
+    own = root.services.serial_mcu_bridge
+    lines: dict[Path, SerialBridge] = {_SERIAL: own}
+    lines |= {(*_SERIAL, "instances", name): line for name, line in own.instances.items()}
+    for path, line in lines.items():
+        yield (*path, *keys[2:]), _at(line, keys[2:])
+
+
+def _at(section: Any, keys: tuple[str, ...]) -> str | None:
+    topic: str | None = reduce(getattr, keys, section)
+    return topic

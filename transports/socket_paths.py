@@ -1,0 +1,26 @@
+"""How long the path of a unix socket in a run directory may be."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pebble.errors import TransportError
+
+#: The longest names of sockets in a run directory: of frames, and of the peers.
+FRAMES_SOCKET, PEER_SOCKET = "frames-microphone.sock", "01234567.sock"
+
+_LIMIT = 108  # bytes, sizeof(sun_path): a longer path cannot be bound
+
+
+def fits_socket(path: Path) -> bool:
+    """Whether a unix socket can have this path."""
+    return len(os.fsencode(path)) < _LIMIT
+
+
+def check_socket_path(path: Path) -> None:
+    """Raise TransportError if ``path`` is too long for a unix socket."""
+    if not fits_socket(path):
+        raise TransportError(
+            f"{path} is too long for a unix socket (limit {_LIMIT - 1} bytes): set transport.run_dir to a shorter path"
+        )
