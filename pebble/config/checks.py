@@ -8,6 +8,8 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from pebble.config.masking import without_login
+from pebble.config.media import VideoStream
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
 from pebble.config.shared_topics import shared_topics
@@ -68,6 +70,14 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
     if services.soundboard_handler.enabled and not services.soundboard_handler.playback.player_command:
         reader.notes.doubt((*path, "soundboard_handler", "playback", "player_command"), "is missing, write aplay")
     return services
+
+
+def _video_stream(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
+    """Every operator receives the address: a login in it would be no secret."""
+    if stream.webrtc_url is None or (public := without_login(stream.webrtc_url)) == stream.webrtc_url:
+        return stream
+    reader.notes.warning((*path, "webrtc_url"), "its login is left out, because the address is published")
+    return replace(stream, webrtc_url=public)
 
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
@@ -220,6 +230,7 @@ CHECKS = _table(
     (Root, _root),
     (TransportSection, _transport),
     (Services, _services),
+    (VideoStream, _video_stream),
     (MqttBridge, _bridge),
     (SerialBridges, _serial),
     (SerialSafety, _safety),

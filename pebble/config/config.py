@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from msgspec.structs import asdict, fields
+from msgspec.structs import asdict
 
 from pebble.config.checks import CHECKS
+from pebble.config.masking import masked
 from pebble.config.raw import Pairs, decode, inherit, plain, read_text
 from pebble.config.reader import Reader
 from pebble.config.tree import Root, SerialBridge, SerialBridges
-from pebble.config.types import Secret, Section
 from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
 
-_LOGIN = re.compile(r"(?<=://)[^/@\s]*(?=@)")  # user:password of a URL
 _LONGEST_NAME = 150  # bytes; file systems allow 255
-_SECRET_KEY = re.compile("password|secret|token", re.IGNORECASE)
-_HARMLESS = ("password_file", "password_env")
 
 
 class Config(Root, frozen=True, kw_only=True):
@@ -183,10 +179,11 @@ def _file_name(base: str) -> str:
 def resolved(config: Config) -> dict[str, Any]:
     """The keys of the file with every default and inherited value, and under ``derived`` what is computed from them.
 
-    JSON can write all of it. Keys that are not set and have no default are left out; secrets read ``***``.
+    JSON can write all of it. Keys that are not set and have no default are left out; secrets and the values of
+    variables read ``***``.
     """
     own = {
-        name: _view(getattr(config, name), name)
+        name: masked(getattr(config, name), name)
         for name in ("log_level", "robot", "local_mqtt", "transport", "services", "web_interface")
     }
     return own | {
@@ -197,21 +194,3 @@ def resolved(config: Config) -> dict[str, Any]:
             "serial_instances": list(config.serial_instances()),
         }
     }
-
-
-def _view(value: Any, key: str) -> Any:
-    if isinstance(value, Secret) or (_SECRET_KEY.search(key) and key not in _HARMLESS and value is not None):
-        return "***"
-    if isinstance(value, Section):
-        return _object({field.encode_name: getattr(value, field.name) for field in fields(value)})
-    if isinstance(value, dict):
-        return _object(value)
-    if isinstance(value, tuple | list):
-        return [_view(item, key) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    return _LOGIN.sub("***", value) if isinstance(value, str) else value
-
-
-def _object(items: dict[str, Any]) -> dict[str, Any]:
-    return {key: _view(value, key) for key, value in items.items() if value is not None}

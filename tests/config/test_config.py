@@ -397,6 +397,9 @@ class TestMistakes:
             ("services.av_daemon.env", {"A=B": "c"}, 'must be the name of a variable, without =, not "A=B"'),
             ("services.autonomy_manager.env", {"": "c"}, 'must be the name of a variable, without =, not ""'),
             ("services.mqtt_bridge.audio_control.publisher_env", {"=": "c"}, "must be the name of a variable"),
+            ("local_mqtt.host", "u" * 64 + ".example", "must be a name or address: 1 to 63 characters between dots"),
+            ("local_mqtt.host", "a..b", "must be a name or address"),
+            ("services.mqtt_bridge.remote_mqtt.host", "u." * 130, "must be a name or address"),
             ("local_mqtt.username", "ü" * 40_000, "is longer than MQTT carries, 65535 bytes"),
             ("local_mqtt.password", "ü" * 40_000, "holds more than MQTT carries, 65535 bytes"),
             ("transport.kind", 5, "must be text, not 5"),
@@ -647,6 +650,36 @@ class TestPasswords:
         shown = json.dumps(resolved(read(raw)))
         assert "mongodb://***@db.example/x" in shown
         assert all(secret not in shown for secret in ("correct", "t0k3n", "s3cret"))
+
+    def test_values_of_variables_and_of_options_are_hidden_too(self) -> None:
+        stream = {
+            "env": {"API_KEY": "k3y", "STREAM_PASS": "p4ss", "PLAIN": "pl41n"},
+            "command": [
+                "stream",
+                "--api-key=0ption",
+                "key-int-max=15",
+                "rtsp://me:p@ss@cam.example/x?token=qu3ry&fps=5",
+            ],
+        }
+        raw = at("services.video_stream", stream)
+        raw["services"]["mqtt_bridge"] = {"audio_control": {"publisher_env": {"X": "y0u"}}}
+        raw["transport"] = {"kind": "other", "settings": {"API_KEY": "an0ther"}}
+        shown = resolved(read(raw))
+        assert shown["services"]["video_stream"]["env"] == dict.fromkeys(stream["env"], "***")
+        assert shown["services"]["video_stream"]["command"] == [
+            "stream",
+            "--api-key=***",
+            "key-int-max=15",
+            "rtsp://***@cam.example/x?token=***&fps=5",
+        ]
+        assert all(secret not in json.dumps(shown) for secret in ("y0u", "an0ther"))
+
+    def test_a_login_in_the_address_of_a_stream_is_left_out_because_it_is_published(self) -> None:
+        config = read(at("services.video_stream.webrtc_url", "https://me:p@ss@pit.example:8889/cam@2"))
+        assert config.services.video_stream.webrtc_url == "https://pit.example:8889/cam@2"
+        assert config.warnings == (
+            "services.video_stream.webrtc_url: its login is left out, because the address is published",
+        )
 
 
 class TestWebInterface:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 from itertools import islice
 from typing import Any
 
 from pebble.config import Config, Mqtt
+from pebble.config.masking import is_secret, without_secrets
 from pebble.errors import PebbleError
 
-_SECRET = re.compile("password|secret|token", re.IGNORECASE)
-_LOGIN = re.compile(r"(?<=://)[^/@\s]*(?=@)")  # user:password of a URL
 _MOST_LINKS = 1000
 
 
@@ -62,12 +60,12 @@ class ConfigCopy:
 
 
 def _public(value: Any) -> Any:
-    """``value`` without keys that may hold a secret, and without logins in URLs."""
+    """``value`` without keys that may hold a secret, and without logins in its texts."""
     if isinstance(value, dict):
-        return {key: _public(item) for key, item in value.items() if not _SECRET.search(key)}
+        return {key: _public(item) for key, item in value.items() if not is_secret(key)}
     if isinstance(value, list):
         return [_public(item) for item in value]
-    return _LOGIN.sub("***", value) if isinstance(value, str) else value
+    return without_secrets(value) if isinstance(value, str) else value
 
 
 def broker_of(config: Config) -> Mqtt:
