@@ -217,7 +217,8 @@ def _remote_connection(remote: RemoteConnection) -> str:
 def _mqtt(mqtt: Mqtt) -> str:
     user = "anonymous" if mqtt.username is None else f"user {mqtt.username}"
     password = "" if mqtt.username is None or mqtt.password is None else ", password ***"
-    tls = "TLS" if mqtt.tls.enabled else "not encrypted"
+    name = " without a check of the name" if mqtt.tls.insecure else ""
+    tls = f"TLS{name}" if mqtt.tls.enabled else "not encrypted"
     return f"{mqtt.host}:{mqtt.port}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
 
 

@@ -67,6 +67,8 @@ def flash(
         micropython=micropython,
         verify=verify,
     )
+    for warning in () if config is None or kind.is_report else config.warnings:
+        typer.echo(f"warning: {warning}", err=True)
     withhold((WIFI_PASSWORD, *(() if config is None else config.password_variables)))
     if dry_run:
         show_steps(options, Tools(), typer.echo)

@@ -8,6 +8,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from pebble.config.exposure import warn_if_readable, warn_of_logins_in_clear
 from pebble.config.masking import without_login
 from pebble.config.media import VideoStream
 from pebble.config.problems import Path
@@ -38,6 +39,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
     if not reader.notes.problems:
         for path, other in shared_topics(root):
             reader.notes.problem(path, f"is also the topic of {other.suffix}, choose another")
+        warn_of_logins_in_clear(reader.notes, root)
     return root
 
 
@@ -138,6 +140,13 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
         return tls
     for key, file in named.items():
         _contents(reader, file, (*path, key))
+    if tls.client_key is not None:
+        warn_if_readable(reader.notes, (*path, "client_key"), tls.client_key, "this key")
+    if tls.insecure:
+        reader.notes.warning(
+            (*path, "insecure"),
+            "is true: another machine with a certificate of a trusted authority can pose as this one",
+        )
     for key, other in (("client_cert", "client_key"), ("client_key", "client_cert")):
         if key in named and other not in named:
             reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")
@@ -169,6 +178,8 @@ def _web_tls(reader: Reader, tls: WebTls, path: Path) -> WebTls:
         file = getattr(tls, key)
         if file is not None and not file.is_file():
             reader.notes.warning((*path, key), f"there is no file {file}; run `pebble cert init`")
+    if tls.key is not None:
+        warn_if_readable(reader.notes, (*path, "key"), tls.key, "this key")
     return tls
 
 
@@ -188,6 +199,7 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
         password = _variable(reader, mqtt.password_env, (*path, "password_env"))
     elif mqtt.password_file is not None:
         password = _contents(reader, mqtt.password_file, (*path, "password_file"))
+        warn_if_readable(reader.notes, (*path, "password_file"), mqtt.password_file, "this password")
     if password is None:
         return mqtt
     if len(password.encode()) > _LONGEST_TEXT:

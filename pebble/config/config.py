@@ -12,7 +12,8 @@ from typing import Any
 from msgspec.structs import asdict
 
 from pebble.config.checks import CHECKS
-from pebble.config.masking import masked
+from pebble.config.exposure import warn_if_readable
+from pebble.config.masking import holds_secret, masked
 from pebble.config.raw import Pairs, decode, inherit, plain, read_text
 from pebble.config.reader import Reader
 from pebble.config.tree import Root, SerialBridge, SerialBridges
@@ -126,6 +127,8 @@ def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -
     merged = inherit(own)
     root = reader.section(Root, merged)
     reader.notes.forget_inherited(own, merged)
+    if path is not None and holds_secret(own):
+        warn_if_readable(reader.notes, (), path, "it, and there is a password in it")
     if reader.notes.problems:
         raise ConfigError(list(dict.fromkeys(map(str, reader.notes.problems))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)

@@ -43,7 +43,10 @@ def run_checks(config: Config | None) -> Iterator[Finding]:
     yield memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], root=os.geteuid() == 0)
     yield clock(time.time(), synchronised())
     yield leftover_segments(Path("/dev/shm"), Path("/proc"))  # noqa: S108 - where Zenoh puts them
-    if config is not None and config.robot.platform == "linux":
+    if config is None:
+        return
+    yield from (Finding(Level.WARN, "config", warning) for warning in config.warnings)
+    if config.robot.platform == "linux":
         yield from _robot(config)
 
 
@@ -336,6 +339,10 @@ def _encryption(what: str, settings: MqttSettings, answer: ProbeResult, now: flo
         days = (answer.expires - now) / 86400
         return Finding(
             Level.WARN, what, f"its certificate expires in {days:.0f} days", "renew the broker's certificate"
+        )
+    if settings.tls.insecure:
+        return Finding(
+            Level.WARN, what, "encrypted, but the name in its certificate is not checked", "set tls.insecure to false"
         )
     return Finding(Level.OK, what, "encrypted")
 

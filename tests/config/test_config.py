@@ -704,6 +704,7 @@ class TestWebInterface:
     def test_a_certificate_and_its_key_are_relative_to_the_config(self, tmp_path: Path) -> None:
         for name in ("server.pem", "server.key", "ca.pem"):
             (tmp_path / name).write_text("x")
+        (tmp_path / "server.key").chmod(0o600)
         tls = {"certificate": "server.pem", "key": "server.key", "ca": "ca.pem"}
         raw = at("web_interface", {"host": "0.0.0.0", "tls": tls, "people": "people.sqlite"})
         config = load(written(tmp_path, json.dumps(raw)), env={})
@@ -745,6 +746,7 @@ class TestWebInterface:
 
     def test_plain_http_beside_a_certificate_has_no_effect(self, tmp_path: Path) -> None:
         (tmp_path / "a").write_text("x")
+        (tmp_path / "a").chmod(0o600)
         (warning,) = read(
             at("web_interface", {"plain_http": True, "tls": {"certificate": "a", "key": "a"}}), folder=tmp_path
         ).warnings

@@ -9,6 +9,7 @@ import resource
 import socket
 import subprocess
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -195,6 +196,9 @@ def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
     assert levels(doctor.broker("b", plain, probe_returning(let_in, shut_out))) == ["ok", "ok", "warn"]
     assert levels(doctor.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
     ending = ProbeResult(code=0, expires=1000.0 + 3 * 86400)
+    anyone = replace(tls, tls=TlsSettings(insecure=True))
+    *_, last = doctor.broker("b", anyone, probe_returning(let_in, shut_out))
+    assert (last.level, last.fix) == (Level.WARN, "set tls.insecure to false")
     *_, last = doctor.broker("b", tls, probe_returning(ending, shut_out), 1000.0)
     assert (last.level, last.text) == (Level.WARN, "its certificate expires in 3 days")
 

@@ -38,6 +38,21 @@ def test_the_config_selects_the_firmware(
     assert "-march=armv6m" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("platform", "fix"), [("esp32", "set tls.enabled"), ("esp8266", "this board has no TLS")])
+def test_a_password_that_the_board_sends_in_clear_is_warned_of(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, platform: str, fix: str
+) -> None:
+    path = lamp(tmp_path, platform=platform)
+    raw = json.loads(path.read_text())
+    raw["local_mqtt"] |= {"username": "lamp", "password": "hush-hush"}
+    path.write_text(json.dumps(raw))
+    path.chmod(0o600)
+    assert flash(monkeypatch, path, "--port", "/dev/ttyNOWHERE", "--wifi", "Lab", "--dry-run") == 0
+    err = capsys.readouterr().err
+    assert f"warning: local_mqtt.username: its password crosses the network unencrypted: {fix}" in err
+    assert len(err.splitlines()) == 1
+
+
 def test_robots_on_a_serial_line_need_only_a_name(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

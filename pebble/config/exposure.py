@@ -1,0 +1,47 @@
+"""Warns of what in a config lets others read or overhear a secret."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path as FilePath
+
+from pebble.config.problems import Notes, Path
+from pebble.config.transport import Mqtt
+from pebble.config.tree import Root
+from pebble.config.web import is_loopback
+
+
+def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> None:
+    """Warn if the mode of ``file``, which is or holds ``what``, lets every user of this machine read it."""
+    if not hasattr(os, "getuid"):  # Windows has no such modes
+        return
+    try:
+        mode = file.stat().st_mode
+    except OSError:
+        return
+    if mode & stat.S_IROTH:
+        notes.warning(path, f"every user of this machine can read {what}: run `chmod o-rwx {file}`")
+
+
+def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
+    """Warn of each broker on the network that receives a user name and a password without encryption."""
+    for path, mqtt in _brokers(root):
+        if mqtt.username is not None and not mqtt.tls.enabled and not is_loopback(mqtt.host):
+            fix = "set tls.enabled"
+            if root.robot.platform == "esp8266":
+                fix = "this board has no TLS, so give it a login of its own that may do nothing else"
+            notes.warning((*path, "username"), f"its password crosses the network unencrypted: {fix}")
+
+
+def _brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
+    bridge, mirror = root.services.mqtt_bridge, root.transport.mqtt_mirror
+    if root.transport.kind == "mqtt":
+        yield ("local_mqtt",), root.local_mqtt
+    if mirror is not None:
+        yield ("transport", "mqtt_mirror"), mirror
+    if bridge.enabled and (bridge.remote is None or bridge.remote.kind == "mqtt"):
+        yield ("services", "mqtt_bridge", "remote_mqtt"), bridge.remote_mqtt
+    if root.web_interface.mqtt.host:
+        yield ("web_interface", "mqtt"), root.web_interface.mqtt
