@@ -15,7 +15,7 @@ class Tls(Section, frozen=True, kw_only=True):
     client_cert: Annotated[File | None, doc("Certificate to show; needs client_key.")] = None
     client_key: Annotated[File | None, doc("Private key of client_cert.")] = None
     insecure: Annotated[bool, doc("Do not check that the certificate names the host.")] = False
-    ciphers: Annotated[str | None, doc("OpenSSL cipher list; unset: OpenSSL's own.")] = None
+    ciphers: Annotated[str | None, doc("OpenSSL cipher list, of TLS 1.2 or newer; unset: OpenSSL's own.")] = None
 
 
 class Mqtt(Section, frozen=True, kw_only=True):
