@@ -65,7 +65,7 @@ class DescribedBridge(SerialService):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._session = Session()
+        self._session = Session(self.config.base)
         self._watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
         self._uid = UidClaim(secrets.token_hex(8))

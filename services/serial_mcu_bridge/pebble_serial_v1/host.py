@@ -115,8 +115,10 @@ class Session:
     :meth:`tick` at ``due``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, base: str = "") -> None:
+        """``base`` is what the robot's topics begin with."""
         self.manifest: Manifest | None = None
+        self._base = base
         self._splitter = LineSplitter(FRAME_LIMIT, END)
         self._too_long = 0
         self._by_id: dict[int, Interface] = {}
@@ -202,7 +204,7 @@ class Session:
             case Type.HELLO:
                 yield from self._hello(parse_hello(frame.payload), now)
             case Type.DESCRIBE:
-                yield from self._describe(parse_describe(frame.payload))
+                yield from self._describe(parse_describe(frame.payload, self._base))
             case Type.SAMPLE | Type.STATE:
                 yield from self._reading(frame, now)
             case Type.ACK | Type.NACK:

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
 
+from pebble.contract import INCOMING, OUTGOING
 from pebble.contract.identity import LEVEL, LEVEL_RULE
 from pebble.contract.payloads import McuManifest
 from pebble.errors import PayloadError
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import Field, FieldType, shortest
+from pebble.transports.topics import MAX_BYTES
 
 PROTOCOL: Final = "pebble_serial_v1"
 #: The level below ``mcu/{uid}/`` that is the topic of the manifest itself.
@@ -101,8 +103,11 @@ def parse_hello(payload: bytes) -> Hello:
     return hello
 
 
-def parse_describe(payload: bytes) -> Manifest:
-    """Return the manifest. PayloadError names what is wrong: bytes missing or left over, invalid topic levels, …"""
+def parse_describe(payload: bytes, base: str = "") -> Manifest:
+    """Return the manifest. PayloadError names what is wrong: bytes missing or left over, invalid topic levels, …
+
+    ``base`` is what the robot's topics begin with: names that are too long below it are refused, too.
+    """
     reader = _Reader(payload)
     hello = _hello(reader)
     if hello.interface_count > _MOST_INTERFACES:
@@ -113,6 +118,11 @@ def parse_describe(payload: bytes) -> Manifest:
     for direction in Direction:
         names = [interface.name for interface in interfaces if interface.direction is direction]
         _all_differ(f"{direction.name.lower()}-going interface name", names)
+    _check_topic(base, "the manifest", f"{OUTGOING}/mcu/{hello.device_uid}/{RESERVED}")
+    for interface in interfaces:
+        way = INCOMING if interface.direction is Direction.IN else OUTGOING
+        _check_topic(base, interface.name, f"{way}/mcu/{hello.device_uid}/{interface.name}")
+        _check_topic(base, interface.name, f"{way}/{interface.channel}")
     return Manifest(hello, interfaces)
 
 
@@ -220,6 +230,12 @@ def _check_channel(name: str, channel: str) -> None:
         raise PayloadError(f"{name}: a channel of {len(levels)} levels, more than {_MOST_LEVELS}")
     for level in levels:
         _check_level(f"{name}: in the channel {channel!r},", level)
+
+
+def _check_topic(base: str, name: str, suffix: str) -> None:
+    size = len(f"{base}/{suffix}".encode())
+    if size > MAX_BYTES:
+        raise PayloadError(f"{name[:40]}: its topic has {size} bytes, more than {MAX_BYTES}: shorten the names in it")
 
 
 def _all_differ(what: str, values: list[Any]) -> None:

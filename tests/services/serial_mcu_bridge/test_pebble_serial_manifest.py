@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import random
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from pebble.config import parse
 from pebble.errors import PayloadError
+from pebble.services.serial_mcu_bridge.devices.described_bridge import DescribedBridge
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
     Direction,
     Hello,
@@ -17,6 +20,7 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import (
     parse_describe,
     parse_hello,
 )
+from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.services.serial_mcu_bridge.mcu_wire import IMU, STATION, F, I, M
 
@@ -55,6 +59,41 @@ def test_the_published_manifest_has_exactly_the_keys_of_the_wire() -> None:
     command, state = msgspec.to_builtins(parse_describe(STATION.describe()).payload())["interfaces"][:2]
     assert (command["dir"], command["kind"]) == ("in", "command")
     assert list(state) == [*keys, "retain"]
+
+
+@pytest.mark.parametrize(
+    ("manifest", "named"),
+    [
+        (M("😀" * 30, (I(1, "😀" * 60, wire.OUT, wire.KIND_STATE),)), "😀" * 40),
+        (M("u", (I(1, "lamp", wire.IN, wire.KIND_COMMAND, channel="/".join(["😀" * 31] * 2)),)), "lamp"),
+    ],
+    ids=["name", "channel"],
+)
+def test_names_that_make_no_topic_of_this_robot_are_refused(manifest: M, named: str) -> None:
+    longest = "/".join(["😀" * 64] * 3)
+    with pytest.raises(
+        PayloadError, match=rf"^{named}: its topic has 1\d\d\d bytes, more than 1024: shorten the names"
+    ):
+        parse_describe(manifest.describe(), longest)
+    assert len(parse_describe(manifest.describe(), "pebble/robots/goob").interfaces) == 1
+    assert parse_describe(IMU.describe(), longest).uid == "goob-imu-nano"
+
+
+def test_a_bridge_of_a_robot_with_long_names_refuses_such_a_manifest_and_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    level = "😀" * 64
+    raw = {
+        "robot": {"system": level, "type": level, "id": level},
+        "services": {"serial_mcu_bridge": {"protocol": "pebble_serial_v1", "serial": {"port": "/dev/none"}}},
+    }
+    config = parse(raw, folder=Path("/nowhere"), env={})
+    with MemoryTransport("mcu", MemoryHub()) as transport:
+        bridge = DescribedBridge(config, transport)
+        bridge.on_input(wire.frame(wire.DESCRIBE, M("😀" * 60).describe()))
+        assert "DESCRIBE refused: the manifest: its topic has 10" in caplog.text
+        bridge.on_input(wire.frame(wire.DESCRIBE, IMU.describe()))
+    assert bridge.counters["describe"] == 1
 
 
 def one(**changes: Any) -> bytes:
