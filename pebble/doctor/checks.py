@@ -22,6 +22,7 @@ from pebble.doctor import Finding, Level
 from pebble.doctor.broker_probe import REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
+from pebble.doctor.reachable import beyond_loopback, own_addresses
 from pebble.errors import PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.settings import MqttSettings
@@ -61,7 +62,10 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield from loudspeaker(config)
     yield from operator_page(config)
     for name, mqtt in _brokers(config):
-        yield from broker(name, mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S))
+        settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+        yield from broker(name, settings)
+        if is_loopback(mqtt.host):
+            yield from beyond_loopback(name, settings, own_addresses())
 
 
 def operator_page(config: Config) -> Iterator[Finding]:
@@ -316,7 +320,7 @@ def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) ->
     if answer.code != 0:
         return Finding(Level.OK, what, "refuses anonymous logins")
     if is_loopback(settings.host):
-        return Finding(Level.OK, what, "accepts anonymous logins, from this machine")
+        return Finding(Level.OK, what, "accepts anonymous logins: every program on this machine can drive the robot")
     return Finding(
         Level.WARN,
         what,
