@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean check-types check-names check-collection test-running test-robots test-pages test-computing
+.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -21,6 +21,9 @@ help:
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
 	@echo "make report           run every comparison and pebble impair, one hour; writes docs/results"
 	@echo "make report QUICK=1   fewer cases, less than five minutes; writes build/report-quick"
+	@echo "make lock             write requirements/ anew from pyproject.toml; UPGRADE=1: with the newest versions"
+	@echo "make audit            ask OSV for known vulnerabilities of all packages; without an answer it fails: not checked"
+	@echo "make sbom             write build/sbom.cdx.json: what a robot's software consists of"
 	@echo "make clean            remove what the other targets created"
 
 demo: .venv/.ready-demo
@@ -136,6 +139,18 @@ check-collection:
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# What pins, audits and lists the packages is apart from them, and pinned by hashes, too.
+lock audit sbom: .venv/.ready-tools
+	@PYTHONPATH=.venv/tools $(VENV) tools/$@.py $(if $(UPGRADE),--upgrade)
+
+.venv/.ready-tools: requirements/tools.txt | .venv/.ready-demo
+	@echo "pebble: installing uv, pip-audit and cyclonedx-bom into .venv/tools"
+	@rm -rf .venv/tools
+	@$(VENV) -m pip install --quiet --disable-pip-version-check --require-hashes --target .venv/tools -r $<
+	@touch $@
+
+.venv/.ready-demo .venv/.ready-bench .venv/.ready-dev: .venv/.ready-%: requirements/%.txt
 
 .venv/.ready-%: pyproject.toml tools/setup.sh tools/fetch_npm.py tools/npm.py
 	@sh tools/setup.sh $*

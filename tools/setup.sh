@@ -53,12 +53,38 @@ make_venv() {
 [ -w "${HOME:-/nonexistent}" ] || export PIP_NO_CACHE_DIR=1
 .venv/bin/python -m pip --version >/dev/null 2>&1 || make_venv
 say "installing Pebble and its dependencies for '$extra' into .venv; the first time takes a minute"
-# Debian's pip takes twice as long to choose the packages for tests; without a newer one it still does.
-[ "$extra" != dev ] || .venv/bin/python -m pip install --disable-pip-version-check --upgrade pip >.venv/pip.log 2>&1 || true
-.venv/bin/python -m pip install --disable-pip-version-check --editable ".[$extra]" >.venv/pip.log 2>&1 || {
-    cat .venv/pip.log >&2
-    fail "pip could not install the dependencies, see above"
+locked=requirements/$extra.txt
+
+pip_install() { .venv/bin/python -m pip install --disable-pip-version-check "$@" >.venv/pip.log 2>&1; }
+
+# Tested together, and checked by their hashes: docs/decisions/0017. All are wheels but esptool.
+install_locked() {
+    pip_install --require-hashes --only-binary :all: --no-binary esptool -r "$locked" &&
+        pip_install --no-deps --no-build-isolation --editable .
 }
+
+# What pyproject.toml allows. Debian's pip takes twice as long to choose the packages for tests; without a newer one it
+# still does.
+install_newest() {
+    [ "$extra" != dev ] || pip_install --upgrade pip || true
+    pip_install --editable ".[$extra]"
+}
+
+pip_failed() {
+    cat .venv/pip.log >&2
+    fail "$1, see above"
+}
+
+rm -f .venv/pip.log
+# For 32-bit Raspberry Pis there are only piwheels' own builds.
+if .venv/bin/python -c "import sys; sys.exit(sys.maxsize < 2**32)" && install_locked; then
+    :
+else
+    ! grep -qs 'DO NOT MATCH THE HASHES' .venv/pip.log || pip_failed "the package index has other files than $locked"
+    say "$locked cannot be installed here: $(grep -s ERROR: .venv/pip.log | tail -n 1)"
+    say "installing the newest versions that pyproject.toml allows"
+    install_newest || pip_failed "pip could not install the dependencies"
+fi
 
 # Programs in JavaScript that tests use, and type stubs of each board's own modules. The ports' stubs
 # contradict each other, so each has its own folder.

@@ -1,0 +1,196 @@
+"""What is installed is bounded, pinned, hashed and named, and an audit without an answer is no success."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from tests.support import ROOT
+
+sys.path.insert(0, str(ROOT / "tools"))
+import audit  # type: ignore[import-not-found]
+import lock  # type: ignore[import-not-found]
+import sbom  # type: ignore[import-not-found]
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+BOUNDS = {"<", "<=", "~=", "=="}
+PIN = re.compile(
+    r"^(?P<name>[a-z0-9.-]+)==(?P<version>[^ ;\\]+)( ; (?P<marker>[^\\]+))? \\\n"
+    r"    --hash=sha256:[0-9a-f]{64}( \\\n    --hash=sha256:[0-9a-f]{64})*",
+    re.MULTILINE,
+)
+
+
+def required() -> list[tuple[str, Requirement]]:
+    """Every direct dependency with what asks for it."""
+    extras = PROJECT["project"]["optional-dependencies"]
+    lists = {"": PROJECT["project"]["dependencies"], **extras, "build": PROJECT["build-system"]["requires"]}
+    lists["tools"] = PROJECT["dependency-groups"]["tools"]
+    return [(extra, Requirement(line)) for extra, lines in lists.items() for line in lines]
+
+
+def pins(name: str) -> list[re.Match[str]]:
+    return list(PIN.finditer((ROOT / "requirements" / f"{name}.txt").read_text()))
+
+
+def versions(name: str) -> dict[str, set[str]]:
+    found: dict[str, set[str]] = {}
+    for pin in pins(name):
+        found.setdefault(pin["name"], set()).add(pin["version"])
+    return found
+
+
+def test_every_dependency_has_an_upper_bound() -> None:
+    open_ended = [str(one) for _, one in required() if not BOUNDS & {part.operator for part in one.specifier}]
+    assert open_ended == []
+
+
+# -- requirements/
+
+
+@pytest.mark.parametrize("name", [*lock.LOCKS, lock.TOOLS])
+def test_every_line_of_a_lock_is_a_pin_with_hashes(name: str) -> None:
+    text = (ROOT / "requirements" / f"{name}.txt").read_text()
+    assert pins(name)
+    rest = [line for line in PIN.sub("", text).splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert rest == [], "no other source, and nothing without a version"
+
+
+@pytest.mark.parametrize("name", [*lock.LOCKS, lock.TOOLS])
+def test_a_lock_has_what_pyproject_asks_for(name: str) -> None:
+    """If not: make lock."""
+    extras = {lock.TOOLS} if name == lock.TOOLS else {"", "build", *lock.LOCKS[name]}
+    locked = versions(name)
+    for extra, wanted in required():
+        if extra in extras:
+            assert canonicalize_name(wanted.name) in locked, f"{name}.txt has no {wanted.name}"
+            for version in locked[canonicalize_name(wanted.name)]:
+                assert wanted.specifier.contains(version), f"{name}.txt has {wanted.name} {version}, not {wanted}"
+
+
+@pytest.mark.parametrize("name", [name for name in lock.LOCKS if name != "dev"])
+def test_robots_install_the_versions_that_the_tests_run_with(name: str) -> None:
+    tested = versions("dev")
+    assert {name: found for name, found in versions(name).items() if not found <= tested.get(name, set())} == {}
+
+
+FAKE_PIP = """#!/bin/sh
+echo "$*" >>"$CALLS"
+case "$*" in
+*--version*) exit 0 ;;
+*--require-hashes*) [ -z "$LOCKED_FAILS" ] || { echo "ERROR: $LOCKED_FAILS"; exit 1; } ;;
+esac
+"""
+
+
+def set_up(folder: Path, locked_fails: str) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+    """tools/setup.sh for the demo, with a Python that only writes down what pip is asked for."""
+    (folder / "tools").mkdir()
+    shutil.copy(ROOT / "tools" / "setup.sh", folder / "tools")
+    python = folder / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text(FAKE_PIP)
+    python.chmod(python.stat().st_mode | stat.S_IXUSR)
+    calls = folder / "calls"
+    environment = {**os.environ, "CALLS": str(calls), "LOCKED_FAILS": locked_fails}
+    command = ["sh", str(folder / "tools" / "setup.sh"), "demo"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    return done, [line.partition(" install ")[2] for line in calls.read_text().splitlines() if " install " in line]
+
+
+def test_a_clone_installs_what_is_locked(tmp_path: Path) -> None:
+    done, installed = set_up(tmp_path, "")
+    assert done.returncode == 0, done.stderr
+    assert installed == [
+        "--disable-pip-version-check --require-hashes --only-binary :all: --no-binary esptool -r requirements/demo.txt",
+        "--disable-pip-version-check --no-deps --no-build-isolation --editable .",
+    ]
+
+
+def test_a_python_without_these_wheels_installs_the_newest_and_reports_it(tmp_path: Path) -> None:
+    done, installed = set_up(tmp_path, "No matching distribution found for numpy==2.4.6")
+    assert done.returncode == 0, done.stderr
+    assert installed[-1] == "--disable-pip-version-check --editable .[demo]"
+    assert "requirements/demo.txt cannot be installed here: ERROR: No matching distribution found" in done.stdout
+
+
+def test_a_file_with_another_hash_ends_the_installation(tmp_path: Path) -> None:
+    done, installed = set_up(tmp_path, "THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE.")
+    assert done.returncode == 1
+    assert len(installed) == 1
+    assert "the package index has other files than requirements/demo.txt, see above" in done.stderr
+
+
+# -- make audit
+
+CLEAN = {"name": "Six", "version": "1", "vulns": []}
+FLAW = {"name": "six", "version": "1", "vulns": [{"id": "PYSEC-1", "fix_versions": ["2"]}]}
+SKIPPED = {"name": "six", "skip_reason": "Dependency not found on PyPI and could not be audited: six (1)"}
+
+
+@pytest.mark.parametrize(
+    ("answer", "log", "code", "line"),
+    [
+        ({"dependencies": [CLEAN]}, "", 0, "f: no known vulnerability in 1 packages; libraries inside wheels"),
+        ({"dependencies": [FLAW]}, "Found 1 known vulnerability", 1, "f: six: PYSEC-1, mended in 2"),
+        ({"dependencies": [SKIPPED]}, "No known vulnerabilities found", 3, "not checked: f: no answer about six"),
+        ({"dependencies": []}, "No known vulnerabilities found", 3, "not checked: f: no answer about six"),
+        ({}, "…\nConnectionError: api.osv.dev\n", 3, "not checked: f: ConnectionError: api.osv.dev"),
+        (None, "", 3, "not checked: f: pip-audit answered nothing"),
+    ],
+)
+def test_an_audit_succeeds_only_with_an_answer_about_every_package(
+    answer: object, log: str, code: int, line: str
+) -> None:
+    found, lines = audit.judge("f", {"six"}, "" if answer is None else json.dumps(answer), log)
+    assert (found, len(lines)) == (code, 1)
+    assert lines[0].startswith(line)
+
+
+def test_an_audit_without_the_service_fails_by_name(tmp_path: Path) -> None:
+    (tmp_path / "pip_audit.py").write_text("raise ConnectionError('api.osv.dev')")
+    command = [sys.executable, str(ROOT / "tools" / "audit.py")]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=environment)
+    assert done.returncode == audit.NOT_CHECKED
+    assert done.stdout.splitlines() == [f"not checked: {file}: ConnectionError: api.osv.dev" for file in audit.FILES]
+
+
+# -- what is in it
+
+
+def test_the_sbom_names_every_vendored_file_and_package_once() -> None:
+    entries = json.loads(sbom.VENDOR.read_text())
+    components = sbom.vendored(entries)
+    assert {part["purl"] for part in components} == {f"pkg:npm/{one['name']}@{one['version']}" for one in entries}
+    assert len({part["bom-ref"] for part in components}) == len(components)
+    files = {(file["name"], file["hashes"][0]["content"]) for part in components for file in part["components"]}
+    assert files == {(one["file"], one["sha256"]) for one in entries}
+
+
+def test_every_package_of_a_robot_is_on_the_page_of_licences() -> None:
+    page = (ROOT / "docs" / "licences.md").read_text()
+    table = page.partition("## Packages of a robot")[2].partition("## What PyAV")[0]
+    assert set(re.findall(r"^\| ([a-z0-9.-]+)", table, re.MULTILINE)) - {"package"} == set(versions("robot"))
+
+
+@pytest.mark.parametrize(
+    ("package", "heading"),
+    [("av", "What PyAV's wheel contains"), ("opencv-python-headless", "What OpenCV's wheel contains")],
+)
+def test_the_libraries_inside_a_wheel_are_on_the_page_of_licences(package: str, heading: str) -> None:
+    """The page describes the locked version: read its wheel again if that changes."""
+    page = (ROOT / "docs" / "licences.md").read_text()
+    (version,) = versions("robot")[package]
+    assert f"version {version}" in page.partition(heading)[2]
