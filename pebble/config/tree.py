@@ -120,19 +120,19 @@ class SystemControl(Section, frozen=True, kw_only=True):
 
 
 class RebootControl(SystemControl, frozen=True, kw_only=True):
-    """What `flags/reboot` runs, for example `sudo -n /sbin/reboot`."""
+    """What `flags/reboot` runs, for example `systemctl --no-ask-password reboot`."""
 
     cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 30.0
 
 
 class ServiceRestartControl(SystemControl, frozen=True, kw_only=True):
-    """What `flags/service-restart` runs, for example `sudo -n systemctl restart pebble.service`."""
+    """What `flags/service-restart` runs, for example `systemctl --no-block restart pebble.service`."""
 
     cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 10.0
 
 
 class GitPullControl(SystemControl, frozen=True, kw_only=True):
-    """What `flags/git-pull` runs, for example `git -C /opt/pebble pull --ff-only`."""
+    """What `flags/git-pull` runs, for example `systemctl --no-ask-password start pebble-update.service`."""
 
     cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 60.0
 
