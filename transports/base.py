@@ -18,6 +18,7 @@ from typing import Self
 import msgspec
 
 from pebble.errors import TransportError
+from pebble.transports import clock
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.counters import Counters
 from pebble.transports.topics import check_filter, check_topic, matches
@@ -53,6 +54,8 @@ class Message(msgspec.Struct, frozen=True):
     Published: ``retain`` asks the broker to retain it. Received: ``retain`` marks a retained message, an old value; on
     a connection opened ``as_published`` it means "retained, or published with retain". ``retain_requested`` says
     whether the publisher of a live message set ``retain``; None where the broker hides it (T5, T7).
+    ``waiting_since``, by :func:`clock.since_boot`, is the earliest moment from which it may have waited for this
+    process, in a socket or a queue (T19); None: published here, or unknown.
     """
 
     topic: str
@@ -60,6 +63,12 @@ class Message(msgspec.Struct, frozen=True):
     qos: QoS = QoS.LATEST
     retain: bool = False
     retain_requested: bool | None = None
+    waiting_since: float | None = None
+
+    @property
+    def waited_s(self) -> float:
+        """For how many seconds it has waited at most, until now; 0 where that is unknown."""
+        return 0.0 if self.waiting_since is None else max(0.0, clock.since_boot() - self.waiting_since)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from pebble.commands.estop import me
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, UrlOption
 from pebble.media.in_flight import InFlight
 from pebble.transports import Message, QoS, State, Transport
+from pebble.transports.clock import since_boot as clock
 
 if TYPE_CHECKING:
     from pebble.client.terminal_keys import Terminal
@@ -93,14 +94,6 @@ def drive(
 
 def register(app: typer.Typer) -> None:
     app.command("drive")(drive)
-
-
-def clock() -> float:
-    """Seconds that go on while the machine is suspended, where the system has such a clock."""
-    for name in ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"):  # of Linux; of macOS, whose time.monotonic() stands still
-        if hasattr(time, name):
-            return time.clock_gettime(getattr(time, name))
-    return time.monotonic()
 
 
 class _Loop:

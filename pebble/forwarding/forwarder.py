@@ -5,7 +5,8 @@ for another thread. All retained messages pass under one lock, because both side
 commands and streams never wait for it.
 
 Retained commands are stale. A live emergency stop passes even if it was published to be retained: a stop that does not
-arrive is worse than one that a later subscriber must recognise as old.
+arrive is worse than one that a later subscriber must recognise as old. What happens once is also stale when it has
+waited here, in a process that was stopped or stuck; a stop never is, nor is a zero.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import NamedTuple
 
-from pebble.contract import ESTOP, Kind
+from pebble.contract import DRIVE, ESTOP, Kind, codec
+from pebble.contract.payloads import Drive
+from pebble.errors import PayloadError
 from pebble.forwarding.admission import Admission
 from pebble.forwarding.event_buffer import EventBuffer
 from pebble.forwarding.loopback_filter import LoopbackFilter
 from pebble.forwarding.reconciliation import Reconciliation, Resolution
-from pebble.forwarding.routing import URGENT, Drop, Forward, Rules, Side, route
+from pebble.forwarding.routing import ONE_SHOT, URGENT, Drop, Forward, Rules, Side, route
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, State, Transport
@@ -39,6 +42,7 @@ _RETAINED_S = 0.05
 #: others with the retain flag keep arriving, a stop with it counts as an old one, but not for longer than this.
 _RETAINED_STOPS_S = 10.0
 _LOGGED = 200  # characters of a topic
+_LATE_S = 0.5  # what happens once and has waited here for longer is stale
 _MAX_WAITING = 4096  # retained messages that wait for the gate to open
 
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
@@ -176,6 +180,8 @@ class Forwarder:
         if refused is not None:
             self._quiet_log.warning(refused.name, "%s is not forwarded: %s", message.topic[:_LOGGED], refused.value)
             return refused
+        if _is_late(subject, message):
+            return Drop.LATE
         if self._is_echo(side, subject, message):
             return Drop.ECHO
         if forward.retain:
@@ -324,6 +330,22 @@ def _ignore(_message: Message) -> None:
 
 def _is_stop(subject: Subject | None) -> bool:
     return subject is not None and subject.channel is ESTOP
+
+
+def _is_late(subject: Subject, message: Message) -> bool:
+    if subject.kind not in ONE_SHOT or message.waited_s <= _LATE_S:
+        return False
+    return not (_is_stop(subject) or _is_zero(subject, message))
+
+
+def _is_zero(subject: Subject, message: Message) -> bool:
+    if subject.channel is not DRIVE:
+        return False
+    try:
+        drive: Drive = codec.decode(DRIVE, message.payload)
+    except PayloadError:
+        return False
+    return not drive.moves
 
 
 def _is_event(subject: Subject, message: Message) -> bool:

@@ -28,7 +28,8 @@ def on(channel: Channel, *, direct: bool = False) -> Callable[[Method], Method]:
     """Mark a method as the handler of ``channel``; it is called with the decoded payload.
 
     For a pattern channel, the names in the topic are arguments too: ``def report(self, report, program)``.
-    ``direct`` is for a handler with an inbox of its own: it runs on the transport's thread, and must return at once.
+    ``direct`` is for a handler with an inbox of its own: it runs on the transport's thread, and must return at once. It
+    also receives when the message arrived, on ``clock``: ``def drive(self, drive, arrived)``.
     Channels are subscribed to in the order of their methods.
     """
 
@@ -290,14 +291,16 @@ class Service:
             self.counters.add("refused")
             self._quiet_log.warning(channel.metric, "refused a message: %s", error)
             return
+        arrived = self.clock() - message.waited_s
         if direct:
-            method(value, **names)
+            method(value, arrived, **names)
             return
-        arrived = self.clock()
-        self._inbox.post(
-            lambda: self._handle(channel, lambda: method(value, **names), arrived),
-            newest_of=message.topic if channel.newest else None,
-        )
+
+        def handle() -> None:
+            # The service's clock may stand still while the machine is suspended; the message's does not.
+            self._handle(channel, lambda: method(value, **names), min(arrived, self.clock() - message.waited_s))
+
+        self._inbox.post(handle, newest_of=message.topic if channel.newest else None)
 
     def _on_state(self, state: State) -> None:
         if state is State.CONNECTED:

@@ -16,6 +16,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.client.estop_states import Reset
 from pebble.fleet.roles import Session, rights
+from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.driving import Tab
@@ -23,7 +24,7 @@ from pebble.web.login import named, printable
 from pebble.web.pace import Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
 from pebble.web.robots import Interest
-from pebble.web.server import Server, clock, encode
+from pebble.web.server import Server, encode
 
 log = logging.getLogger(__name__)
 

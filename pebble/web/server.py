@@ -22,6 +22,7 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
 from pebble.transports import Message
+from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.broker import Broker
@@ -43,12 +44,6 @@ _RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
 _ANNOUNCED = 64  # robots in one announcement
 _ESTOP_METRIC = "web/estop"
 _STREAM_ADDRESS = "stream-address "  # what a setting of the server begins with; then the component
-
-
-def clock() -> float:
-    """Seconds that go on while the machine is suspended, where the system has such a clock."""
-    boottime = getattr(time, "CLOCK_BOOTTIME", None)
-    return time.monotonic() if boottime is None else time.clock_gettime(boottime)
 
 
 class Server:

@@ -152,7 +152,7 @@ class AutonomyManager(Service):
             self._runner.stop(why)
 
     @on(DRIVE, direct=True)
-    def drive(self, drive: Drive) -> None:
+    def drive(self, drive: Drive, _arrived: float) -> None:
         """On the transport's thread. A person's commands all mean the same here."""
         if not drive.signed:
             self.post(self._person_drives, newest_of="person")

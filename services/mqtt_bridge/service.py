@@ -239,7 +239,7 @@ class MqttBridge(Service):
             if channel is None or not (local and self._actions.accepts_retained(channel)):
                 self._refuse_stale(channel)
                 return
-        elif routed.outcome is Drop.ECHO or not (local or isinstance(routed.outcome, Forward)):
+        elif routed.outcome in (Drop.ECHO, Drop.LATE) or not (local or isinstance(routed.outcome, Forward)):
             return
         reaction = self._message_reactions.get(channel.suffix) if channel is not None else None
         if reaction is not None:

@@ -17,7 +17,7 @@ from pebble.forwarding.probes import PROBE_REQUEST, Probes, new_probe
 from pebble.forwarding.reconciliation import TOPICS, Reconciliation, Resolution
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.subjects import Subjects
-from pebble.transports import Message, QoS, State
+from pebble.transports import Message, QoS, State, clock
 from pebble.transports.counters import Counters
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
@@ -354,6 +354,45 @@ class TestGate:
         forwarder.rearm()
         forwarder.open()
         assert remote.sent == []
+
+
+class TestLate:
+    """What has waited in a process that stood still, before it was forwarded."""
+
+    @pytest.fixture
+    def local(self) -> Wire:
+        return Wire()
+
+    @pytest.fixture
+    def forwarder(self, local: Wire) -> Forwarder:
+        transports = {LOCAL: local, REMOTE: Wire()}
+        forwarder = Forwarder(Subjects(make_config()), TABLE_A1, transports, winner=REMOTE, clock=Clock())
+        forwarder.open()
+        return forwarder
+
+    @pytest.mark.parametrize(
+        ("metric", "payload", "passes"),
+        [
+            ("drive-values", b'{"z": 1}', False),
+            ("drive-values", b"{", False),
+            ("drive-values", b'{"z": 0}', True),  # a stop must arrive
+            ("estop", b"{}", True),
+            ("estop-reset", b'{"boot": "a", "count": 1}', False),
+            ("soundboard-command", b'{"action": "play", "file": "a"}', False),
+            ("flags/reboot", b"true", False),
+            ("flags/mqtt-video", b"true", True),
+        ],
+    )
+    def test_what_happens_once_is_dropped(
+        self, forwarder: Forwarder, local: Wire, metric: str, payload: bytes, passes: bool
+    ) -> None:
+        now = clock.since_boot()
+        for waiting_since in (now - 0.6, now):
+            forwarder.receive(
+                REMOTE, Message(f"{BASE}/incoming/{metric}", payload, QoS.DELIVERED, waiting_since=waiting_since)
+            )
+        assert local.sent == [payload] * (1 + passes)
+        assert forwarder.counters["remote: waited too long in this process"] == (not passes)
 
 
 class TestStops:

@@ -34,7 +34,7 @@ from pebble.contract.payloads import (
     TouchValues,
 )
 from pebble.service import Service, every, on
-from pebble.transports import Message, QoS, State, Subscription
+from pebble.transports import Message, QoS, State, Subscription, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import until
 
@@ -323,6 +323,34 @@ def test_a_steering_command_that_waited_too_long_is_dropped(robot: Robot) -> Non
     robot.publish(DRIVE_TOPIC, '{"x": 0.25}')
     assert robot.saw("a", "b", 0.25)
     assert robot.service.counters["late"] == 1
+
+
+def test_a_command_that_waited_while_the_machine_was_suspended_is_dropped(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the inbox or before; the service's own clock may have stood still meanwhile."""
+    now = clock.since_boot
+    robot.start()
+    robot.service.go_on.clear()
+    robot.publish(f"{BASE}/incoming/soundboard-command", '{"action": "play", "file": "a"}')
+    assert robot.saw("a")
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert until(lambda: robot.service.transport.counters["delivered"] == 2)
+    monkeypatch.setattr(clock, "since_boot", lambda: now() + 3600)
+    robot.service.go_on.set()
+    assert until(lambda: robot.service.counters["late"] == 1)
+    robot.publish(DRIVE_TOPIC, '{"x": 0.25}')
+    assert robot.saw("a", 0.25)
+
+
+def test_a_command_that_waited_in_the_transport_is_dropped(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot.start()
+    monkeypatch.setattr(robot.hub, "now", lambda: clock.since_boot() - 0.6)
+    robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert until(lambda: robot.service.counters["late"] == 1)
+    monkeypatch.undo()
+    robot.publish(DRIVE_TOPIC, '{"x": 0.25}')
+    assert robot.saw(0.25)
 
 
 def test_commands_that_must_all_be_handled_are(robot: Robot) -> None:

@@ -19,7 +19,7 @@ import pytest
 from paho.mqtt.client import topic_matches_sub
 
 from pebble.errors import TransportError
-from pebble.transports import Message, QoS, State, Transport
+from pebble.transports import Message, QoS, State, Transport, clock
 from tests.support import ROOT, until
 from tests.transports.net import Net
 from tests.transports.received import Received
@@ -34,6 +34,11 @@ def drained(sender: Transport, receiver: Transport, base: str) -> None:
     assert sender.publish(f"{base}/last-word", b"", qos=DELIVERED)
     assert until(lambda: last.messages)
     subscription.close()
+
+
+def arrived_on_another_connection(net: Net, sender: Transport, base: str) -> None:
+    """Wait until what ``sender`` has published is on its way to every subscriber."""
+    drained(sender, net.client("bystander"), base)
 
 
 @contextmanager
@@ -576,6 +581,40 @@ def test_T19_a_network_that_stopped_answering_is_not_connected(net: Net, base: s
         assert until(lambda: client.state is State.CONNECTING)
         net.thaw_network()
     drained(client, client, base)
+
+
+@pytest.mark.parametrize("direct", [False, True], ids=["queued", "direct"])
+def test_T19_a_message_says_how_long_it_has_waited_for_a_process_that_stood_still(
+    net: Net, base: str, direct: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped, suspended or stuck: the second message is there while the first one is being handled."""
+    client, sender, stopped, go_on = net.client("client"), net.client("sender"), threading.Event(), threading.Event()
+    waited: list[float] = []
+
+    def handle(message: Message) -> None:
+        waited.append(message.waited_s)
+        stopped.set()
+        go_on.wait(10)
+
+    client.subscribe(base, handle, direct=direct)
+    assert sender.publish(base, b"first", qos=DELIVERED)
+    assert stopped.wait(10)
+    assert sender.publish(base, b"second", qos=DELIVERED)
+    arrived_on_another_connection(net, sender, base)
+    now = clock.since_boot
+    monkeypatch.setattr(clock, "since_boot", lambda: now() + 0.6)
+    go_on.set()
+    assert until(lambda: len(waited) == 2)
+    assert waited[0] < 0.6 <= waited[1]
+
+
+def test_T19_a_fresh_message_has_not_waited(net: Net, base: str) -> None:
+    client, sender, waited = net.client("client"), net.client("sender"), []
+    client.subscribe(base, lambda message: waited.append(message.waited_s))
+    for _ in range(20):
+        assert sender.publish(base, b"", qos=DELIVERED)
+    assert until(lambda: len(waited) == 20)
+    assert min(waited) < 0.1
 
 
 # -- T13, T14: handlers

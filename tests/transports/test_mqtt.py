@@ -16,8 +16,8 @@ import pytest
 from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.errors import TransportError
-from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, create
-from pebble.transports.mqtt.connection import UNACKED_LIMIT
+from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
+from pebble.transports.mqtt.connection import UNACKED_LIMIT, Connection
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
 from tests.tcp_proxy import TcpProxy
 from tests.transports.received import Received
@@ -310,6 +310,43 @@ def test_what_a_frozen_broker_found_when_it_woke_up_never_arrives(tmp_path: Path
     operator.disconnect()
     operator.loop_stop()
     broker.stop()
+
+
+def test_what_came_while_the_machine_was_suspended_never_arrives(
+    broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The connection may have survived that. ``time.monotonic()`` does not count a suspend."""
+    robot, received, now = clients(broker.port), Received(), clock.since_boot
+    robot.subscribe(topic, received)
+    operator = connect_as(broker, "operator")
+    monkeypatch.setattr(clock, "since_boot", lambda: now() + 10)
+    operator.publish(topic, b"typed while it slept", qos=1).wait_for_publish(10)
+    assert reconnected(robot)
+    operator.publish(topic, b"after", qos=1).wait_for_publish(10)
+    assert received.until(b"after")
+    operator.disconnect()
+    operator.loop_stop()
+
+
+def test_a_stop_of_the_process_while_it_reads_counts(
+    broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stops, now, read = [0.0], clock.since_boot, Connection._on_message
+    monkeypatch.setattr(clock, "since_boot", lambda: now() + stops[0])
+
+    def read_late(*arguments: Any) -> None:
+        stops[0] += 0.6
+        read(*arguments)
+
+    monkeypatch.setattr(Connection, "_on_message", read_late)
+    waited: list[float] = []
+    robot, operator = clients(broker.port), connect_as(broker, "operator")
+    robot.subscribe(topic, lambda message: waited.append(message.waited_s))
+    operator.publish(topic, b"", qos=1)
+    assert until(lambda: waited)
+    assert waited[0] >= 0.6
+    operator.disconnect()
+    operator.loop_stop()
 
 
 @pytest.mark.parametrize(("keepalive_s", "silence_s", "interval_s"), [(0, 2.0, 0.5), (0, 0.001, 0.05)])

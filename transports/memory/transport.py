@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from msgspec.structs import replace
 
+from pebble.transports import clock
 from pebble.transports.base import Message, State, Subscription, Transport
 
 INBOX_LIMIT = 10_000  # undelivered messages per client
@@ -78,9 +79,13 @@ class MemoryHub:
                 self.retained[message.topic], self.publishers[message.topic] = message, publisher
             elif message.retain:
                 self.retained.pop(message.topic, None)
-            live = replace(message, retain=False, retain_requested=message.retain)
+            live = replace(message, retain=False, retain_requested=message.retain, waiting_since=self.now())
             for client in self._connected_clients:
                 client.receive(_Delivery(live, publisher))
+
+    def now(self) -> float | None:
+        """The time at which messages are handed over; None in a simulated time."""
+        return clock.since_boot()
 
     def _wake_all(self) -> None:
         for client in self._clients:

@@ -27,8 +27,10 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS
 from pebble.transports.counters import Counters
+from pebble.transports.mqtt.incoming import WaitingTime, readable_bytes
 from pebble.transports.mqtt.outgoing import Backlog, InFlightTable, PendingAck, shortest_round_trip_s, unconfirmed_bytes
 from pebble.transports.settings import MqttSettings
 
@@ -39,6 +41,7 @@ _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connec
 UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
+_OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _BATCH = 64  # messages read in a row before they are delivered
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
@@ -90,6 +93,7 @@ class _Client(paho.Client):
     """paho, with pings of our own (its keepalive is too slow for T19) and the size of what it has not written."""
 
     on_pong: Callable[[], None]
+    received = 0  # bytes so far
 
     @property
     def unwritten(self) -> int:
@@ -98,6 +102,11 @@ class _Client(paho.Client):
 
     def ping(self) -> None:
         self._send_pingreq()
+
+    def _sock_recv(self, bufsize: int) -> bytes:
+        data = super()._sock_recv(bufsize)
+        self.received += len(data)
+        return data
 
     def _handle_pingresp(self) -> MQTTErrorCode:
         self.on_pong()
@@ -135,7 +144,8 @@ class Connection:
         self._answers: dict[str, bool] = {}  # filters answered since the last `on_answers`: refused?
         self._backlog = Backlog()
         self._in_flight = InFlightTable()
-        self._answered_at = time.monotonic()
+        self._answered_at = clock.since_boot()
+        self._waiting = WaitingTime(self._answered_at)
         self._packets = 0  # received so far
         self._more = False  # a batch ended before the socket was empty
         self._accepted = False
@@ -154,7 +164,7 @@ class Connection:
         except (OSError, ValueError) as error:
             raise Lost(f"{self.where} cannot be reached: {error}") from None
         self.dialling = False
-        self._answered_at = time.monotonic()
+        self._answered_at = clock.since_boot()
         deadline = time.monotonic() + CONNECT_TIMEOUT_S
         try:
             while not self._accepted:
@@ -227,22 +237,31 @@ class Connection:
             blocked = self._client.want_write()
             poll = _Poll(sock.fileno(), self._wake_read.fileno(), write=blocked)
             wait = 0.0 if self._more else min(timeout, self._ping_due_in())
-        readable, writable, woken = poll.wait(max(wait, 0.0))
+        began = clock.since_boot()
+        readable, writable, woken = poll.wait(0.0)
+        if not (readable or writable or woken):
+            self._waiting.empty(began)
+            readable, writable, woken = poll.wait(max(wait, 0.0))
+            if (now := clock.since_boot()) - began <= wait + _OVERSLEPT_S:
+                self._waiting.empty(now)  # until just now
         if woken:
             self._wake_read.recv(4096)
         if writable:
-            self._answered_at = time.monotonic()  # the other side's TCP accepted some: slow, but alive
+            self._answered_at = clock.since_boot()  # the other side's TCP accepted some: slow, but alive
+        if readable:
+            self._waiting.found(readable_bytes(sock), clock.since_boot())
         return readable
 
     def _check_silence(self) -> None:
         if not self._accepted:
             return  # `connect` has its own deadline, and gives the first round trip
         limit = max(self._settings.silence_s, 4 * _LEAST_PING_S, 4 * self._in_flight.round_trip_s)
-        if time.monotonic() - self._answered_at > limit:
+        if clock.since_boot() - self._answered_at > limit:
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 
     def _read(self) -> None:
+        began, size = clock.since_boot(), self._client.received
         received = before = self._packets
         while True:
             self._read_some()
@@ -250,10 +269,13 @@ class Connection:
                 break
             before = self._packets
         if self._packets == received:
-            self._answered_at = time.monotonic()  # a piece of a long message: alive
+            self._answered_at = clock.since_boot()  # a piece of a long message: alive
         sock = self._socket()
         buffered = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
         self._more = buffered or len(self._inbox) >= _BATCH
+        self._waiting.read(self._client.received - size)
+        if not self._more:
+            self._waiting.empty(began)
 
     def _read_some(self) -> None:
         failed = self._client.loop_read()
@@ -293,7 +315,7 @@ class Connection:
         return ack
 
     def _ping(self, ack: PendingAck | None = None) -> None:
-        self._in_flight.ping(time.monotonic(), ack)
+        self._in_flight.ping(clock.since_boot(), ack)
         self._client.ping()
         self._client.loop_write()
 
@@ -301,7 +323,7 @@ class Connection:
         newest = self._in_flight.pinged_at
         keepalive_s = self._settings.keepalive_s or inf  # 0: none
         interval = max(_LEAST_PING_S, min(self._settings.silence_s, keepalive_s) / 4)
-        return (self._answered_at if newest is None else newest) + interval - time.monotonic()
+        return (self._answered_at if newest is None else newest) + interval - clock.since_boot()
 
     def _on_pong(self) -> None:
         self._note_answer()
@@ -335,7 +357,7 @@ class Connection:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
             properties.MessageExpiryInterval = expires_s
         sent = self._client.publish(message.topic, message.payload, int(message.qos), message.retain, properties)
-        self._in_flight.sent(message, sent.mid, time.monotonic())
+        self._in_flight.sent(message, sent.mid, clock.since_boot())
         self._client.loop_write()
 
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
@@ -398,7 +420,7 @@ class Connection:
             round_trip_s, since = shortest_round_trip_s(sock), self._in_flight.waiting_since
             # TCP may end before the broker; and brokers without TCP_NODELAY send an answer after that to the one before
             usual_s = 2 * max(round_trip_s, self._in_flight.round_trip_s)
-            stalled_s = 0.0 if since is None else max(0.0, time.monotonic() - since - usual_s)
+            stalled_s = 0.0 if since is None else max(0.0, clock.since_boot() - since - usual_s)
             return Outgoing(waiting, round_trip_s, stalled_s)
 
     def unconfirmed_retained(self) -> list[Message]:
@@ -437,7 +459,7 @@ class Connection:
 
     def _note_answer(self) -> None:
         self._packets += 1
-        self._answered_at = time.monotonic()
+        self._answered_at = clock.since_boot()
 
     def _on_socket_open(self, _client: Any, _data: Any, sock: Any) -> None:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -479,7 +501,7 @@ class Connection:
 
     def _on_publish(self, _client: Any, _data: Any, mid: int, _reason: Any, _properties: Any) -> None:
         if self._in_flight.acknowledge(
-            mid, time.monotonic()
+            mid, clock.since_boot()
         ):  # paho also reports QoS 0 messages, which are only written
             self._note_answer()
 
@@ -492,7 +514,8 @@ class Connection:
             return
         retain = bool(raw.retain)
         retain_requested = retain if self.as_published else (True if retain else None)
-        self._inbox.append(Message(topic, bytes(raw.payload), QoS(min(raw.qos, 1)), retain, retain_requested))
+        qos, since = QoS(min(raw.qos, 1)), self._waiting.since
+        self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, since))
 
 
 def _explain(reason: ReasonCode) -> str:

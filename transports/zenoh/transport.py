@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from pebble.errors import TransportError
+from pebble.transports import clock
 from pebble.transports.base import QUEUE_BYTES, QUEUE_LIMIT, Message, QoS, State, Subscription, Transport
 from pebble.transports.bounds import BoundedQueue
 from pebble.transports.counters import Counters
@@ -344,10 +345,11 @@ class ZenohTransport(Transport):
 
         def take(sample: zenoh.Sample) -> None:
             self.counters.add("received")
+            read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
             if self._is_late(sample, stamp):
                 return
-            message = _live_message(sample, stamp, subscription.qos)
+            message = _live_message(sample, stamp, subscription.qos, read_at)
             if subscription.direct and self._putting == threading.get_ident():
                 self._loopback.put(subscription, message)
             else:
@@ -481,9 +483,11 @@ def _direct(function: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
     return zenoh.handlers.Callback(function, indirect=False)
 
 
-def _live_message(sample: zenoh.Sample, stamp: wire.LiveStamp, qos: QoS) -> Message:
+def _live_message(sample: zenoh.Sample, stamp: wire.LiveStamp, qos: QoS, read_at: float) -> Message:
+    """A sender of the same boot shares the clock, so that also the time in the socket counts."""
+    waiting_since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else read_at
     topic = key_to_topic(str(sample.key_expr))
-    return Message(topic, sample.payload.to_bytes(), min(stamp.qos, qos), retain_requested=stamp.retain_requested)
+    return Message(topic, sample.payload.to_bytes(), min(stamp.qos, qos), False, stamp.retain_requested, waiting_since)
 
 
 def _retained_message(sample: zenoh.Sample, stamp: wire.Stamp, qos: QoS) -> Message:

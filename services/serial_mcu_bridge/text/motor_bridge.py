@@ -102,16 +102,16 @@ class MotorBridge(SerialService):
     # -- on the transport's threads; the stop is subscribed to before the drive commands
 
     @on(ESTOP, direct=True)
-    def receive_stop(self, stop: EstopCommand) -> None:
+    def receive_stop(self, stop: EstopCommand, _arrived: float) -> None:
         self._judge_soon(self._waiting.put_stop(stop))
 
     @on(ESTOP_RESET, direct=True)
-    def receive_reset(self, reset: EstopReset) -> None:
-        self._judge_soon(self._waiting.put_reset(reset, self.clock()))
+    def receive_reset(self, reset: EstopReset, arrived: float) -> None:
+        self._judge_soon(self._waiting.put_reset(reset, arrived))
 
     @on(DRIVE, direct=True)
-    def receive_drive(self, drive: Drive) -> None:
-        self._judge_soon(self._waiting.put_drive(drive, self.clock()))
+    def receive_drive(self, drive: Drive, arrived: float) -> None:
+        self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def _judge_soon(self, was_empty: bool) -> None:
         if was_empty:

@@ -31,6 +31,9 @@ class Network(MemoryHub):
         self._last: dict[tuple[Process | None, Connection], float] = {}  # arrivals
         self._recent: dict[Process, deque[tuple[Any, Connection, int]]] = {}
 
+    def now(self) -> None:
+        """Messages are as old as the services' own clock says."""
+
     def distribute(self, message: Message, publisher: Any) -> None:
         self.published(publisher.process, message)
         super().distribute(message, publisher)

@@ -71,7 +71,7 @@ def test_after_a_pause_of_the_process_the_stop_is_sent_before_the_next_command(b
 
     def pause() -> None:
         time.sleep(0.9)
-        bench.service.receive_drive(Drive(x=0.0, z=0.25))
+        bench.service.receive_drive(Drive(x=0.0, z=0.25), bench.service.clock())
         bench.service._judge()
 
     bench.service.post(pause)
