@@ -17,6 +17,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
+from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, Connection
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
 from tests.tcp_proxy import TcpProxy
@@ -398,6 +399,79 @@ def test_a_long_message_on_a_slow_link_is_not_a_silence(broker: Broker, clients:
         assert client.publish(topic, payload, qos=DELIVERED)
         assert received.until(payload, timeout=30)
         assert client.counters["silences"] == 0
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transport_module, "_ANSWER_S", 0.3)
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize(("count", "size"), [(40, 1000), (1, 40_000)], ids=["many", "a large one"])
+def test_retained_messages_may_take_longer_than_an_answer(
+    broker: Broker, clients: Clients, topic: str, count: int, size: int
+) -> None:
+    planter, received = clients(broker.port, "planter"), Received()
+    for number in range(count):
+        assert planter.publish(f"{topic}/{number}", bytes(size), qos=DELIVERED, retain=True)
+    with TcpProxy(broker.port, delay_s=0.01, piece=300) as slow:
+        robot = clients(slow.port, "robot", silence_s=0.3, opened=False)
+        robot.open(0.0)
+        robot.subscribe(f"{topic}/#", received)
+        assert until(lambda: robot.state is State.CONNECTED), robot.problem
+        assert received.until(*[bytes(size)] * count)
+        assert robot.counters["connected"] == 1
+        assert robot.counters["silences"] == 0
+
+
+def test_handling_retained_messages_may_take_longer_than_an_answer(
+    broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bridge publishes each of them on its other side, which may delay that."""
+    planter, received, slow, now = clients(broker.port, "planter"), Received(), [0.0], clock.since_boot
+    for number in range(5):
+        assert planter.publish(f"{topic}/{number}", b"%d" % number, qos=DELIVERED, retain=True)
+    planter.close()
+    monkeypatch.setattr(clock, "since_boot", lambda: now() + slow[0])
+
+    def handle(message: Message) -> None:
+        slow[0] += 1.0
+        received(message)
+
+    robot = clients(broker.port, "robot", opened=False).open(0.0)
+    robot.subscribe(f"{topic}/#", handle, direct=True)
+    assert received.until(*[b"%d" % number for number in range(5)])
+    assert until(lambda: robot.state is State.CONNECTED)
+    assert robot.counters["connected"] == 1
+    assert robot.counters["silences"] == 0
+
+
+@pytest.mark.usefixtures("impatient")
+def test_what_stood_behind_many_retained_messages_does_not_count_as_fresh(
+    broker: Broker, clients: Clients, topic: str
+) -> None:
+    planter, commands = clients(broker.port, "planter"), []
+    for number in range(60):  # with QoS 0, of which no broker limits how many are on their way
+        assert planter.publish(f"{topic}/{number}", bytes(1000), retain=True)
+    with TcpProxy(broker.port, delay_s=0.01, piece=300) as slow:
+        robot = clients(slow.port, "robot", silence_s=0.3, opened=False)
+
+        def receive(message: Message) -> None:
+            began.set()
+            if not message.retain:
+                commands.append((clock.since_boot() - float(message.payload), message.waited_s))
+
+        began = threading.Event()
+        robot.open(0.0)
+        robot.subscribe(f"{topic}/#", receive)
+        assert began.wait(10)
+        assert planter.publish(topic, b"%f" % clock.since_boot())
+        assert until(lambda: robot.state is State.CONNECTED)
+        assert planter.publish(topic, b"%f" % clock.since_boot())
+        assert until(lambda: len(commands) == 2)
+        (age, waited), (_, fresh) = commands
+        assert waited >= age > 1
+        assert fresh < 0.3
 
 
 @pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])

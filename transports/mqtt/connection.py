@@ -135,6 +135,8 @@ class Connection:
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
         self.hesitated = False  # the broker took so long to accept us that it may have been suspended
         self.where = f"broker {settings.host}:{settings.port}"
+        #: When there was the last sign that the answers are behind retained messages, or behind a long one.
+        self.arriving_at = float("-inf")
         self._settings, self._counters = settings, counters
         self._modern = settings.protocol == "5"
         self._lock = threading.RLock()
@@ -146,6 +148,7 @@ class Connection:
         self._in_flight = InFlightTable()
         self._answered_at = clock.since_boot()
         self._waiting = WaitingTime(self._answered_at)
+        self._overdue = False  # an answer is, or was until the newest one
         self._packets = 0  # received so far
         self._more = False  # a batch ended before the socket was empty
         self._accepted = False
@@ -227,6 +230,7 @@ class Connection:
         if answers:
             self._on_answers(answers)
         receive(messages)
+        self._note_copies(messages)  # again: they may take longer to handle than an answer may
         self._in_flight.complete()
 
     def _wait(self, timeout: float) -> bool:
@@ -255,10 +259,29 @@ class Connection:
     def _check_silence(self) -> None:
         if not self._accepted:
             return  # `connect` has its own deadline, and gives the first round trip
-        limit = max(self._settings.silence_s, 4 * _LEAST_PING_S, 4 * self._in_flight.round_trip_s)
-        if clock.since_boot() - self._answered_at > limit:
+        limit, now = self._silence_limit_s, clock.since_boot()
+        if now - max(self._answered_at, self.arriving_at) > limit:
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
+        self._overdue |= now - self._answered_at > limit
+
+    @property
+    def _silence_limit_s(self) -> float:
+        return max(self._settings.silence_s, 4 * _LEAST_PING_S, 4 * self._in_flight.round_trip_s)
+
+    @property
+    def _waiting_since(self) -> float:
+        """Since when what is read now may have waited; at the broker too, where it was behind what delayed an answer."""
+        if self._overdue:
+            asked_at = self._in_flight.newest_answered_at
+            self._overdue = clock.since_boot() - asked_at > self._silence_limit_s
+            if self._overdue:
+                return min(self._waiting.since, asked_at)
+        return self._waiting.since
+
+    def _note_copies(self, messages: list[Message]) -> None:
+        if any(message.retain for message in messages):
+            self.arriving_at = clock.since_boot()
 
     def _read(self) -> None:
         began, size = clock.since_boot(), self._client.received
@@ -269,7 +292,8 @@ class Connection:
                 break
             before = self._packets
         if self._packets == received:
-            self._answered_at = clock.since_boot()  # a piece of a long message: alive
+            self.arriving_at = clock.since_boot()  # a piece of a long message
+        self._note_copies(self._inbox)
         sock = self._socket()
         buffered = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
         self._more = buffered or len(self._inbox) >= _BATCH
@@ -472,6 +496,7 @@ class Connection:
         started = self._answered_at
         self._note_answer()
         self._in_flight.measured(self._answered_at - started)
+        self._in_flight.newest_answered_at = started
         self.hesitated = self._answered_at - started > _HESITATION_S
         if reason.is_failure:
             self._refusal = f"{self.where} refused us: {_explain(reason)}"
@@ -514,7 +539,7 @@ class Connection:
             return
         retain = bool(raw.retain)
         retain_requested = retain if self.as_published else (True if retain else None)
-        qos, since = QoS(min(raw.qos, 1)), self._waiting.since
+        qos, since = QoS(min(raw.qos, 1)), self._waiting_since
         self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, since))
 
 

@@ -129,6 +129,8 @@ class InFlightTable:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
         self._unacked: dict[int, tuple[str | None, float]] = {}  # by message id: the topic, if retained; when sent
         self._acked_at = float("-inf")  # the newest acknowledgement
+        #: When the newest of what is answered was sent: what the broker sends after the answer is no older.
+        self.newest_answered_at = float("-inf")
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, PendingAck] = {}
         self._answered: list[PendingAck] = []  # not completed yet
@@ -173,7 +175,8 @@ class InFlightTable:
         if mid not in self._unacked:
             return False
         self._acked_at = now
-        topic, _ = self._unacked.pop(mid)
+        topic, sent_at = self._unacked.pop(mid)
+        self.newest_answered_at = max(self.newest_answered_at, sent_at)
         if topic is not None and topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
         return True
@@ -206,6 +209,7 @@ class InFlightTable:
             return
         sent_at, ack = self._pings.popleft()
         self._pong_number += 1
+        self.newest_answered_at = max(self.newest_answered_at, sent_at)
         self.measured(now - sent_at)
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]

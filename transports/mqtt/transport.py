@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from math import ceil
 
 from pebble.errors import TransportError
+from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
@@ -240,13 +241,14 @@ class MqttTransport(Transport):
         stopping: threading.Event,
         receive: Callable[[list[Message]], None],
     ) -> None:
-        deadline = time.monotonic() + _ANSWER_S
+        asked_at = clock.since_boot()
         while not ack.done:
             if stopping.is_set():
                 raise Lost("closed")
-            if time.monotonic() > deadline:
+            left = max(asked_at, connection.arriving_at) + _ANSWER_S - clock.since_boot()
+            if left < 0:
                 raise Silent(f"{connection.where} does not answer")
-            connection.pump(deadline - time.monotonic(), receive)
+            connection.pump(left, receive)
 
     def _deliver_all(self, messages: list[Message]) -> None:
         for message in messages:
