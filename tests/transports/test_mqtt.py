@@ -18,7 +18,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
 from pebble.transports.mqtt import transport as transport_module
-from pebble.transports.mqtt.connection import UNACKED_LIMIT, Connection
+from pebble.transports.mqtt.connection import MAX_PACKET, UNACKED_LIMIT, Connection
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
 from tests.tcp_proxy import TcpProxy
 from tests.transports.received import Received
@@ -392,10 +392,10 @@ def test_a_slow_link_is_not_a_silent_one(broker: Broker, clients: Clients, topic
 
 
 def test_a_long_message_on_a_slow_link_is_not_a_silence(broker: Broker, clients: Clients, topic: str) -> None:
-    with TcpProxy(broker.port, delay_s=0.02) as slow:
+    with TcpProxy(broker.port, delay_s=0.02, piece=20_000) as slow:
         client, received = clients(slow.port, silence_s=0.8), Received()
         client.subscribe(topic, received)
-        payload = bytes(3_000_000)  # some 50 pieces of 64 KB, 20 ms each, in either direction
+        payload = bytes(1_000_000)  # 50 pieces of 20 ms, in either direction
         assert client.publish(topic, payload, qos=DELIVERED)
         assert received.until(payload, timeout=30)
         assert client.counters["silences"] == 0
@@ -472,6 +472,47 @@ def test_what_stood_behind_many_retained_messages_does_not_count_as_fresh(
         (age, waited), (_, fresh) = commands
         assert waited >= age > 1
         assert fresh < 0.3
+
+
+# -- messages that are too large
+
+
+@both_protocols
+@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
+def test_a_message_that_is_too_large_is_discarded_and_costs_no_connection(
+    broker: Broker, clients: Clients, topic: str, protocol: str, qos: QoS
+) -> None:
+    robot, received = clients(broker.port, "robot", protocol=protocol), Received()
+    robot.subscribe(topic, received)
+    stranger = connect_as(broker, "stranger")
+    for size in (MAX_PACKET - 2 - len(topic) - 2 - 1, 20 * MAX_PACKET, 10):  # the longest one on 5: no properties
+        stranger.publish(topic, bytes(size), qos=qos).wait_for_publish(30)
+    assert until(lambda: received.payloads[-1:] == [bytes(10)], 30)
+    assert [len(payload) for payload in received.payloads[:-1]] == [MAX_PACKET - 2 - len(topic) - 2 - 1]
+    assert robot.counters["too_long"] == 1
+    assert robot.counters["connected"] == 1
+    stranger.disconnect()
+    stranger.loop_stop()
+
+
+def test_a_message_that_is_too_large_is_never_collected(broker: Broker, clients: Clients, topic: str) -> None:
+    robot, most = clients(broker.port, "robot"), [0]
+    client = robot._connection._client  # type: ignore[attr-defined]
+    read = client._packet_read
+
+    def note() -> Any:
+        result = read()
+        most[0] = max(most[0], len(client._in_packet["packet"]))
+        return result
+
+    client._packet_read = note
+    robot.subscribe(topic, Received())
+    stranger = connect_as(broker, "stranger")
+    stranger.publish(topic, bytes(20 * MAX_PACKET)).wait_for_publish(30)
+    assert until(lambda: robot.counters["too_long"] == 1, 30)
+    assert 0 < most[0] < 200_000
+    stranger.disconnect()
+    stranger.loop_stop()
 
 
 @pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])

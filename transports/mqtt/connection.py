@@ -39,6 +39,9 @@ log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 2.0  # for TCP and TLS, and again for the broker's CONNACK (T12)
 _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
 UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused
+MAX_PACKET = 1024 * 1024  # bytes; a longer one is read and discarded
+_HEAD = 2 + 65_535 + 2  # bytes of a PUBLISH up to its message id, at most
+_PIECE = 64 * 1024  # bytes of a long packet that are read at once
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
@@ -90,9 +93,10 @@ def ignore(_messages: list[Message]) -> None:
 
 
 class _Client(paho.Client):
-    """paho, with pings of our own (its keepalive is too slow for T19) and the size of what it has not written."""
+    """paho, with pings of our own (its keepalive is too slow for T19), a limit, and the sizes of what waits."""
 
     on_pong: Callable[[], None]
+    on_too_long: Callable[[bytes, int], None]  # with the topic of a PUBLISH, and the length of the packet
     received = 0  # bytes so far
 
     @property
@@ -104,9 +108,27 @@ class _Client(paho.Client):
         self._send_pingreq()
 
     def _sock_recv(self, bufsize: int) -> bytes:
+        if self._too_long:
+            del self._in_packet["packet"][_HEAD:]
+            bufsize = min(bufsize, _PIECE)
         data = super()._sock_recv(bufsize)
         self.received += len(data)
         return data
+
+    @property
+    def _too_long(self) -> bool:
+        """Whether the packet that arrives is discarded, but for its head."""
+        return bool(self._in_packet["have_remaining"]) and self._in_packet["remaining_length"] > MAX_PACKET
+
+    def _handle_publish(self) -> MQTTErrorCode:
+        if not self._too_long:
+            return super()._handle_publish()
+        head = self._in_packet["packet"]
+        end = 2 + int.from_bytes(head[:2])
+        self.on_too_long(bytes(head[2:end]), self._in_packet["remaining_length"])
+        if not self._in_packet["command"] & 0b110:  # QoS 0
+            return MQTTErrorCode.MQTT_ERR_SUCCESS
+        return self._send_puback(int.from_bytes(head[end : end + 2]))
 
     def _handle_pingresp(self) -> MQTTErrorCode:
         self.on_pong()
@@ -471,6 +493,7 @@ class Connection:
         if will is not None:
             client.will_set(will.topic, will.payload, int(will.qos), will.retain)
         client.on_pong = self._on_pong
+        client.on_too_long = self._on_too_long
         client.on_socket_open = self._on_socket_open
         client.on_socket_register_write = self._on_register_write
         client.on_connect = self._on_connect
@@ -541,6 +564,11 @@ class Connection:
         retain_requested = retain if self.as_published else (True if retain else None)
         qos, since = QoS(min(raw.qos, 1)), self._waiting_since
         self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, since))
+
+    def _on_too_long(self, topic: bytes, length: int) -> None:
+        self._packets += 1
+        self._counters.add("too_long")
+        log.debug("%s sent %d bytes on %r: discarded", self.where, length, topic)
 
 
 def _explain(reason: ReasonCode) -> str:
