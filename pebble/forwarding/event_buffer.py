@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -11,16 +12,23 @@ from dataclasses import dataclass
 from pebble.transports import Message, State, Transport
 from pebble.transports.counters import Counters
 
+log = logging.getLogger(__name__)
+
 LIMIT = 256
 #: A dead connection accepts messages until its silence is detected (2 s by default). Events published so shortly before
 #: the loss are sent again: QoS 1 allows duplicates, and no loss.
 RESEND_S = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Sent:
-    at: float
+#: After so many losses in a row while it was on its way, an event is given up: the broker may hang up because of it.
+_LOSSES = 3
+
+
+@dataclass(eq=False, slots=True)
+class _Event:
     message: Message
+    losses: int = 0  # of the connection while it was on its way
+    sent_at: float = 0.0
 
 
 class EventBuffer:
@@ -36,8 +44,8 @@ class EventBuffer:
     ) -> None:
         self._transport, self._counters, self._clock, self._limit = transport, counters, clock, limit
         self._lock = threading.Lock()
-        self._waiting: deque[Message] = deque()
-        self._recent: deque[_Sent] = deque(maxlen=limit)
+        self._waiting: deque[_Event] = deque()
+        self._recent: deque[_Event] = deque(maxlen=limit)
         self._lost_at: float | None = None  # when the connection was lost, until flush()
 
     def watch(self, state: State) -> None:
@@ -52,7 +60,7 @@ class EventBuffer:
     def hold(self, message: Message) -> None:
         """Store ``message`` until the next :meth:`resume` or :meth:`flush`."""
         with self._lock:
-            self._append(message)
+            self._append(_Event(message))
 
     def resume(self) -> None:
         """Send what waits, in order, unless a new connection has to be flushed first."""
@@ -64,8 +72,8 @@ class EventBuffer:
         """The connection is up (again): send what may have been lost with the last one, then what waits."""
         with self._lock:
             if self._lost_at is not None:
-                recent = [sent.message for sent in self._recent if 0 <= self._lost_at - sent.at <= RESEND_S]
-                waiting = recent + list(self._waiting)
+                recent = [event for event in self._recent if 0 <= self._lost_at - event.sent_at <= RESEND_S]
+                waiting = self._without_refused(recent) + list(self._waiting)
                 self._counters.add("events_dropped", max(0, len(waiting) - self._limit))
                 self._waiting = deque(waiting[-self._limit :])
                 self._lost_at = None
@@ -77,15 +85,32 @@ class EventBuffer:
             self._waiting.clear()
             self._recent.clear()
 
-    def _append(self, message: Message) -> None:
-        self._waiting.append(message)
+    def _without_refused(self, lost: list[_Event]) -> list[_Event]:
+        """``lost`` without the largest of those that were lost too often in a row: nothing else says which it was."""
+        for event in lost:
+            event.losses += 1
+        suspects = [event for event in lost if event.losses >= _LOSSES]
+        if not suspects:
+            return lost
+        refused = max(suspects, key=lambda event: len(event.message.payload))
+        for event in lost:
+            event.losses = 0
+        size, topic = len(refused.message.payload), refused.message.topic
+        log.error("dropped an event of %d bytes on %s: three connections in a row were lost with it", size, topic)
+        self._counters.add("events_dropped")
+        return [event for event in lost if event is not refused]
+
+    def _append(self, event: _Event) -> None:
+        self._waiting.append(event)
         if len(self._waiting) > self._limit:
             self._waiting.popleft()
             self._counters.add("events_dropped")
 
     def _drain(self) -> None:
         while self._waiting:
-            message = self._waiting[0]
+            event = self._waiting[0]
+            message = event.message
             if not self._transport.publish(message.topic, message.payload, qos=message.qos):
                 return
-            self._recent.append(_Sent(self._clock(), self._waiting.popleft()))
+            event.sent_at = self._clock()
+            self._recent.append(self._waiting.popleft())

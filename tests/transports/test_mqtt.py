@@ -515,6 +515,40 @@ def test_a_message_that_is_too_large_is_never_collected(broker: Broker, clients:
     stranger.loop_stop()
 
 
+@pytest.fixture(scope="module")
+def small_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Hangs up on whoever sends a larger packet."""
+    broker = Broker(tmp_path_factory.mktemp("small"), "max_packet_size 20000")
+    yield broker
+    broker.stop()
+
+
+@both_protocols
+@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
+def test_a_retained_message_that_the_broker_refuses_is_set_aside(
+    small_broker: Broker, clients: Clients, topic: str, protocol: str, qos: QoS, caplog: pytest.LogCaptureFixture
+) -> None:
+    """On 3.1.1 it can only be told from how the connection ends; 5 says what is too large."""
+    robot, late, received = (
+        clients(small_broker.port, "robot", protocol=protocol),
+        clients(small_broker.port),
+        Received(),
+    )
+    for number in range(2):
+        robot.publish(f"{topic}/map", b"%d" % number + bytes(50_000), qos=qos, retain=True)
+        robot.publish(f"{topic}/state", b"%d" % number, qos=DELIVERED, retain=True)
+        late.subscribe(f"{topic}/+", received)
+        assert until(lambda: received.payloads[-1:] == [b"%d" % number])  # noqa: B023
+    assert until(lambda: robot.state is State.CONNECTED)
+    assert robot.counters["connected"] == {"3.1.1": 4, "5": 1}[protocol]
+    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert len(errors) == 1
+    assert f"{topic}/map" in errors[0]
+    assert "50001 bytes" in errors[0]
+    robot.publish(f"{topic}/map", b"smaller", qos=qos, retain=True)
+    assert until(lambda: b"smaller" in received.payloads)
+
+
 @pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
 def test_a_retained_message_lost_in_a_hole_is_sent_again(
     broker: Broker, clients: Clients, proxy: TcpProxy, topic: str, qos: QoS

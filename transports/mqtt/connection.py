@@ -41,6 +41,7 @@ _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connec
 UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused
 MAX_PACKET = 1024 * 1024  # bytes; a longer one is read and discarded
 _HEAD = 2 + 65_535 + 2  # bytes of a PUBLISH up to its message id, at most
+_OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
 _PIECE = 64 * 1024  # bytes of a long packet that are read at once
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
@@ -157,6 +158,7 @@ class Connection:
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
         self.hesitated = False  # the broker took so long to accept us that it may have been suspended
         self.where = f"broker {settings.host}:{settings.port}"
+        self.max_packet: int | None = None  # bytes, as the broker says on MQTT 5
         #: When there was the last sign that the answers are behind retained messages, or behind a long one.
         self.arriving_at = float("-inf")
         self._settings, self._counters = settings, counters
@@ -293,7 +295,7 @@ class Connection:
 
     @property
     def _waiting_since(self) -> float:
-        """Since when what is read now may have waited; at the broker too, where it was behind what delayed an answer."""
+        """Since when what is read now may have waited; at the broker too, if it was behind what delayed an answer."""
         if self._overdue:
             asked_at = self._in_flight.newest_answered_at
             self._overdue = clock.since_boot() - asked_at > self._silence_limit_s
@@ -396,6 +398,11 @@ class Connection:
         if blocked:
             self.wake()
         return True
+
+    def takes(self, message: Message) -> bool:
+        """Whether the broker has not said that ``message`` is too large."""
+        size = _OVERHEAD + len(message.topic.encode()) + len(message.payload)
+        return self.max_packet is None or size <= self.max_packet
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
         properties = None
@@ -515,7 +522,8 @@ class Connection:
     def _on_register_write(self, _client: Any, _data: Any, _sock: Any) -> None:
         """If this is set, paho does not write by itself; we write after every call that queues something."""
 
-    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: ReasonCode, _properties: Any) -> None:
+    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: ReasonCode, properties: Any) -> None:
+        self.max_packet = getattr(properties, "MaximumPacketSize", None)
         started = self._answered_at
         self._note_answer()
         self._in_flight.measured(self._answered_at - started)

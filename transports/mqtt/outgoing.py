@@ -11,8 +11,10 @@ import struct
 import sys
 import threading
 from collections import deque
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
+from math import inf
 
 from pebble.transports.base import Message, QoS
 
@@ -26,6 +28,9 @@ else:
 
 BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
+LOSSES = 3  # in a row with a message in flight, after which it counts as refused
+REFUSED_S = 3600.0
+_REFUSED = 1000  # topics
 ROUND_TRIPS = 8  # answer times that are remembered
 
 _TCP_INFO = getattr(socket, "TCP_INFO", None)  # Linux only
@@ -111,6 +116,41 @@ class PendingAck:
 
     def complete(self) -> None:
         self._answered.set()
+
+
+class RefusedMessages:
+    """Retained messages that the broker refuses: by its limit, or by hanging up each time they are sent.
+
+    Nothing else says so on MQTT 3.1.1, and the one in question is unknown: of those in flight at several losses in a
+    row it is the largest. A smaller one on the same topic is not refused, and after a while none is: other causes end.
+    """
+
+    def __init__(self) -> None:
+        self._losses: dict[str, int] = {}  # in a row, by topic
+        self._refused: dict[str, tuple[int, float]] = {}  # by topic: bytes, and when
+
+    def note_loss(self, in_flight: Collection[Message], now: float) -> Message | None:
+        """The broker has hung up with ``in_flight`` unconfirmed; returns the message that is refused from now on."""
+        self._losses = {message.topic: self._losses.get(message.topic, 0) + 1 for message in in_flight}
+        suspects = [message for message in in_flight if self._losses[message.topic] >= LOSSES]
+        if not suspects:
+            return None
+        largest = max(suspects, key=lambda message: len(message.payload))
+        self._losses.clear()
+        self.add(largest, now)
+        return largest
+
+    def add(self, message: Message, now: float) -> bool:
+        """Refuse ``message`` from now on; returns whether that is new."""
+        if len(self._refused) >= _REFUSED:
+            del self._refused[next(iter(self._refused))]
+        is_new = message.topic not in self._refused
+        self._refused[message.topic] = len(message.payload), now
+        return is_new
+
+    def has(self, message: Message, now: float) -> bool:
+        size, since = self._refused.get(message.topic, (inf, -inf))
+        return len(message.payload) >= size and now - since < REFUSED_S
 
 
 @dataclass(slots=True)

@@ -16,7 +16,7 @@ from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
-from pebble.transports.mqtt.outgoing import PendingAck
+from pebble.transports.mqtt.outgoing import LOSSES, PendingAck, RefusedMessages
 from pebble.transports.settings import MqttSettings
 from pebble.transports.tls import make_context
 
@@ -58,6 +58,7 @@ class MqttTransport(Transport):
         self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
         self._own_message_filter = OwnMessageFilter()
+        self._refused_messages = RefusedMessages()
 
     @property
     def outgoing(self) -> Outgoing:
@@ -92,6 +93,14 @@ class MqttTransport(Transport):
         connection = self._connection
         if connection is None or not (self._state is State.CONNECTED or self._syncing):
             return False
+        if not connection.takes(message):
+            if self._refused_messages.add(message, time.monotonic()):
+                self._report_refused(message, f"{connection.where} takes packets of at most {connection.max_packet}")
+            self.counters.add("too_large")
+            return True
+        if message.retain and self._refused_messages.has(message, time.monotonic()):
+            self.counters.add("too_large")
+            return True  # as if it were sent: it must not be tried again with every connection
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)
@@ -157,17 +166,28 @@ class MqttTransport(Transport):
         connection = self._attempt = self._make_connection()
         try:
             self._connect(connection, stopping)
-            self._synchronize(connection, stopping)
-            while not stopping.is_set():
-                connection.pump(_IDLE_S, self._deliver_all)
-                if self._pending and connection.has_room:
-                    self._sync_retained(self._own.keys())
+            self._serve(connection, stopping)
             self._finish(connection)
         finally:
             with self._routing:
                 self._connection = None
             connection.discard()
             self._keep_unconfirmed(connection)
+
+    def _serve(self, connection: Connection, stopping: threading.Event) -> None:
+        try:
+            self._synchronize(connection, stopping)
+            while not stopping.is_set():
+                connection.pump(_IDLE_S, self._deliver_all)
+                if self._pending and connection.has_room:
+                    self._sync_retained(self._own.keys())
+        except Silent:
+            raise
+        except Lost:
+            refused = self._refused_messages.note_loss(connection.unconfirmed_retained(), time.monotonic())
+            if refused is not None:
+                self._report_refused(refused, f"{connection.where} hung up {LOSSES} times in a row while it was sent")
+            raise
 
     def _make_connection(self) -> Connection:
         as_published = self.settings.as_published and self._refusals < _REFUSALS
@@ -288,6 +308,10 @@ class MqttTransport(Transport):
             for message in connection.unconfirmed_retained():
                 if message.topic not in self._pending:
                     self._remember(message, sent=False)
+
+    def _report_refused(self, message: Message, why: str) -> None:
+        size = len(message.payload)
+        log.error("%s: a message of %d bytes on %s is not sent: %s", self.client_id, size, message.topic, why)
 
     def _report_problem(self, problem: str) -> None:
         self.problem = problem
