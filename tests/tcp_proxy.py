@@ -118,6 +118,22 @@ class TcpProxy:
         return self._passing.wait(_STEP_S)
 
 
+class BridgelessProxy(TcpProxy):
+    """Makes any broker one that hangs up on bridge mode, as RabbitMQ does, while ``bridgeless`` is set."""
+
+    bridgeless = True
+    connections = 0
+
+    def _join_to_target(self, near: socket.socket) -> None:
+        self.connections += 1
+        near.settimeout(5)
+        connect = near.recv(16, socket.MSG_PEEK)
+        if self.bridgeless and connect.partition(b"MQTT")[2][0] & 0x80:  # the protocol level
+            near.close()
+        else:
+            super()._join_to_target(near)
+
+
 class _Pair:
     """The two connections that make one connection through a proxy."""
 

@@ -23,8 +23,8 @@ from pebble.services.mqtt_mirror import MqttMirror
 from pebble.transports import MqttSettings, State, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet, Running, gate_of
-from tests.support import AmqttBroker, Broker, until
-from tests.tcp_proxy import TcpProxy
+from tests.support import AmqttBroker, Broker, free_port, until
+from tests.tcp_proxy import BridgelessProxy, TcpProxy
 
 DRIVE = "incoming/drive-values"
 FLAG = "incoming/flags/mqtt-video"
@@ -426,6 +426,41 @@ class TestWrongBroker:
         rig.start()
         rig.program.publish("outgoing/online", heartbeat(), retain=True)
         assert until(lambda: rig.local.on("outgoing/online"))
+
+    def test_a_broker_without_bridge_mode_is_refused_for_one_connection_only(
+        self, broker: Broker, rigs: Rigs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        monkeypatch.setattr(mirror_module, "_CHECK_AGAIN_S", 60.0)
+        with BridgelessProxy(broker.port) as way:
+            rig = rigs()
+            rig.mirror_port = way.port
+            rig.start(ready=False)
+            assert until(lambda: rig.gate is Gate.SHUT)
+            way.bridgeless = False
+            way.drop()
+            rig.wait_ready()
+            rig.program.publish(DRIVE, b"1")
+            assert until(lambda: rig.local.payloads(DRIVE) == [b"1"])
+        assert len(errors(caplog)) == 1
+
+    def test_one_that_is_away_behind_a_proxy_is_not_refused(
+        self, broker: Broker, rigs: Rigs, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        with BridgelessProxy(broker.port) as way:
+            way.bridgeless = False
+            rig = rigs()
+            rig.mirror_port = way.port
+            rig.start()
+            for more in range(3):
+                way.lead_to(free_port())
+                attempts = way.connections + 2 + more
+                assert until(lambda: way.connections > attempts)  # noqa: B023
+                way.lead_to(broker.port)
+                assert until(lambda: rig.mirror._broker.state is State.CONNECTED)
+            rig.wait_ready()
+            rig.program.publish(DRIVE, b"1")
+            assert until(lambda: rig.local.payloads(DRIVE) == [b"1"])
+        assert not errors(caplog)
 
     def test_a_broker_without_bridge_mode_is_refused(
         self, amqtt: AmqttBroker, caplog: pytest.LogCaptureFixture

@@ -20,7 +20,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Tr
 from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.connection import MAX_PACKET, UNACKED_LIMIT, Connection
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
-from tests.tcp_proxy import TcpProxy
+from tests.tcp_proxy import BridgelessProxy, TcpProxy
 from tests.transports.received import Received
 
 DELIVERED = QoS.DELIVERED
@@ -191,6 +191,40 @@ def test_a_broker_that_restarts_is_not_taken_for_one_without_bridge_mode(broker:
         assert reconnected(bridge)
         assert bridge.as_published
         assert bridge.exact_echo
+
+
+def test_a_broker_that_hangs_up_on_bridge_mode_gets_a_plain_connection_until_it_is_another_one(
+    broker: Broker, clients: Clients, caplog: pytest.LogCaptureFixture, topic: str
+) -> None:
+    watcher, wills = clients(broker.port), Received()
+    watcher.subscribe(topic, wills)
+    with BridgelessProxy(broker.port) as proxy:
+        bridge = clients(proxy.port, "bridge", as_published=True, will=Message(topic, b"gone"))
+        assert not bridge.as_published
+        assert "no bridge mode" in caplog.text
+        proxy.bridgeless = False
+        proxy.drop()
+        assert reconnected(bridge)
+        assert bridge.as_published
+        assert bridge.exact_echo
+        watcher.publish(topic, b"last", qos=DELIVERED)
+        assert wills.until(b"gone", b"last")  # of the one that was dropped: a probe has none
+
+
+def test_a_proxy_whose_broker_is_away_is_not_taken_for_one_without_bridge_mode(
+    broker: Broker, clients: Clients, caplog: pytest.LogCaptureFixture
+) -> None:
+    with BridgelessProxy(broker.port) as proxy:
+        proxy.bridgeless = False
+        bridge = clients(proxy.port, "bridge", as_published=True)
+        for times in range(2, 5):
+            proxy.lead_to(free_port())
+            attempts = proxy.connections + times
+            assert until(lambda: proxy.connections > attempts)  # noqa: B023
+            proxy.lead_to(broker.port)
+            assert reconnected(bridge, times)
+            assert bridge.as_published
+    assert "no bridge mode" not in caplog.text
 
 
 def test_a_broker_without_mqtt_5_is_a_problem_in_words(amqtt: AmqttBroker, clients: Clients) -> None:

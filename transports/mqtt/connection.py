@@ -30,6 +30,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS
 from pebble.transports.counters import Counters
+from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.incoming import WaitingTime, readable_bytes
 from pebble.transports.mqtt.outgoing import Backlog, InFlightTable, PendingAck, shortest_round_trip_s, unconfirmed_bytes
 from pebble.transports.settings import MqttSettings
@@ -61,6 +62,10 @@ class Silent(Lost):
 
 class Refused(Lost):
     """The broker refused our CONNECT, or closed the connection instead of answering."""
+
+    def __init__(self, text: str, result: Result = Result.FAILED) -> None:
+        super().__init__(text)
+        self.result = result
 
 
 class _Poll:
@@ -99,6 +104,7 @@ class _Client(paho.Client):
     on_pong: Callable[[], None]
     on_too_long: Callable[[bytes, int], None]  # with the topic of a PUBLISH, and the length of the packet
     received = 0  # bytes so far
+    protocol_refused = False  # by return code 1 of a CONNACK on MQTT 3.1.1
 
     @property
     def unwritten(self) -> int:
@@ -130,6 +136,10 @@ class _Client(paho.Client):
         if not self._in_packet["command"] & 0b110:  # QoS 0
             return MQTTErrorCode.MQTT_ERR_SUCCESS
         return self._send_puback(int.from_bytes(head[end : end + 2]))
+
+    def _handle_connack(self) -> MQTTErrorCode:
+        self.protocol_refused = self._in_packet["packet"][1:2] == b"\1"
+        return super()._handle_connack()
 
     def _handle_pingresp(self) -> MQTTErrorCode:
         self.on_pong()
@@ -204,7 +214,7 @@ class Connection:
             raise
         except Lost as lost:
             if self._socket() is None:
-                raise Refused(f"{self.where} hung up on our CONNECT") from None
+                raise Refused(f"{self.where} hung up on our CONNECT", Result.HUNG_UP) from None
             raise lost from None
 
     def discard(self) -> None:
@@ -329,8 +339,8 @@ class Connection:
         failed = self._client.loop_read()
         if self._refusal:
             raise Refused(self._refusal)
-        if failed is MQTTErrorCode.MQTT_ERR_PROTOCOL and not self._accepted:
-            raise Refused(f"{self.where} refused us: unacceptable protocol version")
+        if failed and self._client.protocol_refused:
+            raise Refused(f"{self.where} refused us: {Result.PROTOCOL_REFUSED.value}", Result.PROTOCOL_REFUSED)
         if failed:
             raise Lost(f"{self.where} closed the connection")
 

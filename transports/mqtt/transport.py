@@ -14,6 +14,7 @@ from math import ceil
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
+from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import LOSSES, PendingAck, RefusedMessages
@@ -30,7 +31,6 @@ _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
 _IDLE_S = 60.0  # the connection wakes up earlier, for its pings
-_REFUSALS = 2  # of bridge mode in a row, after which the broker counts as not supporting it
 
 
 class MqttTransport(Transport):
@@ -54,7 +54,7 @@ class MqttTransport(Transport):
         self._stopping = threading.Event()
         self._will_on_close: Message | None = None
         self._thread: threading.Thread | None = None
-        self._refusals = 0
+        self._bridge_mode = BridgeMode()
         self._broker_stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
         self._own_message_filter = OwnMessageFilter()
@@ -163,7 +163,11 @@ class MqttTransport(Transport):
 
     def _run_connection(self, stopping: threading.Event) -> None:
         """Run one connection from its start to its end; raises Lost unless it ends by `close`."""
-        connection = self._attempt = self._make_connection()
+        if self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE:
+            self._probe(stopping)
+        plain = self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PLAIN
+        as_published = self.settings.as_published and not plain
+        connection = self._attempt = self._make_connection(self.will, as_published=as_published)
         try:
             self._connect(connection, stopping)
             self._serve(connection, stopping)
@@ -189,13 +193,12 @@ class MqttTransport(Transport):
                 self._report_refused(refused, f"{connection.where} hung up {LOSSES} times in a row while it was sent")
             raise
 
-    def _make_connection(self) -> Connection:
-        as_published = self.settings.as_published and self._refusals < _REFUSALS
+    def _make_connection(self, will: Message | None, *, as_published: bool) -> Connection:
         return Connection(
             self._mqtt_client_id,
             self.settings,
             self._context,
-            self.will,
+            will,
             self.counters,
             as_published=as_published,
             on_answers=self._note_answers,
@@ -205,14 +208,31 @@ class MqttTransport(Transport):
         try:
             connection.connect(stopping)
         except Lost as lost:
-            bridge = connection.as_published and self.settings.protocol == "3.1.1"
-            self._refusals = self._refusals + 1 if bridge and isinstance(lost, Refused) else 0
+            self._bridge_mode.note(lost.result if isinstance(lost, Refused) else Result.FAILED)
             raise
+        self._bridge_mode.note(Result.ACCEPTED)
         if self.settings.as_published:
-            self._refusals = 0
             if self.as_published and not connection.as_published:
                 log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
             self.as_published = self.exact_echo = connection.as_published
+
+    @property
+    def _asks_for_bridge_mode(self) -> bool:
+        """MQTT 5 has options of its own for the same."""
+        return self.settings.as_published and self.settings.protocol == "3.1.1"
+
+    def _probe(self, stopping: threading.Event) -> None:
+        """Connect without bridge mode, and leave in order; without our will, which a failure would publish."""
+        probe = self._attempt = self._make_connection(None, as_published=False)
+        try:
+            probe.connect(stopping)
+            probe.disconnect()
+        except Lost:
+            self._bridge_mode.note(Result.FAILED)
+            raise
+        finally:
+            probe.discard()
+        self._bridge_mode.note(Result.ACCEPTED)
 
     def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
         """Query which of our retained messages the broker has, subscribe, and send what it lacks."""

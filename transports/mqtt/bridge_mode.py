@@ -1,0 +1,48 @@
+"""Finds out whether a broker has bridge mode, which MQTT 3.1.1 does not define. Pure.
+
+A broker without it answers CONNECT with return code 1, or hangs up. So does a proxy whose broker is away: a hang-up
+counts only if the same broker accepts a plain CONNECT, and then hangs up once more.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Attempt(Enum):
+    BRIDGE = "bridge"  # connect in bridge mode
+    PROBE = "probe"  # connect without it, only to see whether that is accepted
+    PLAIN = "plain"  # connect without it
+
+
+class Result(Enum):
+    ACCEPTED = "accepted"
+    PROTOCOL_REFUSED = "unacceptable protocol version"
+    HUNG_UP = "closed without an answer"
+    FAILED = "anything else: a wrong password, no answer, no connection"
+
+
+class BridgeMode:
+    """How to connect next. Bridge mode is tried again with each connection: an address may lead to another broker."""
+
+    def __init__(self) -> None:
+        self.next_attempt = Attempt.BRIDGE
+        self._probed = False  # a plain CONNECT was accepted since the broker hung up
+        self._lacking = False  # a broker at this address has no bridge mode: one hang-up is enough
+
+    def note(self, result: Result) -> None:
+        """The next attempt has ended with ``result``."""
+        attempt, self.next_attempt = self.next_attempt, Attempt.BRIDGE
+        if attempt is Attempt.PROBE:
+            self._probed = result is Result.ACCEPTED
+        elif attempt is Attempt.BRIDGE:
+            self._note_bridge(result)
+
+    def _note_bridge(self, result: Result) -> None:
+        probed, self._probed = self._probed, False
+        if result is Result.ACCEPTED:
+            self._lacking = False
+        elif result is Result.PROTOCOL_REFUSED or (result is Result.HUNG_UP and (probed or self._lacking)):
+            self._lacking, self.next_attempt = True, Attempt.PLAIN
+        elif result is Result.HUNG_UP:
+            self.next_attempt = Attempt.PROBE
