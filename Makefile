@@ -47,7 +47,7 @@ PAGES = $(filter tests/web/%,$(ALONE))
 
 # What only computes, as little as possible in the way, uses what the others leave, from the beginning to the end.
 test: check
-	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables
+	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
 	@$(MAKE) --no-print-directory --jobs=2 test-computing test-running
 	@echo "pebble: the demo, whose robots need all processors"
 	@$(VENV) tools/run_tests.py $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
