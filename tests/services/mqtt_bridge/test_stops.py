@@ -202,7 +202,12 @@ class TestRetain:
             rig.remote.publish(f"incoming/flags/f{number}", TRUE, retain=True)
         rig.remote.publish(STOP, OLD, retain=True)
         rig.start(ready=False)
-        assert until(lambda: len(rig.local.seen) >= others, 30)
+
+        def arrived() -> int:
+            counted = rig.bridge._forwarder.counters.snapshot()
+            return sum(number for name, number in counted.items() if name.startswith("remote: "))
+
+        assert until(lambda: arrived() >= others, 30)
         rig.wait_ready()
         Quiet(rig.local, rig.remote).wait(0.7)
         assert not rig.local.on(STOP)
