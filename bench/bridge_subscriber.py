@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
-from paho.mqtt.client import Client
+from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.bench.bridge_operator import Wheels, wheels_of
@@ -55,7 +55,12 @@ def main(arguments: list[str]) -> int:
     received: list[tuple[int, bytes]] = []
     subscribed = threading.Event()
     client = Client(CallbackAPIVersion.VERSION2)
-    client.on_message = lambda _client, _data, message: received.append((time.monotonic_ns(), bytes(message.payload)))
+
+    def receive(_client: Client, _data: object, message: MQTTMessage) -> None:
+        if not message.payload.isspace():  # else a bridge's probe
+            received.append((time.monotonic_ns(), bytes(message.payload)))
+
+    client.on_message = receive
     client.on_connect = lambda connected, *_: connected.subscribe(topic, DRIVE.default_qos)
     client.on_subscribe = lambda *_: subscribed.set()
     client.connect("127.0.0.1", int(port))

@@ -12,13 +12,14 @@ from typing import Any
 
 from pebble.contract import BRIDGE_PROBE, INCOMING, ONLINE, OUTGOING, codec
 from pebble.errors import ConfigError, PayloadError
+from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import INITIAL_SYNC_S, Forwarder, Gate, barrier
 from pebble.forwarding.probes import PROBE_REQUEST, Probes
 from pebble.forwarding.routing import MIRROR, Side
 from pebble.forwarding.subjects import Subjects
 from pebble.runtime.connections import mirror_transport
 from pebble.runtime.process import run
-from pebble.runtime.service import Service
+from pebble.runtime.service import Service, every
 from pebble.transports import Message, QoS, State, Subscription
 
 _FRESH_HEARTBEATS = 3.0  # a heartbeat is current for so many of its intervals
@@ -134,11 +135,16 @@ class MqttMirror(Service):
         ]
         barrier(self._broker, self._probe_topic)
         self._forwarder.subscribed(Side.REMOTE)
+        self._forwarder.probe_commands(*Side)
         self.call_at(self.clock() + INITIAL_SYNC_S, partial(self._synchronize_broker, epoch))
 
     def _synchronize_broker(self, epoch: int) -> None:
         if epoch == self._epoch:
             self._forwarder.synchronize(Side.REMOTE)
+
+    @every(PROBE_PERIOD_S)
+    def _probe_again(self) -> None:
+        self._forwarder.probe_again()
 
     def _request_probe(self) -> None:
         """Request a probe from the bridge, if the robot has one."""

@@ -91,6 +91,11 @@ def _stop(channel: Channel, raw: bytes) -> EstopCommand:
     return EstopCommand(stop=name or UNSET, by=by, why=why)
 
 
+def is_blank(raw: bytes) -> bool:
+    """Whether ``raw`` is white space only: by such payloads bridges look for cycles, and everybody ignores them."""
+    return bool(raw) and raw.isspace()
+
+
 def too_deep(raw: bytes) -> bool:
     """True if this JSON is nested deeper than MAX_DEPTH. Counts brackets outside strings, without parsing."""
     if raw.count(b"[") + raw.count(b"{") <= MAX_DEPTH:

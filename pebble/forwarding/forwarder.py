@@ -18,10 +18,13 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import NamedTuple
 
-from pebble.contract import DRIVE, ESTOP, Kind, codec
+import msgspec
+
+from pebble.contract import DRIVE, ESTOP, GIT_PULL, REBOOT, SERVICE_RESTART, Kind, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError
 from pebble.forwarding.admission import Admission
+from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.event_buffer import EventBuffer
 from pebble.forwarding.loopback_filter import LoopbackFilter
 from pebble.forwarding.reconciliation import Reconciliation, Resolution
@@ -44,7 +47,12 @@ _RETAINED_STOPS_S = 10.0
 _LOGGED = 200  # characters of a topic
 _LATE_S = 0.5  # what happens once and has waited here for longer is stale
 _MAX_WAITING = 4096  # retained messages that wait for the gate to open
+#: What circulates comes back within this time; the same message later is new.
+_RETURN_S = 2.0
+#: Probed at each connection, before they are used.
+_PROBED = (DRIVE, REBOOT, SERVICE_RESTART, GIT_PULL)
 
+_FINDINGS = {Finding.PROBE: Drop.PROBE, Finding.CIRCULATES: Drop.CIRCULATES}
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
@@ -91,6 +99,8 @@ class Forwarder:
         self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
         self._events = {side: EventBuffer(transports[side], self.counters, clock=clock) for side in Side}
         self._loopback = {side: LoopbackFilter(clock) for side in Side}
+        self._cycles = Cycles(clock)
+        self._returns = {side: LoopbackFilter(clock, _RETURN_S) for side in Side}  # what circulates, once each
         self._retained_until = {side: float("inf") for side in Side}
         self._subscribed_at = {side: float("inf") for side in Side}
         self._retained_at = {side: float("-inf") for side in Side}  # the newest of the messages that may be old
@@ -159,6 +169,42 @@ class Forwarder:
             self._restarted.add(Side.REMOTE)
             self.gate = Gate.WAITING
 
+    # -- cycles: what we forward to one side comes back from the other
+
+    def probe_commands(self, *sides: Side) -> None:
+        """Find out whether commands and actions from ``sides`` would circulate; after each connection."""
+        for side in sides:
+            for topic in self._subjects.topics(*_PROBED):
+                self._probe(side, topic, b"")
+
+    def probe_again(self) -> None:
+        """Find out whether what circulated does so still; to be called once a second."""
+        for side, topic in self._cycles.poll():
+            self._probe(side, topic, self._reconciliation.value(topic) or b"")
+
+    def _probe(self, side: Side, topic: str, value: bytes) -> None:
+        """Publish a probe on the other side, where something else may lead back to ``side``."""
+        subject, transport = self._subjects[topic], self._transports[side.other]
+        if subject is None or transport.state is not State.CONNECTED:
+            return
+        once = subject.kind in ONE_SHOT
+        if once or _is_json(value):
+            probe = (b"" if once else value) + self._cycles.probe(side, topic)
+            transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
+
+    def _examine(self, side: Side, subject: Subject, message: Message) -> Finding:
+        if self.gate is not Gate.OPEN:
+            return Finding.PASS
+        if _is_stop(subject):
+            repeated = self._cycles.repeats_stop(side, message.topic, message.payload)
+            return Finding.CIRCULATES if repeated else Finding.PASS
+        return self._cycles.receive(side, message.topic, message.payload, once=subject.kind in ONE_SHOT)
+
+    def _note_return(self, side: Side, subject: Subject, message: Message) -> None:
+        """``message`` goes to ``side``; if its topic circulates, it comes back from the other one."""
+        if subject.kind not in ONE_SHOT and self._cycles.closed(side.other, message.topic):
+            self._returns[side.other].expect(message.topic, message.payload)
+
     # -- the receiving threads
 
     def receive(self, side: Side, message: Message) -> Routed:
@@ -184,11 +230,23 @@ class Forwarder:
             return Drop.LATE
         if self._is_echo(side, subject, message):
             return Drop.ECHO
+        finding = self._examine(side, subject, message)
+        if finding in _FINDINGS:
+            return _FINDINGS[finding]
+        if finding is Finding.RELAY:
+            self._publish(side.other, subject, message, Forward(forward.qos, False, forward.urgent))
+            return Drop.PROBE
+        if finding is Finding.SUSPECT:  # the probe goes first: it comes back before the message does
+            self._probe(side, message.topic, message.payload)
+        return self._pass(side, subject, message, forward)
+
+    def _pass(self, side: Side, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
         if forward.retain:
             return self._pass_retained(side, subject, message, forward)
         if self.gate is not Gate.OPEN:
             return self._hold_event(side, subject, message)
         if _is_event(subject, message):
+            self._note_return(side.other, subject, message)
             self._events[side.other].send(message)
         else:
             self._publish(side.other, subject, message, forward)
@@ -280,6 +338,7 @@ class Forwarder:
 
     def _publish(self, side: Side, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, self._transports[side]
+        self._note_return(side, subject, message)
         echoing = not transport.exact_echo and _echo_matters(subject)
         if echoing:
             self._loopback[side].expect(topic, payload)
@@ -292,6 +351,8 @@ class Forwarder:
             self._reconciliation.note_published(side, topic, payload)
 
     def _is_echo(self, side: Side, subject: Subject, message: Message) -> bool:
+        if self._cycles.closed(side, message.topic) and self._returns[side].is_echo(message.topic, message.payload):
+            return True
         if self._transports[side].exact_echo or message.retain or not _echo_matters(subject):
             return False
         return self._loopback[side].is_echo(message.topic, message.payload)
@@ -322,6 +383,15 @@ def barrier(transport: Transport, filter_: str) -> None:
     broker may forbid others.
     """
     transport.subscribe(filter_, _ignore, echo=False, direct=True, limit=1).close()
+
+
+def _is_json(value: bytes) -> bool:
+    """Whether white space may follow ``value`` without changing it."""
+    try:
+        msgspec.json.decode(value)
+    except msgspec.DecodeError:
+        return False
+    return True
 
 
 def _ignore(_message: Message) -> None:

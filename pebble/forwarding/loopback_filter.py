@@ -1,4 +1,4 @@
-"""Recognises our own messages on a connection to a broker without bridge mode, which sends them back."""
+"""Recognises our own messages that come back: from a broker without bridge mode, or by way of something else."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ EXPIRY_S = 10.0  # an echo that has not arrived by then never will
 class LoopbackFilter:
     """Remembers what was published, by topic and in order, until it comes back."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self, clock: Callable[[], float] = time.monotonic, expiry_s: float = EXPIRY_S) -> None:
+        self._clock, self._expiry_s = clock, expiry_s
         self._lock = threading.Lock()
         self._out: dict[str, deque[tuple[float, bytes]]] = {}  # when, and a digest
         self._messages = 0
@@ -52,7 +52,7 @@ class LoopbackFilter:
             out = self._out.get(topic)
             if not out:
                 return False
-            while out and self._clock() - out[0][0] > EXPIRY_S:
+            while out and self._clock() - out[0][0] > self._expiry_s:
                 self._drop_first(out)
             digest = _digest(payload)
             for index, (_, earlier) in enumerate(out):

@@ -37,6 +37,8 @@ class Drop(Enum):
     TOO_LARGE = "larger than a message to a robot may be"
     TOO_MANY = "one more unknown flag than a robot stores"
     ECHO = "our own, sent back by the broker"
+    PROBE = "a probe for cycles"
+    CIRCULATES = "comes back by another way"
     KNOWN = "the other side has this value"
     OVERRULED = "the other side's value counts"
     HELD = "waits for the other side's values"

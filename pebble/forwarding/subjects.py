@@ -79,6 +79,10 @@ class Subjects:
         outside = (topic for topic in renamed if not any(matches(family, topic) for family in families))
         return [*families, *dict.fromkeys(outside)]
 
+    def topics(self, *channels: Channel) -> list[str]:
+        """The topics of ``channels``, those of every serial instance included."""
+        return list(dict.fromkeys(addresses[channel].topic for addresses in self._addresses for channel in channels))
+
     def _find(self, topic: str) -> Subject | None:
         try:
             check_topic(topic)

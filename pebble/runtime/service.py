@@ -288,6 +288,9 @@ class Service:
         try:
             value = codec.decode(channel, message.payload)
         except PayloadError as error:
+            if codec.is_blank(message.payload):
+                self.counters.add("blank")
+                return
             self.counters.add("refused")
             self._quiet_log.warning(channel.metric, "refused a message: %s", error)
             return

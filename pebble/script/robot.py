@@ -230,7 +230,8 @@ class Robot:
             try:
                 value = codec.decode(channel, message.payload)
             except PayloadError as error:
-                self._quiet_log.warning(channel.metric, "refused a message: %s", error)
+                if not codec.is_blank(message.payload):
+                    self._quiet_log.warning(channel.metric, "refused a message: %s", error)
                 return
             handler(value, **names)
 

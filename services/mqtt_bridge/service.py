@@ -9,6 +9,7 @@ from typing import Any
 from pebble.contract import BRIDGE_PROBE, INCOMING, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, codec
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError
+from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import INITIAL_SYNC_S, Forwarder, Gate, Routed, barrier
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.subjects import Subject, Subjects
@@ -25,6 +26,8 @@ from pebble.transports import Message, State, Subscription
 #: After the barrier, for brokers that pass messages between connections with a delay.
 _PROBE_WAIT_S = 0.1
 _RETRY_S = 1.0
+_IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
+_CHECK_AGAIN_S = 30.0  # while nothing is mirrored
 
 
 class MqttBridge(Service):
@@ -116,6 +119,7 @@ class MqttBridge(Service):
             self._subscribe_remote()
         else:
             self._same_broker.send()
+            self._forwarder.probe_commands(Side.REMOTE)
 
     def _disconnected(self, side: Side) -> None:
         if side is Side.REMOTE:
@@ -143,6 +147,7 @@ class MqttBridge(Service):
             for filter_ in self._subjects.filters(INCOMING)
         ]
         self._forwarder.subscribed(Side.REMOTE)
+        self._forwarder.probe_commands(Side.REMOTE)
         self._synchronize_later(Side.REMOTE)
 
     def _unsubscribe_remote(self) -> None:
@@ -182,8 +187,18 @@ class MqttBridge(Service):
     def _disable(self) -> None:
         self._forwarder.shut()  # again: it may just have been opened
         self._unsubscribe_remote()
-        self.log.info("the local and the remote side are one broker: nothing is mirrored")
+        self.call_at(self.clock() + _CHECK_AGAIN_S, self._check_again)
+        self.log.info(
+            "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
+            "nothing is mirrored"
+        )
         self._forwarder.synchronize(Side.REMOTE)  # retained local flags wait for remote ones, which will not come
+
+    def _check_again(self) -> None:
+        """The cause may be gone, without a reconnect."""
+        if self._forwarder.gate is Gate.SHUT:
+            self._check_brokers()
+            self.call_at(self.clock() + _CHECK_AGAIN_S, self._check_again)
 
     def _run_action(self, channel: Channel) -> None:
         self.counters.add("actions" if self._actions.request(channel) else "actions_refused")
@@ -191,6 +206,10 @@ class MqttBridge(Service):
     @every(_RETRY_S)
     def _send_media_requests(self) -> None:
         self._media.send()
+
+    @every(PROBE_PERIOD_S)
+    def _probe_again(self) -> None:
+        self._forwarder.probe_again()
 
     # -- the transports' threads
 
@@ -239,10 +258,10 @@ class MqttBridge(Service):
             if channel is None or not (local and self._actions.accepts_retained(channel)):
                 self._refuse_stale(channel)
                 return
-        elif routed.outcome in (Drop.ECHO, Drop.LATE) or not (local or isinstance(routed.outcome, Forward)):
+        elif routed.outcome in _IGNORED or not (local or isinstance(routed.outcome, Forward)):
             return
         reaction = self._message_reactions.get(channel.suffix) if channel is not None else None
-        if reaction is not None:
+        if reaction is not None and not codec.is_blank(message.payload):
             reaction(message.payload)
 
     def _on_flag(self, subject: Subject, payload: bytes) -> None:

@@ -49,6 +49,11 @@ def test_a_boolean_control_has_three_forms(channel: Channel, value: bool, form: 
     assert codec.decode(channel, form.format(json.dumps(value)).encode()) is value
 
 
+def test_white_space_may_follow_a_value() -> None:
+    """A bridge's probe on a flag's topic is the flag's value."""
+    assert codec.decode(c.MQTT_VIDEO, b'{"value": true}' + b" \t\n" * 8) is True
+
+
 def test_value_wins_over_enabled() -> None:
     assert codec.decode(c.MQTT_VIDEO, b'{"value": false, "enabled": true}') is False
 
@@ -250,6 +255,7 @@ UNREADABLE = [
     b'{"k": ' + b"[" * 32 + b"]" * 32 + b"}",
     b"[" * 60_000,
     b'{"k":' * 10_000,
+    b" \t\n" * 8,  # by such payloads bridges look for cycles
 ]
 
 

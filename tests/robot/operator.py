@@ -61,8 +61,9 @@ class Operator:
         self._client.publish(f"{self.base}/{suffix}", raw, qos=qos, retain=retain)
 
     def on(self, suffix: str, since: float = 0.0) -> list[ReceivedMessage]:
-        """Everything seen on one topic after ``since`` (monotonic)."""
-        return [seen for seen in list(self.seen) if seen.topic == f"{self.base}/{suffix}" and seen.at >= since]
+        """Everything seen on one topic after ``since`` (monotonic), without a bridge's probes."""
+        found = [seen for seen in list(self.seen) if seen.topic == f"{self.base}/{suffix}" and seen.at >= since]
+        return [seen for seen in found if not seen.payload.isspace()]
 
     def last(self, suffix: str) -> ReceivedMessage | None:
         seen = self.on(suffix)

@@ -409,6 +409,17 @@ def test_a_malformed_message_is_counted_logged_once_and_replaces_nothing(
     assert lines[0].endswith("(1 so far)")
 
 
+def test_white_space_is_ignored_silently(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+    """By such payloads bridges look for cycles."""
+    robot.start()
+    for topic in (DRIVE_TOPIC, f"{BASE}/incoming/soundboard-command", REBOOT_TOPIC):
+        robot.publish(topic, " \t\n" * 8)
+    assert until(lambda: robot.service.counters["blank"] == 3)
+    assert robot.service.seen == []
+    assert robot.service.counters["refused"] == 0
+    assert "refused" not in caplog.text
+
+
 def test_a_renamed_channel_is_received_under_its_new_name() -> None:
     robot = Robot(serial_mcu_bridge={"topics": {"drive_values": f"{BASE}/incoming/steer"}})
     robot.start()

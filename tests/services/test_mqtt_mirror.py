@@ -181,6 +181,12 @@ class TestBothWays:
         assert rig.retained_on_broker()["outgoing/estop/mcu"] == b"latched"
         assert rig.retained_on_local()["incoming/estop"] == b"from local"  # its publisher's, not the mirror's
 
+    def test_at_each_connection_both_sides_receive_probes(self, rigs: Rigs) -> None:
+        rig = rigs()
+        rig.start()
+        assert until(lambda: len(rig.local.probes) == len(rig.program.probes) == 4)
+        assert all(probe.payload.isspace() for probe in rig.local.probes + rig.program.probes)
+
     def test_media_stays_away(self, rigs: Rigs) -> None:
         rig = rigs()
         rig.start()

@@ -44,11 +44,15 @@ def make_config(
 
 
 class Client:
-    """A client on one side, and the messages of others that it has received below the robot's base."""
+    """A client on one side, and the messages of others that it has received below the robot's base.
+
+    ``probes`` are those by which bridges look for cycles; for programs they are nothing, or a value once more.
+    """
 
     def __init__(self, transport: Transport, base: str = BASE, *, listen: bool = True) -> None:
         self.transport, self.base = transport, base
         self.seen: list[Message] = []
+        self.probes: list[Message] = []
         transport.open(10)
         assert transport.state is State.CONNECTED, transport.problem
         if listen:
@@ -67,7 +71,12 @@ class Client:
         return [message.payload for message in self.on(suffix)]
 
     def _remember(self, message: Message) -> None:
-        self.seen.append(message)
+        (self.probes if is_probe(message.payload) else self.seen).append(message)
+
+
+def is_probe(payload: bytes) -> bool:
+    """Whether white space that encodes a number ends the payload, or is all of it."""
+    return payload[-24:].isspace() and len(payload) >= 24
 
 
 class Running:

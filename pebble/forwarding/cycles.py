@@ -1,0 +1,188 @@
+"""Detects that what we forward comes back by another way, for ever. Pure.
+
+Something else may forward the same topics: a broker's own bridge, or a second robot with this id. A probe that we
+publish on one side and receive on the other proves it for its topic. It travels on that topic, because the other way
+may carry no other. Its payload is white space that encodes a random number, so it moves nothing: for something that
+happens once it is nothing else, which no parser accepts; otherwise it follows the topic's value, and changes none.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Final
+
+from pebble.forwarding.routing import Side
+
+log = logging.getLogger(__name__)
+
+_DIGITS = b" \t\n"
+_LENGTH = 24  # digits of a probe's number
+_PROBES = 256  # remembered: ours, and those of others
+_TOPICS = 1024
+_MOST_CLOSED = 256  # topics that circulate
+_PAYLOADS = 64  # of one topic, counted at a time
+_LONGEST = 16 * 1024  # bytes that a probe repeats
+
+#: A payload that is received more often within this time may circulate; or an operator holds a key. If something else
+#: circulates, each topic is suspicious.
+_SUSPICIOUS, _WINDOW_S = 5, 2.0
+#: No operator and no script repeats a payload so often in this time.
+_STORM = 150
+PROBE_PERIOD_S, _PERIOD_IN_STORM_S = 1.0, 0.1  # between two probes of a topic
+_UNANSWERED = 3  # probes, after which the other way is gone
+#: A stop is published again after 0.5 s at the earliest; what comes back is faster.
+_STOP_PERIOD_S = 0.25
+
+
+class Finding(Enum):
+    """What is to be done with a received message."""
+
+    PASS = "forward it"  # noqa: S105  (no password)
+    SUSPECT = "send a probe, then forward it"
+    CIRCULATES = "do not forward it"
+    RELAY = "another bridge's probe: forward it as it is"
+    PROBE = "one of ours, or forwarded already"
+
+
+@dataclass(slots=True)
+class _Way:
+    """From one side to the other by us, on one topic."""
+
+    began: float
+    counts: dict[int, int] = field(default_factory=dict)  # of payloads, by their hash, since then
+    probed_at: float = float("-inf")
+    unanswered: int = 0
+    closed: bool = False  # something else leads back
+
+    def count(self, payload: bytes, now: float) -> int:
+        if now - self.began > _WINDOW_S:
+            self.began, self.counts = now, {}
+        key = hash(payload)
+        if key not in self.counts and len(self.counts) >= _PAYLOADS:
+            return 0
+        self.counts[key] = count = self.counts.get(key, 0) + 1
+        return count
+
+
+class Cycles:
+    """Which topics circulate, by the side they come from. Two threads may call it at once."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._ways: dict[tuple[Side, str], _Way] = {}
+        self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
+        self._others: dict[tuple[Side, bytes], None] = {}
+        self._stops: dict[tuple[Side, bytes], float] = {}
+        self._closed: Final[set[tuple[Side, str]]] = set()
+
+    def closed(self, side: Side, topic: str) -> bool:
+        """Whether what comes from ``side`` on ``topic`` and is forwarded comes back there."""
+        return (side, topic) in self._closed
+
+    def receive(self, side: Side, topic: str, payload: bytes, *, once: bool) -> Finding:
+        """``side`` has sent a message that may be forwarded; ``once``: it means something that happens once."""
+        number = _number_of(payload)
+        with self._lock:
+            if number is not None:
+                return self._receive_probe(side, topic, number)
+            way, now = self._way(side, topic), self._clock()
+            count = way.count(payload, now)
+            if way.closed and once:
+                return Finding.CIRCULATES
+            period = _PERIOD_IN_STORM_S if count > _STORM and not way.closed else PROBE_PERIOD_S
+            never_probed = way.probed_at == float("-inf")
+            suspicious = way.closed or count > _SUSPICIOUS or (never_probed and bool(self._closed))
+            suspicious = suspicious and (once or len(payload) <= _LONGEST)
+            return Finding.SUSPECT if suspicious and now - way.probed_at >= period else Finding.PASS
+
+    def repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
+        """Whether an emergency stop returns too fast for its sender. Stops are not probed: any payload is one."""
+        with self._lock:
+            now, key = self._clock(), (side, payload)
+            often = self._way(side, topic).count(payload, now) > _SUSPICIOUS
+            if often and now - self._stops.get(key, float("-inf")) < _STOP_PERIOD_S:
+                return True
+            _remember(self._stops, key, now)
+            return False
+
+    def probe(self, side: Side, topic: str) -> bytes:
+        """The white space of a new probe about ``topic`` from ``side``, which is to be published on the other one."""
+        number = bytes(_DIGITS[byte % len(_DIGITS)] for byte in secrets.token_bytes(_LENGTH))
+        with self._lock:
+            way = self._way(side, topic)
+            way.probed_at = self._clock()
+            way.unanswered += 1
+            _remember(self._ours, number, side.other)
+        return number
+
+    def poll(self) -> list[tuple[Side, str]]:
+        """Once a second: what needs a new probe, because it circulated; forget what does so no more."""
+        with self._lock:
+            due = []
+            for key in [key for key in self._closed if self._clock() - self._ways[key].probed_at >= PROBE_PERIOD_S / 2]:
+                if self._ways[key].unanswered >= _UNANSWERED:
+                    self._open(*key)
+                else:
+                    due.append(key)
+            return due
+
+    # -- with the lock held
+
+    def _receive_probe(self, side: Side, topic: str, number: bytes) -> Finding:
+        sent_to = self._ours.get(number)
+        if sent_to is side.other:
+            self._close(side, topic)
+        if sent_to is not None or (side, number) in self._others:
+            return Finding.PROBE
+        _remember(self._others, (side, number), None)
+        return Finding.RELAY
+
+    def _close(self, side: Side, topic: str) -> None:
+        way = self._way(side, topic)
+        way.unanswered = 0
+        if way.closed or len(self._closed) >= _MOST_CLOSED:
+            return
+        way.closed = True
+        if self._closed:
+            log.info("%s circulates, too, from the %s side", topic, side.value)
+        else:
+            log.error(
+                "%s circulates: something else forwards it from the %s to the %s side, so commands on it are not "
+                "forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot with this id",
+                topic,
+                side.other.value,
+                side.value,
+            )
+        self._closed.add((side, topic))
+
+    def _open(self, side: Side, topic: str) -> None:
+        self._ways[side, topic].closed = False
+        self._closed.discard((side, topic))
+        if not self._closed:
+            log.info("%s and what else circulated does so no more: everything is forwarded again", topic)
+
+    def _way(self, side: Side, topic: str) -> _Way:
+        way = self._ways.get((side, topic))
+        if way is None:
+            if len(self._ways) >= _TOPICS:
+                del self._ways[next(key for key in self._ways if key not in self._closed)]
+            way = self._ways[side, topic] = _Way(self._clock())
+        return way
+
+
+def _number_of(payload: bytes) -> bytes | None:
+    """The white space that makes ``payload`` a probe."""
+    text = payload.rstrip(_DIGITS)
+    return payload[-_LENGTH:] if len(payload) - len(text) == _LENGTH else None
+
+
+def _remember(memory: dict[Any, Any], key: Hashable, value: object) -> None:
+    if key not in memory and len(memory) >= _PROBES:
+        del memory[next(iter(memory))]
+    memory[key] = value
