@@ -287,7 +287,7 @@ def test_the_first_reason_counts() -> None:
     assert texts["silent"] == "goob is silent for 12 s"
     assert texts["stopped"] == "Stopped by eve"
     assert texts["lease"] == "bob (phone, fair-2) is driving"
-    assert texts["free"] == "Take control to drive"
+    assert texts["free"] == "april-follow runs. Take control to drive"
     assert texts["picture"] == "The picture is 2.4 s old"
     assert texts["late"] == "Commands are late (640 ms)"
     assert texts["release"] == "Let go first"

@@ -106,7 +106,9 @@ def test_the_page_refuses_the_same() -> None:
       secure: addresses.filter((one) => !refusal(one, secure)),
       reported: status.map(reported),
     };"""
-    found = evaluate({"core/stream.js": "refusal, reported"}, steps, {"addresses": addresses, "host": HOST})
+    found = evaluate(
+        {"core/stream.js": "refusal", "ui/words.js": "reported"}, steps, {"addresses": addresses, "host": HOST}
+    )
     assert found["shown"][: len(GOOD)] == list(GOOD)
     assert set(found["shown"][len(GOOD) :]) <= set(addresses[-3:])
     assert found["own"] == []

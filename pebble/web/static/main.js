@@ -12,6 +12,7 @@ import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
 
 const WATCHING = ["estop", "stop", "watch", "read-logs"]; // all that a screen sends that only watches
+const IDLE_MS = 55_000; // the server ends what is not used for a minute
 const REST_MS = 3000; // after the start what is not shown yet is fetched, so that it is here without a server, too
 
 const version = document.querySelector("meta[name=pebble-version]")?.getAttribute("content") ?? "";
@@ -49,7 +50,7 @@ function join() {
   const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
   connection.socket = socket;
   estop.onChange = () => connection.changed();
-  driver.onControlLost = (by) => connection.show(by ? `${by} took over` : "Your control has ended: take it again");
+  driver.onControlLost = (by, idleMs) => connection.show(controlEnd(by, idleMs));
   if (read("pads", null)) driver.mappingOf = () => null; // until ui/more.js is here they only stop
   driver.loading = () => !isHere(PARTS.robot);
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
@@ -62,6 +63,12 @@ function join() {
 }
 
 /** Listening and talking, fetched with its controls, or when a key asks for it. */
+/** @param {string} by who has it now @param {number} idleMs since this page drove */
+function controlEnd(by, idleMs) {
+  const why = idleMs > IDLE_MS ? "after a minute without driving" : "with the connection";
+  return by ? `${by} took over` : `Your control has ended ${why}: take it again`;
+}
+
 function sound(services) {
   let held = false;
   const use = async (act) => {

@@ -25,7 +25,7 @@ export class Driver {
     this.pictureAge = () => null;
     /** @type {() => boolean} whether what shows the picture and the reasons is not here yet */
     this.loading = () => false;
-    /** @type {(by: string) => void} called when this page loses the lease: to ``by``, or "" */
+    /** @type {(by: string, idleMs: number) => void} called when this page loses the lease: to ``by``, or "" */
     this.onControlLost = () => {};
     /** @type {() => void} called when something ends gestures: a talk ends with them */
     this.onInterrupt = () => {};
@@ -36,6 +36,7 @@ export class Driver {
     /** @type {(id: string) => import("./inputs.js").Mapping | null} of a gamepad; null: unknown yet, it only stops */
     this.mappingOf = () => USUAL;
     this.mine = false;
+    this.idleFrom = Infinity; // since when the lease is not used
     this.padName = this.padKey = "";
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
@@ -264,8 +265,11 @@ export class Driver {
   watchLease() {
     const view = this.store.get(this.ref, "web/driver")?.value;
     if (this.socket.state !== "open" || !view) return;
-    if (this.mine && !view.you) this.onControlLost(view.by);
+    const now = performance.now();
+    if (this.mine && !view.you) this.onControlLost(view.by, Math.max(0, now - this.idleFrom));
     this.mine = view.you;
+    const idle = this.idleMs();
+    if (this.mine) this.idleFrom = idle < 0 ? Infinity : now - idle;
   }
 
   /** Where the page's clock stands still while the machine is suspended, only the other one shows it. */

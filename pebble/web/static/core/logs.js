@@ -75,12 +75,15 @@ export class LogBook {
 function matches(line, filter, search) {
   if (line.gap) return true;
   if (line.rank < filter.rank) return false;
-  if (filter.service && !isOf(line.service, filter.service)) return false;
+  if (filter.service && !isOf(line.service, filter.service) && !isAbout(line, filter.service)) return false;
   return !search || `${line.service} ${line.text}`.toLowerCase().includes(search);
 }
 
 /** A service's own lines, and those of its parts: ``serial_mcu_bridge:imu``. */
 const isOf = (service, wanted) => service === wanted || service.startsWith(`${wanted}:`);
+
+/** What the launcher says of it: how it ended, and when it is started again. */
+const isAbout = ({ service, text }, wanted) => service === "launcher" && text.startsWith(wanted);
 
 /**
  * @param {unknown} raw a record, a record in a ``value``, or plain text

@@ -75,7 +75,10 @@ function silence(s) {
 
 function leaseReason(s) {
   if (s.driver?.you) return null;
-  if (!s.driver?.by) return reason("free", "Take control to drive", { label: "Take control", kind: "take" });
+  if (!s.driver?.by) {
+    const runs = s.script?.running ? `${scriptName(s) || "A script"} runs. ` : "";
+    return reason("free", `${runs}Take control to drive`, { label: "Take control", kind: "take" });
+  }
   const where = [s.driver.device, s.driver.server].filter(Boolean).join(", ");
   const who = `${s.driver.by}${where ? ` (${where})` : ""}`;
   if (s.driverIdleMs >= IDLE_MS) {
@@ -88,7 +91,7 @@ function leaseReason(s) {
 function momentReason(s) {
   if (s.loading) return reason("loading", "This screen is still loading");
   if (s.dialog) return reason("dialog", "Close the panel first");
-  if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(s.script.file);
+  if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(scriptName(s));
   if (s.pictureAgeMs !== null && !(s.pictureAgeMs <= PICTURE_OLD_MS) && !s.inSight) return reason("picture", oldPicture(s), SEE);
   if (s.roundTripMs >= LATE_MS) return reason("late", `Commands are late (${Math.round(s.roundTripMs)} ms)`);
   if (s.padFrozen) return reason("pad", "The gamepad stands still: move its stick to neutral and back");
@@ -97,8 +100,12 @@ function momentReason(s) {
   return null;
 }
 
-function scriptReason(file) {
-  const name = typeof file === "string" ? file.slice(0, 40) : "";
+function scriptName(s) {
+  const { file } = s.script;
+  return typeof file === "string" ? file.slice(0, 40) : "";
+}
+
+function scriptReason(name) {
   const action = { label: `Stop ${name || "the script"}`, kind: "stop-script" };
   return reason("script", `${name || "A script"} is driving: stop it first`, action);
 }

@@ -1,17 +1,8 @@
 /** The stream that a robot serves itself, or that was entered for it: whether the page may show it in a frame. Pure. */
 
-const KEYS = ["webrtc_url", "webrtcUrl", "url"]; // robots of the original use all of them
 const LONGEST = 500;
 /** The same rule as the server's: what that does not allow, the page's policy refuses. */
 const ADDRESS = /^https?:\/\/([a-z0-9]([a-z0-9.-]{0,252}[a-z0-9])?|\[[0-9a-f:.]{2,45}\])(:[0-9]{1,5})?([/?#][!-~]*)?$/i;
-
-/** @param {any} status payload @returns {string} the address that it reports; "" none */
-export function reported(status) {
-  const value = status?.value;
-  if (typeof value !== "object" || value === null) return "";
-  const key = KEYS.find((one) => value[one]);
-  return key && typeof value[key] === "string" ? value[key] : "";
-}
 
 /**
  * Why this address is not shown, for people; "" it may be. Browsers send cookies to every port of a host: hence none of

@@ -34,6 +34,13 @@ export function poseOf(payload) {
   return { x, y, heading: name ? value[name] * HEADING[name] : 0, run: distance };
 }
 
+/** @param {any} pose of poseOf, or null @returns {string} */
+export function poseWords(pose) {
+  if (!pose) return "No position was received yet.";
+  const rounded = (value, digits) => (Number(value.toFixed(digits)) || 0).toFixed(digits); // without the sign of zero
+  return `x ${rounded(pose.x, 2)} m · y ${rounded(pose.y, 2)} m · heading ${rounded((pose.heading * 180) / Math.PI, 0)}°`;
+}
+
 function length(value, names, unit) {
   const name = Object.keys(names).find((one) => Number.isFinite(value[one]));
   const metres = name ? value[name] / (names[name] || unit) : NaN;

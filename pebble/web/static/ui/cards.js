@@ -4,9 +4,10 @@ import { styled } from "./hooks.js";
 
 /**
  * ``tab``: where it is on a phone. ``wants``: whether this component has it. ``part``: fetches what draws it; a
- * component with ``at`` and ``offers``. ``right``: in the right one of a desktop's columns.
+ * component with ``at`` and ``offers``. ``right``: in the right one of a desktop's columns; ``wide``: below both.
+ * ``sends``: it is for commands only, so screens that only watch are without it.
  * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
- *   part: () => Promise<any>, right?: boolean}} CardKind
+ *   part: () => Promise<any>, right?: boolean, wide?: boolean, sends?: boolean}} CardKind
  */
 
 /** Listening and talking; a desktop has them below the picture. */
@@ -24,6 +25,7 @@ export const CARDS = [
   },
   {
     id: "lights",
+    sends: true,
     right: true,
     title: "Lights",
     icon: "light",
@@ -41,6 +43,7 @@ export const CARDS = [
   },
   {
     id: "sounds",
+    sends: true,
     right: true,
     title: "Sounds",
     icon: "sound",
@@ -50,6 +53,7 @@ export const CARDS = [
   },
   {
     id: "autonomy",
+    sends: true,
     right: true,
     title: "Autonomy",
     icon: "script",
@@ -59,6 +63,7 @@ export const CARDS = [
   },
   {
     id: "outlets",
+    sends: true,
     right: true,
     title: "Outlets",
     icon: "plug",
@@ -84,6 +89,7 @@ export const CARDS = [
   },
   {
     id: "mcus",
+    sends: true,
     title: "Microcontrollers",
     icon: "chip",
     tab: "more",
@@ -92,6 +98,7 @@ export const CARDS = [
   },
   {
     id: "logs",
+    wide: true,
     title: "Logs",
     icon: "list",
     tab: "more",
@@ -100,6 +107,7 @@ export const CARDS = [
   },
   {
     id: "system",
+    sends: true,
     right: true,
     title: "System",
     icon: "power",
@@ -109,6 +117,7 @@ export const CARDS = [
   },
   {
     id: "values",
+    wide: true,
     title: "All values",
     icon: "list",
     tab: "more",

@@ -61,7 +61,7 @@ export function Fleet() {
       <h1>
         ${total === 0
           ? "Robots"
-          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}, ${present.length} online`}
+          : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${present.length} online` : ""}`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
       </h1>
       ${total > 0 && html`<${FleetTools} filter=${filter} onFilter=${setFilter} />`}
@@ -156,6 +156,15 @@ export const iconOf = (ref) => ICONS[typeOf(ref)] ?? "thing";
 
 const TRANSPORTS = { mqtt: "MQTT", zenoh: "Zenoh", mcu: "MCU" };
 
+/** A service that is not well: its page has the rest. */
+function ServiceFact({ at }) {
+  const services = inner(useValue(at, "status"))?.services;
+  if (!isObject(services)) return null;
+  const ill = Object.keys(services).filter((name) => ["failed", "restarting"].includes(services[name]?.state));
+  if (!ill.length) return null;
+  return html`<li class="fact bad"><span aria-hidden="true">▲</span>${ill[0].replaceAll("_", " ")} ${services[ill[0]].state}</li>`;
+}
+
 function FleetCard({ at }) {
   const { commands, settings, connection } = usePage();
   useModel(settings);
@@ -178,12 +187,15 @@ function FleetCard({ at }) {
       </div>
       <${Liveness} at=${at} />
     </div>
-    ${(settings.thumbnails || WATCHES) && offers.hasVideo && html`<${Thumbnail} at=${at} picture=${picture} />`}
+    ${(settings.thumbnails || WATCHES) &&
+    (offers.hasVideo
+      ? html`<${Thumbnail} at=${at} picture=${picture} />`
+      : html`<div class="thumbnail">no camera</div>`)}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
       <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
       <${ScriptFact} at=${at} online=${connection.isOpen} />
-      ${typeOf(at) !== "robots" && html`<${StatusFact} at=${at} />`}
+      ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}
       ${estop?.latched &&
       html`<li class="fact bad">
         <span aria-hidden="true">■</span><b>STOPPED</b>${estop.by ? ` by ${estop.by}` : ""}

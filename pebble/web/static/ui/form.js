@@ -31,7 +31,7 @@ function FormField({ id, field, text, wrong, onText }) {
     onText("");
   };
   return html`<div class=${`ask-field ${wrong ? "wrong" : ""}`}>
-    <label for=${id}>${plain(field.label)}${field.required && html` <span class="required">(required)</span>`}</label>
+    <label for=${id}>${plain(field.label)}${field.required && field.default === null && html` <span class="required">(required)</span>`}</label>
     <div class="ask-row">
       <${Input} id=${id} field=${field} text=${text} wrong=${wrong} onText=${onText} />
       ${text !== undefined &&

@@ -16,7 +16,8 @@ export function HelpPanel({ onClose }) {
         <li><b>Space</b> stops it for now: the next command moves it again. Everybody may.</li>
         <li>
           <b>STOP</b> holds it: nothing moves it before somebody who may drive resets it, by holding the button for a
-          second. Everybody may press it, also without having control.
+          second. Everybody may press it, also without having control. Its keys count for every robot where no single one
+          is shown.
         </li>
       </ul>
       <p class="warn-box">

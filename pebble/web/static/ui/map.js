@@ -1,10 +1,9 @@
 // Where a component was and is, by its odometry: a trail over a grid.
 
-import { differs, pieces, poseOf } from "../core/trail.js";
+import { differs, pieces, poseOf, poseWords } from "../core/trail.js";
 import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "./hooks.js";
 import { Gone, isGone } from "./parts.js";
 import { recorderOf } from "./recorder.js";
-import { number } from "./words.js";
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const ARROW_PX = 24;
@@ -57,12 +56,6 @@ export function Odometry({ at }) {
       >`}
     </div>
   </div>`;
-}
-
-function poseWords(pose) {
-  if (!pose) return "No position was received yet.";
-  const degrees = ((pose.heading * 180) / Math.PI).toFixed(0);
-  return `x ${number(pose.x, 2)} m · y ${number(pose.y, 2)} m · heading ${degrees}°`;
 }
 
 /** The drawing, and how it is moved: by buttons, mouse and two fingers; one finger scrolls the page. */

@@ -95,7 +95,11 @@ export function Tools({ source, wanted }) {
   useModel(video);
   useModel(switches);
   const drawn = useMetrics(source).includes(OVERLAYS);
-  const save = () => snapshot(video, store, source).catch((error) => connection.show(`Not saved: ${error.message}`));
+  const save = () =>
+    snapshot(video, store, source).then(
+      (name) => connection.show(`Saved as ${name}`),
+      (error) => connection.show(`Not saved: ${error.message}`),
+    );
   return html`${video.info &&
   !video.stream &&
   html`<button type="button" data-test="snapshot" onClick=${save}><${Icon} name="save" />Snapshot</button>`}
@@ -111,7 +115,7 @@ export function Tools({ source, wanted }) {
   <${Stream} source=${source} wanted=${wanted} />`;
 }
 
-/** Save what is on the canvas, under the time at which it was taken. */
+/** Save what is on the canvas, under the time at which it was taken; returns the file's name. */
 async function snapshot(video, store, source) {
   const name = fileName(source, store.now() - video.age().ms);
   const blob = await new Promise((resolve) => video.canvas.toBlob(resolve, "image/png"));
@@ -121,6 +125,7 @@ async function snapshot(video, store, source) {
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  return name;
 }
 
 /** @param {string} source @param {number} ms epoch @returns {string} goob-2026-05-01T12-03-41.png, in local time */

@@ -99,7 +99,7 @@ function StreamAddress({ source }) {
           inputmode="url"
           autocapitalize="off"
           spellcheck="false"
-          placeholder="http://camera.local:8889/cam"
+          placeholder="http://…"
           data-test="stream-url"
           value=${typed ?? current}
           aria-describedby=${why ? "why-stream-address" : undefined}

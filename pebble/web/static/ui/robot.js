@@ -3,7 +3,7 @@
 import { CARDS, TABS, VOICE } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
-import { CardView, Offers } from "./models.js";
+import { CardView, Offers, WATCHES } from "./models.js";
 import { Card, Icon, Part } from "./parts.js";
 import { NoCamera, PictureSettings, Stage, useStream, useVideo } from "./video.js";
 import { nameOf, typeOf } from "./words.js";
@@ -41,6 +41,7 @@ function Unknown({ at }) {
 function Desktop({ at, offers, view, video, source }) {
   const cards = wanted(offers, view).filter(({ part }) => part !== VOICE || !video);
   const side = !offers.drives && video ? cards.shift() : null;
+  const shown = (card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`;
   return html`<div class="robot">
     <h1 class="sr">${nameOf(at)}</h1>
     <div class=${`bench ${offers.drives || side ? "" : "no-side"}`}>
@@ -51,12 +52,9 @@ function Desktop({ at, offers, view, video, source }) {
         /><//>`}
         ${!video && offers.drives && html`<${NoCamera} at=${at} offers=${offers} />`}
         <div class="cards">
-          ${columns(cards).map(
-            (column, index) => html`<div key=${index} class="column">
-              ${column.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
-            </div>`,
-          )}
+          ${columns(cards).map((column, index) => html`<div key=${index} class="column">${column.map(shown)}</div>`)}
         </div>
+        ${cards.filter(({ wide }) => wide).map(shown)}
         <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
       </div>
       ${offers.drives && html`<${Boundary} what="Driving"><${DriveCard} at=${at} offers=${offers} /><//>`}
@@ -104,6 +102,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
       ${cards
         .filter((card) => tabOf(card) === tab)
         .map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
+      ${tab !== "more" && html`<${Hidden} cards=${hidden(view).filter((card) => tabOf(card) === tab)} view=${view} />`}
       ${tab === "more" &&
       html`${video &&
         html`<${Card} id="picture" title="Picture" icon="camera"
@@ -170,11 +169,13 @@ function SettingsWords() {
   return `Settings and notices${unread ? ` (${unread} new)` : ""}`;
 }
 
-const wanted = (offers, view) => CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id));
+const wanted = (offers, view) =>
+  CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id) && !(WATCHES && card.sends));
 
 /** Two columns, so that a card that grows moves only those below it. */
 function columns(cards) {
-  const [left, right] = [false, true].map((wanted) => cards.filter(({ right: is = false }) => is === wanted));
+  const narrow = cards.filter(({ wide }) => !wide);
+  const [left, right] = [false, true].map((wanted) => narrow.filter(({ right: is = false }) => is === wanted));
   if (!right.length) right.push(...left.splice(Math.ceil(left.length / 2)));
   return [left, right].filter((column) => column.length);
 }
@@ -189,11 +190,17 @@ function CardOf({ card, at, offers, view }) {
 function Missing({ at, offers, view, hasVideo }) {
   const isRobot = typeOf(at) === "robots";
   const lacks = [!hasVideo && "camera", !offers.drives && offers.known && "driving"].filter((one) => isRobot && one);
-  const hidden = CARDS.filter((card) => view.hidden.has(card.id));
-  if (!lacks.length && !hidden.length) return null;
+  return html`${lacks.length > 0 && html`<p class="dim">Not on ${nameOf(at)}: ${lacks.join(", ")}.</p>`}
+    <${Hidden} cards=${hidden(view)} view=${view} />`;
+}
+
+const hidden = (view) => CARDS.filter((card) => view.hidden.has(card.id));
+
+/** What was closed comes back by these. */
+function Hidden({ cards, view }) {
+  if (!cards.length) return null;
   return html`<div class="missing">
-    ${lacks.length > 0 && html`<span class="dim">Not on ${nameOf(at)}: ${lacks.join(", ")}.</span>`}
-    ${hidden.map(
+    ${cards.map(
       ({ id, title }) => html`<button key=${id} type="button" onClick=${() => view.show(id)}>Show ${title}</button>`,
     )}
   </div>`;

@@ -6,6 +6,8 @@ import { inner, isObject, plain, roughly } from "./words.js";
 
 const MOST = 64;
 const RECENT_MS = 600_000;
+const OFTEN = 3; // restarts within that time
+const NOTED = 16; // the server's newest
 const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
 
 export function Services({ at, view }) {
@@ -37,13 +39,14 @@ function Service({ at, view, name, online, one, times }) {
   const { store } = usePage();
   const state = plain(isObject(one) ? one.state : one);
   const bad = state === "failed" || state === "restarting";
+  const often = times.filter((t) => store.now() - t < RECENT_MS).length >= OFTEN;
   const words = restartWords(isObject(one) ? one : {}, times, store.now());
   const logs = () => {
     logViewOf(at).choose({ service: name, rank: 0, search: "" });
     view?.reveal("logs");
   };
-  return html`<li class=${online ? (bad ? "bad" : "") : "dim"} data-test=${`service-${name}`}>
-    <i aria-hidden="true">${Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
+  return html`<li class=${online ? (bad ? "bad" : often ? "often" : "") : "dim"} data-test=${`service-${name}`}>
+    <i aria-hidden="true">${often && !bad ? SIGNS.restarting : Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
     <span class="services-name">${name.replaceAll("_", " ")}</span>
     <span class="services-state">${online ? "" : "was "}${state}</span>
     <button type="button" class="quiet" aria-label=${`Logs of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
@@ -61,7 +64,7 @@ function restartWords(one, times, now) {
   const last = times.length ? `the last time ${roughly(Math.max(0, now - times[times.length - 1]))} ago` : "before the server looked";
   return [
     `restarted ${count}×, ${last}`,
-    recent > 1 && `${recent}× in the last 10 min`,
+    recent > 1 && `${recent}×${recent >= NOTED ? " or more" : ""} in the last 10 min`,
     one.last_exit && `last exit: ${plain(one.last_exit)}`,
   ]
     .filter(Boolean)

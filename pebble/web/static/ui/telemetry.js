@@ -2,8 +2,10 @@
 
 import { html, styled, useMetric, useOnline, useTick, useValue } from "./hooks.js";
 import { Live, Part } from "./parts.js";
+import { poseOf, poseWords } from "../core/trail.js";
 import { battery, charging, inner, isObject, number, plain, roughly, span } from "./words.js";
 
+const STREAM_MS = 1000;
 const SERVICES = styled(async () => (await import("./services.js")).Services, "system.css");
 
 export function Telemetry({ at, view }) {
@@ -12,19 +14,21 @@ export function Telemetry({ at, view }) {
     <${Row} at=${at} metric="charging-level" name="Battery" online=${online}>${battery}<//>
     <${Row} at=${at} metric="charging-status" name="Charger" online=${online}>${charging}<//>
     <${Heartbeat} at=${at} />
-    <${Row} at=${at} metric="sensors/imu" name="Roll, pitch" online=${online}>${attitude}<//>
-    <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online}>${rate}<//>
-    <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online}>${acceleration}<//>
-    <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online}>${touch}<//>
-    <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online}>${(value) => plain(inner(value))}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Roll, pitch" online=${online} streams>${attitude}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Turn rate" online=${online} streams>${rate}<//>
+    <${Row} at=${at} metric="sensors/imu" name="Acceleration" online=${online} streams>${acceleration}<//>
+    <${Row} at=${at} metric="touch-sensors" name="Touch" online=${online} streams>${touch}<//>
+    <${Row} at=${at} metric="wheel-odometry" name="Odometry" online=${online} streams>${odometry}<//>
     <${Media} at=${at} online=${online} />
     <${Services} at=${at} view=${view} />
   </dl>`;
 }
 
-function Row({ at, metric, name, online, children: words }) {
-  const entry = useMetric(at, metric);
-  if (!entry) return null;
+/** ``streams``: it comes several times a second, so a single one is old after ten seconds, too. */
+function Row({ at, metric, name, online, streams = false, children: words }) {
+  const received = useMetric(at, metric);
+  if (!received) return null;
+  const entry = streams ? { ...received, period: received.period || STREAM_MS } : received;
   return html`<div>
     <dt>${name}</dt>
     <dd><${Live} entry=${entry} online=${online}>${words(entry.value)}<//></dd>
@@ -64,6 +68,12 @@ function attitude(payload) {
 }
 
 const rate = (payload) => `${number(inner(payload)?.gyro_dps?.z, 1)} °/s`;
+
+/** Where it is; all else of it is in the list of all values. */
+function odometry(payload) {
+  const pose = poseOf(payload);
+  return pose ? poseWords(pose) : plain(inner(payload));
+}
 
 const acceleration = (payload) => `${number(inner(payload)?.accel_norm_g, 2)} g`;
 

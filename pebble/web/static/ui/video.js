@@ -1,6 +1,5 @@
 // The live picture: how old it is, how it comes, and where from.
 
-import { reported } from "../core/stream.js";
 import { VOICE } from "./cards.js";
 import {
   Boundary,
@@ -16,7 +15,7 @@ import {
   useValue,
 } from "./hooks.js";
 import { Icon, Part } from "./parts.js";
-import { nameOf, span } from "./words.js";
+import { nameOf, reported, span } from "./words.js";
 
 const EXTRAS = styled(() => import("./picture-extras.js"), "picture.css");
 
@@ -136,8 +135,8 @@ function ageWords(video) {
 }
 
 const MORE = {
-  settings: async () => (await import("./picture-settings.js")).PictureSettings,
-  noCamera: async () => (await import("./picture-settings.js")).NoCamera,
+  settings: styled(async () => (await import("./picture-settings.js")).PictureSettings, "picture.css"),
+  noCamera: styled(async () => (await import("./picture-settings.js")).NoCamera, "picture.css"),
 };
 
 /** How the picture comes, and where from; fetched later. */

@@ -41,6 +41,15 @@ export const number = (value, digits) => (Number.isFinite(value) ? Number(value)
 /** The payload without the envelope that most have. @param {unknown} payload @returns {any} */
 export const inner = (payload) => (isObject(payload) && "value" in payload ? payload.value : payload);
 
+const STREAM_KEYS = ["webrtc_url", "webrtcUrl", "url"]; // robots of the original use all of them
+
+/** @param {any} status payload @returns {string} the address of a stream that it reports; "" none */
+export function reported(status) {
+  const value = inner(status);
+  const key = isObject(value) && STREAM_KEYS.find((one) => value[one]);
+  return key && typeof value[key] === "string" ? value[key] : "";
+}
+
 /** @param {unknown} payload of charging-level @returns {string} 7.92 V, 81 % */
 export function battery(payload) {
   const value = inner(payload);
@@ -65,7 +74,7 @@ const MAX_TEXT = 400;
 
 /** One line for any JSON value. @param {unknown} value @returns {string} */
 export function plain(value) {
-  if (typeof value === "number") return Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(5)));
+  if (typeof value === "number") return String(Math.abs(value) < 1e5 ? Number(value.toPrecision(5)) : Math.round(value));
   if (value === null || value === undefined) return "–";
   if (typeof value !== "object") return cut(String(value));
   if (Array.isArray(value)) return cut(`[${value.slice(0, 40).map(plain).join(", ")}]`);
