@@ -135,12 +135,12 @@ class MqttMirror(Service):
         ]
         barrier(self._broker, self._probe_topic)
         self._forwarder.subscribed(Side.REMOTE)
-        self._forwarder.probe_commands(*Side)
         self.call_at(self.clock() + INITIAL_SYNC_S, partial(self._synchronize_broker, epoch))
 
     def _synchronize_broker(self, epoch: int) -> None:
         if epoch == self._epoch:
             self._forwarder.synchronize(Side.REMOTE)
+            self._forwarder.probe_commands(*Side)
 
     @every(PROBE_PERIOD_S)
     def _probe_again(self) -> None:

@@ -93,7 +93,7 @@ class Cycles:
                 return self._receive_probe(side, topic, number)
             way, now = self._way(side, topic), self._clock()
             count = way.count(payload, now)
-            if way.closed and once:
+            if way.closed and (once or count > _SUSPICIOUS):  # more than one copy may come back
                 return Finding.CIRCULATES
             period = _PERIOD_IN_STORM_S if count > _STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
@@ -153,7 +153,7 @@ class Cycles:
             log.info("%s circulates, too, from the %s side", topic, side.value)
         else:
             log.error(
-                "%s circulates: something else forwards it from the %s to the %s side, so commands on it are not "
+                "%s circulates: something else forwards it from the %s to the %s side. Commands that circulate are not "
                 "forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot with this id",
                 topic,
                 side.other.value,

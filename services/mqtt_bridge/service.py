@@ -119,7 +119,6 @@ class MqttBridge(Service):
             self._subscribe_remote()
         else:
             self._same_broker.send()
-            self._forwarder.probe_commands(Side.REMOTE)
 
     def _disconnected(self, side: Side) -> None:
         if side is Side.REMOTE:
@@ -131,6 +130,7 @@ class MqttBridge(Service):
         def synchronize() -> None:
             if side is Side.LOCAL or epoch == self._remote_epoch:
                 self._forwarder.synchronize(side)
+                self._forwarder.probe_commands(Side.REMOTE)  # by now a mirror of the wrong broker has stopped
 
         self.call_at(self.clock() + INITIAL_SYNC_S, synchronize)
 
@@ -147,7 +147,6 @@ class MqttBridge(Service):
             for filter_ in self._subjects.filters(INCOMING)
         ]
         self._forwarder.subscribed(Side.REMOTE)
-        self._forwarder.probe_commands(Side.REMOTE)
         self._synchronize_later(Side.REMOTE)
 
     def _unsubscribe_remote(self) -> None:

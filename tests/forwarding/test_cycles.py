@@ -197,6 +197,19 @@ class TestSeveralBridges:
         world.wait(5)
         assert world.arrives(world.robot, DRIVE, b"again")
 
+    @pytest.mark.parametrize("direction", ["in", "out"])
+    def test_two_other_ways(self, world: World, direction: str) -> None:
+        """Each copy becomes two."""
+        for _ in range(2):
+            Way(world.local, world.remote, direction, "incoming/#")
+            Way(world.local, world.remote, "in", "outgoing/#")
+        world.bridge(mirroring=True)
+        world.send(world.operator, DRIVE, MOVE, ZERO)
+        world.send(world.robot, DRIVE, MOVE, ZERO)
+        world.send(world.operator, FLAG, b"true", b"false", retain=True)
+        world.send(world.robot, "outgoing/status", b"1", b"2", retain=True)
+        assert world.rests(5_000)
+
     def test_a_mirror_and_a_way_from_its_broker(self, world: World, caplog: pytest.LogCaptureFixture) -> None:
         mirrored = Node(world.network)
         way = Way(mirrored, world.remote, "both", "incoming/#")

@@ -63,7 +63,7 @@ def test_what_means_the_same_is_no_change(file: Path, caplog: pytest.LogCaptureF
     ],
     ids=["torn", "misspelt", "deep", "removed"],
 )
-def test_a_file_that_cannot_be_used_any_more_is_said_to_be_so(
+def test_a_file_that_cannot_be_used_any_more_is_reported(
     file: Path, text: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     watch = ConfigWatch(load(file))

@@ -584,7 +584,7 @@ def test_T19_a_network_that_stopped_answering_is_not_connected(net: Net, base: s
 
 
 @pytest.mark.parametrize("direct", [False, True], ids=["queued", "direct"])
-def test_T19_a_message_says_how_long_it_has_waited_for_a_process_that_stood_still(
+def test_T19_a_message_knows_how_long_it_has_waited_for_a_process_that_stood_still(
     net: Net, base: str, direct: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped, suspended or stuck: the second message is there while the first one is being handled."""

@@ -40,7 +40,7 @@ def test_an_emptied_socket_ends_it() -> None:
     assert waiting.since == 9.1
 
 
-def test_the_kernel_says_how_much_is_there() -> None:
+def test_the_kernel_knows_how_much_is_there() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         assert readable_bytes(ours) == 0

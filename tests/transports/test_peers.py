@@ -111,7 +111,7 @@ def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "run").stat().st_mode & 0o777 == 0o770, "it may be any folder, and not a robot's"
 
 
-def test_a_full_disk_keeps_nobody_from_being_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_no_process_from_being_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -124,7 +124,7 @@ def test_a_full_disk_keeps_nobody_from_being_there(tmp_path: Path, monkeypatch: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_lock_file_is_nobody(tmp_path: Path) -> None:
+def test_what_is_no_lock_file_is_no_process(tmp_path: Path) -> None:
     (tmp_path / "folder.seat").mkdir()
     os.mkfifo(tmp_path / "pipe.seat")
     (tmp_path / "link.seat").symlink_to(tmp_path / "nowhere")

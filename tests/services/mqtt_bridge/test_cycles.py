@@ -131,10 +131,11 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
 
 def test_at_each_connection_the_robots_own_side_receives_probes(rig: MemoryRig) -> None:
     rig.bridge()
-    assert until(lambda: len(rig.local.probes) == 4)
+    assert until(lambda: len(rig.local.probes) >= 4)
     rig.cut()
+    before = len(rig.local.probes)
     rig.uplink.mend()
-    assert until(lambda: len(rig.local.probes) == 8)
+    assert until(lambda: len(rig.local.probes) >= before + 4)
     assert all(probe.payload.isspace() for probe in rig.local.probes)
     assert not rig.remote.probes
 

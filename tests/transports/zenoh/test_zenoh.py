@@ -605,10 +605,10 @@ def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path, sche
         stranger.put(wire.RETAINED + "parked", b"stranger", attachment=stamp)
         assert list(stranger.get(wire.RETAINED + "**", timeout=0.5)) == []
         guest = stack.enter_context(create("zenoh", "guest", replace(elsewhere, tls=_tls("client"))))
-        heard = Recorder(guest)
+        received = Recorder(guest)
         assert until(lambda: guest.publish("drive", b"guest", qos=DELIVERED) and b"guest" in received.payloads)
         robot.publish("state", b"robot", qos=DELIVERED, retain=True)
-        assert until(lambda: b"robot" in heard.payloads and retained_of(hub) == {"state": b"robot"})
+        assert until(lambda: b"robot" in received.payloads and retained_of(hub) == {"state": b"robot"})
         assert (overheard, b"stranger" in received.payloads) == ([], False)
 
 
