@@ -20,8 +20,8 @@ from pebble.forwarding.routing import Side
 
 log = logging.getLogger(__name__)
 
-_DIGITS = b" \t\n"
-_LENGTH = 24  # digits of a probe's number
+_DIGITS = b" \t"  # no line ends: tools print a message as a line
+_LENGTH = 32  # digits of a probe's number
 _PROBES = 256  # remembered: ours, and those of others
 _TOPICS = 1024
 _MOST_CLOSED = 256  # topics that circulate
@@ -29,7 +29,7 @@ _PAYLOADS = 64  # of one topic, counted at a time
 _LONGEST = 16 * 1024  # bytes that a probe repeats
 
 #: A payload that is received more often within this time may circulate; or an operator holds a key. If something else
-#: circulates, each topic is suspicious.
+#: circulates, each topic is suspicious. Sensors repeat themselves for hours: their reports are suspicious in a storm.
 _SUSPICIOUS, _WINDOW_S = 5, 2.0
 #: No operator and no script repeats a payload so often in this time.
 _STORM = 150
@@ -85,8 +85,11 @@ class Cycles:
         """Whether what comes from ``side`` on ``topic`` and is forwarded comes back there."""
         return (side, topic) in self._closed
 
-    def receive(self, side: Side, topic: str, payload: bytes, *, once: bool) -> Finding:
-        """``side`` has sent a message that may be forwarded; ``once``: it means something that happens once."""
+    def receive(self, side: Side, topic: str, payload: bytes, *, once: bool, report: bool = False) -> Finding:
+        """``side`` has sent a message that may be forwarded.
+
+        ``once``: it means something that happens once; ``report``: it is what a robot reports again and again.
+        """
         number = _number_of(payload)
         with self._lock:
             if number is not None:
@@ -97,7 +100,8 @@ class Cycles:
                 return Finding.CIRCULATES
             period = _PERIOD_IN_STORM_S if count > _STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
-            suspicious = way.closed or count > _SUSPICIOUS or (never_probed and bool(self._closed))
+            often = count > (_STORM if report else _SUSPICIOUS)
+            suspicious = way.closed or often or (never_probed and bool(self._closed))
             suspicious = suspicious and (once or len(payload) <= _LONGEST)
             return Finding.SUSPECT if suspicious and now - way.probed_at >= period else Finding.PASS
 

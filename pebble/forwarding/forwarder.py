@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from pebble.contract import DRIVE, ESTOP, GIT_PULL, REBOOT, SERVICE_RESTART, Kind, codec
+from pebble.contract import DRIVE, ESTOP, GIT_PULL, OUTGOING, REBOOT, SERVICE_RESTART, Kind, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError
 from pebble.forwarding.admission import Admission
@@ -198,7 +198,8 @@ class Forwarder:
         if _is_stop(subject):
             repeated = self._cycles.repeats_stop(side, message.topic, message.payload)
             return Finding.CIRCULATES if repeated else Finding.PASS
-        return self._cycles.receive(side, message.topic, message.payload, once=subject.kind in ONE_SHOT)
+        once, report = subject.kind in ONE_SHOT, subject.kind.direction == OUTGOING
+        return self._cycles.receive(side, message.topic, message.payload, once=once, report=report)
 
     def _note_return(self, side: Side, subject: Subject, message: Message) -> None:
         """``message`` goes to ``side``; if its topic circulates, it comes back from the other one."""

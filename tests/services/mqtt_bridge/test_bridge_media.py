@@ -411,7 +411,8 @@ def drive(robot: Robot, *, seconds: float, rate_hz: float) -> list[float]:
     arrived: dict[bytes, float] = {}
 
     def note(message: Message) -> None:
-        arrived[message.payload] = time.monotonic()
+        if not message.payload.isspace():  # else a probe of the bridge
+            arrived[message.payload] = time.monotonic()
 
     listener = robot.local.transport.subscribe(f"{BASE}/{DRIVE}", note, echo=False, direct=True)
     sent: dict[bytes, float] = {}

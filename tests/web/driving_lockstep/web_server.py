@@ -14,6 +14,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
+from pebble.transports import clock as message_clock
 from pebble.web import broker, control, robots, server
 from pebble.web.settings import WebSettings
 from tests.robot.lockstep.network import Connection, Network
@@ -51,6 +52,9 @@ class _Nothing:
     def get(self, key: str) -> str | None:
         return self._values.get(key)
 
+    def all(self, _prefix: str) -> dict[str, str]:
+        return {}
+
     def set(self, key: str, value: str) -> None:
         self._values[key] = value
 
@@ -68,7 +72,7 @@ def virtual() -> Iterator[None]:
         token_hex=lambda size: f"{next(numbers):0{2 * size}x}", token_urlsafe=lambda _: f"token-{next(numbers)}"
     )
     with ExitStack() as stack:
-        for module in (server, robots, control, broker):
+        for module in (server, robots, control, broker, message_clock):
             stack.enter_context(patch.object(module, "time", TIME))
         for module in (server, control, broker):
             stack.enter_context(patch.object(module, "secrets", secrets))
