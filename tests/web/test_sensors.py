@@ -497,9 +497,18 @@ def test_an_address_that_was_entered_is_shown_instead(server: CannedServer, brow
         assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
 
 
-def test_an_address_is_entered_and_taken_back(server: CannedServer, browser: Browser) -> None:
-    url = "http://camera.local:8889/cam"
+def test_who_only_drives_enters_no_address(server: CannedServer, browser: Browser) -> None:
     with showing(server, browser, STATES["driving"]) as opened:
+        opened.test("stream-address").click()
+        opened.test("stream-url").fill("http://camera.local:8889/cam")
+        assert opened.test("set-stream").is_disabled()
+        assert "maintainer" in opened.page.locator("#why-stream-address").inner_text()
+
+
+def test_an_address_is_entered_and_taken_back(server: CannedServer, browser: Browser) -> None:
+    url, maintainer = "http://camera.local:8889/cam", {"role": "maintainer", "rights": ["drive", "reset", "system"]}
+    state = replace(STATES["driving"], welcome={"user": "max", **maintainer})
+    with showing(server, browser, state) as opened:
         opened.test("stream-address").click()
         use, address = opened.test("set-stream"), opened.test("stream-url")
         assert use.is_disabled()
@@ -510,7 +519,7 @@ def test_an_address_is_entered_and_taken_back(server: CannedServer, browser: Bro
         use.click()
         assert opened.until(lambda: [one["url"] for one in server.sent("stream-address")] == [url])
         entered = at(GOOB, "web/stream-address", {"url": url})
-        server.show(replace(STATES["driving"], values=changed(fleet, MINE, entered)))
+        server.show(replace(state, values=changed(fleet, MINE, entered)))
         opened.test("unset-stream").click()
         assert opened.until(lambda: server.sent("stream-address")[-1]["url"] == "")
         assert opened.complaints() == []

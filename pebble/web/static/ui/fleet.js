@@ -162,7 +162,8 @@ function ServiceFact({ at }) {
   if (!isObject(services)) return null;
   const ill = Object.keys(services).filter((name) => ["failed", "restarting"].includes(services[name]?.state));
   if (!ill.length) return null;
-  return html`<li class="fact bad"><span aria-hidden="true">▲</span>${ill[0].replaceAll("_", " ")} ${services[ill[0]].state}</li>`;
+  const words = `${ill[0].replaceAll("_", " ")} ${services[ill[0]].state}`;
+  return html`<li class="fact bad"><span><span aria-hidden="true">▲ </span>${words}</span></li>`;
 }
 
 function FleetCard({ at }) {
@@ -190,7 +191,7 @@ function FleetCard({ at }) {
     ${(settings.thumbnails || WATCHES) &&
     (offers.hasVideo
       ? html`<${Thumbnail} at=${at} picture=${picture} />`
-      : html`<div class="thumbnail">no camera</div>`)}
+      : typeOf(at) === "robots" && html`<div class="thumbnail">no camera</div>`)}
     <ul class="facts">
       <${BatteryFact} at=${at} online=${connection.isOpen} />
       <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} stopped=${estop?.latched} />
