@@ -520,6 +520,8 @@ def test_an_address_is_entered_and_taken_back(server: CannedServer, browser: Bro
         assert opened.until(lambda: [one["url"] for one in server.sent("stream-address")] == [url])
         entered = at(GOOB, "web/stream-address", {"url": url})
         server.show(replace(state, values=changed(fleet, MINE, entered)))
+        opened.page.reload()
+        opened.test("stream-address").click()
         opened.test("unset-stream").click()
         assert opened.until(lambda: server.sent("stream-address")[-1]["url"] == "")
         assert opened.complaints() == []
