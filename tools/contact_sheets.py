@@ -32,12 +32,12 @@ def sheet(size: str) -> int:
     step = tile[0] + GAP, tile[1] + LABEL + GAP
     rows = -(-len(paths) // columns)
     whole = Image.new("RGB", (GAP + columns * step[0], GAP + rows * step[1]), BACKGROUND)
-    draw, font = ImageDraw.Draw(whole), ImageFont.load_default(13)
+    draw, font = ImageDraw.Draw(whole), ImageFont.load_default(min(13, tile[0] // 10))
     for number, path in enumerate(paths):
         left, top = GAP + number % columns * step[0], GAP + number // columns * step[1]
         picture = Image.open(path).convert("RGB")
         picture.thumbnail(tile, Image.Resampling.LANCZOS)
-        draw.text((left, top + 2), path.stem.replace(f"-{size}-", " · "), INK, font)
+        draw.text((left, top + 2), path.stem.replace(f"-{size}-", " ")[: tile[0] // 5], INK, font)
         whole.paste(picture, (left, top + LABEL))
     target = DOCS / f"page-states-{size}.jpg"
     whole.save(target, quality=quality, optimize=True)
