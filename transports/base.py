@@ -190,6 +190,9 @@ class Transport(ABC):
     exact_echo: bool = True
     #: Received ``retain`` means "retained, or published with retain"; own messages never come back (T7).
     as_published: bool = False
+    #: Whether the other end had older values of what only we publish when the newest connection began: it was restored
+    #: from an earlier save, or is another one. A backend that cannot notice it leaves it False.
+    went_back: bool = False
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
         if will is not None:
@@ -208,6 +211,7 @@ class Transport(ABC):
         # Our newest retained message, by topic; empty payloads included.
         self._own = BoundedTable[Message](_OWN_LIMIT, _OWN_BYTES, lambda message: len(message.payload))
         self._pending: dict[str, None] = {}  # topics in _own whose message is not sent yet, oldest first
+        self._shared: set[str] = set()  # topics in _own that others publish on, too
         self._syncing = False  # guarded by _publishing
 
     # -- what services call
@@ -267,13 +271,15 @@ class Transport(ABC):
         retain: bool = False,
         urgent: bool = False,
         remember: bool = True,
+        shared: bool = False,
     ) -> bool:
         """Publish one message; return whether it was accepted.
 
         A live message is refused while there is no connection, and never delivered late. A retained one is accepted
         unless the transport is closed: its newest value is stored, for at most 10,000 topics and 16 MB, and sent when
         the connection is back (T4). ``remember`` False: it is not stored here, because others change it as well;
-        without a connection it is refused. ``urgent`` gives commands and flags priority where the backend can. Raises
+        without a connection it is refused. ``shared``: others change it as well, so after an outage another value there
+        counts as newer than ours, and is left alone (T9). ``urgent`` gives commands and flags priority where the backend can. Raises
         TransportError for a topic that is not allowed.
         """
         check_topic(topic)
@@ -287,6 +293,7 @@ class Transport(ABC):
             accepted = self._send(message, urgent)
             sent = accepted and self._state is State.CONNECTED
             stored = retain and remember and self._remember(message, sent=sent)
+            (self._shared.add if shared and topic in self._own else self._shared.discard)(topic)
             # "parked" is the published name of the counter of pending messages.
             self.counters.add("sent" if accepted else "parked" if stored else "refused")
             return accepted or stored

@@ -126,7 +126,7 @@ class Viewer:
     def _set_flag(self, medium: Medium, *, up: bool) -> None:
         topic = self.topic(medium, "flag_topic", _FLAGS[medium])
         self._flags[topic] = up
-        self._transport.publish(topic, codec.encode(_FLAGS[medium], up), qos=QoS.DELIVERED, retain=True)
+        self._transport.publish(topic, codec.encode(_FLAGS[medium], up), qos=QoS.DELIVERED, retain=True, shared=True)
 
     def _send(self, medium: Medium, request: MediaRequest) -> None:
         topic = self.topic(medium, "command_topic", _CONTROLS[medium])

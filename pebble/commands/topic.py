@@ -170,7 +170,9 @@ def pub(
             if number:
                 time.sleep(1 / (rate or 1))
             _refuse_stopped(estop)
-            if not transport.publish(message.topic, message.payload, qos=QoS(message.qos), retain=message.retain):
+            if not transport.publish(
+                message.topic, message.payload, qos=QoS(message.qos), retain=message.retain, shared=True
+            ):
                 raise TransportError(
                     f"{message.topic} was not published: {transport.problem or 'the connection was lost'}"
                 )

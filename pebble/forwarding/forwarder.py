@@ -46,6 +46,8 @@ _RETAINED_S = 0.05
 _RETAINED_STOPS_S = 10.0
 _LOGGED = 200  # characters of a topic
 _LATE_S = 0.5  # what happens once and has waited here for longer is stale
+#: After a longer outage an earlier value at a broker that was restored may have been chosen again by somebody.
+_RESTORED_S = 30.0
 _MAX_WAITING = 4096  # retained messages that wait for the gate to open
 #: What circulates comes back within this time; the same message later is new.
 _RETURN_S = 2.0
@@ -106,6 +108,8 @@ class Forwarder:
         self._retained_at = {side: float("-inf") for side in Side}  # the newest of the messages that may be old
         self._stops_retained_until = {side: float("inf") for side in Side}
         self._restarted: set[Side] = set()
+        self._lost_at = {side: float("-inf") for side in Side}  # -inf: before the first connection, too
+        self._went_back = dict.fromkeys(Side, False)
         self._mirror_refused = False
 
     # -- connections
@@ -121,6 +125,10 @@ class Forwarder:
         if state is not State.CONNECTED:
             self.subscribing(side)  # the transport does so at the next connection
             self._restarted.add(side)
+            self._lost_at[side] = self._clock()
+        else:
+            brief = self._clock() - self._lost_at[side] < _RESTORED_S
+            self._went_back[side] = brief and self._transports[side].went_back
 
     def subscribed(self, side: Side) -> None:
         """``side`` is connected and subscribed to, and its retained messages have arrived."""
@@ -287,7 +295,9 @@ class Forwarder:
         if not retained and not self._echo_is_exact(any) and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN
         away = self._transports[side.other].state is not State.CONNECTED
-        resolution = self._reconciliation.receive(side, topic, payload, retained=retained, other_away=away)
+        resolution = self._reconciliation.receive(
+            side, topic, payload, retained=retained, other_away=away, went_back=self._went_back[side]
+        )
         if resolution is Resolution.PASS:
             self._on_value(subject, payload)
             return None
@@ -343,7 +353,14 @@ class Forwarder:
         echoing = not transport.exact_echo and _echo_matters(subject)
         if echoing:
             self._loopback[side].expect(topic, payload)
-        accepted = transport.publish(topic, payload, qos=forward.qos, retain=forward.retain, urgent=forward.urgent)
+        accepted = transport.publish(
+            topic,
+            payload,
+            qos=forward.qos,
+            retain=forward.retain,
+            urgent=forward.urgent,
+            shared=self._rules.both_ways(subject.kind),
+        )
         if not accepted:
             self.counters.add(f"{side.value}: refused")
         if echoing and (not accepted or transport.state is not State.CONNECTED):

@@ -6,7 +6,8 @@ The rules:
 2. A retained message that a subscription brings counts only where nothing else is known. At a reconnect the *winner*
    side is right. Retained messages of the other side fill what the winner does not have; they are held back until the
    winner's have arrived.
-3. A side that lost a value receives it again.
+3. A side that lost a value receives it again. So does the winner if it has gone back, restored from an earlier save: a
+   retained message of it that is an earlier value counts as old.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pebble.transports.bounds import BoundedTable
 
 TOPICS = 4096  # remembered; beyond it the oldest is dropped,
 BYTES = 8 << 20  # as it is beyond this size of topics and values
+_EARLIER = 8  # values of a topic that are recognised
 
 
 class Resolution(Enum):
@@ -35,6 +37,11 @@ class LastValue:
 
     payload: bytes
     side: Side
+    earlier: tuple[int, ...] = ()  # hashes of the values before it
+
+    def then(self, payload: bytes, side: Side) -> LastValue:
+        """The value after this one."""
+        return LastValue(payload, side, (*self.earlier, hash(self.payload))[-_EARLIER:])
 
 
 class Reconciliation:
@@ -69,12 +76,24 @@ class Reconciliation:
         return topic in self._received[side]
 
     def receive(
-        self, side: Side, topic: str, payload: bytes, *, retained: bool, other_away: bool = False
+        self,
+        side: Side,
+        topic: str,
+        payload: bytes,
+        *,
+        retained: bool,
+        other_away: bool = False,
+        went_back: bool = False,
     ) -> Resolution:
-        """``side`` published ``payload``; ``retained``: a subscription brought it, it may be old."""
+        """``side`` published ``payload``; ``retained``: a subscription brought it, it may be old.
+
+        ``went_back``: ``side`` has older values than it had a moment ago.
+        """
         if len(self._received[side]) < TOPICS:
             self._received[side].add(topic)
-        resolution = self._resolve_retained(side, topic, payload) if retained else Resolution.PASS
+        resolution = Resolution.PASS
+        if retained:
+            resolution = self._resolve_retained(side, topic, payload, went_back=went_back)
         if resolution is Resolution.HOLD:
             self._held[topic] = payload
         elif resolution is Resolution.PASS:
@@ -83,7 +102,7 @@ class Reconciliation:
                 self._overtaken.discard(topic)
             elif other_away and len(self._overtaken) < TOPICS:
                 self._overtaken.add(topic)
-            self._last[topic] = LastValue(payload, side)
+            self._set(topic, payload, side)
         return resolution
 
     def note_published(self, side: Side, topic: str, payload: bytes) -> None:
@@ -97,7 +116,7 @@ class Reconciliation:
         if side is self._winner:
             self._overtaken.clear()
             for topic, payload in self._held.items():
-                self._last[topic] = LastValue(payload, side.other)
+                self._set(topic, payload, side.other)
                 due.append((side, topic, payload))
             self._held.clear()
         fresh = {topic for _, topic, _ in due}
@@ -108,11 +127,17 @@ class Reconciliation:
         ]
         return due
 
-    def _resolve_retained(self, side: Side, topic: str, payload: bytes) -> Resolution:
+    def _set(self, topic: str, payload: bytes, side: Side) -> None:
+        last = self._last.get(topic)
+        self._last[topic] = LastValue(payload, side) if last is None else last.then(payload, side)
+
+    def _resolve_retained(self, side: Side, topic: str, payload: bytes, *, went_back: bool) -> Resolution:
         last = self._last.get(topic)
         if side is self._winner:
             if topic in self._overtaken:
                 return Resolution.OVERTAKEN
+            if went_back and last is not None and last.payload != payload and hash(payload) in last.earlier:
+                return Resolution.CORRECT
             return Resolution.KNOWN if last is not None and last.payload == payload else Resolution.PASS
         if last is None:
             return Resolution.PASS if self._synchronized[self._winner] else Resolution.HOLD

@@ -196,7 +196,8 @@ class Robot:
 
     def _publish(self, channel: Channel, value: Any, topic: str) -> bool:
         address = self._addresses[channel]
-        return self._transport.publish(topic, codec.encode(channel, value), qos=QoS(address.qos), retain=address.retain)
+        payload, flag = codec.encode(channel, value), channel.kind is Kind.FLAG
+        return self._transport.publish(topic, payload, qos=QoS(address.qos), retain=address.retain, shared=flag)
 
     def _publish_last(self, channel: Channel, value: Callable[[], Any]) -> None:
         try:

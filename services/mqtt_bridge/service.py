@@ -18,6 +18,7 @@ from pebble.runtime.parent import Notifier, earlier_requests
 from pebble.runtime.service import Service, every
 from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
+from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.media import MEDIA, Media, MediaRequests
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
@@ -28,6 +29,9 @@ _PROBE_WAIT_S = 0.1
 _RETRY_S = 1.0
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 _CHECK_AGAIN_S = 30.0  # while nothing is mirrored
+_SETTLED_S = 30.0  # by then all services have published what they retain; so long after the start, or later
+_LOGGED = 200  # characters of a topic
+_ASK_S = 0.2  # between two questions about what is left at the remote broker
 
 
 class MqttBridge(Service):
@@ -61,6 +65,7 @@ class MqttBridge(Service):
         self._media = MediaRequests(Media(self.config.on_demand_programs(), earlier_requests()), Notifier().request)
         self._private = PrivateTopics(self.config.base)
         self._subjects = Subjects(self.config)
+        self._leftovers = Leftovers(self.config.base, self._subjects, self._remote)
         self._forwarder = Forwarder(
             self._subjects,
             TABLE_A1,
@@ -87,6 +92,7 @@ class MqttBridge(Service):
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
+        self.call_at(self.clock() + _SETTLED_S, self._look_for_leftovers)
         self.post(self._subscribe_local)
 
     def stop(self) -> None:
@@ -97,6 +103,20 @@ class MqttBridge(Service):
     def _publish_heartbeat(self) -> None:
         if self._heartbeat is not None:
             self._heartbeat.publish(self._remote, now_ms())
+
+    def _look_for_leftovers(self) -> None:
+        """Remove from the remote side what the robot has taken back while no bridge was running."""
+        if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
+            self.call_at(self.clock() + _SETTLED_S, self._look_for_leftovers)
+        elif self._leftovers.ask_next():
+            self.call_at(self.clock() + _ASK_S, self._look_for_leftovers)
+        else:
+            self.call_at(self.clock() + INITIAL_SYNC_S, self._remove_leftovers)
+
+    def _remove_leftovers(self) -> None:
+        gone = self._leftovers.remove()
+        if gone:
+            self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), _few(gone))
 
     def _subscribe_local(self) -> None:
         self._local_subscriptions = [
@@ -231,6 +251,7 @@ class MqttBridge(Service):
                 self.post_message(BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
         for admitted in self._private.admit(message):
+            self._leftovers.note_local(admitted)
             self._react(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))
 
     def _on_probe(self, message: Message) -> None:
@@ -303,6 +324,10 @@ class MqttBridge(Service):
         what = "a command" if channel is None else channel.metric
         self.counters.add("stale")
         self._quiet_log.warning(f"{what} retained", "refused a retained message on %s", what)
+
+
+def _few(topics: list[str]) -> str:
+    return ", ".join(topic[:_LOGGED] for topic in topics[:3]) + (", …" if len(topics) > 3 else "")
 
 
 def _close_all(subscriptions: list[Subscription]) -> None:

@@ -86,8 +86,7 @@ class Client(MemoryTransport):
         *,
         qos: QoS = QoS.LATEST,
         retain: bool = False,
-        urgent: bool = False,
-        remember: bool = True,
+        **_options: bool,
     ) -> bool:
         self._node.distribute(Message(topic, payload, qos, retain_requested=retain), self)
         return True

@@ -147,10 +147,19 @@ class TestReconciliation:
             ("R:a x:b R:a", ["pass", "pass", "overtaken"]),
             ("R:a x:b sync R:a", ["pass", "pass", "pass"]),
             ("R:a x:b r:c R:d", ["pass", "pass", "pass", "pass"]),
+            ("r:a r:b R:a", ["pass", "pass", "pass"]),
+            ("r:a r:b B:a", ["pass", "pass", "correct"]),
+            ("r:a l:b B:a", ["pass", "pass", "correct"]),
+            ("r:a r:b B:c", ["pass", "pass", "pass"]),
+            ("r:a r:b B:b", ["pass", "pass", "known"]),
+            ("r:a r:b r:a B:b", ["pass", "pass", "pass", "correct"]),
         ],
     )
     def test_resolutions(self, history: str, resolutions: list[str]) -> None:
-        """L, R: retained messages. l, r: live ones. x: a live local one while the remote side is away."""
+        """L, R: retained messages. l, r: live ones. x: a live local one while the remote side is away.
+
+        B: a retained message of the remote side, which has gone back.
+        """
         reconciliation = Reconciliation(REMOTE)
         given = []
         for word in history.split():
@@ -158,9 +167,9 @@ class TestReconciliation:
                 reconciliation.synchronize(REMOTE)
                 continue
             who, _, payload = word.partition(":")
-            side = REMOTE if who in "Rr" else LOCAL
+            side = REMOTE if who in "RrB" else LOCAL
             resolution = reconciliation.receive(
-                side, "t", payload.encode(), retained=who.isupper(), other_away=who == "x"
+                side, "t", payload.encode(), retained=who.isupper(), other_away=who == "x", went_back=who == "B"
             )
             given.append(resolution)
         assert given == [Resolution[name.upper()] for name in resolutions]
@@ -262,9 +271,7 @@ class Wire(MemoryTransport):
     def state(self) -> State:
         return State.CONNECTED if self.up else State.CONNECTING
 
-    def publish(
-        self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False, urgent: bool = False
-    ) -> bool:
+    def publish(self, topic: str, payload: bytes, **_options: object) -> bool:
         self.sent += [payload] if self.up else []
         return self.up
 

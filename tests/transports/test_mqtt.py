@@ -749,6 +749,31 @@ def test_nothing_is_announced_again_to_a_broker_that_still_has_it(
     assert len([message for message in received.messages if message.topic != topic]) == 30
 
 
+def test_an_older_value_at_a_broker_is_replaced_unless_others_may_have_chosen_it(
+    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
+) -> None:
+    """A broker that was restored from an earlier save, or another one behind the same address."""
+    writer, other = clients(proxy.port, "writer"), clients(broker.port)
+    for name, shared in (("own", False), ("shared", True)):
+        writer.publish(f"{topic}/{name}", b"new", qos=DELIVERED, retain=True, shared=shared)
+    writer.subscribe(f"{topic}/echo", Received())  # its answer comes after all acknowledgements
+    proxy.drop()
+    assert reconnected(writer)
+    assert not writer.went_back
+    proxy.cut()
+    for name in ("own", "shared"):
+        other.publish(f"{topic}/{name}", b"old", qos=DELIVERED, retain=True, remember=False)
+    other.subscribe(f"{topic}/echo", Received())
+    proxy.mend()
+    assert reconnected(writer, 3)
+    assert writer.went_back
+    late = Received()
+    clients(broker.port).subscribe(f"{topic}/+", late)
+    assert until(
+        lambda: sorted((one.topic[-3:], one.payload) for one in late.messages) == [("own", b"new"), ("red", b"old")]
+    )
+
+
 def test_no_broker_is_a_problem_in_words(clients: Clients, caplog: pytest.LogCaptureFixture) -> None:
     port = free_port()
     client = clients(port, opened=False)

@@ -257,22 +257,30 @@ class MqttTransport(Transport):
         self._broker_stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Own topics the broker has a retained message of. A ping's answer follows these messages (QoS 0)."""
+        """Own topics of which the broker has our newest retained message, or that others publish on as well.
+
+        A ping's answer follows these messages (QoS 0).
+        """
+        self.went_back = False
         with self._publishing:
-            topics = [topic for topic in self._own if topic not in self._pending]
+            own = {topic: message for topic, message in self._own.items() if topic not in self._pending}
+            shared = set(self._shared)
+        topics = list(own)
         if not topics:
             return set()
         connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
         found: dict[str, bytes] = {}
 
         def note(messages: list[Message]) -> None:
-            found.update((message.topic, message.payload) for message in messages if message.retain)
+            found.update((one.topic, one.payload) for one in messages if one.retain and one.topic in own)
 
         self._await(connection, connection.ping(), stopping, note)
         connection.unsubscribe(topics)
         if self.will is not None and found.get(self.will.topic) == self.will.payload:
             del found[self.will.topic]  # our own will, published although we were running
-        return set(found)
+        older = {topic for topic, payload in found.items() if topic not in shared and payload != own[topic].payload}
+        self.went_back = bool(older)
+        return found.keys() - older
 
     def _await(
         self,

@@ -1,0 +1,58 @@
+"""Finds at the remote broker what the robot has taken back while no bridge was running.
+
+An earlier bridge process had forwarded it, so only the broker knows of it. Each bridge process looks once, and only for
+retained topics that nobody but the robot publishes.
+"""
+
+from __future__ import annotations
+
+from pebble.contract import CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Kind
+from pebble.forwarding.subjects import Subjects
+from pebble.transports import Message, QoS, Subscription, Transport
+
+_TOPICS = 10_000  # noted of each side; with more nothing is removed
+_NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE covers
+
+
+class Leftovers:
+    """What robot and broker retain. Transports call :meth:`note_local` on their threads."""
+
+    def __init__(self, base: str, subjects: Subjects, remote: Transport) -> None:
+        self._remote = remote
+        self._here: set[str] | None = set()  # topics that the robot retains; None: it is over
+        self._there: set[str] = set()
+        self._subscriptions: list[Subscription] = []
+        states = [one for one in CHANNELS if one.kind is Kind.STATE and one.direction == OUTGOING]
+        named = subjects.topics(*(one for one in states if one not in _NOT_HERE and not one.is_pattern))
+        patterns = [one.filter(base) for one in states if one not in _NOT_HERE and one.is_pattern]
+        self._filters = [MCU_VALUE.filter(base), *patterns, *named]
+
+    def note_local(self, message: Message) -> None:
+        """The robot publishes ``message``."""
+        here = self._here
+        if here is not None and len(here) <= _TOPICS:
+            (here.add if message.payload else here.discard)(message.topic)
+
+    def ask_next(self) -> bool:
+        """Ask the broker for some of the topics; False if all were asked for. Waits for its answer."""
+        if not self._filters:
+            return False
+        filter_ = self._filters.pop(0)
+        self._subscriptions.append(self._remote.subscribe(filter_, self._note_remote, echo=False, direct=True))
+        return True
+
+    def remove(self) -> list[str]:
+        """Remove what only the broker retains, and return these topics; the last call."""
+        for subscription in self._subscriptions:
+            subscription.close()
+        here, self._here = self._here or set(), None
+        if max(len(here), len(self._there)) > _TOPICS:
+            return []
+        gone = sorted(self._there - here)
+        for topic in gone:
+            self._remote.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+        return gone
+
+    def _note_remote(self, message: Message) -> None:
+        if message.retain and message.payload and len(self._there) <= _TOPICS:
+            self._there.add(message.topic)

@@ -1,0 +1,134 @@
+"""A remote broker that has gone back to an older save, or still has what the robot took back while no bridge ran."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.services.mqtt_bridge import service as bridge_module
+from pebble.transports import State
+from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig, MqttRig, Quiet
+from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
+
+AUDIO_FLAG = "incoming/flags/mqtt-audio"
+STATUS = "outgoing/autonomy-status"
+TRUE, FALSE = b'{"value": true}', b'{"value": false}'
+
+
+@pytest.fixture
+def brokers(tmp_path: Path) -> Iterator[tuple[Broker, Broker]]:
+    """The robot's broker, and the operators', which saves."""
+    local, remote = Broker(tmp_path), Broker(tmp_path, persistence=True)
+    yield local, remote
+    local.stop()
+    remote.kill()
+
+
+@pytest.fixture
+def way(brokers: tuple[Broker, Broker]) -> Iterator[TcpProxy]:
+    """The bridge's way to the operators' broker."""
+    with TcpProxy(brokers[1].port) as way:
+        yield way
+
+
+@pytest.fixture
+def rig(brokers: tuple[Broker, Broker], way: TcpProxy) -> Iterator[MqttRig]:
+    local, remote = ({"host": "127.0.0.1", "port": broker.port} for broker in brokers)
+    rig = MqttRig(local, remote, uplink=way.port)
+    rig.start()
+    yield rig
+    rig.close()
+
+
+def set_flag(rig: MqttRig, value: bytes, *, here: bool = True) -> None:
+    """By an operator, who is not asked to repeat it; ``here``: it arrives at the robot now."""
+    before = len(rig.local.on(AUDIO_FLAG))
+    rig.remote.publish(AUDIO_FLAG, value, retain=True)
+    rig.remote.transport._own.clear()
+    assert not here or until(lambda: rig.local.payloads(AUDIO_FLAG)[before:] == [value])
+
+
+def set_status(rig: MqttRig, value: bytes) -> None:
+    rig.local.publish(STATUS, value, retain=True)
+    assert until(lambda: rig.remote.payloads(STATUS)[-1:] == [value])
+
+
+def connections(rig: MqttRig) -> int:
+    return rig.bridge._remote.counters["connected"]
+
+
+def test_a_broker_that_was_restored_from_an_older_save_gets_the_newest_values(
+    rig: MqttRig, brokers: tuple[Broker, Broker]
+) -> None:
+    set_status(rig, b"old")
+    set_flag(rig, FALSE)
+    brokers[1].save()
+    older = {file: file.read_bytes() for file in brokers[1]._store.iterdir()}
+    set_status(rig, b"new")
+    set_flag(rig, TRUE)
+    before = connections(rig)
+    brokers[1].kill()
+    for file, saved in older.items():
+        file.write_bytes(saved)
+    brokers[1].start()
+    assert until(lambda: connections(rig) > before and rig.bridge._remote.state is State.CONNECTED)
+    assert until(lambda: rig.retained("remote") == {STATUS: b"new", AUDIO_FLAG: TRUE}, 5)
+    Quiet(rig.local, rig.remote).wait(0.7)
+    assert rig.retained("local")[AUDIO_FLAG] == TRUE
+    assert rig.local.payloads(AUDIO_FLAG) == [FALSE, TRUE]
+
+
+def test_a_value_that_an_operator_chose_again_during_an_outage_is_no_older_one(rig: MqttRig, way: TcpProxy) -> None:
+    set_status(rig, b"status")
+    set_flag(rig, FALSE)
+    set_flag(rig, TRUE)
+    before = connections(rig)
+    way.cut()
+    assert until(lambda: rig.bridge._remote.state is not State.CONNECTED)
+    set_flag(rig, FALSE, here=False)
+    way.mend()
+    assert until(lambda: connections(rig) > before)
+    assert until(lambda: rig.local.payloads(AUDIO_FLAG) == [FALSE, TRUE, FALSE])
+
+
+class TestLeftovers:
+    @pytest.fixture
+    def memory(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
+        monkeypatch.setattr(bridge_module, "_SETTLED_S", 0.3)
+        monkeypatch.setattr(bridge_module, "_ASK_S", 0.0)
+        rig = MemoryRig(monkeypatch)
+        yield rig
+        rig.close()
+
+    def test_what_was_taken_back_while_no_bridge_ran_is_removed_there(self, memory: MemoryRig) -> None:
+        gone = ["mcu/m1/describe", "mcu/m1/range", "outlets/1/status", "autonomy-status"]
+        stays = ["mcu/m2/describe", "estop/serial", "status"]
+        foreign = ["incoming/flags/foreign", "outgoing/video", "outgoing/unknown", "outgoing/online"]
+        memory.bridge()
+        for name in (*gone, *stays):
+            memory.local.publish(f"outgoing/{name}", b'{"interfaces": [{"name": "range"}]}', retain=True)
+        there = {f"{BASE}/outgoing/{name}" for name in (*gone, *stays)}
+        assert until(lambda: there <= memory.remote_hub.retained.keys())
+        memory.stop_bridges()
+        for topic in foreign:
+            memory.remote.publish(topic, b"1", retain=True)
+        for name in gone:
+            memory.local.publish(f"outgoing/{name}", b"", retain=True)
+        bridge = memory.bridge()
+        assert until(lambda: bridge._leftovers._here is None)
+        left = {f"{BASE}/{topic}" for topic in (*foreign, *(f"outgoing/{name}" for name in stays))}
+        assert until(lambda: {*memory.remote_hub.retained} == left), memory.remote_hub.retained.keys()
+
+    def test_nothing_is_removed_while_the_robot_has_no_connection(self, memory: MemoryRig) -> None:
+        memory.bridge()
+        memory.local.publish("outgoing/status", b"1", retain=True)
+        assert until(lambda: f"{BASE}/outgoing/status" in memory.remote_hub.retained)
+        memory.stop_bridges()
+        memory.local_hub.stop(forget=True)
+        bridge = memory.bridge(ready=False)
+        Quiet(memory.remote).wait(1.0)
+        assert f"{BASE}/outgoing/status" in memory.remote_hub.retained
+        assert bridge._leftovers._here is not None
