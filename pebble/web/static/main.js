@@ -6,14 +6,14 @@ import { Driver } from "./core/driver.js";
 import { Estop } from "./core/estop.js";
 import { Store } from "./core/store.js";
 import { App, PARTS } from "./ui/app.js";
-import { Page, fetchPart, isHere } from "./ui/hooks.js";
+import { Page, fetchPart, fetchRest, isHere, withRest } from "./ui/hooks.js";
 import { Connection, Panels, Route, Settings, WATCHES, read } from "./ui/models.js";
 import { Video } from "./ui/video-model.js";
 import { Pictures } from "./media/pictures.js";
 
 const WATCHING = ["estop", "stop", "watch", "read-logs"]; // all that a screen sends that only watches
 const IDLE_MS = 55_000; // the server ends what is not used for a minute
-const REST_MS = 3000; // after the start what is not shown yet is fetched, so that it is here without a server, too
+const REST_MS = 3000; // after the start everything is fetched, so that it is here without a server, too
 
 const version = document.querySelector("meta[name=pebble-version]")?.getAttribute("content") ?? "";
 const store = new Store();
@@ -55,7 +55,10 @@ function join() {
   driver.loading = () => !isHere(PARTS.robot);
   driver.pictureAge = () => (video.ref ? video.age().ms : null);
   video.pictures = new Pictures(
-    (bitmap, info) => video.draw(bitmap, info),
+    (bitmap, info) => {
+      video.draw(bitmap, info);
+      fetchRest();
+    },
     (state) => video.report(state),
   );
   const services = { store, connection, route, settings, panels, video, driver, estop };
@@ -138,8 +141,12 @@ page.driver.start();
 follow();
 render(h(Page.Provider, { value: page }, h(App)), document.getElementById("app"));
 page.connection.socket.connect();
-setTimeout(() => Promise.allSettled(Object.values(PARTS).map(fetchPart)), REST_MS);
-fetchMore();
+withRest(fetchMore);
+if (!route.ref) fetchRest();
+setTimeout(() => {
+  fetchRest();
+  Promise.allSettled(Object.values(PARTS).map(fetchPart));
+}, REST_MS);
 
 /** What keys, gamepad and wall screens do besides; as often as it takes. */
 function fetchMore() {

@@ -55,20 +55,21 @@ export function App() {
     <${Boundary} what="The banner"><${Banners} at=${ref} layout=${layout} /><//>
     ${shown &&
     html`<${Boundary} key=${shown} what="This panel"
-      ><${Part} part=${PARTS.panels} shown=${shown} onClose=${() => panels.show("")}
+      ><${Part} part=${PARTS.panels} now shown=${shown} onClose=${() => panels.show("")}
     /><//>`}
     <main id="main" tabindex="-1">
       <${Boundary} key=${ref || "fleet"} what="This screen">
         ${ref
           ? html`<${Part}
               part=${PARTS.robot}
+              now
               key=${ref}
               at=${ref}
               layout=${layout}
               drawer=${drawer}
               onPanel=${toggle}
             />`
-          : html`<${Part} part=${PARTS.fleet} />`}
+          : html`<${Part} part=${PARTS.fleet} now />`}
       <//>
     </main>
   </div>`;

@@ -138,6 +138,15 @@ const fetched = new Map(); // parts of the page that are here, by what fetches t
 /** @param {() => Promise<any>} part @returns {boolean} whether it can be shown at once */
 export const isHere = (part) => fetched.has(part);
 
+let begin;
+const picture = new Promise((resolve) => (begin = resolve));
+
+/** What is not needed to see and to drive waits for this, so that it takes nothing from the first picture. */
+export const fetchRest = () => begin();
+
+/** @param {() => void} fn called once all the rest is fetched */
+export const withRest = (fn) => picture.then(fn);
+
 /** @param {() => Promise<any>} part fetched now, so that it is here when it is shown */
 export async function fetchPart(part) {
   if (!isHere(part)) fetched.set(part, await part());
@@ -145,9 +154,10 @@ export async function fetchPart(part) {
 
 /**
  * A part of the page, fetched when it is first shown. ``failed``: nobody should wait for it any more.
- * @param {() => Promise<any>} part the same one each time @returns {{body: any, failed: boolean}}
+ * @param {() => Promise<any>} part the same one each time @param {boolean} [now] without waiting for fetchRest()
+ * @returns {{body: any, failed: boolean}}
  */
-export function usePart(part) {
+export function usePart(part, now = false) {
   const redraw = useRedraw();
   const failures = useRef(0);
   const body = fetched.get(part);
@@ -156,6 +166,7 @@ export function usePart(part) {
     let over = Boolean(body);
     async function attempt() {
       try {
+        if (!now) await picture;
         await fetchPart(part);
       } catch (error) {
         console.error(error);

@@ -140,9 +140,9 @@ export function Card({ title, id, icon, aside, view, className = "", children })
   </section>`;
 }
 
-/** A part of the page that is fetched when it is first shown. */
-export function Part({ part, ...props }) {
-  const { body, failed } = usePart(part);
+/** A part of the page that is fetched when it is first shown; ``now``: even before the first picture. */
+export function Part({ part, now = false, ...props }) {
+  const { body, failed } = usePart(part, now);
   if (body) return html`<${body} ...${props} />`;
   if (!failed) return html`<p class="loading" role="status">Loading…</p>`;
   return html`<p class="failed" role="alert">

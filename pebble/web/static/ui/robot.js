@@ -2,7 +2,7 @@
 
 import { CARDS, TABS, VOICE } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
-import { Boundary, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
+import { Boundary, fetchRest, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
 import { CardView, Offers, WATCHES } from "./models.js";
 import { Card, Icon, Part } from "./parts.js";
 import { NoCamera, PictureSettings, Stage, useStream, useVideo } from "./video.js";
@@ -17,6 +17,11 @@ export function Robot({ at, layout, drawer, onPanel }) {
   const hasVideo = offers.hasVideo || source !== at || stream !== "";
   const known = useKnown(at);
   const video = useVideo(at, hasVideo && known ? source : "");
+  const online = useValue(source, "web/liveness")?.online !== false;
+  const awaits = !known || (hasVideo && video.wanted && online);
+  useEffect(() => {
+    if (!awaits) fetchRest();
+  }, [awaits]);
   const parts = { at, offers, view, video: hasVideo ? video : null, source };
   if (!known) return html`<${Unknown} at=${at} />`;
   if (layout === "immersive") return html`<${Immersive} ...${parts} drawer=${drawer} onPanel=${onPanel} />`;
