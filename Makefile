@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test thorough stops schedules script-schedules page-schedules page-tests check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
+.PHONY: help demo test thorough stops soak floods schedules script-schedules page-schedules page-tests check firmware report clean lock audit sbom check-types check-names check-collection test-running test-robots test-pages test-computing
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -13,6 +13,8 @@ help:
 	@echo "make test             all checks and tests, a quarter of an hour"
 	@echo "make thorough         the same, with all cases of the random tests, and the tests that take longest"
 	@echo "make stops            400 random schedules of emergency stops and faults with whole robots, 40 minutes"
+	@echo "make soak             floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport"
+	@echo "make floods           60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes"
 	@echo "make schedules        10,000 random schedules of persons, scripts and faults in virtual time, five minutes"
 	@echo "make script-schedules  200 of them with whole robots, 30 minutes"
 	@echo "make page-tests       every state, card, interruption and finger at the operator page in Chromium, 20 minutes"
@@ -84,6 +86,17 @@ stops: .venv/.ready-dev
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@$(VENV) -m tests.robot.stop_schedules --transport zenoh --log build/stops
 	@$(VENV) -m tests.robot.stop_schedules --transport mqtt --log build/stops
+
+# Attacks at random while an operator drives; the seed repeats their order.
+soak: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@$(VENV) -m tests.robot.soak --transport zenoh --minutes $(or $(MINUTES),5)
+	@$(VENV) -m tests.robot.soak --transport mqtt --minutes $(or $(MINUTES),5)
+
+floods: .venv/.ready-dev
+	@sh tools/debian-packages.sh mosquitto=mosquitto
+	@$(VENV) -m tests.robot.soak.floods --transport zenoh
+	@$(VENV) -m tests.robot.soak.floods --transport mqtt
 
 # The shortest schedule that violates a rule is printed.
 schedules: .venv/.ready-dev

@@ -76,6 +76,9 @@ class MqttMirror(Service):
         self.on_stop(self._broker.close)
         self.post(self._subscribe_local)
 
+    def dropped(self) -> dict[str, int]:
+        return self._forwarder.dropped()
+
     def stop(self) -> None:
         self.log.info("forwarded and dropped: %s", self._forwarder.counters.snapshot())
 

@@ -80,7 +80,9 @@ class Trace:
             self._file = None
 
 
-def read_trace(path: Path) -> list[Entry]:
-    """Read the entries of a trace file, without a last line that is incomplete."""
-    raw = path.read_bytes()
+def read_trace(path: Path, start: int = 0) -> list[Entry]:
+    """Read the entries of a trace file from byte ``start`` on, without a last line that is incomplete."""
+    with path.open("rb") as file:
+        file.seek(start)
+        raw = file.read()
     return [msgspec.json.decode(line, type=Entry) for line in raw[: raw.rfind(b"\n") + 1].splitlines()]

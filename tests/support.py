@@ -100,13 +100,13 @@ class Broker:
         lines = [f"listener {self.port} 127.0.0.1", "allow_anonymous true", *options]
         if os.geteuid() == 0:
             lines.append("user root")  # else it changes to a user without access to our folders
-        self._store = folder / f"store-{self.port}"
+        self.store = folder / f"store-{self.port}"
         if persistence:
-            self._store.mkdir(parents=True, exist_ok=True)
-            self._store.chmod(0o777)
+            self.store.mkdir(parents=True, exist_ok=True)
+            self.store.chmod(0o777)
             lines += [
                 "persistence true",
-                f"persistence_location {self._store}/",
+                f"persistence_location {self.store}/",
                 "autosave_on_changes true",
                 "autosave_interval 1",
             ]
@@ -145,14 +145,14 @@ class Broker:
 
     def save(self) -> None:
         """Make it write its persistence now, and wait until it has done so."""
-        file = self._store / "mosquitto.db"
+        file = self.store / "mosquitto.db"
         before = file.stat().st_mtime_ns if file.exists() else 0
         os.kill(self.pid, signal.SIGUSR1)
         assert until(lambda: file.exists() and file.stat().st_mtime_ns != before), "mosquitto did not save"
 
     def forget(self) -> None:
         """Delete what a stopped broker saved."""
-        for file in self._store.glob("*"):
+        for file in self.store.glob("*"):
             file.unlink()
 
     def freeze(self) -> None:

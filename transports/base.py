@@ -279,8 +279,8 @@ class Transport(ABC):
         unless the transport is closed: its newest value is stored, for at most 10,000 topics and 16 MB, and sent when
         the connection is back (T4). ``remember`` False: it is not stored here, because others change it as well;
         without a connection it is refused. ``shared``: others change it as well, so after an outage another value there
-        counts as newer than ours, and is left alone (T9). ``urgent`` gives commands and flags priority where the backend can. Raises
-        TransportError for a topic that is not allowed.
+        counts as newer than ours, and is left alone (T9). ``urgent`` gives commands and flags priority where the
+        backend can. Raises TransportError for a topic that is not allowed.
         """
         check_topic(topic)
         if not isinstance(payload, bytes):

@@ -11,9 +11,11 @@ waited here, in a process that was stopped or stuck; a stop never is, nor is a z
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import NamedTuple
@@ -32,7 +34,7 @@ from pebble.forwarding.routing import ONE_SHOT, URGENT, Drop, Forward, Rules, Si
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, State, Transport
-from pebble.transports.counters import Counters
+from pebble.transports.counters import Counters, bounds_reached
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +56,7 @@ _RETURN_S = 2.0
 #: Probed at each connection, before they are used.
 _PROBED = (DRIVE, REBOOT, SERVICE_RESTART, GIT_PULL)
 
+_BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.LATE, Drop.CIRCULATES)
 _FINDINGS = {Finding.PROBE: Drop.PROBE, Finding.CIRCULATES: Drop.CIRCULATES}
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
@@ -111,6 +114,13 @@ class Forwarder:
         self._lost_at = {side: float("-inf") for side in Side}  # -inf: before the first connection, too
         self._went_back = dict.fromkeys(Side, False)
         self._mirror_refused = False
+
+    def dropped(self) -> dict[str, int]:
+        """How many messages did not pass, here or in a transport, because of a bound; by reason, like ``too_many``."""
+        found = Counter(bounds_reached(*(transport.counters for transport in self._transports.values())))
+        for one, side in itertools.product(_BOUNDS, Side):
+            found[one.name.lower()] += self.counters[f"{side.value}: {one.value}"]
+        return {**found, "events": self.counters["events_dropped"]}
 
     # -- connections
 

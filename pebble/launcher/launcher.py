@@ -10,6 +10,7 @@ from pebble.config import Config
 from pebble.errors import ConfigError
 from pebble.launcher.child import Child
 from pebble.launcher.config_watch import ConfigWatch
+from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
@@ -45,7 +46,8 @@ class Launcher:
         self._supervisors = [self._supervise(program) for program in (programs(config) if table is None else table)]
         self._on_demand = OnDemand(self._reactor, self._supervisors)
         self._features = Features(lambda: self._status.capabilities_changed())
-        self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features)
+        self._dropped = Dropped()
+        self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features, self._dropped)
         self._logs = LogForwarder(self._status.publish_log, config.services.launcher.logs)
         self._config_watch = ConfigWatch(config)
         self._signals = StopSignals(self._kill_all)
@@ -103,11 +105,14 @@ class Launcher:
             self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
 
     def _receive_note(self, program: Program, line: str) -> None:
-        if not self._features.receive(program.name, line):
+        if self._dropped.receive(program.name, line):
+            self._status.changed()
+        elif not self._features.receive(program.name, line):
             self._on_demand.receive(program, line)
 
     def _ended(self, program: Program) -> None:
         self._features.ended(program.name)
+        self._dropped.ended(program.name)
         self._on_demand.ended(program)
 
     def _spawn(self, program: Program) -> Child:

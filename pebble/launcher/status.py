@@ -7,15 +7,17 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from msgspec import UNSET
+
 from pebble.config import Config
 from pebble.contract import CAPABILITIES, LOGS, STATUS, Channel, codec
 from pebble.contract.payloads import Capabilities, LogRecord, ServiceState, Status
 from pebble.launcher.announcer_pipe import AnnouncerPipe
 from pebble.launcher.capabilities import capabilities
+from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.reactor import Reactor
-from pebble.launcher.restart_policy import RestartPolicy
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, QoS
@@ -29,10 +31,15 @@ class StatusPublisher:
     """Turns the states of all supervisors into messages for operators and for systemd."""
 
     def __init__(
-        self, config: Config, reactor: Reactor, supervisors: Sequence[ProcessSupervisor], features: Features
+        self,
+        config: Config,
+        reactor: Reactor,
+        supervisors: Sequence[ProcessSupervisor],
+        features: Features,
+        dropped: Dropped,
     ) -> None:
         self._config, self._addresses = config, Addresses(config)
-        self._reactor, self._supervisors, self._features = reactor, supervisors, features
+        self._reactor, self._supervisors, self._features, self._dropped = reactor, supervisors, features, dropped
         self._pipe = AnnouncerPipe(reactor)
         self._systemd = SystemdNotifier()
         self._status_due = self._capabilities_due = False
@@ -97,10 +104,16 @@ class StatusPublisher:
     def _publish_status(self) -> None:
         self._status_due = False
         shown = [supervisor for supervisor in self._supervisors if supervisor.shown]
-        relevant = {s.program.name: _state(s.policy) for s in shown if not _rests(s)}
+        relevant = {s.program.name: self._state(s) for s in shown if not _rests(s)}
         self._systemd.status(_summary(relevant))
-        states = {supervisor.program.name: _state(supervisor.policy) for supervisor in shown}
+        states = {supervisor.program.name: self._state(supervisor) for supervisor in shown}
         self._publish_state(STATUS, _status(states, self._webrtc_url()))
+
+    def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
+        policy, dropped = supervisor.policy, self._dropped[supervisor.program.name]
+        return ServiceState(
+            state=policy.state, restarts=policy.restarts, last_exit=policy.last_exit, dropped=dropped or UNSET
+        )
 
     def _publish_capabilities(self) -> None:
         self._capabilities_due = False
@@ -127,10 +140,6 @@ class StatusPublisher:
 def _rests(supervisor: ProcessSupervisor) -> bool:
     """An on-demand program that is not requested: systemd's summary leaves it out."""
     return supervisor.program.on_demand and not supervisor.requested and not supervisor.running
-
-
-def _state(policy: RestartPolicy) -> ServiceState:
-    return ServiceState(state=policy.state, restarts=policy.restarts, last_exit=policy.last_exit)
 
 
 def _status(states: dict[str, ServiceState], webrtc_url: str | None = None) -> Status:

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from pebble.errors import PebbleError
-from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, DroppedMessages, Notifier, set_up_logging
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.hub import ZenohHub
 
@@ -39,11 +39,13 @@ def main(arguments: list[str]) -> int:
 def run_hub(settings: ZenohSettings, stop: threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
+    dropped = DroppedMessages(notify)
     hub = ZenohHub(settings).open()
     try:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):
             notify.alive()
+            dropped.report({"no_room": hub.refused})
     finally:
         hub.close()
 

@@ -10,16 +10,19 @@ import re
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-NOTIFY_FD = "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, "WANT …", "LACKS …"
+NOTIFY_FD = (
+    "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, "WANT …", "LACKS …", "DROPPED …"
+)
 WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predecessor of this process requested
 ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 LAUNCHER_LOCK = "launcher.lock"  # in the run directory, with the process id of the robot's newest launcher
 ALIVE_PERIOD_S = 1.0
+DROPPED_PERIOD_S = 10.0
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
 TAG = re.compile(r"\[([^\]]+) (\d+)\] (.*)", re.DOTALL)  # of a line by ``tagged``
 _PR_SET_PDEATHSIG = 1
@@ -129,6 +132,11 @@ class Notifier:
         """
         return self._write(f"{'LACKS' if lacking else 'HAS'} {feature}\n".encode())
 
+    def dropped(self, counts: Mapping[str, int]) -> bool:
+        """Report how many messages were dropped since the start. False: the launcher was too busy, repeat it."""
+        words = " ".join(f"{reason}={number}" for reason, number in counts.items())
+        return self._write(f"DROPPED {words}\n".encode())
+
     def _write(self, line: bytes) -> bool:
         if self._fd is None:
             return True
@@ -138,6 +146,20 @@ class Notifier:
             log.debug("the launcher did not take %s", line)
             return False
         return True
+
+
+class DroppedMessages:
+    """Reports to the launcher how many messages this process has dropped: call :meth:`report` regularly."""
+
+    def __init__(self, notifier: Notifier) -> None:
+        self._notifier = notifier
+        self._reported: dict[str, int] = {}
+
+    def report(self, counts: Mapping[str, int]) -> None:
+        """``counts``: all since the start, by reason. Reported if it has changed."""
+        found = {reason: number for reason, number in counts.items() if number}
+        if found != self._reported and self._notifier.dropped(found):
+            self._reported = found
 
 
 class ProvidedFeatures:

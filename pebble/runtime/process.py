@@ -13,7 +13,7 @@ from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
 from pebble.runtime.connections import local_transport
 from pebble.runtime.environment import withhold
-from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, DROPPED_PERIOD_S, DroppedMessages, Notifier, set_up_logging
 from pebble.runtime.service import Service
 
 _STOP_DEADLINE_S = 3.0
@@ -58,6 +58,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
     transport = local_transport(config, service_class.client_name or name, as_published=service_class.as_published)
     service = service_class(config, transport, instance=instance)
     notify = Notifier()
+    dropped = DroppedMessages(notify)
 
     def quit_(_signal: int, _frame: object) -> None:
         exit_at_the_latest()
@@ -66,6 +67,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
     signal.signal(signal.SIGTERM, quit_)
     signal.signal(signal.SIGINT, quit_)
     service.timers.add(service.clock(), notify.alive, period=ALIVE_PERIOD_S)
+    service.timers.add(service.clock(), lambda: dropped.report(service.dropped()), period=DROPPED_PERIOD_S)
     service.run(ready=notify.ready)
     return 0
 

@@ -16,7 +16,7 @@ from pebble.runtime.inbox import Inbox
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.timers import Timer, Timers
 from pebble.transports import Message, QoS, State, Subscription, Transport
-from pebble.transports.counters import Counters
+from pebble.transports.counters import Counters, bounds_reached
 
 _ONE_SHOT = (Kind.COMMAND, Kind.ACTION, Kind.FEED)
 WAIT_LIMIT_S = 0.5  # of a drive command in the inbox; with a transport's silence limit of 2 s, none acts after 2.5 s
@@ -119,6 +119,10 @@ class Service:
         All are called even if one raises.
         """
         self._on_stop.callback(callback)
+
+    def dropped(self) -> dict[str, int]:
+        """How many messages were dropped since the start because a bound was reached, by reason: for the status."""
+        return bounds_reached(self.transport.counters) | {"late": self.counters["late"]}
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
         """Send ``value`` on ``channel`` to its effective topic; ``names`` fill a pattern channel's levels."""

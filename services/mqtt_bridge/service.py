@@ -95,6 +95,9 @@ class MqttBridge(Service):
         self.call_at(self.clock() + _SETTLED_S, self._look_for_leftovers)
         self.post(self._subscribe_local)
 
+    def dropped(self) -> dict[str, int]:
+        return self._forwarder.dropped()
+
     def stop(self) -> None:
         self.log.info("forwarded and dropped: %s", self._forwarder.counters.snapshot())
 

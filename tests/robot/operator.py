@@ -32,8 +32,8 @@ class ReceivedMessage:
 class Operator:
     """Connects to one broker, subscribes to one robot, records every message, and publishes on request."""
 
-    def __init__(self, port: int, base: str) -> None:
-        self.base = base
+    def __init__(self, port: int, base: str, listens: str = "#") -> None:
+        self.base, self._listens = base, listens
         self.seen: list[ReceivedMessage] = []
         self._client = paho.Client(CallbackAPIVersion.VERSION2)
         self._client.on_connect = self._subscribe
@@ -75,7 +75,7 @@ class Operator:
         return self.on(suffix, since)[0]
 
     def _subscribe(self, client: paho.Client, *_: Any) -> None:
-        client.subscribe(f"{self.base}/#", qos=1)
+        client.subscribe(f"{self.base}/{self._listens}", qos=1)
 
     def _remember(self, _client: paho.Client, _data: Any, message: paho.MQTTMessage) -> None:
         self.seen.append(ReceivedMessage(time.monotonic(), message.topic, bytes(message.payload), bool(message.retain)))
@@ -109,9 +109,9 @@ def number_of(left: float, right: float) -> int:
 class Driver:
     """Sends numbered commands at ``rate_hz`` until stopped, and remembers when each was sent."""
 
-    def __init__(self, operator: Operator, rate_hz: float = 20.0, first: int = 0) -> None:
+    def __init__(self, operator: Operator, rate_hz: float = 20.0, first: int = 0, *, qos: int = 1) -> None:
         self.sent_at: dict[int, float] = {}
-        self._operator, self._period, self._first = operator, 1 / rate_hz, first
+        self._operator, self._period, self._first, self._qos = operator, 1 / rate_hz, first, qos
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -124,7 +124,7 @@ class Driver:
         number, due = self._first, time.monotonic()
         while not self._stop.is_set():
             self.sent_at[number] = time.monotonic()
-            self._operator.send("incoming/drive-values", numbered(number))
+            self._operator.send("incoming/drive-values", numbered(number), qos=self._qos)
             number += 1
             due += self._period
             self._stop.wait(max(0.0, due - time.monotonic()))

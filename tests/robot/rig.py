@@ -38,10 +38,15 @@ class Motors:
 
     def __init__(self, port: Path, trace: Path) -> None:
         self.port, self._trace = port, trace
+        self._start = 0  # byte of the trace
+
+    def forget(self) -> None:
+        """Read the trace from here on only: that of an hour takes a second each time."""
+        self._start = self._trace.stat().st_size
 
     def entries(self, since: float = 0.0) -> list[Entry]:
         """What happened on the line after ``since`` (monotonic seconds)."""
-        return [entry for entry in read_trace(self._trace) if entry.ns >= since * 1e9]
+        return [entry for entry in read_trace(self._trace, self._start) if entry.ns >= since * 1e9]
 
     def drives(self, since: float = 0.0) -> list[tuple[float, tuple[float, float]]]:
         """Every drive line after ``since`` as (monotonic seconds, (left, right))."""
@@ -91,7 +96,8 @@ class Rig:
 
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
-    replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU.
+    replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU. ``listens``:
+    what the operator subscribes to, below the robot's base.
     """
 
     def __init__(
@@ -107,6 +113,7 @@ class Rig:
         remote: Broker | None = None,
         local: Broker | None = None,
         login: str | None = None,
+        listens: str = "#",
         **config: Any,
     ) -> None:
         self.kind, self.name, self._extra, self._direct = kind, name, config, direct
@@ -123,7 +130,7 @@ class Rig:
         self.config.write_text(json.dumps(self._config(), indent=1))
         self.log = self.folder / "robot.log"
         self._robot: subprocess.Popen[bytes] | None = None
-        self.operator = Operator(self.remote.port, f"pebble/robots/{name}")
+        self.operator = Operator(self.remote.port, f"pebble/robots/{name}", listens)
         if start:
             try:
                 self.start()
@@ -159,6 +166,11 @@ class Rig:
         assert self._robot is not None
         self._robot.send_signal(signal.SIGTERM)
         return self._robot.wait(20)
+
+    def end(self) -> None:
+        """Stop the robot, if it runs."""
+        if self._robot is not None and self._robot.poll() is None:
+            self.stop()
 
     def kill_launcher(self) -> list[int]:
         """SIGKILL for the launcher; returns the pids of the children it leaves."""
@@ -200,8 +212,7 @@ class Rig:
 
     def close(self) -> None:
         self.operator.close()
-        if self._robot is not None and self._robot.poll() is None:
-            self.stop()
+        self.end()
         self.mcu.close()
         self.uplink.stop()
         for broker in (self.local, self.remote):

@@ -120,6 +120,7 @@ class TestPlanted:
         assert until(lambda: rig.local.on(DRIVE))
         Quiet(rig.local, rig.remote).wait()
         assert len({one.topic for one in rig.local.seen if "/flags/f" in one.topic}) == MAX_UNKNOWN_FLAGS
+        assert rig.bridge.dropped()["too_many"] == 3000 - MAX_UNKNOWN_FLAGS
 
 
 class TestStorms:

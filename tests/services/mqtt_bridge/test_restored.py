@@ -66,7 +66,7 @@ def test_a_broker_that_was_restored_from_an_older_save_gets_the_newest_values(
     set_status(rig, b"old")
     set_flag(rig, FALSE)
     brokers[1].save()
-    older = {file: file.read_bytes() for file in brokers[1]._store.iterdir()}
+    older = {file: file.read_bytes() for file in brokers[1].store.iterdir()}
     set_status(rig, b"new")
     set_flag(rig, TRUE)
     before = connections(rig)

@@ -51,6 +51,12 @@ class ZenohHub:
         self._session: zenoh.Session | None = None
         self._worker: HubWorker | None = None
         self._token: zenoh.LivelinessToken | None = None
+        self._store: HubStore | None = None
+
+    @property
+    def refused(self) -> int:
+        """Retained messages and wills there was no room for."""
+        return 0 if self._store is None else self._store.refused
 
     def open(self) -> ZenohHub:
         """Start. Raises TransportError if the run directory has a hub already, or cannot be used."""
@@ -81,7 +87,7 @@ class ZenohHub:
     def _start(self, run_dir: Path) -> None:
         journal = None if self._settings.journal is None else Journal(self._settings.journal)
         siblings = PeerRegistry(run_dir).sockets()  # they would connect within 0.5 s; we connect at once
-        store = HubStore(tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved))
+        self._store = store = HubStore(tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved))
         self._worker = HubWorker(self.name, store, journal, self.counters)
         try:
             config = session_config(self._settings, "router", listen=[run_dir / HUB_SOCKET], connect=siblings)
