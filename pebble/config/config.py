@@ -21,6 +21,9 @@ from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
 
+#: In the run directory: the process id of the robot's newest launcher, and on a second line the robot's base topic.
+LAUNCHER_LOCK = "launcher.lock"
+_BY_SYSTEMD = Path("/run/pebble")  # of our unit; a tool that is started from a shell does not see its environment
 _LONGEST_NAME = 150  # bytes; file systems allow 255
 
 
@@ -155,10 +158,20 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
     """
     if by_systemd := env.get("RUNTIME_DIRECTORY"):
         return Path(by_systemd.split(":")[0])  # one per RuntimeDirectory= of the unit
+    if _is_run_from(_BY_SYSTEMD, base):
+        return _BY_SYSTEMD
     robot = f"{zlib.crc32(base.encode()):08x}"
     if by_login := env.get("XDG_RUNTIME_DIR"):
         return Path(by_login, "pebble", robot)
     return Path(env.get("TMPDIR", "/tmp"), f"pebble-{_user_id()}", robot)  # noqa: S108 - 0700 and checked when made
+
+
+def _is_run_from(folder: Path, base: str) -> bool:
+    """Whether the newest launcher in this run directory, if we may read it, was that of this robot."""
+    try:
+        return (folder / LAUNCHER_LOCK).read_text(errors="replace").splitlines()[1:2] == [base]
+    except OSError:
+        return False
 
 
 def _user_id() -> int:

@@ -10,8 +10,8 @@ import struct
 from pathlib import Path
 from typing import Self
 
+from pebble.config import LAUNCHER_LOCK
 from pebble.errors import PebbleError
-from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.transports.peers import FileLock, make_private
 
 _PEER = struct.Struct("3i")  # SO_PEERCRED: process, user, group
@@ -36,7 +36,7 @@ class RunLock:
         make_private(self._run_dir, close=True)
         self._lock = FileLock.take(self.path)
         if self._lock is None:
-            holder = self.path.read_text(errors="replace").strip("\0\n") or "(unknown)"
+            holder = self.path.read_text(errors="replace").strip("\0\n").partition("\n")[0] or "(unknown)"
             raise PebbleError(
                 f"{self._robot} already runs: process {holder} holds {self.path}; end it there with Ctrl-C"
             )
@@ -45,11 +45,11 @@ class RunLock:
         except PebbleError:
             self.release()
             raise
-        self._lock.write(f"{os.getpid()}\n".encode())
+        self._lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
         return self
 
     def release(self) -> None:
-        """Release the locks. The file stays, with the process id of the last launcher."""
+        """Release the locks. The file stays, with the process id of the last launcher and its robot."""
         if self._name is not None:
             self._name.close()
             self._name = None

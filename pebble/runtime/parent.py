@@ -14,13 +14,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from pebble.config import LAUNCHER_LOCK
+
 NOTIFY_FD = (
     "PEBBLE_NOTIFY_FD"  # a pipe to the launcher: "READY" once, "ALIVE" every second, "WANT …", "LACKS …", "DROPPED …"
 )
 WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predecessor of this process requested
 ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
-LAUNCHER_LOCK = "launcher.lock"  # in the run directory, with the process id of the robot's newest launcher
 ALIVE_PERIOD_S = 1.0
 DROPPED_PERIOD_S = 10.0
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
@@ -74,7 +75,7 @@ def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None)
 def launcher_runs(run_dir: Path) -> bool:
     """Whether the newest launcher of the robot with this run directory is still a running process."""
     try:
-        pid = int((run_dir / LAUNCHER_LOCK).read_text())
+        pid = int((run_dir / LAUNCHER_LOCK).read_text().partition("\n")[0])
         os.kill(pid, 0)
     except (OSError, ValueError, OverflowError):
         return False

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from pebble.config import Config, load, parse, resolved
+from pebble.config import LAUNCHER_LOCK, Config, load, parse, resolved
 from pebble.contract import channel_of
 from pebble.errors import ConfigError
 from pebble.runtime.connections import hub_settings
@@ -800,6 +800,18 @@ class TestRunDirectory:
     def test_systemds_comes_before_the_logins(self) -> None:
         env = {"RUNTIME_DIRECTORY": "/run/pebble:/run/more", "XDG_RUNTIME_DIR": "/run/user/7"}
         assert read({"robot": {"id": "goob"}}, env).run_dir() == Path("/run/pebble")
+
+    def test_a_tool_in_a_shell_finds_that_of_our_unit(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("pebble.config.config._BY_SYSTEMD", tmp_path)
+        goob, fred = {"robot": {"id": "goob"}}, {"robot": {"id": "fred"}}
+        assert read(goob, {}).run_dir() != tmp_path
+        for text in ("", "1\n", "1\npebble/robots/fred\n", "\xff\n\xff"):
+            (tmp_path / LAUNCHER_LOCK).write_text(text)
+            assert read(goob, {}).run_dir() != tmp_path, text
+        (tmp_path / LAUNCHER_LOCK).write_text("1\npebble/robots/goob\n")
+        assert read(goob, {"XDG_RUNTIME_DIR": "/run/user/7"}).run_dir() == tmp_path
+        assert read(fred, {}).run_dir() != tmp_path
+        assert read(goob, {"RUNTIME_DIRECTORY": "/run/other"}).run_dir() == Path("/run/other")
 
     def test_the_configs_own_comes_before_all(self, tmp_path: Path) -> None:
         raw = at("transport", {"kind": "zenoh", "run_dir": "run"})

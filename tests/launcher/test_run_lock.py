@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from pebble.config import LAUNCHER_LOCK
 from pebble.errors import PebbleError
 from pebble.launcher.run_lock import RunLock
-from pebble.runtime.parent import LAUNCHER_LOCK
 
 
 def test_the_folder_is_made_for_this_user_alone(tmp_path: Path) -> None:
     with RunLock(tmp_path / "a" / "b", "x/y/z", tmp_path / "robot.json") as lock:
         assert (tmp_path / "a" / "b").stat().st_mode & 0o777 == 0o700
-        assert lock.path.read_text() == f"{os.getpid()}\n"
+        assert lock.path.read_text() == f"{os.getpid()}\nx/y/z\n"
 
 
 def test_an_open_folder_of_ours_is_closed(tmp_path: Path) -> None:

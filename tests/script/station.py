@@ -12,11 +12,10 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.config import load
+from pebble.config import LAUNCHER_LOCK, load
 from pebble.contract import DRIVE, ESTOP_STATE, codec
 from pebble.contract.payloads import Drive, EstopState
 from pebble.runtime.connections import local_transport
-from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.transports import Message, QoS
 from tests.support import Broker, Child, until
 from tests.transports.zenoh_net import HubProcess

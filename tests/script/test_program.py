@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from pebble.config import LAUNCHER_LOCK
 from pebble.contract.payloads import Drive
-from pebble.runtime.parent import LAUNCHER_LOCK
 from pebble.script import EXIT_ENDED
 from tests.commands.command_line import config_file
 from tests.script.station import Station
