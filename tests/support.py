@@ -93,9 +93,19 @@ def mosquitto_path() -> str:
 
 
 class Broker:
-    """A real mosquitto on a free loopback port. ``stop``/``kill`` then ``start`` keep port and persistence."""
+    """A real mosquitto on a free loopback port. ``stop``/``kill`` then ``start`` keep port and persistence.
 
-    def __init__(self, folder: Path, *options: str, port: int | None = None, persistence: bool = False) -> None:
+    With ``persistence`` it saves after each change, or without ``autosave`` when asked to.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *options: str,
+        port: int | None = None,
+        persistence: bool = False,
+        autosave: bool = True,
+    ) -> None:
         self.port = port or free_port()
         lines = [f"listener {self.port} 127.0.0.1", "allow_anonymous true", *options]
         if os.geteuid() == 0:
@@ -107,8 +117,8 @@ class Broker:
             lines += [
                 "persistence true",
                 f"persistence_location {self.store}/",
-                "autosave_on_changes true",
-                "autosave_interval 1",
+                f"autosave_on_changes {str(autosave).lower()}",
+                f"autosave_interval {int(autosave)}",
             ]
         self._config = folder / f"mosquitto-{self.port}.conf"
         self._config.write_text("\n".join(lines) + "\n")

@@ -36,7 +36,7 @@ class World:
         self._mounted: list[Path] = []
         self._folder = Path(f"/tmp/pebble-soak-{os.getpid()}")
         self._folder.mkdir(mode=0o700)
-        self.remote = Broker(self._folder, persistence=True)
+        self.remote = Broker(self._folder, persistence=True, autosave=False)
         self.older: dict[str, bytes] = {}  # what the remote broker saved some time ago
         never = {"command": ["true"], "cooldown_seconds": 10}
         actions = {f"{name}_control": never for name in ("reboot", "service_restart", "git_pull")}
