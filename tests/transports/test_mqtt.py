@@ -384,6 +384,29 @@ def test_a_stop_of_the_process_while_it_reads_counts(
     operator.loop_stop()
 
 
+def test_what_waited_at_the_broker_or_on_the_way_is_no_younger(
+    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
+) -> None:
+    """Pings are sent twice a second: their answers stand in the same queue."""
+    robot, operator, waited = clients(proxy.port), clients(broker.port), list[float]()
+    robot.subscribe(topic, lambda message: waited.append(message.waited_s))
+    operator.publish(topic, b"")
+    assert until(lambda: len(waited) == 1)
+    assert waited[0] < 0.4
+    proxy.blackhole()
+    time.sleep(0.1)
+    operator.publish(topic, b"")
+    time.sleep(1.5)
+    proxy.resume()
+    assert until(lambda: len(waited) == 2)
+    assert 0.9 < waited[1] < 2.5
+    time.sleep(1.0)
+    operator.publish(topic, b"")
+    assert until(lambda: len(waited) == 3)
+    assert waited[2] < 0.4
+    assert robot.counters["connected"] == 1
+
+
 @pytest.mark.parametrize(("keepalive_s", "silence_s", "interval_s"), [(0, 2.0, 0.5), (0, 0.001, 0.05)])
 def test_pings_are_never_a_storm(
     tmp_path: Path, clients: Clients, keepalive_s: int, silence_s: float, interval_s: float

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import socket
 
-from pebble.transports.mqtt.incoming import WaitingTime, readable_bytes
+import pytest
+
+from pebble.transports.mqtt.incoming import BrokerDelay, WaitingTime, readable_bytes
 
 
 def test_bytes_that_come_into_an_empty_socket_have_not_waited() -> None:
@@ -47,3 +49,66 @@ def test_the_kernel_knows_how_much_is_there() -> None:
         theirs.send(b"123")
         assert readable_bytes(ours) == 3
     assert readable_bytes(ours) == 0
+
+
+class TestBrokerDelay:
+    """A connection whose answers usually take 0.1 s."""
+
+    @pytest.fixture
+    def delay(self) -> BrokerDelay:
+        delay = BrokerDelay()
+        delay.usual(0.1)
+        return delay
+
+    @staticmethod
+    def at(delay: BrokerDelay, now: float, round_trip_s: float = 0.1) -> float:
+        return round(delay.seconds(now, lambda: round_trip_s), 3)
+
+    def test_usual_answers_are_no_delay(self, delay: BrokerDelay) -> None:
+        delay.asked(1.0, clear=True)
+        assert self.at(delay, 1.19) == 0
+        delay.answered(1.19)
+        assert self.at(delay, 9.0) == 0
+
+    def test_what_comes_before_an_overdue_answer_is_as_old_as_that(self, delay: BrokerDelay) -> None:
+        delay.asked(1.0, clear=True)
+        delay.asked(1.5, clear=True)
+        assert self.at(delay, 1.8) == 0.7
+
+    def test_what_comes_after_it_has_stood_behind_the_same(self, delay: BrokerDelay) -> None:
+        """Also if answers come regularly, each of them late."""
+        for number in range(4):
+            delay.asked(1.0 + number / 2, clear=True)
+        for number in range(4):
+            delay.answered(3.0 + number / 2)
+            assert self.at(delay, 3.1 + number / 2) == 1.9
+        delay.asked(5.0, clear=True)
+        delay.answered(5.1)
+        assert self.at(delay, 5.2) == 0
+
+    def test_a_long_way_is_none(self, delay: BrokerDelay) -> None:
+        delay.asked(1.0, clear=True)
+        delay.answered(2.0)
+        assert self.at(delay, 2.1, round_trip_s=0.9) == 0.1
+        assert self.at(delay, 2.1) == 0.9
+
+    def test_a_ping_behind_our_own_data_says_nothing(self, delay: BrokerDelay) -> None:
+        delay.asked(1.0, clear=False)
+        assert self.at(delay, 3.0) == 0
+        delay.asked(2.0, clear=True)
+        assert self.at(delay, 3.0) == 0.9
+        delay.answered(3.0)
+        assert self.at(delay, 3.0) == 0.9
+        delay.answered(3.0)
+        assert self.at(delay, 3.0) == 0.9
+
+    def test_no_link_is_so_slow_that_a_second_is_usual(self) -> None:
+        delay = BrokerDelay()
+        delay.usual(5.0)
+        delay.asked(1.0, clear=True)
+        delay.answered(6.0)
+        assert self.at(delay, 6.0) == 4.0
+
+    def test_an_answer_without_a_ping_is_none(self, delay: BrokerDelay) -> None:
+        delay.answered(1.0)
+        assert self.at(delay, 1.0) == 0

@@ -31,8 +31,15 @@ from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
-from pebble.transports.mqtt.incoming import WaitingTime, readable_bytes
-from pebble.transports.mqtt.outgoing import Backlog, InFlightTable, PendingAck, shortest_round_trip_s, unconfirmed_bytes
+from pebble.transports.mqtt.incoming import BrokerDelay, WaitingTime, readable_bytes
+from pebble.transports.mqtt.outgoing import (
+    Backlog,
+    InFlightTable,
+    PendingAck,
+    present_round_trip_s,
+    shortest_round_trip_s,
+    unconfirmed_bytes,
+)
 from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
@@ -45,6 +52,7 @@ _HEAD = 2 + 65_535 + 2  # bytes of a PUBLISH up to its message id, at most
 _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
 _PIECE = 64 * 1024  # bytes of a long packet that are read at once
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
+_CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _BATCH = 64  # messages read in a row before they are delivered
@@ -182,7 +190,7 @@ class Connection:
         self._in_flight = InFlightTable()
         self._answered_at = clock.since_boot()
         self._waiting = WaitingTime(self._answered_at)
-        self._overdue = False  # an answer is, or was until the newest one
+        self._delay = BrokerDelay()
         self._packets = 0  # received so far
         self._more = False  # a batch ended before the socket was empty
         self._accepted = False
@@ -297,7 +305,6 @@ class Connection:
         if now - max(self._answered_at, self.arriving_at) > limit:
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
-        self._overdue |= now - self._answered_at > limit
 
     @property
     def _silence_limit_s(self) -> float:
@@ -305,13 +312,10 @@ class Connection:
 
     @property
     def _waiting_since(self) -> float:
-        """Since when what is read now may have waited; at the broker too, if it was behind what delayed an answer."""
-        if self._overdue:
-            asked_at = self._in_flight.newest_answered_at
-            self._overdue = clock.since_boot() - asked_at > self._silence_limit_s
-            if self._overdue:
-                return min(self._waiting.since, asked_at)
-        return self._waiting.since
+        """Since when what is read now may have waited, here or at the broker."""
+        now, sock = clock.since_boot(), self._socket()
+        waited = self._delay.seconds(now, lambda: 0.0 if sock is None else present_round_trip_s(sock))
+        return min(self._waiting.since, now - waited) if waited > 0 else self._waiting.since
 
     def _note_copies(self, messages: list[Message]) -> None:
         if any(message.retain for message in messages):
@@ -373,7 +377,10 @@ class Connection:
         return ack
 
     def _ping(self, ack: PendingAck | None = None) -> None:
+        sock = self._socket()
+        ahead = self._client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
         self._in_flight.ping(clock.since_boot(), ack)
+        self._delay.asked(clock.since_boot(), clear=ahead <= _CLEAR)
         self._client.ping()
         self._client.loop_write()
 
@@ -386,6 +393,7 @@ class Connection:
     def _on_pong(self) -> None:
         self._note_answer()
         self._in_flight.pong(self._answered_at)
+        self._delay.answered(self._answered_at)
 
     # -- any thread
 
@@ -537,7 +545,7 @@ class Connection:
         started = self._answered_at
         self._note_answer()
         self._in_flight.measured(self._answered_at - started)
-        self._in_flight.newest_answered_at = started
+        self._delay.usual(self._answered_at - started)
         self.hesitated = self._answered_at - started > _HESITATION_S
         if reason.is_failure:
             self._refusal = f"{self.where} refused us: {_explain(reason)}"

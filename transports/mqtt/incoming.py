@@ -1,9 +1,11 @@
-"""How long received bytes may have waited in the kernel, which does not say when they arrived (T19)."""
+"""How long what is received may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
 
 from __future__ import annotations
 
 import socket
 import sys
+from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 
 try:
@@ -13,6 +15,9 @@ except ImportError:  # Windows has neither
     _can_measure = False
 else:
     _can_measure = True
+
+_FAR_S = 1.0  # no round trip of a usable link is longer
+_NOTICED_S = 0.1
 
 
 class WaitingTime:
@@ -39,6 +44,40 @@ class WaitingTime:
     def read(self, size: int) -> None:
         """``size`` bytes were taken out of it."""
         self._counted -= size
+
+
+class BrokerDelay:
+    """How long what is received now has waited at the broker, which sends the answer to a ping after it.
+
+    A ping of which the way there took long itself, behind our own data, says nothing. What is usual is no delay: the
+    shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
+    """
+
+    def __init__(self) -> None:
+        self._asked: deque[tuple[float, bool]] = deque()  # unanswered pings: when, and whether they say something
+        self._shortest = _FAR_S
+        self._newest = 0.0  # seconds until the newest answer
+
+    def usual(self, seconds: float) -> None:
+        """An answer took so long that waited for nothing."""
+        self._shortest = min(self._shortest, seconds)
+
+    def asked(self, now: float, *, clear: bool) -> None:
+        """A ping was sent; ``clear``: nothing of ours was on its way."""
+        self._asked.append((now, clear))
+
+    def answered(self, now: float) -> None:
+        """The oldest ping was answered."""
+        if self._asked:
+            asked_at, clear = self._asked.popleft()
+            self._newest = now - asked_at if clear else 0.0
+            self.usual(now - asked_at)
+
+    def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
+        """``round_trip_s`` asks for TCP's present one, if that matters."""
+        oldest = next((asked_at for asked_at, clear in self._asked if clear), now)
+        waited = max(self._newest, now - oldest)
+        return waited - max(self._shortest, round_trip_s()) if waited > self._shortest + _NOTICED_S else 0.0
 
 
 def readable_bytes(sock: socket.socket) -> int:

@@ -34,8 +34,8 @@ _REFUSED = 1000  # topics
 ROUND_TRIPS = 8  # answer times that are remembered
 
 _TCP_INFO = getattr(socket, "TCP_INFO", None)  # Linux only
-_MIN_RTT = struct.Struct("@I")  # of struct tcp_info (linux/tcp.h, since 4.5): tcpi_min_rtt, microseconds
-_MIN_RTT_AT = 148
+_RTT = struct.Struct("@I")  # microseconds
+_RTT_AT, _MIN_RTT_AT = 68, 148  # bytes; in struct tcp_info (linux/tcp.h): tcpi_rtt, and since 4.5 tcpi_min_rtt
 _NEVER = 0xFFFFFFFF  # no round trip was measured yet
 
 
@@ -169,8 +169,6 @@ class InFlightTable:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
         self._unacked: dict[int, tuple[str | None, float]] = {}  # by message id: the topic, if retained; when sent
         self._acked_at = float("-inf")  # the newest acknowledgement
-        #: When the newest of what is answered was sent: what the broker sends after the answer is no older.
-        self.newest_answered_at = float("-inf")
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, PendingAck] = {}
         self._answered: list[PendingAck] = []  # not completed yet
@@ -215,8 +213,7 @@ class InFlightTable:
         if mid not in self._unacked:
             return False
         self._acked_at = now
-        topic, sent_at = self._unacked.pop(mid)
-        self.newest_answered_at = max(self.newest_answered_at, sent_at)
+        topic, _ = self._unacked.pop(mid)
         if topic is not None and topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
         return True
@@ -249,7 +246,6 @@ class InFlightTable:
             return
         sent_at, ack = self._pings.popleft()
         self._pong_number += 1
-        self.newest_answered_at = max(self.newest_answered_at, sent_at)
         self.measured(now - sent_at)
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]
@@ -293,12 +289,21 @@ def unconfirmed_bytes(sock: socket.socket) -> int:
 
 def shortest_round_trip_s(sock: socket.socket) -> float:
     """The kernel's own measurement over the last minutes; 0 where it has none."""
+    return _round_trip_s(sock, _MIN_RTT_AT)
+
+
+def present_round_trip_s(sock: socket.socket) -> float:
+    """The kernel's own measurement, smoothed; 0 where it has none."""
+    return _round_trip_s(sock, _RTT_AT)
+
+
+def _round_trip_s(sock: socket.socket, at: int) -> float:
     if _TCP_INFO is None:
         return 0.0
     info = b""
     with suppress(OSError, ValueError):
-        info = sock.getsockopt(socket.IPPROTO_TCP, _TCP_INFO, _MIN_RTT_AT + _MIN_RTT.size)
-    if len(info) < _MIN_RTT_AT + _MIN_RTT.size:
+        info = sock.getsockopt(socket.IPPROTO_TCP, _TCP_INFO, at + _RTT.size)
+    if len(info) < at + _RTT.size:
         return 0.0
-    (microseconds,) = _MIN_RTT.unpack_from(info, _MIN_RTT_AT)
+    (microseconds,) = _RTT.unpack_from(info, at)
     return 0.0 if microseconds == _NEVER else microseconds / 1e6
