@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from pebble.contract import INCOMING, Kind
+import time
+from collections.abc import Callable
+
+from pebble.contract import INCOMING, Channel, Kind
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message
 
+MAX_ACTIONS = 10  # of one topic in a second: the rest requests what is requested already
+MAX_UNKNOWN_COMMANDS = 1000  # in a second, of all topics together
 MAX_UNKNOWN_FLAGS = 64  # each is retained on the robot: in its broker or hub, and in the hub's file
 
 
 class Admission:
-    """Bounds the messages to a robot, by size, and flags that are not in the contract by their number.
+    """Bounds the messages to a robot: by size, and by number what is no command of the contract.
 
-    What the robot itself has set counts as well, so a restarted bridge begins no new number, but is always admitted.
+    Flags that the contract does not know: what the robot itself has set counts as well, so a restarted bridge begins no
+    new number, but is always admitted.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._flags: set[str] = set()
+        self._clock = clock
+        self._second = 0
+        self._counts: dict[Kind | Channel, int] = {}  # of this second
 
     def __len__(self) -> int:
         return len(self._flags)
@@ -27,6 +36,8 @@ class Admission:
         """Why this message may not pass; None if it may."""
         if side is Side.REMOTE and subject.kind.direction == INCOMING and len(message.payload) > MAX_COMMAND_BYTES:
             return Drop.TOO_LARGE
+        if side is Side.REMOTE and self._is_too_often(subject, message):
+            return Drop.TOO_OFTEN
         if subject.channel is not None or subject.kind is not Kind.FLAG:
             return None
         if not message.payload:  # removed
@@ -36,3 +47,20 @@ class Admission:
         else:
             return Drop.TOO_MANY
         return None
+
+    def _is_too_often(self, subject: Subject, message: Message) -> bool:
+        if subject.kind is Kind.ACTION and subject.channel is not None:
+            key: Kind | Channel = subject.channel
+            most = MAX_ACTIONS
+        elif subject.kind is Kind.COMMAND and subject.channel is None:
+            key, most = subject.kind, MAX_UNKNOWN_COMMANDS
+        else:
+            return False
+        if message.payload.isspace():  # perhaps a probe for cycles
+            return False
+        second = int(self._clock())
+        if second != self._second:
+            self._second = second
+            self._counts.clear()
+        count = self._counts[key] = self._counts.get(key, 0) + 1
+        return count > most

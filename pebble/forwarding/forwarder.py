@@ -56,7 +56,7 @@ _RETURN_S = 2.0
 #: Probed at each connection, before they are used.
 _PROBED = (DRIVE, REBOOT, SERVICE_RESTART, GIT_PULL)
 
-_BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.LATE, Drop.CIRCULATES)
+_BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES)
 _FINDINGS = {Finding.PROBE: Drop.PROBE, Finding.CIRCULATES: Drop.CIRCULATES}
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
@@ -99,7 +99,7 @@ class Forwarder:
         self._winner, self._on_value, self._clock = winner, on_value, clock
         self._lock = threading.RLock()
         self._reconciliation = Reconciliation(winner)
-        self._admission = Admission()
+        self._admission = Admission(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
         self._events = {side: EventBuffer(transports[side], self.counters, clock=clock) for side in Side}

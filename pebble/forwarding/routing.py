@@ -36,6 +36,7 @@ class Drop(Enum):
     # found by the forwarder
     TOO_LARGE = "larger than a message to a robot may be"
     TOO_MANY = "one more unknown flag than a robot stores"
+    TOO_OFTEN = "more often in a second than a robot takes it"
     ECHO = "our own, sent back by the broker"
     PROBE = "a probe for cycles"
     CIRCULATES = "comes back by another way"

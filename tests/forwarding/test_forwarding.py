@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tracemalloc
 from collections.abc import Callable
 
@@ -9,7 +10,7 @@ import pytest
 
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.forwarding import loopback_filter as loopback_filter
-from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS, Admission
+from pebble.forwarding.admission import MAX_ACTIONS, MAX_UNKNOWN_COMMANDS, MAX_UNKNOWN_FLAGS, Admission
 from pebble.forwarding.event_buffer import RESEND_S, EventBuffer
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.loopback_filter import EXPIRY_S, LoopbackFilter
@@ -123,6 +124,27 @@ class TestAdmission:
         admission = Admission()
         assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES)) is None
         assert self.refuse(admission, f"incoming/{topic}", bytes(MAX_COMMAND_BYTES + 1)) is Drop.TOO_LARGE
+
+    @pytest.mark.parametrize(
+        ("topics", "most"),
+        [(["flags/reboot"], MAX_ACTIONS), ([f"mine/{number}" for number in range(9)], MAX_UNKNOWN_COMMANDS)],
+        ids=["actions", "unknown commands"],
+    )
+    def test_what_no_robot_needs_often_is_bounded_in_each_second(self, topics: list[str], most: int) -> None:
+        clock = Clock()
+        admission, several = Admission(clock), itertools.cycle(topics)
+        for _ in range(2):
+            found = [self.refuse(admission, f"incoming/{next(several)}") for _ in range(most + 5)]
+            assert found == [None] * most + [Drop.TOO_OFTEN] * 5
+            assert self.refuse(admission, "incoming/drive-values") is None
+            assert self.refuse(admission, "incoming/flags/git-pull") is None
+            assert self.refuse(admission, f"incoming/{topics[0]}", b" \t" * 16) is None  # a probe
+            assert self.refuse(admission, f"incoming/{topics[0]}", side=LOCAL) is None
+            clock.now += 1
+
+    def test_commands_of_the_contract_are_not_since_one_may_be_a_stop(self) -> None:
+        admission = Admission(Clock())
+        assert {self.refuse(admission, "incoming/drive-values") for _ in range(5000)} == {None}
 
     def test_what_a_robot_sends_is_not(self) -> None:
         assert self.refuse(Admission(), "outgoing/map", bytes(MAX_COMMAND_BYTES + 1), side=LOCAL) is None

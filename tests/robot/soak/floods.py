@@ -10,7 +10,7 @@ import argparse
 import signal
 import sys
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from rich.table import Table
 
 from tests.robot.operator import number_of, numbered
 from tests.robot.rig import STOP
-from tests.robot.soak.flood import flooding
+from tests.robot.soak.flood import FLOODS, flooding
 from tests.robot.soak.world import World
 from tests.support import until
 
@@ -91,13 +91,15 @@ def rss_mb(pid: int) -> float:
 
 
 def flooded(world: World, name: str, first: int) -> dict[str, Figures]:
-    """A flood of a running robot, then of one that starts."""
+    """A flood of a running robot, then of one that starts; one that starts after what was retained has been planted."""
     before = {program: rss_mb(pid) for program, pid in world.robot.items()}
     found = {}
     with flooding(name, world.remote.port, _SECONDS, "--keep"):
         found["while it runs"] = observe(world, before, first)
     world.rig.stop()
-    with flooding(name, world.remote.port, _SECONDS + _START_S):
+    with ExitStack() as stack:
+        if not FLOODS[name].retain:
+            stack.enter_context(flooding(name, world.remote.port, _SECONDS + _START_S))
         started = time.monotonic()
         world.start(ready=False)
         until(lambda: [one for one in world.operator.on("outgoing/online", started) if b"false" not in one.payload], 30)
@@ -109,14 +111,15 @@ def flooded(world: World, name: str, first: int) -> dict[str, Figures]:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.robot.soak.floods", description=__doc__)
     parser.add_argument("--transport", choices=("zenoh", "mqtt"), required=True)
+    parser.add_argument("--only", choices=NAMES)
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything that was started ends
     terminal, wrong = Console(), 0
     table = Table(
         "flood", "", "heartbeats", "obeyed", "slowest, s", "MB more", "log lines/s", "", title=options.transport
     )
-    for index, name in enumerate(NAMES):
-        world = World(options.transport)
+    for index, name in enumerate([options.only] if options.only else NAMES):
+        world = World(options.transport, direct=True)
         try:
             world.start()
             time.sleep(2.0)
@@ -126,6 +129,9 @@ def main() -> int:
                 grown = f"{one.mb:.1f} ({one.program})"
                 table.add_row(name, when, *cells, grown, f"{one.lines:.1f}", "" if one.good else "WRONG")
                 terminal.print(f"{name}, {when}: {one}", highlight=False)
+            status = world.rig.operator.last("outgoing/status")
+            dropped = {} if status is None else status.json["value"]["services"]["mqtt_bridge"].get("dropped", {})
+            terminal.print(f"    dropped by the bridge, as its status says: {dropped}", highlight=False)
         finally:
             world.close()
     terminal.print(table)

@@ -32,7 +32,8 @@ time.time = lambda: clock() + struct.unpack("q", ahead)[0] / 1e9
 class World:
     """The rig, the operator who drives, and what can happen to the machine around them."""
 
-    def __init__(self, transport: str) -> None:
+    def __init__(self, transport: str, *, direct: bool = False) -> None:
+        """``direct``: the robot's link to the remote broker cannot fail."""
         self._mounted: list[Path] = []
         self._folder = Path(f"/tmp/pebble-soak-{os.getpid()}")
         self._folder.mkdir(mode=0o700)
@@ -41,7 +42,13 @@ class World:
         never = {"command": ["true"], "cooldown_seconds": 10}
         actions = {f"{name}_control": never for name in ("reboot", "service_restart", "git_pull")}
         self.rig = Rig(
-            transport, mcu="fred", start=False, remote=self.remote, listens="outgoing/#", mqtt_bridge=actions
+            transport,
+            mcu="fred",
+            start=False,
+            direct=direct,
+            remote=self.remote,
+            listens="outgoing/#",
+            mqtt_bridge=actions,
         )
         self.operator = Operator(self.remote.port, BASE, "outgoing/online")
         self.disks = [self.rig.folder / name for name in ("run", "state")]
