@@ -292,8 +292,7 @@ class Transport(ABC):
                 return False
             accepted = self._send(message, urgent)
             sent = accepted and self._state is State.CONNECTED
-            stored = retain and remember and self._remember(message, sent=sent)
-            (self._shared.add if shared and topic in self._own else self._shared.discard)(topic)
+            stored = retain and remember and self._remember(message, sent=sent, shared=shared)
             # "parked" is the published name of the counter of pending messages.
             self.counters.add("sent" if accepted else "parked" if stored else "refused")
             return accepted or stored
@@ -365,16 +364,23 @@ class Transport(ABC):
         for subscription in subscriptions:
             subscription.renew()
 
-    def _remember(self, message: Message, *, sent: bool) -> bool:
-        """Store a retained message, to send it again; False, and no older one is sent again, if there is no room."""
+    def _remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
+        """Store a retained message, to send it again; False, and no older one is sent again, if there is no room.
+
+        ``shared`` None: as the older one.
+        """
+        shared = message.topic in self._shared if shared is None else shared
         self._pending.pop(message.topic, None)
         self._own.pop(message.topic, None)
+        self._shared.discard(message.topic)
         if sent and not message.payload:
             return True
         if not self._own.has_room(message.topic, message):
             self.counters.add("forgotten")
             return False
         self._own[message.topic] = message
+        if shared:
+            self._shared.add(message.topic)
         if not sent:
             self._pending[message.topic] = None
         return True

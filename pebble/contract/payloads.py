@@ -102,6 +102,9 @@ class LightsFlash(LightsSolid, frozen=True, kw_only=True):
         _clamp(self, 0.05, math.inf, "period")
 
 
+STOP_WORDS = frozenset(("stop", "disable", "disabled", "off"))  # as the ``action`` of a command
+
+
 class SoundboardCommand(Payload, frozen=True, kw_only=True):
     """Play or stop a clip (paper A.8.10); ``action`` wins over ``enabled``.
 

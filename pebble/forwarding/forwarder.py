@@ -6,7 +6,7 @@ commands and streams never wait for it.
 
 Retained commands are stale. A live emergency stop passes even if it was published to be retained: a stop that does not
 arrive is worse than one that a later subscriber must recognise as old. What happens once is also stale when it has
-waited here, in a process that was stopped or stuck; a stop never is, nor is a zero.
+waited, in a process that was stopped or stuck, or at the broker; what only ends something never is.
 """
 
 from __future__ import annotations
@@ -22,8 +22,24 @@ from typing import NamedTuple
 
 import msgspec
 
-from pebble.contract import DRIVE, ESTOP, GIT_PULL, OUTGOING, REBOOT, SERVICE_RESTART, Kind, codec
-from pebble.contract.payloads import Drive
+from pebble.contract import (
+    AUDIO_CONTROL,
+    AUTONOMY_COMMAND,
+    DRIVE,
+    ESTOP,
+    GIT_PULL,
+    LIGHTS_FLASH,
+    LIGHTS_SOLID,
+    OUTGOING,
+    OUTLET_COMMAND,
+    REBOOT,
+    SERVICE_RESTART,
+    SOUNDBOARD_COMMAND,
+    VIDEO_CONTROL,
+    Kind,
+    codec,
+)
+from pebble.contract.payloads import STOP_WORDS, Drive
 from pebble.errors import PayloadError
 from pebble.forwarding.admission import Admission
 from pebble.forwarding.cycles import Cycles, Finding
@@ -47,7 +63,10 @@ _RETAINED_S = 0.05
 #: others with the retain flag keep arriving, a stop with it counts as an old one, but not for longer than this.
 _RETAINED_STOPS_S = 10.0
 _LOGGED = 200  # characters of a topic
-_LATE_S = 0.5  # what happens once and has waited here for longer is stale
+_LATE_S = 0.5  # what happens once and has waited for longer is stale
+_PATIENT_S = 2.0  # the same, of what moves nothing
+_PATIENT = (LIGHTS_SOLID, LIGHTS_FLASH, SOUNDBOARD_COMMAND, VIDEO_CONTROL, AUDIO_CONTROL)
+_SWITCHES = (AUTONOMY_COMMAND, OUTLET_COMMAND, SOUNDBOARD_COMMAND, VIDEO_CONTROL, AUDIO_CONTROL)
 #: After a longer outage an earlier value at a broker that was restored may have been chosen again by somebody.
 _RESTORED_S = 30.0
 _MAX_WAITING = 4096  # retained messages that wait for the gate to open
@@ -97,7 +116,7 @@ class Forwarder:
         self.counters = Counters()
         self._subjects, self._rules, self._transports = subjects, rules, transports
         self._winner, self._on_value, self._clock = winner, on_value, clock
-        self._lock = threading.RLock()
+        self._lock = self.retained_lock = threading.RLock()  # while it is held no retained message passes
         self._reconciliation = Reconciliation(winner)
         self._admission = Admission(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
@@ -152,6 +171,7 @@ class Forwarder:
         """Publish what retained messages have left open; to be called INITIAL_SYNC_S after :meth:`subscribed`."""
         with self._lock:
             self._begin_restarted()
+            self._went_back[side] = False
             for to, topic, payload in self._reconciliation.synchronize(side):
                 self._report_value(topic)
                 self._publish_value(to, topic, payload)
@@ -431,19 +451,25 @@ def _is_stop(subject: Subject | None) -> bool:
 
 
 def _is_late(subject: Subject, message: Message) -> bool:
-    if subject.kind not in ONE_SHOT or message.waited_s <= _LATE_S:
+    limit = _PATIENT_S if subject.channel in _PATIENT else _LATE_S
+    if subject.kind not in ONE_SHOT or message.waited_s <= limit:
         return False
-    return not (_is_stop(subject) or _is_zero(subject, message))
+    return not (_is_stop(subject) or _ends_something(subject, message))
 
 
-def _is_zero(subject: Subject, message: Message) -> bool:
-    if subject.channel is not DRIVE:
+def _ends_something(subject: Subject, message: Message) -> bool:
+    """Whether it can only bring something to rest: a zero, and the end of a script, a sound or a picture."""
+    channel = subject.channel
+    if channel not in _SWITCHES and channel is not DRIVE:
         return False
     try:
-        drive: Drive = codec.decode(DRIVE, message.payload)
+        command = codec.decode(channel, message.payload)
     except PayloadError:
         return False
-    return not drive.moves
+    if isinstance(command, Drive):
+        return not command.moves
+    word = getattr(command, "action", None) or ""
+    return word.strip().lower() in STOP_WORDS or getattr(command, "enabled", getattr(command, "on", None)) is False
 
 
 def _is_event(subject: Subject, message: Message) -> bool:

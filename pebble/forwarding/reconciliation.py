@@ -41,6 +41,8 @@ class LastValue:
 
     def then(self, payload: bytes, side: Side) -> LastValue:
         """The value after this one."""
+        if payload == self.payload:
+            return LastValue(payload, side, self.earlier)
         return LastValue(payload, side, (*self.earlier, hash(self.payload))[-_EARLIER:])
 
 

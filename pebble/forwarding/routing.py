@@ -44,7 +44,7 @@ class Drop(Enum):
     OVERRULED = "the other side's value counts"
     HELD = "waits for the other side's values"
     CLOSED = "nothing is forwarded now"
-    LATE = "waited too long in this process"
+    LATE = "waited too long, here or at the broker"
 
 
 @dataclass(frozen=True, slots=True)

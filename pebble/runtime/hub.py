@@ -11,12 +11,13 @@ import logging
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 import msgspec
 
 from pebble.errors import PebbleError
-from pebble.runtime.parent import ALIVE_PERIOD_S, DroppedMessages, Notifier, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, DROPPED_PERIOD_S, DroppedMessages, Notifier, set_up_logging
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.hub import ZenohHub
 
@@ -39,13 +40,15 @@ def main(arguments: list[str]) -> int:
 def run_hub(settings: ZenohSettings, stop: threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
-    dropped = DroppedMessages(notify)
+    dropped, due = DroppedMessages(notify), time.monotonic()
     hub = ZenohHub(settings).open()
     try:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):
             notify.alive()
-            dropped.report({"no_room": hub.refused})
+            if time.monotonic() >= due:
+                due += DROPPED_PERIOD_S
+                dropped.report({"no_room": hub.refused})
     finally:
         hub.close()
 

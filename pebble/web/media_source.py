@@ -171,9 +171,9 @@ class _OwnTopics:
         self._transport, self._ref = transport, ref
         self._channels = (CAPABILITIES, *_NAMED[medium].values())
 
-    def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.LATEST, retain: bool = False) -> bool:
+    def publish(self, topic: str, payload: bytes, **options: Any) -> bool:
         self._check(topic, *(channel for channel in self._channels if channel.direction == INCOMING))
-        return self._transport.publish(topic, payload, qos=qos, retain=retain, urgent=True)
+        return self._transport.publish(topic, payload, urgent=True, **options)
 
     def subscribe(
         self, filter_: str, handler: Handler, *, qos: QoS = QoS.DELIVERED, echo: bool = True, direct: bool = False

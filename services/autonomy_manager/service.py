@@ -15,6 +15,7 @@ from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, D
 from pebble.contract.payloads import (
     LAST_RUN,
     SCRIPT,
+    STOP_WORDS,
     AutonomyCommand,
     AutonomyDependency,
     AutonomyFiles,
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from pebble.services.autonomy_manager.gate.gate import Gate
 
 _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
-_STOP = frozenset(("stop", "disable", "disabled", "off"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
 _SHORTEST_SCAN_S = 1.0
@@ -107,7 +107,7 @@ class AutonomyManager(Service):
     @on(AUTONOMY_COMMAND)
     def command(self, command: AutonomyCommand) -> None:
         word = (command.action or "").strip().lower()
-        begin = True if word in _START else False if word in _STOP else command.enabled
+        begin = True if word in _START else False if word in STOP_WORDS else command.enabled
         if begin is None:
             self._quiet_log.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:

@@ -6,12 +6,14 @@ retained topics that nobody but the robot publishes.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+
 from pebble.contract import CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Kind
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, QoS, Subscription, Transport
 
 _TOPICS = 10_000  # noted of each side; with more nothing is removed
-_NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE covers
+_NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALUE covers
 
 
 class Leftovers:
@@ -23,9 +25,14 @@ class Leftovers:
         self._there: set[str] = set()
         self._subscriptions: list[Subscription] = []
         states = [one for one in CHANNELS if one.kind is Kind.STATE and one.direction == OUTGOING]
-        named = subjects.topics(*(one for one in states if one not in _NOT_HERE and not one.is_pattern))
-        patterns = [one.filter(base) for one in states if one not in _NOT_HERE and one.is_pattern]
-        self._filters = [MCU_VALUE.filter(base), *patterns, *named]
+        ours = [one for one in states if one not in _NOT_HERE and one.synonym_of is None]
+        named = subjects.topics(*(one for one in ours if not one.is_pattern))
+        self._filters = [MCU_VALUE.filter(base), *(one.filter(base) for one in ours if one.is_pattern), *named]
+        self._next = 0  # of the filters
+
+    @property
+    def done(self) -> bool:
+        return self._here is None
 
     def note_local(self, message: Message) -> None:
         """The robot publishes ``message``."""
@@ -33,25 +40,44 @@ class Leftovers:
         if here is not None and len(here) <= _TOPICS:
             (here.add if message.payload else here.discard)(message.topic)
 
+    def begin(self) -> None:
+        """Begin anew: a connection was lost."""
+        self._close()
+        self._next = 0
+        self._there.clear()
+
     def ask_next(self) -> bool:
         """Ask the broker for some of the topics; False if all were asked for. Waits for its answer."""
-        if not self._filters:
+        if self._next == len(self._filters):
             return False
-        filter_ = self._filters.pop(0)
-        self._subscriptions.append(self._remote.subscribe(filter_, self._note_remote, echo=False, direct=True))
+        filter_ = self._filters[self._next]
+        self._next += 1
+        asked = self._remote.subscribe(filter_, self._note_remote, echo=False, direct=True)
+        self._subscriptions.append(asked)
+        if asked.refused:  # it will refuse the others as well
+            self._next = len(self._filters)
         return True
 
-    def remove(self) -> list[str]:
-        """Remove what only the broker retains, and return these topics; the last call."""
-        for subscription in self._subscriptions:
-            subscription.close()
-        here, self._here = self._here or set(), None
-        if max(len(here), len(self._there)) > _TOPICS:
-            return []
-        gone = sorted(self._there - here)
-        for topic in gone:
-            self._remote.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+    def remove(self, lock: AbstractContextManager[object]) -> list[str]:
+        """Remove what only the broker retains, and return these topics; the last call.
+
+        With ``lock`` held nothing is forwarded: what a service publishes meanwhile comes after the removal.
+        """
+        self._close()
+        gone = []
+        for topic in sorted(self._there):
+            with lock:
+                here = self._here or set()
+                if topic not in here and max(len(here), len(self._there)) <= _TOPICS:
+                    self._remote.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+                    gone.append(topic)
+        self._here = None
         return gone
+
+    def _close(self) -> None:
+        subscriptions, self._subscriptions = self._subscriptions, []
+        for subscription in subscriptions:
+            subscription.close()
 
     def _note_remote(self, message: Message) -> None:
         if message.retain and message.payload and len(self._there) <= _TOPICS:

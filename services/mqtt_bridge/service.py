@@ -16,6 +16,7 @@ from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import Notifier, earlier_requests
 from pebble.runtime.service import Service, every
+from pebble.runtime.timers import Timer
 from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
@@ -66,6 +67,7 @@ class MqttBridge(Service):
         self._private = PrivateTopics(self.config.base)
         self._subjects = Subjects(self.config)
         self._leftovers = Leftovers(self.config.base, self._subjects, self._remote)
+        self._leftover_timer: Timer | None = None
         self._forwarder = Forwarder(
             self._subjects,
             TABLE_A1,
@@ -92,7 +94,7 @@ class MqttBridge(Service):
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
-        self.call_at(self.clock() + _SETTLED_S, self._look_for_leftovers)
+        self._settle()
         self.post(self._subscribe_local)
 
     def dropped(self) -> dict[str, int]:
@@ -107,17 +109,28 @@ class MqttBridge(Service):
         if self._heartbeat is not None:
             self._heartbeat.publish(self._remote, now_ms())
 
+    def _settle(self) -> None:
+        """Wait (again) until all that the robot retains is known, and look for what only the remote side retains."""
+        if self._leftovers.done:
+            return
+        if self._leftover_timer is not None:
+            self._leftover_timer.cancel()
+        self._leftovers.begin()
+        self._leftover_timer = self.call_at(self.clock() + _SETTLED_S, self._look_for_leftovers)
+
     def _look_for_leftovers(self) -> None:
-        """Remove from the remote side what the robot has taken back while no bridge was running."""
         if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
-            self.call_at(self.clock() + _SETTLED_S, self._look_for_leftovers)
-        elif self._leftovers.ask_next():
-            self.call_at(self.clock() + _ASK_S, self._look_for_leftovers)
-        else:
-            self.call_at(self.clock() + INITIAL_SYNC_S, self._remove_leftovers)
+            self._settle()
+            return
+        asked = self._leftovers.ask_next()
+        wait, then = (_ASK_S, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
+        self._leftover_timer = self.call_at(self.clock() + wait, then)
 
     def _remove_leftovers(self) -> None:
-        gone = self._leftovers.remove()
+        if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
+            self._settle()
+            return
+        gone = self._leftovers.remove(self._forwarder.retained_lock)
         if gone:
             self.log.info("removed %d retained topics that the robot no longer has: %s", len(gone), _few(gone))
 
@@ -144,6 +157,7 @@ class MqttBridge(Service):
             self._same_broker.send()
 
     def _disconnected(self, side: Side) -> None:
+        self._settle()
         if side is Side.REMOTE:
             self._unsubscribe_remote()
 
@@ -253,8 +267,8 @@ class MqttBridge(Service):
                 # one broker after all, or another program's heartbeat of the same millisecond
                 self.post_message(BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
+        self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
-            self._leftovers.note_local(admitted)
             self._react(Side.LOCAL, admitted, self._forwarder.receive(Side.LOCAL, admitted))
 
     def _on_probe(self, message: Message) -> None:

@@ -10,13 +10,12 @@ from typing import Any
 from msgspec import Struct
 
 from pebble.contract import MEDIA_REPORT, SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
-from pebble.contract.payloads import MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
+from pebble.contract.payloads import STOP_WORDS, MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
 from pebble.runtime.service import Service, on
 from pebble.services.soundboard_handler.clips import Clip, Clips
 from pebble.services.soundboard_handler.playback import Playback, Players
 
 _PLAY = ("play", "start", "on", "enable", "enabled")
-_STOP = ("stop", "off", "disable", "disabled")
 _AT_ONCE_S = 1.0  # a player that fails so soon may not have got the device
 _REPORT_AGE_S = 3.0  # of a report that still counts; one comes every second
 _SHORTEST_S = 0.2  # between two starts of a clip that is repeated
@@ -70,7 +69,7 @@ class SoundboardHandler(Service):
     def command(self, command: SoundboardCommand) -> None:
         """Play or stop; ``action`` wins over ``enabled``."""
         action = (command.action or "").strip().lower()
-        play = True if action in _PLAY else False if action in _STOP else command.enabled
+        play = True if action in _PLAY else False if action in STOP_WORDS else command.enabled
         if play is None:
             self.log.warning("ignored a command that neither plays nor stops: %.100r", command.action)
             return

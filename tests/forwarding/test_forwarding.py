@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import tracemalloc
 from collections.abc import Callable
+from math import inf
 
 import pytest
 
@@ -175,6 +176,7 @@ class TestReconciliation:
             ("r:a r:b B:c", ["pass", "pass", "pass"]),
             ("r:a r:b B:b", ["pass", "pass", "known"]),
             ("r:a r:b r:a B:b", ["pass", "pass", "pass", "correct"]),
+            ("r:a " + "r:b " * 9 + "B:a", [*["pass"] * 10, "correct"]),
         ],
     )
     def test_resolutions(self, history: str, resolutions: list[str]) -> None:
@@ -427,28 +429,37 @@ class TestLate:
         return forwarder
 
     @pytest.mark.parametrize(
-        ("metric", "payload", "passes"),
+        ("metric", "payload", "limit_s"),
         [
-            ("drive-values", b'{"z": 1}', False),
-            ("drive-values", b"{", False),
-            ("drive-values", b'{"z": 0}', True),  # a stop must arrive
-            ("estop", b"{}", True),
-            ("estop-reset", b'{"boot": "a", "count": 1}', False),
-            ("soundboard-command", b'{"action": "play", "file": "a"}', False),
-            ("flags/reboot", b"true", False),
-            ("flags/mqtt-video", b"true", True),
+            ("drive-values", b'{"z": 1}', 0.5),
+            ("drive-values", b"{", 0.5),
+            ("drive-values", b'{"z": 0}', inf),  # a stop must arrive
+            ("estop", b"{}", inf),
+            ("estop-reset", b'{"boot": "a", "count": 1}', 0.5),
+            ("unknown", b"1", 0.5),
+            ("lights-solid", b'{"r": 1}', 2.0),
+            ("soundboard-command", b'{"action": "play", "file": "a"}', 2.0),
+            ("soundboard-command", b'{"enabled": false}', inf),
+            ("autonomy-command", b'{"action": "start", "file": "a"}', 0.5),
+            ("autonomy-command", b'{"action": "Stop", "file": "a"}', inf),
+            ("outlets/lamp/power", b'{"on": true}', 0.5),
+            ("outlets/lamp/power", b'{"on": false}', inf),
+            ("front-camera", b'{"enabled": true}', 2.0),
+            ("front-camera", b'{"enabled": false}', inf),
+            ("flags/reboot", b"true", 0.5),
+            ("flags/mqtt-video", b"true", inf),
         ],
     )
     def test_what_happens_once_is_dropped(
-        self, forwarder: Forwarder, local: Wire, metric: str, payload: bytes, passes: bool
+        self, forwarder: Forwarder, local: Wire, metric: str, payload: bytes, limit_s: float
     ) -> None:
-        now = clock.since_boot()
-        for waiting_since in (now - 0.6, now):
+        now, endless = clock.since_boot(), limit_s == inf
+        for waiting_since in (now - min(limit_s, 100) - 0.1, now - min(limit_s, 100) + 0.2):
             forwarder.receive(
                 REMOTE, Message(f"{BASE}/incoming/{metric}", payload, QoS.DELIVERED, waiting_since=waiting_since)
             )
-        assert local.sent == [payload] * (1 + passes)
-        assert forwarder.counters["remote: waited too long in this process"] == (not passes)
+        assert local.sent == [payload] * (1 + endless)
+        assert forwarder.counters[f"remote: {Drop.LATE.value}"] == (not endless)
 
 
 class TestStops:

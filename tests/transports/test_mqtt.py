@@ -420,6 +420,18 @@ def test_pings_are_never_a_storm(
     broker.stop()
 
 
+def test_pings_are_sent_while_other_answers_come(tmp_path: Path, clients: Clients, topic: str) -> None:
+    """They show how long messages wait at the broker; a robot's heartbeats are acknowledged four times a second."""
+    log = tmp_path / "log"
+    broker = Broker(tmp_path, f"log_dest file {log}", "log_type debug")
+    client, before = clients(broker.port), log.read_text().count("PINGREQ")
+    for _ in range(30):
+        client.publish(topic, b"", qos=DELIVERED)
+        time.sleep(0.1)
+    assert log.read_text().count("PINGREQ") - before >= 4
+    broker.stop()
+
+
 def test_four_pings_are_always_waited_for(clients: Clients, proxy: TcpProxy) -> None:
     client = clients(proxy.port, silence_s=0.001)
     proxy.blackhole()

@@ -89,8 +89,9 @@ class TestBrokerDelay:
     def test_a_long_way_is_none(self, delay: BrokerDelay) -> None:
         delay.asked(1.0, clear=True)
         delay.answered(2.0)
-        assert self.at(delay, 2.1, round_trip_s=0.9) == 0.1
         assert self.at(delay, 2.1) == 0.9
+        assert self.at(delay, 2.1, round_trip_s=0.5) == 0.5
+        assert self.at(delay, 2.1, round_trip_s=0.9) == 0.4  # half a second more than usual, and not more
 
     def test_a_ping_behind_our_own_data_says_nothing(self, delay: BrokerDelay) -> None:
         delay.asked(1.0, clear=False)

@@ -191,6 +191,7 @@ class Connection:
         self._answered_at = clock.since_boot()
         self._waiting = WaitingTime(self._answered_at)
         self._delay = BrokerDelay()
+        self._pinged_at = self._answered_at  # pings are sent regularly: other answers come only to what we publish
         self._packets = 0  # received so far
         self._more = False  # a batch ended before the socket was empty
         self._accepted = False
@@ -379,16 +380,16 @@ class Connection:
     def _ping(self, ack: PendingAck | None = None) -> None:
         sock = self._socket()
         ahead = self._client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
-        self._in_flight.ping(clock.since_boot(), ack)
-        self._delay.asked(clock.since_boot(), clear=ahead <= _CLEAR)
+        self._pinged_at = now = clock.since_boot()
+        self._in_flight.ping(now, ack)
+        self._delay.asked(now, clear=ahead <= _CLEAR)
         self._client.ping()
         self._client.loop_write()
 
     def _ping_due_in(self) -> float:
-        newest = self._in_flight.pinged_at
         keepalive_s = self._settings.keepalive_s or inf  # 0: none
         interval = max(_LEAST_PING_S, min(self._settings.silence_s, keepalive_s) / 4)
-        return (self._answered_at if newest is None else newest) + interval - clock.since_boot()
+        return self._pinged_at + interval - clock.since_boot()
 
     def _on_pong(self) -> None:
         self._note_answer()

@@ -18,6 +18,7 @@ else:
 
 _FAR_S = 1.0  # no round trip of a usable link is longer
 _NOTICED_S = 0.1
+_UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may as well be the way to us
 
 
 class WaitingTime:
@@ -77,7 +78,9 @@ class BrokerDelay:
         """``round_trip_s`` asks for TCP's present one, if that matters."""
         oldest = next((asked_at for asked_at, clear in self._asked if clear), now)
         waited = max(self._newest, now - oldest)
-        return waited - max(self._shortest, round_trip_s()) if waited > self._shortest + _NOTICED_S else 0.0
+        if waited <= self._shortest + _NOTICED_S:
+            return 0.0
+        return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
 
 
 def readable_bytes(sock: socket.socket) -> int:

@@ -260,11 +260,6 @@ class InFlightTable:
         """The shortest recent one: an answer that a stalled connection delayed gives the next stall no extra time."""
         return min(self._round_trips, default=0.0)
 
-    @property
-    def pinged_at(self) -> float | None:
-        """When the newest unanswered ping was sent."""
-        return self._pings[-1][0] if self._pings else None
-
     def end(self) -> None:
         """Complete everything: no answer can come any more."""
         self.complete()

@@ -264,7 +264,7 @@ class MqttTransport(Transport):
         self.went_back = False
         with self._publishing:
             own = {topic: message for topic, message in self._own.items() if topic not in self._pending}
-            shared = set(self._shared)
+            unsure = self._shared | {topic for topic, message in own.items() if not self._accepts(connection, message)}
         topics = list(own)
         if not topics:
             return set()
@@ -278,9 +278,13 @@ class MqttTransport(Transport):
         connection.unsubscribe(topics)
         if self.will is not None and found.get(self.will.topic) == self.will.payload:
             del found[self.will.topic]  # our own will, published although we were running
-        older = {topic for topic, payload in found.items() if topic not in shared and payload != own[topic].payload}
+        older = {topic for topic, payload in found.items() if topic not in unsure and payload != own[topic].payload}
         self.went_back = bool(older)
         return found.keys() - older
+
+    def _accepts(self, connection: Connection, message: Message) -> bool:
+        """Whether the broker has, as far as is known, accepted this retained message."""
+        return connection.takes(message) and not self._refused_messages.has(message, time.monotonic())
 
     def _await(
         self,

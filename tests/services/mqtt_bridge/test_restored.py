@@ -118,7 +118,7 @@ class TestLeftovers:
         for name in gone:
             memory.local.publish(f"outgoing/{name}", b"", retain=True)
         bridge = memory.bridge()
-        assert until(lambda: bridge._leftovers._here is None)
+        assert until(lambda: bridge._leftovers.done)
         left = {f"{BASE}/{topic}" for topic in (*foreign, *(f"outgoing/{name}" for name in stays))}
         assert until(lambda: {*memory.remote_hub.retained} == left), memory.remote_hub.retained.keys()
 
@@ -131,4 +131,4 @@ class TestLeftovers:
         bridge = memory.bridge(ready=False)
         Quiet(memory.remote).wait(1.0)
         assert f"{BASE}/outgoing/status" in memory.remote_hub.retained
-        assert bridge._leftovers._here is not None
+        assert not bridge._leftovers.done
