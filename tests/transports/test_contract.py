@@ -435,7 +435,7 @@ def test_T09_only_what_changed_during_the_outage_is_sent(net: Net, base: str) ->
     retainer.publish(f"{base}/same", b"1", qos=DELIVERED, retain=True)
     retainer.publish(f"{base}/changed", b"1", qos=DELIVERED, retain=True)
     retainer.publish(f"{base}/removed", b"1", qos=DELIVERED, retain=True)
-    retainer.publish(f"{base}/flag", b"by keeper", qos=DELIVERED, retain=True)
+    retainer.publish(f"{base}/flag", b"by keeper", qos=DELIVERED, retain=True, shared=True)
     drained(retainer, retainer, base)
     other = net.client("other")
     other.publish(f"{base}/flag", b"by other", qos=DELIVERED, retain=True)
