@@ -40,7 +40,9 @@ class Admission:
             return Drop.TOO_OFTEN
         if subject.channel is not None or subject.kind is not Kind.FLAG:
             return None
-        if not message.payload:  # removed
+        if not message.payload:  # removed; who removes a million others costs the robot nothing
+            if side is Side.REMOTE and message.topic not in self._flags:
+                return Drop.KNOWN
             self._flags.discard(message.topic)
         elif side is Side.LOCAL or message.topic in self._flags or len(self._flags) < MAX_UNKNOWN_FLAGS:
             self._flags.add(message.topic)

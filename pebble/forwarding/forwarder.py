@@ -262,6 +262,8 @@ class Forwarder:
         if isinstance(forward, Drop) or subject is None:
             return forward if isinstance(forward, Drop) else Drop.FOREIGN
         refused = self._admission.refuse(side, subject, message)
+        if refused is Drop.KNOWN:
+            return refused
         if refused is not None:
             self._quiet_log.warning(refused.name, "%s is not forwarded: %s", message.topic[:_LOGGED], refused.value)
             return refused

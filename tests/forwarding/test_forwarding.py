@@ -113,6 +113,14 @@ class TestAdmission:
         assert self.refuse(admission, "incoming/flags/more") is None
         assert self.refuse(admission, "incoming/flags/f7") is Drop.TOO_MANY
 
+    def test_a_flag_that_the_robot_does_not_have_need_not_be_removed(self) -> None:
+        admission = Admission()
+        assert self.refuse(admission, "incoming/flags/one", b"") is Drop.KNOWN
+        assert self.refuse(admission, "incoming/flags/one") is None
+        assert self.refuse(admission, "incoming/flags/one", b"") is None
+        assert self.refuse(admission, "incoming/flags/mqtt-video", b"") is None  # of the contract
+        assert self.refuse(admission, "incoming/flags/one", b"", side=LOCAL) is None
+
     def test_flags_of_the_robot_itself_are_always_admitted_and_count(self) -> None:
         admission = Admission()
         for number in range(MAX_UNKNOWN_FLAGS + 5):
