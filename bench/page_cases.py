@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
+from urllib.parse import urldefrag, urlsplit
 
 from pebble.bench.estop_driver import Driver
 from pebble.bench.page_rig import Rig, monotonic
@@ -227,7 +227,8 @@ def files(rig: Rig, _scale: float) -> Samples:
     rig.pause(page, _LATER_S)
     entries = page.evaluate("performance.getEntriesByType('resource').map((one) => [one.name, one.startTime])")
     picture = page.evaluate("bench.picture")
-    urls = {page.url: 0.0} | {url: at for url, at in reversed(entries) if url.startswith("http")}
+    fetched = [(urldefrag(url).url, at) for url, at in entries if url.startswith("http")]  # one file of many icons
+    urls = {page.url: 0.0} | dict(reversed(fetched))
     own = {url: at for url, at in urls.items() if urlsplit(url).netloc == urlsplit(rig.stage.url).netloc}
     bodies = {url: urllib.request.urlopen(url, timeout=5).read() for url in own}  # noqa: S310 - of our own server
     packed = {url: len(gzip.compress(body)) / 1000 for url, body in bodies.items()}
