@@ -429,8 +429,8 @@ class Forwarder:
 def barrier(transport: Transport, filter_: str) -> None:
     """Wait, bounded, until the other end of ``transport`` has handled all we sent, and its retained messages are here.
 
-    A subscription is acknowledged after everything before it. ``filter_`` should be one that is subscribed to anyway: a
-    broker may forbid others.
+    A subscription is acknowledged after everything before it. ``filter_`` should be within one that is subscribed to
+    anyway: a broker may forbid others. A narrow one brings few retained messages.
     """
     transport.subscribe(filter_, _ignore, echo=False, direct=True, limit=1).close()
 

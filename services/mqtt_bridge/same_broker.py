@@ -60,7 +60,7 @@ class SameBrokerProbe:
         if self._remote.state is State.CONNECTED:
             self.send()
 
-    def begin_round(self, remote_filter: str) -> int | None:
+    def begin_round(self, remote_topic: str) -> int | None:
         """Send a probe and wait, bounded, until it would have arrived; None if a connection was lost meanwhile.
 
         The barrier is first on the side the probe went to, then on the side where it would arrive.
@@ -68,7 +68,7 @@ class SameBrokerProbe:
         self._round += 1
         if not self.send():
             return None
-        barrier(self._remote, remote_filter)
+        barrier(self._remote, remote_topic)
         barrier(self._local, self.topic)
         return self._round if self.both_connected else None
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from pebble.contract import BRIDGE_PROBE, INCOMING, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, codec
+from pebble.contract import BRIDGE_PROBE, DRIVE, INCOMING, ONLINE, OUTGOING, REMOTE_MIRROR, Channel, codec
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError
 from pebble.forwarding.cycles import PROBE_PERIOD_S
@@ -198,7 +198,7 @@ class MqttBridge(Service):
             self._open()
         if self._forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self._subjects.filters(INCOMING)[0])
+        round_ = self._same_broker.begin_round(self._subjects.topics(DRIVE)[0])
         if round_ is not None:
             self.call_at(self.clock() + _PROBE_WAIT_S, partial(self._end_round, round_))
 

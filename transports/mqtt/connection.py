@@ -191,6 +191,7 @@ class Connection:
         self._answered_at = clock.since_boot()
         self._waiting = WaitingTime(self._answered_at)
         self._delay = BrokerDelay()
+        self._since = self._answered_at  # of the batch that is read
         self._pinged_at = self._answered_at  # pings are sent regularly: other answers come only to what we publish
         self._packets = 0  # received so far
         self._more = False  # a batch ended before the socket was empty
@@ -324,6 +325,7 @@ class Connection:
 
     def _read(self) -> None:
         began, size = clock.since_boot(), self._client.received
+        self._since = self._waiting_since
         received = before = self._packets
         while True:
             self._read_some()
@@ -589,8 +591,8 @@ class Connection:
             return
         retain = bool(raw.retain)
         retain_requested = retain if self.as_published else (True if retain else None)
-        qos, since = QoS(min(raw.qos, 1)), self._waiting_since
-        self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, since))
+        qos = QoS(min(raw.qos, 1))
+        self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, self._since))
 
     def _on_too_long(self, topic: bytes, length: int) -> None:
         self._packets += 1
