@@ -416,7 +416,7 @@ def test_pings_are_never_a_storm(
     clients(broker.port, keepalive_s=keepalive_s, silence_s=silence_s)
     began, before = time.monotonic(), log.read_text().count("PINGREQ")
     assert until(lambda: log.read_text().count("PINGREQ") >= before + 5)
-    assert time.monotonic() - began >= 4 * interval_s  # the first may be due at once
+    assert time.monotonic() - began >= 3 * interval_s  # the first may be due at once, and the others a quarter earlier
     broker.stop()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import socket
 
 import pytest
@@ -113,3 +114,39 @@ class TestBrokerDelay:
     def test_an_answer_without_a_ping_is_none(self, delay: BrokerDelay) -> None:
         delay.answered(1.0)
         assert self.at(delay, 1.0) == 0
+
+    def test_a_later_acknowledgement_shows_that_an_answer_is_lost(self, delay: BrokerDelay) -> None:
+        delay.asked(1.0, clear=True)
+        delay.asked(1.5, clear=True)
+        delay.acknowledged(1.2, 1.6)
+        assert self.at(delay, 2.3) == 0.7
+        delay.answered(2.4)
+        delay.acknowledged(2.3, 2.4)
+        assert self.at(delay, 2.4) == 0
+
+    def test_answers_that_come_right_after_the_newest_ping_are_its(self) -> None:
+        near = BrokerDelay()
+        near.usual(0.001)
+        near.asked(0.0, clear=True)  # whose answer is lost
+        for number in range(1, 9):
+            near.asked(number / 2, clear=True)
+            assert self.at(near, number / 2, round_trip_s=0.0) >= 0.4
+            near.answered(number / 2 + 0.01)
+        assert self.at(near, 4.3, round_trip_s=0.0) == 0
+        near.asked(4.5, clear=True)
+        near.answered(4.51)
+        assert self.at(near, 4.9, round_trip_s=0.0) == 0
+
+    @pytest.mark.parametrize("usual_s", [0.001, 0.05, 0.6])
+    def test_a_queue_of_constant_length_is_not_taken_for_lost_answers(self, usual_s: float) -> None:
+        """Pings are sent after 0.375 to 0.5 s; an answer behind others comes at any time after the newest."""
+        delay, chance, sent, now = BrokerDelay(), random.Random(1), list[float](), 0.0
+        delay.usual(usual_s)
+        for _ in range(300):
+            now += chance.uniform(0.375, 0.5)
+            while sent and sent[0] + usual_s + 1.5 <= now:
+                at = sent.pop(0) + usual_s + 1.5
+                delay.answered(at)
+                assert self.at(delay, at, round_trip_s=usual_s) >= 1.4
+            sent.append(now)
+            delay.asked(now, clear=True)

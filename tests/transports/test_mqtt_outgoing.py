@@ -67,11 +67,11 @@ def test_an_acknowledgement_proves_the_message_it_names() -> None:
     send(in_flight, retained("a"), 2)
     newer = send(in_flight, retained("a", b"2"), 3)
     assert in_flight.unacked == 3
-    assert in_flight.acknowledge(2, 0.0)
+    assert in_flight.acknowledge(2, 0.0) is not None
     assert in_flight.unconfirmed_retained() == [newer]
-    assert in_flight.acknowledge(3, 0.0)
+    assert in_flight.acknowledge(3, 0.0) is not None
     assert in_flight.unconfirmed_retained() == []
-    assert not in_flight.acknowledge(3, 0.0)
+    assert in_flight.acknowledge(3, 0.0) is None
     assert in_flight.unacked == 1
 
 

@@ -9,6 +9,7 @@ runs.
 from __future__ import annotations
 
 import logging
+import random
 import select
 import socket
 import ssl
@@ -54,6 +55,7 @@ _PIECE = 64 * 1024  # bytes of a long packet that are read at once
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
+_LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _BATCH = 64  # messages read in a row before they are delivered
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
@@ -192,6 +194,7 @@ class Connection:
         self._waiting = WaitingTime(self._answered_at)
         self._delay = BrokerDelay()
         self._since = self._answered_at  # of the batch that is read
+        self._ping_share = 1.0  # of the interval until the next ping
         self._pinged_at = self._answered_at  # pings are sent regularly: other answers come only to what we publish
         self._packets = 0  # received so far
         self._more = False  # a batch ended before the socket was empty
@@ -383,6 +386,7 @@ class Connection:
         sock = self._socket()
         ahead = self._client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
         self._pinged_at = now = clock.since_boot()
+        self._ping_share = random.uniform(_LEAST_SHARE, 1.0)  # noqa: S311  (no secret)
         self._in_flight.ping(now, ack)
         self._delay.asked(now, clear=ahead <= _CLEAR)
         self._client.ping()
@@ -391,7 +395,7 @@ class Connection:
     def _ping_due_in(self) -> float:
         keepalive_s = self._settings.keepalive_s or inf  # 0: none
         interval = max(_LEAST_PING_S, min(self._settings.silence_s, keepalive_s) / 4)
-        return self._pinged_at + interval - clock.since_boot()
+        return self._pinged_at + interval * self._ping_share - clock.since_boot()
 
     def _on_pong(self) -> None:
         self._note_answer()
@@ -577,10 +581,12 @@ class Connection:
         self._in_flight.answer(mid)
 
     def _on_publish(self, _client: Any, _data: Any, mid: int, _reason: Any, _properties: Any) -> None:
-        if self._in_flight.acknowledge(
-            mid, clock.since_boot()
-        ):  # paho also reports QoS 0 messages, which are only written
+        """Called by paho also for QoS 0 messages, which are only written."""
+        now = clock.since_boot()
+        sent_at = self._in_flight.acknowledge(mid, now)
+        if sent_at is not None:
             self._note_answer()
+            self._delay.acknowledged(sent_at, now)
 
     def _on_message(self, _client: Any, _data: Any, raw: paho.MQTTMessage) -> None:
         self._packets += 1

@@ -18,6 +18,8 @@ else:
 
 _FAR_S = 1.0  # no round trip of a usable link is longer
 _NOTICED_S = 0.1
+_NEAR_S = 0.05  # of a broker further away PUBACKs must show what is lost
+_LOST = 8  # prompt answers in a row
 _UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may as well be the way to us
 
 
@@ -52,12 +54,16 @@ class BrokerDelay:
 
     A ping of which the way there took long itself, behind our own data, says nothing. What is usual is no delay: the
     shortest answer of this connection, and TCP's own round trips, which do not wait for the broker.
+
+    Answers carry no number, and mosquitto drops them where a client's queue is full. A later PUBACK shows that, and so
+    do answers that always come right after the newest ping, which is not sent at regular intervals.
     """
 
     def __init__(self) -> None:
         self._asked: deque[tuple[float, bool]] = deque()  # unanswered pings: when, and whether they say something
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds until the newest answer
+        self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
         """An answer took so long that waited for nothing."""
@@ -73,6 +79,18 @@ class BrokerDelay:
             asked_at, clear = self._asked.popleft()
             self._newest = now - asked_at if clear else 0.0
             self.usual(now - asked_at)
+        near = self._shortest <= _NEAR_S
+        prompt = near and bool(self._asked) and now - self._asked[-1][0] <= self._shortest + _NEAR_S
+        self._prompt = self._prompt + 1 if prompt else 0
+        if self._prompt >= _LOST:
+            self._asked.clear()
+            self._newest = 0.0
+
+    def acknowledged(self, sent_at: float, now: float) -> None:
+        """What was sent at ``sent_at`` was answered: so were all pings before it, or their answers are lost."""
+        while self._asked and self._asked[0][0] < sent_at:
+            self._asked.popleft()
+        self._newest = min(self._newest, now - sent_at)
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
         """``round_trip_s`` asks for TCP's present one, if that matters."""

@@ -208,15 +208,15 @@ class InFlightTable:
             else:
                 entry.ping = self._ping_number + 1
 
-    def acknowledge(self, mid: int, now: float) -> bool:
-        """Process a PUBACK; False if it belongs to no known message."""
+    def acknowledge(self, mid: int, now: float) -> float | None:
+        """Process a PUBACK: when its message was sent; None if it belongs to no known message."""
         if mid not in self._unacked:
-            return False
+            return None
         self._acked_at = now
-        topic, _ = self._unacked.pop(mid)
+        topic, sent_at = self._unacked.pop(mid)
         if topic is not None and topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
-        return True
+        return sent_at
 
     # -- requests and pings
 
