@@ -30,7 +30,7 @@ _PROBE_WAIT_S = 0.1
 _RETRY_S = 1.0
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 _CHECK_AGAIN_S = 30.0  # while nothing is mirrored
-_SETTLED_S = 30.0  # by then all services have published what they retain; so long after the start, or later
+_LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
 _ASK_S = 0.2  # between two questions about what is left at the remote broker
 
@@ -94,7 +94,7 @@ class MqttBridge(Service):
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
-        self._settle()
+        self._look_later()
         self.post(self._subscribe_local)
 
     def dropped(self) -> dict[str, int]:
@@ -109,18 +109,18 @@ class MqttBridge(Service):
         if self._heartbeat is not None:
             self._heartbeat.publish(self._remote, now_ms())
 
-    def _settle(self) -> None:
+    def _look_later(self) -> None:
         """Wait (again) until all that the robot retains is known, and look for what only the remote side retains."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:
             self._leftover_timer.cancel()
         self._leftovers.begin()
-        self._leftover_timer = self.call_at(self.clock() + _SETTLED_S, self._look_for_leftovers)
+        self._leftover_timer = self.call_at(self.clock() + _LEFTOVERS_AFTER_S, self._look_for_leftovers)
 
     def _look_for_leftovers(self) -> None:
         if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
-            self._settle()
+            self._look_later()
             return
         asked = self._leftovers.ask_next()
         wait, then = (_ASK_S, self._look_for_leftovers) if asked else (INITIAL_SYNC_S, self._remove_leftovers)
@@ -128,7 +128,7 @@ class MqttBridge(Service):
 
     def _remove_leftovers(self) -> None:
         if self._forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
-            self._settle()
+            self._look_later()
             return
         gone = self._leftovers.remove(self._forwarder.retained_lock)
         if gone:
@@ -157,7 +157,7 @@ class MqttBridge(Service):
             self._same_broker.send()
 
     def _disconnected(self, side: Side) -> None:
-        self._settle()
+        self._look_later()
         if side is Side.REMOTE:
             self._unsubscribe_remote()
 

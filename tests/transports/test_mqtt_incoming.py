@@ -94,7 +94,7 @@ class TestBrokerDelay:
         assert self.at(delay, 2.1, round_trip_s=0.5) == 0.5
         assert self.at(delay, 2.1, round_trip_s=0.9) == 0.4  # half a second more than usual, and not more
 
-    def test_a_ping_behind_our_own_data_says_nothing(self, delay: BrokerDelay) -> None:
+    def test_a_ping_behind_our_own_data_means_nothing(self, delay: BrokerDelay) -> None:
         delay.asked(1.0, clear=False)
         assert self.at(delay, 3.0) == 0
         delay.asked(2.0, clear=True)

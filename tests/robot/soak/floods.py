@@ -26,17 +26,17 @@ from tests.support import until
 NAMES = ("retained flags", "retained topics", "60 MB once a second", "actions")
 _SECONDS = 10.0
 _COMMANDS = 5
-_BEATS_S = 0.25  # between two heartbeats
+_HEARTBEAT_S = 0.25  # between two heartbeats
 _OBEYED_S = 1.0
 _START_S = 30.0
-_MOST = {"beats": 0.95, "mb": 30.0, "lines": 10.0}
+_MOST = {"heartbeats": 0.95, "mb": 30.0, "lines": 10.0}
 
 
 @dataclass
 class Figures:
     """Of ten seconds: the share of heartbeats, commands obeyed, the process that took most more, lines per second."""
 
-    beats: float
+    heartbeats: float
     obeyed: int
     slowest_s: float
     mb: float
@@ -45,7 +45,7 @@ class Figures:
 
     @property
     def good(self) -> bool:
-        enough = self.beats >= _MOST["beats"] and self.obeyed == _COMMANDS
+        enough = self.heartbeats >= _MOST["heartbeats"] and self.obeyed == _COMMANDS
         return enough and self.mb <= _MOST["mb"] and self.lines <= _MOST["lines"]
 
 
@@ -59,12 +59,12 @@ def observe(world: World, before: dict[str, float], first: int, seconds: float =
         most = max(most, *_growth(world, before), key=lambda one: one[1])
         time.sleep(max(0.0, since + (index + 1) * seconds / _COMMANDS - time.monotonic()))
     passed = time.monotonic() - since
-    beats = len([one for one in world.operator.on("outgoing/online", since) if not one.retain])
+    heartbeats = len([one for one in world.operator.on("outgoing/online", since) if not one.retain])
     with rig.log.open("rb") as log:
         log.seek(logged)
         lines = log.read().count(b"\n") / passed
     obeyed = [delay for delay in delays if delay <= _OBEYED_S]
-    return Figures(min(1.0, beats / (passed / _BEATS_S)), len(obeyed), max(delays), most[1], most[0], lines)
+    return Figures(min(1.0, heartbeats / (passed / _HEARTBEAT_S)), len(obeyed), max(delays), most[1], most[0], lines)
 
 
 def _delay(world: World, number: int) -> float:
@@ -125,7 +125,7 @@ def main() -> int:
             time.sleep(2.0)
             for when, one in flooded(world, name, 1 + 2 * _COMMANDS * index).items():
                 wrong += not one.good
-                cells = (f"{one.beats:.0%}", f"{one.obeyed} of {_COMMANDS}", f"{one.slowest_s:.2f}")
+                cells = (f"{one.heartbeats:.0%}", f"{one.obeyed} of {_COMMANDS}", f"{one.slowest_s:.2f}")
                 grown = f"{one.mb:.1f} ({one.program})"
                 table.add_row(name, when, *cells, grown, f"{one.lines:.1f}", "" if one.good else "WRONG")
                 terminal.print(f"{name}, {when}: {one}", highlight=False)

@@ -97,7 +97,7 @@ def test_a_value_that_an_operator_chose_again_during_an_outage_is_no_older_one(r
 class TestLeftovers:
     @pytest.fixture
     def memory(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
-        monkeypatch.setattr(bridge_module, "_SETTLED_S", 0.3)
+        monkeypatch.setattr(bridge_module, "_LEFTOVERS_AFTER_S", 0.3)
         monkeypatch.setattr(bridge_module, "_ASK_S", 0.0)
         rig = MemoryRig(monkeypatch)
         yield rig
