@@ -62,7 +62,7 @@ def test_it_raises_the_flag_and_requests_and_undoes_both(robot: Robot, viewer: V
     assert until(lambda: robot.requests == [b'{"enabled":true,"encoding":"h264"}'])
     assert robot.flags == [b'{"value":true}']
     viewer.close()
-    assert until(lambda: robot.requests[-1] == b'{"enabled":false}')
+    assert until(lambda: robot.requests[-1:] == [b'{"enabled":false}'])
     assert robot.flags == [b'{"value":true}', b'{"value":false}']
 
 
@@ -84,7 +84,7 @@ def test_a_flag_lowered_by_another_operator_stays_down(
     assert until(lambda: not viewer._flags[FLAG])
     viewer.repeat_requests()
     viewer.close()
-    assert until(lambda: robot.requests[-1] == b'{"enabled":false}')
+    assert until(lambda: robot.requests[-1:] == [b'{"enabled":false}'])
     assert robot.flags == [b'{"value":true}']
 
 
@@ -125,5 +125,5 @@ def test_with_an_encoding_as_well_a_flag_that_was_up_stays_up(robot: Robot, view
     robot.publish(FLAG, b"true", retain=True)
     viewer.request("video", "h264")
     viewer.close()
-    assert until(lambda: robot.requests[-1] == b'{"enabled":false}')
+    assert until(lambda: robot.requests[-1:] == [b'{"enabled":false}'])
     assert robot.flags == []

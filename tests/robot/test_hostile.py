@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from pebble.contract import CHANNELS, ESTOP, INCOMING, Channel
+from pebble.contract import CHANNELS, ESTOP, INCOMING, Channel, Kind
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, MediaRequest, SoundboardCommand
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
@@ -122,6 +122,7 @@ _TARGETS = [
     for channel in CHANNELS
     if channel.direction == INCOMING and channel.payload is not bytes and channel is not ESTOP
 ]
+_ACTIONS = {channel.metric for channel in _TARGETS if channel.kind is Kind.ACTION}
 
 
 @pytest.fixture(params=["mqtt", "zenoh"])
@@ -152,9 +153,10 @@ def test_malformed_messages(rig: Rig) -> None:
     expected = {metric: number for metric, number in sent.items() if metric in received}
     assert refused.keys() == expected.keys()
     # QoS 0: a connection that is reset on a busy machine loses what is on its way. A kind of garbage that was accepted
-    # would be a seventh of a channel's messages.
+    # would be a seventh of a channel's messages. Of actions the bridge lets few pass in a second.
     lost = {metric: number - refused[metric] for metric, number in expected.items()}
-    assert all(0 <= lost[metric] < 0.02 * number for metric, number in expected.items()), lost
+    assert all(lost[metric] >= 0 for metric in expected), lost
+    assert all(lost[metric] < 0.02 * number for metric, number in expected.items() if metric not in _ACTIONS), lost
 
 
 @pytest.mark.timeout(180)

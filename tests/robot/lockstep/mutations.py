@@ -147,7 +147,7 @@ MUTATIONS = {
     ),
     "every command starts a script": Mutation(
         f"{_MANAGER}.service",
-        "begin = True if word in _START else False if word in _STOP else command.enabled",
+        "begin = True if word in _START else False if word in STOP_WORDS else command.enabled",
         "begin = True if word else command.enabled",
     ),
     # -- the script API
