@@ -470,8 +470,9 @@ def _ends_something(subject: Subject, message: Message) -> bool:
         return False
     if isinstance(command, Drive):
         return not command.moves
-    word = getattr(command, "action", None) or ""
-    return word.strip().lower() in STOP_WORDS or getattr(command, "enabled", getattr(command, "on", None)) is False
+    if word := getattr(command, "action", None):  # it wins over ``enabled``
+        return word.strip().lower() in STOP_WORDS
+    return getattr(command, "enabled", getattr(command, "on", None)) is False
 
 
 def _is_event(subject: Subject, message: Message) -> bool:

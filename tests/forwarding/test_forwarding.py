@@ -449,6 +449,7 @@ class TestLate:
             ("soundboard-command", b'{"action": "play", "file": "a"}', 2.0),
             ("soundboard-command", b'{"enabled": false}', inf),
             ("autonomy-command", b'{"action": "start", "file": "a"}', 0.5),
+            ("autonomy-command", b'{"action": "start", "enabled": false, "file": "a"}', 0.5),
             ("autonomy-command", b'{"action": "Stop", "file": "a"}', inf),
             ("outlets/lamp/power", b'{"on": true}', 0.5),
             ("outlets/lamp/power", b'{"on": false}', inf),
