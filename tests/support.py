@@ -76,10 +76,10 @@ class Child(subprocess.Popen[Any]):
         super().__init__(tied_to_parent(command), **options)
 
 
-def listening(port: int) -> bool:
-    """Does a server accept connections on this loopback port?"""
+def listening(port: int, address: str = "127.0.0.1") -> bool:
+    """Does a server accept connections on this port of a loopback address?"""
     try:
-        socket.create_connection(("127.0.0.1", port), 0.2).close()
+        socket.create_connection((address, port), 0.2).close()
     except OSError:
         return False
     return True

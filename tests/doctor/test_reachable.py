@@ -10,9 +10,16 @@ from pebble.doctor import Finding, Level
 from pebble.doctor.checks import run_checks
 from pebble.doctor.reachable import beyond_loopback, own_addresses
 from pebble.transports.settings import MqttSettings
-from tests.support import Broker, free_port
+from tests.support import Broker, free_port, listening, until
 
 OUTSIDE = "127.0.0.2"
+
+
+def with_another_listener(folder: Path, port: int, *options: str) -> Broker:
+    """One that also answers OUTSIDE; mosquitto opens its listeners one after the other."""
+    broker = Broker(folder, *options, f"listener {port} {OUTSIDE}", port=port)
+    assert until(lambda: listening(port, OUTSIDE))
+    return broker
 
 
 def findings(broker: Broker) -> list[Finding]:
@@ -21,7 +28,7 @@ def findings(broker: Broker) -> list[Finding]:
 
 def test_a_broker_for_everybody_is_a_warning(tmp_path: Path) -> None:
     port = free_port()
-    broker = Broker(tmp_path, f"listener {port} {OUTSIDE}", port=port)
+    broker = with_another_listener(tmp_path, port)
     (found,) = findings(broker)
     broker.stop()
     assert (found.level, found.what) == (Level.WARN, f"local broker 127.0.0.1:{port}")
@@ -32,8 +39,7 @@ def test_a_broker_for_everybody_is_a_warning(tmp_path: Path) -> None:
 def test_one_that_requires_a_login_is_named(tmp_path: Path) -> None:
     port, passwords = free_port(), tmp_path / "passwords"
     subprocess.run(["mosquitto_passwd", "-b", "-c", str(passwords), "ann", "pw"], check=True, capture_output=True)
-    options = ("allow_anonymous false", f"password_file {passwords}", f"listener {port} {OUTSIDE}")
-    broker = Broker(tmp_path, *options, port=port)
+    broker = with_another_listener(tmp_path, port, "allow_anonymous false", f"password_file {passwords}")
     (found,) = findings(broker)
     broker.stop()
     assert (found.level, found.text) == (Level.OK, f"also answers at {OUTSIDE}, and refuses anonymous logins there")

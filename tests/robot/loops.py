@@ -103,7 +103,7 @@ def perform(case: Case) -> Outcome:
             outcome.errors = max(outcome.errors, robot.log.read_text().count("[ERROR]"))
         way.cut()
         for robot in robots[1:]:
-            robot.end()
+            robot.ensure_stopped()
         outcome.again_s = _again(rig)
         return outcome
 

@@ -20,6 +20,7 @@ from tests.tcp_proxy import TcpProxy
 
 BASE = "pebble/robots/rover"
 STOP = (0.0, 0.0)
+_LISTENS = (b"forwarding between the robot and its remote side", b"nothing is mirrored")  # in its log
 PROGRAMS = (
     *("zenoh_hub", "announcer", "serial_mcu_bridge", "av_daemon", "mqtt_bridge", "mqtt_mirror"),
     *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream"),
@@ -148,14 +149,24 @@ class Rig:
 
     def start(self, ready: bool = True) -> float:
         """Start the launcher; returns the monotonic time just before. Waits until the robot is up if asked."""
-        began = time.monotonic()
+        began, logged = time.monotonic(), self.log.stat().st_size if self.log.exists() else 0
         with self.log.open("ab") as log:
             self._robot = subprocess.Popen(
                 [sys.executable, "-m", "pebble.cli", "up", str(self.config)], cwd=ROOT, stderr=log, stdout=log
             )
         if ready:
             self.wait_until_up(began)
+            assert until(lambda: self._listens_since(logged), 10), (
+                f"nothing is forwarded:\n{self.log.read_text()[-4000:]}"
+            )
         return began
+
+    def _listens_since(self, logged: int) -> bool:
+        """Whether it is subscribed at its remote broker, some milliseconds after it has said there that it is up."""
+        with self.log.open("rb") as log:
+            log.seek(logged)
+            text = log.read()
+        return any(line in text for line in _LISTENS)
 
     def wait_until_up(self, since: float, timeout: float = 15.0) -> None:
         """Every service is ready, and heartbeats arrive."""
@@ -167,7 +178,7 @@ class Rig:
         self._robot.send_signal(signal.SIGTERM)
         return self._robot.wait(20)
 
-    def end(self) -> None:
+    def ensure_stopped(self) -> None:
         """Stop the robot, if it runs."""
         if self._robot is not None and self._robot.poll() is None:
             self.stop()
@@ -212,7 +223,7 @@ class Rig:
 
     def close(self) -> None:
         self.operator.close()
-        self.end()
+        self.ensure_stopped()
         self.mcu.close()
         self.uplink.stop()
         for broker in (self.local, self.remote):

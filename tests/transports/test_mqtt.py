@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import socket
 import subprocess
 import threading
 import time
@@ -19,6 +20,7 @@ from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
 from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.connection import MAX_PACKET, UNACKED_LIMIT, Connection
+from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
 from tests.tcp_proxy import BridgelessProxy, TcpProxy
 from tests.transports.received import Received
@@ -541,6 +543,35 @@ def test_what_stood_behind_many_retained_messages_does_not_count_as_fresh(
         (age, waited), (_, fresh) = commands
         assert waited >= age > 1
         assert fresh < 0.3
+
+
+def test_a_burst_is_taken_out_of_the_socket_at_once_and_grows_old_all_the_same(
+    broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What waits in the process is as old as what waits in the kernel."""
+    read, sizes = paho.Client._sock_recv, list[int]()
+
+    def note(client: paho.Client, size: int) -> bytes:
+        data = read(client, size)
+        sizes.append(len(data))
+        return data
+
+    monkeypatch.setattr(paho.Client, "_sock_recv", note)
+    robot, received = clients(broker.port), list[tuple[bytes, float]]()
+
+    def receive(message: Message) -> None:
+        time.sleep(0 if received else 0.4)
+        received.append((message.payload, message.waited_s))
+
+    robot.subscribe(topic, receive, direct=True)
+    sizes.clear()
+    numbers = [b"%d" % number for number in range(500)]
+    with socket.create_connection(("127.0.0.1", broker.port)) as operator:
+        operator.sendall(connect(None, None) + b"".join(publish(topic, number) for number in numbers))
+        assert until(lambda: len(received) == len(numbers), 10)
+    assert [payload for payload, _ in received] == numbers
+    assert len(sizes) < len(numbers) / 3
+    assert received[-1][1] >= 0.3
 
 
 # -- messages that are too large

@@ -113,13 +113,19 @@ class _Client(paho.Client):
 
     on_pong: Callable[[], None]
     on_too_long: Callable[[bytes, int], None]  # with the topic of a PUBLISH, and the length of the packet
-    received = 0  # bytes so far
+    received = 0  # bytes of the packets so far
+    _ahead, _ahead_at = b"", 0  # read from the socket in one go, and how much of that paho has had
     protocol_refused = False  # by return code 1 of a CONNACK on MQTT 3.1.1
 
     @property
     def unwritten(self) -> int:
         """Bytes that the kernel has not accepted yet."""
         return sum(packet["to_process"] for packet in self._out_packet)
+
+    @property
+    def unread(self) -> int:
+        """Bytes that were taken out of the socket, and not read yet."""
+        return len(self._ahead) - self._ahead_at
 
     def ping(self) -> None:
         self._send_pingreq()
@@ -128,7 +134,14 @@ class _Client(paho.Client):
         if self._too_long:
             del self._in_packet["packet"][_HEAD:]
             bufsize = min(bufsize, _PIECE)
-        data = super()._sock_recv(bufsize)
+        begin = self._ahead_at
+        if begin == len(self._ahead) and bufsize >= _PIECE:
+            data = super()._sock_recv(bufsize)
+        else:  # paho reads a packet in three pieces or more: take many packets out of the socket at once
+            if begin == len(self._ahead):
+                self._ahead, begin = super()._sock_recv(_PIECE), 0
+            data = self._ahead[begin : begin + bufsize]
+            self._ahead_at = begin + len(data)
         self.received += len(data)
         return data
 
@@ -146,6 +159,11 @@ class _Client(paho.Client):
         if not self._in_packet["command"] & 0b110:  # QoS 0
             return MQTTErrorCode.MQTT_ERR_SUCCESS
         return self._send_puback(int.from_bytes(head[end : end + 2]))
+
+    def _handle_on_message(self, message: paho.MQTTMessage) -> None:
+        """Without paho's search for callbacks by topic."""
+        if self.on_message is not None:
+            self.on_message(self, None, message)
 
     def _handle_connack(self) -> MQTTErrorCode:
         self.protocol_refused = self._in_packet["packet"][1:2] == b"\1"
@@ -287,10 +305,10 @@ class Connection:
                 raise Lost(self._disconnect_reason or f"{self.where} closed the connection")
             blocked = self._client.want_write()
             poll = _Poll(sock.fileno(), self._wake_read.fileno(), write=blocked)
-            wait = 0.0 if self._more else min(timeout, self._ping_due_in())
+            wait = min(timeout, self._ping_due_in())
         began = clock.since_boot()
         readable, writable, woken = poll.wait(0.0)
-        if not (readable or writable or woken):
+        if not (readable or writable or woken or self._more):
             self._waiting.empty(began)
             readable, writable, woken = poll.wait(max(wait, 0.0))
             if (now := clock.since_boot()) - began <= wait + _OVERSLEPT_S:
@@ -300,7 +318,7 @@ class Connection:
         if writable:
             self._answered_at = clock.since_boot()  # the other side's TCP accepted some: slow, but alive
         if readable:
-            self._waiting.found(readable_bytes(sock), clock.since_boot())
+            self._waiting.found(readable_bytes(sock) + self._client.unread, clock.since_boot())
         return readable
 
     def _check_silence(self) -> None:
@@ -340,7 +358,7 @@ class Connection:
         self._note_copies(self._inbox)
         sock = self._socket()
         buffered = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
-        self._more = buffered or len(self._inbox) >= _BATCH
+        self._more = buffered or self._client.unread > 0 or len(self._inbox) >= _BATCH
         self._waiting.read(self._client.received - size)
         if not self._more:
             self._waiting.empty(began)

@@ -62,7 +62,7 @@ class World:
 
     def close(self) -> None:
         self.operator.close()
-        self.rig.end()
+        self.rig.ensure_stopped()
         for disk in self._mounted:
             subprocess.run(["umount", "--lazy", str(disk)], check=False)
         self.rig.close()

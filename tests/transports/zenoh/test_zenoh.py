@@ -20,6 +20,7 @@ import msgspec
 import pytest
 import zenoh
 
+from pebble.bench.usage import pss_mb
 from pebble.errors import TransportError
 from pebble.runtime.hub import run_hub
 from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
@@ -330,6 +331,19 @@ def test_more_topics_than_publishers_are_received_in_order(robot: Robot, monkeyp
         assert sender.publish(f"many/{number % 7}", b"%d" % number, qos=QoS(number % 2), urgent=number % 3 == 0)
     assert until(lambda: sum(map(len, received.values())) == 70)
     assert received == {f"many/{topic}": list(range(topic, 70, 7)) for topic in range(7)}
+
+
+def test_topics_that_strangers_invent_take_no_memory(robot: Robot) -> None:
+    """Zenoh stores 2.4 KB in the hub for each key that ever had a publisher: these would be 14 MB more."""
+    sender, hub = robot.client("sender"), robot.hub.pid
+    numbers = []
+    robot.client("receiver").subscribe("invented/+", lambda message: numbers.append(int(message.payload)))
+    before = pss_mb(hub)
+    for number in range(6000):
+        assert sender.publish(f"invented/{number}", b"%d" % number, qos=DELIVERED)
+    assert until(lambda: len(numbers) == 6000)
+    assert numbers == list(range(6000))
+    assert pss_mb(hub) < before + 8.0
 
 
 def test_a_hub_that_stands_still_holds_up_no_flood_it_does_not_listen_to(robot: Robot) -> None:
