@@ -193,6 +193,9 @@ class Transport(ABC):
     #: Whether the other end had older values of what only we publish when the newest connection began: it was restored
     #: from an earlier save, or is another one. A backend that cannot notice it leaves it False.
     went_back: bool = False
+    #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
+    #: plant 100,000. Asked on the transport's threads; a backend may ignore it.
+    skips_retained: Callable[[bytes], bool] = staticmethod(lambda _topic: False)
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
         if will is not None:

@@ -50,6 +50,10 @@ class Admission:
             return Drop.TOO_MANY
         return None
 
+    def refuses_flag(self, topic: bytes) -> bool:
+        """Whether this flag, which the contract does not know, would be one too many."""
+        return len(self._flags) >= MAX_UNKNOWN_FLAGS and topic.decode(errors="replace") not in self._flags
+
     def _is_too_often(self, subject: Subject, message: Message) -> bool:
         if subject.kind is Kind.ACTION and subject.channel is not None:
             key: Kind | Channel = subject.channel

@@ -246,6 +246,18 @@ class Forwarder:
 
     # -- the receiving threads
 
+    def skips_retained(self, side: Side, topic: bytes) -> bool:
+        """Whether a retained message of ``topic`` does not pass, whatever it is: for Transport.skips_retained."""
+        kind = self._subjects.invented(topic)
+        if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
+            return False
+        drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
+        self._note_retained_now(side)
+        self.counters.add(f"{side.value}: {drop.value}")
+        shown = topic[:_LOGGED].decode(errors="replace")
+        self._quiet_log.warning(drop.name, "%s is not forwarded: %s", shown, drop.value)
+        return True
+
     def receive(self, side: Side, message: Message) -> Routed:
         """Forward ``message`` by the table."""
         subject = self._subjects[message.topic]
@@ -353,8 +365,10 @@ class Forwarder:
 
     def _note_retained(self, side: Side, message: Message) -> None:
         """Retained messages still arrive: a stop may be among them. Stops do not count, so that one can be repeated."""
-        if not message.retain:
-            return
+        if message.retain:
+            self._note_retained_now(side)
+
+    def _note_retained_now(self, side: Side) -> None:
         now, until = self._clock(), self._stops_retained_until[side]
         if now >= until:
             return

@@ -56,6 +56,9 @@ class Subjects:
         names = dict.fromkeys(["", *config.serial_instances()])
         self._addresses = [Addresses(view_of(config, name)) for name in names]
         self._known: dict[str, Subject | _Unknown | None] = {}
+        self._incoming = f"{self._base}/{INCOMING}/".encode()
+        named = (addresses[one].topic.encode() for addresses in self._addresses for one in CHANNELS)
+        self._named = frozenset(topic.removeprefix(self._incoming) for topic in named)
 
     def __getitem__(self, topic: str) -> Subject | None:
         """The subject of ``topic``; None if it is not this robot's, or not a valid topic."""
@@ -66,6 +69,15 @@ class Subjects:
             self._known.clear()
         subject = self._known[topic] = self._find(topic)
         return subject
+
+    def invented(self, topic: bytes) -> Kind | None:
+        """The kind of an incoming topic that the contract does not name, as UTF-8; found out quickly."""
+        if not topic.startswith(self._incoming):
+            return None
+        metric = topic[len(self._incoming) :]
+        if metric in self._named:
+            return None
+        return Kind.FLAG if metric.startswith(b"flags/") else Kind.COMMAND
 
     def filters(self, *directions: str) -> list[str]:
         """What to subscribe to for everything of ``directions``: no two of the filters overlap."""

@@ -9,6 +9,7 @@ from math import inf
 
 import pytest
 
+from pebble.contract import Kind
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.forwarding import loopback_filter as loopback_filter
 from pebble.forwarding.admission import MAX_ACTIONS, MAX_UNKNOWN_COMMANDS, MAX_UNKNOWN_FLAGS, Admission
@@ -127,6 +128,35 @@ class TestAdmission:
             assert self.refuse(admission, f"incoming/flags/f{number}", side=LOCAL) is None
         assert self.refuse(admission, "incoming/flags/f1") is None
         assert self.refuse(admission, "incoming/flags/more") is Drop.TOO_MANY
+
+    def test_one_flag_too_many_need_not_be_read(self) -> None:
+        admission = Admission()
+        for number in range(MAX_UNKNOWN_FLAGS):
+            assert not admission.refuses_flag(f"{BASE}/incoming/flags/f{number}".encode())
+            self.refuse(admission, f"incoming/flags/f{number}")
+        assert not admission.refuses_flag(f"{BASE}/incoming/flags/f0".encode())
+        assert admission.refuses_flag(f"{BASE}/incoming/flags/more".encode())
+        assert admission.refuses_flag(f"{BASE}/incoming/flags/".encode() + b"\xff")
+
+    @pytest.mark.parametrize(
+        ("topic", "kind"),
+        [
+            ("incoming/unknown", Kind.COMMAND),
+            ("incoming/mcu/1/light", Kind.COMMAND),
+            ("incoming/flags/mine", Kind.FLAG),
+            ("incoming/flags/mqtt-video", None),
+            ("incoming/flags/reboot", None),
+            ("incoming/drive-values", None),
+            ("incoming/estop", None),
+            ("incoming", None),
+            ("outgoing/unknown", None),
+        ],
+    )
+    def test_topics_that_the_contract_does_not_name_are_known_by_their_beginning(
+        self, topic: str, kind: Kind | None
+    ) -> None:
+        assert self.SUBJECTS.invented(f"{BASE}/{topic}".encode()) is kind
+        assert self.SUBJECTS.invented(f"pebble/robots/another/{topic}".encode()) is None
 
     @pytest.mark.parametrize("topic", ["drive-values", "flags/reboot", "flags/mqtt-video", "flags/mine", "mine"])
     def test_messages_to_a_robot_are_bounded_in_size(self, topic: str) -> None:

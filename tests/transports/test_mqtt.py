@@ -574,6 +574,30 @@ def test_a_burst_is_taken_out_of_the_socket_at_once_and_grows_old_all_the_same(
     assert received[-1][1] >= 0.3
 
 
+@both_protocols
+@pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
+def test_retained_messages_that_are_not_wanted_are_skipped(
+    broker: Broker, clients: Clients, topic: str, protocol: str, qos: QoS
+) -> None:
+    planter = clients(broker.port, "planter")
+    for number in range(300):  # more than mosquitto sends before it waits for an acknowledgement
+        assert planter.publish(f"{topic}/skipped/{number}", b"x", qos=qos, retain=True)
+    assert planter.publish(f"{topic}/wanted", b"x", qos=qos, retain=True)
+    robot, received, asked = clients(broker.port, "robot", protocol=protocol, opened=False), Received(), list[bytes]()
+
+    def skips(name: bytes) -> bool:
+        asked.append(name)
+        return b"/skipped/" in name
+
+    robot.skips_retained = skips  # type: ignore[method-assign]
+    robot.open(5)
+    robot.subscribe(f"{topic}/#", received)
+    assert until(lambda: received.payloads == [b"x"])
+    assert until(lambda: len(asked) == 301)
+    assert planter.publish(f"{topic}/skipped/live", b"live", qos=qos)
+    assert until(lambda: received.payloads == [b"x", b"live"])
+
+
 # -- messages that are too large
 
 

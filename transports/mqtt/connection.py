@@ -58,6 +58,7 @@ _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _BATCH = 64  # messages read in a row before they are delivered
+_RETAIN, _ANY_QOS = 0b1, 0b110  # in the first byte of a PUBLISH
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
 
@@ -113,6 +114,7 @@ class _Client(paho.Client):
 
     on_pong: Callable[[], None]
     on_too_long: Callable[[bytes, int], None]  # with the topic of a PUBLISH, and the length of the packet
+    skips: Callable[[bytes], bool]  # whether a retained message of this topic is not wanted
     received = 0  # bytes of the packets so far
     _ahead, _ahead_at = b"", 0  # read from the socket in one go, and how much of that paho has had
     protocol_refused = False  # by return code 1 of a CONNACK on MQTT 3.1.1
@@ -151,12 +153,17 @@ class _Client(paho.Client):
         return bool(self._in_packet["have_remaining"]) and self._in_packet["remaining_length"] > MAX_PACKET
 
     def _handle_publish(self) -> MQTTErrorCode:
-        if not self._too_long:
+        head, first = self._in_packet["packet"], self._in_packet["command"]
+        too_long = self._too_long
+        if not (too_long or first & _RETAIN):
             return super()._handle_publish()
-        head = self._in_packet["packet"]
         end = 2 + int.from_bytes(head[:2])
-        self.on_too_long(bytes(head[2:end]), self._in_packet["remaining_length"])
-        if not self._in_packet["command"] & 0b110:  # QoS 0
+        topic = bytes(head[2:end])
+        if too_long:
+            self.on_too_long(topic, self._in_packet["remaining_length"])
+        elif not self.skips(topic):
+            return super()._handle_publish()
+        if not first & _ANY_QOS:
             return MQTTErrorCode.MQTT_ERR_SUCCESS
         return self._send_puback(int.from_bytes(head[end : end + 2]))
 
@@ -191,6 +198,7 @@ class Connection:
         *,
         as_published: bool,
         on_answers: Callable[[Mapping[str, bool]], None],
+        skips_retained: Callable[[bytes], bool],
     ) -> None:
         self.as_published = as_published
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
@@ -203,7 +211,7 @@ class Connection:
         self._modern = settings.protocol == "5"
         self._lock = threading.RLock()
         self._inbox: list[Message] = []
-        self._on_answers = on_answers
+        self._on_answers, self._skips_retained = on_answers, skips_retained
         self._asked: dict[int, list[str]] = {}  # the filters of each SUBSCRIBE without an answer, by message id
         self._answers: dict[str, bool] = {}  # filters answered since the last `on_answers`: refused?
         self._backlog = Backlog()
@@ -350,7 +358,7 @@ class Connection:
         received = before = self._packets
         while True:
             self._read_some()
-            if self._packets == before or len(self._inbox) >= _BATCH:
+            if self._packets == before or self._packets - received >= _BATCH:
                 break
             before = self._packets
         if self._packets == received:
@@ -358,7 +366,7 @@ class Connection:
         self._note_copies(self._inbox)
         sock = self._socket()
         buffered = isinstance(sock, ssl.SSLSocket) and sock.pending() > 0
-        self._more = buffered or self._client.unread > 0 or len(self._inbox) >= _BATCH
+        self._more = buffered or self._client.unread > 0 or self._packets - received >= _BATCH
         self._waiting.read(self._client.received - size)
         if not self._more:
             self._waiting.empty(began)
@@ -544,6 +552,7 @@ class Connection:
             client.will_set(will.topic, will.payload, int(will.qos), will.retain)
         client.on_pong = self._on_pong
         client.on_too_long = self._on_too_long
+        client.skips = self._skips
         client.on_socket_open = self._on_socket_open
         client.on_socket_register_write = self._on_register_write
         client.on_connect = self._on_connect
@@ -617,6 +626,13 @@ class Connection:
         retain_requested = retain if self.as_published else (True if retain else None)
         qos = QoS(min(raw.qos, 1))
         self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, self._since))
+
+    def _skips(self, topic: bytes) -> bool:
+        skipped = self._skips_retained(topic)
+        if skipped:
+            self._packets += 1
+            self.arriving_at = clock.since_boot()
+        return skipped
 
     def _on_too_long(self, topic: bytes, length: int) -> None:
         self._packets += 1
