@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.server
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import ROOT, free_port
+from tests.support import ROOT, free_port, gone, until
 
 PATH = "/@micropython/micropython-webassembly-pyscript/-/micropython-webassembly-pyscript-1.29.0-6.tgz"
 
@@ -108,3 +109,18 @@ def test_many_failures_are_no_coincidence(tmp_path: Path) -> None:
 
 def test_an_error_in_a_test_file_fails(tmp_path: Path) -> None:
     assert run_tests(tmp_path, "import nothing_like_this")[0] not in (0, 5)
+
+
+LEAVES = """
+import subprocess
+def test_leaves():
+    subprocess.Popen(["sleep", "60"], start_new_session=True)
+"""
+
+
+def test_processes_that_a_test_leaves_behind_are_named_and_ended(tmp_path: Path) -> None:
+    code, output = run_tests(tmp_path, LEAVES)
+    assert code == 1
+    left = re.search(r"LEFT BEHIND, please report: (\d+) sleep 60 PYTEST_CURRENT_TEST=test_it.py::test_leaves", output)
+    assert left is not None
+    assert until(lambda: gone(int(left[1])))

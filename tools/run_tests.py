@@ -2,17 +2,38 @@
 
 Several hundred tests start whole robots and check deadlines. Where other programs take the processors for seconds, one
 of them may miss its deadline; a test that fails twice, the second time with nothing beside it, fails.
+
+Processes that a test has left behind are ended, named with their test, and a failure.
 """
 
+import os
+import secrets
+import signal
 import subprocess
 import sys
 import tempfile
+import time
+from contextlib import suppress
 from pathlib import Path
 
 FAILED, MOST = 1, 10  # pytest's exit code for failed tests; more than these are no coincidence
+RUN = f"PEBBLE_TEST_RUN={secrets.token_hex(8)}"  # in the environment of every process that a test starts
+ENDING_S = 5.0  # for processes that are about to end
 
 
 def main(arguments: list[str]) -> int:
+    name, token = RUN.split("=")
+    os.environ[name] = token
+    code = run(arguments)
+    left = processes_left()
+    for pid, what in left.items():
+        sys.stdout.write(f"pebble: LEFT BEHIND, please report: {what}\n")
+        with suppress(OSError):
+            os.kill(pid, signal.SIGKILL)
+    return code or (FAILED if left else 0)
+
+
+def run(arguments: list[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         list_ = Path(folder, "failed")
         code = pytest(arguments, list_)
@@ -31,6 +52,31 @@ def main(arguments: list[str]) -> int:
 def pytest(arguments: list[str], list_: Path) -> int:
     command = [sys.executable, "-m", "pytest", "-p", "tools.failed_tests", f"--failed-list={list_}", *arguments]
     return subprocess.run(command, check=False).returncode
+
+
+def processes_left() -> dict[int, str]:
+    """Command lines and tests of processes of this run, by pid; of Linux only."""
+    deadline = time.monotonic() + ENDING_S
+    while left := {pid: what for pid in pids() if (what := described(pid))}:
+        if time.monotonic() > deadline:
+            break
+        time.sleep(0.1)
+    return left
+
+
+def pids() -> list[int]:
+    return [int(path.name) for path in Path("/proc").glob("[0-9]*") if int(path.name) != os.getpid()]
+
+
+def described(pid: int) -> str:
+    """Empty for a process that is not of this run, or has ended."""
+    with suppress(OSError):
+        variables = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
+        command = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
+        if RUN in variables and command:
+            test = next((one for one in variables if one.startswith("PYTEST_CURRENT_TEST=")), "")
+            return f"{pid} {command}{test}"
+    return ""
 
 
 if __name__ == "__main__":

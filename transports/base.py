@@ -194,8 +194,10 @@ class Transport(ABC):
     #: from an earlier save, or is another one. A backend that cannot notice it leaves it False.
     went_back: bool = False
     #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
-    #: plant 100,000. Asked on the transport's threads; a backend may ignore it.
+    #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
     skips_retained: Callable[[bytes], bool] = staticmethod(lambda _topic: False)
+    #: Whether a topic is one of any number that strangers invent: a backend then stores nothing for it.
+    is_invented: Callable[[str], bool] = staticmethod(lambda _topic: False)
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
         if will is not None:

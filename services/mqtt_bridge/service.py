@@ -76,6 +76,7 @@ class MqttBridge(Service):
             on_value=self._on_flag,
             clock=self.clock,
         )
+        self.transport.is_invented = lambda topic: self._subjects.invented(topic.encode()) is not None
         self._remote.skips_retained = partial(self._forwarder.skips_retained, Side.REMOTE)
         #: What the bridge itself does about a message, and about a flag's value, by channel.
         self._message_reactions: dict[str, Callable[[bytes], None]] = {

@@ -20,7 +20,7 @@ from tests.tcp_proxy import TcpProxy
 
 BASE = "pebble/robots/rover"
 STOP = (0.0, 0.0)
-_LISTENS = (b"forwarding between the robot and its remote side", b"nothing is mirrored")  # in its log
+_LISTENS = (b"forwarding between the robot and its remote side", b"to the local one: nothing is mirrored")  # in its log
 PROGRAMS = (
     *("zenoh_hub", "announcer", "serial_mcu_bridge", "av_daemon", "mqtt_bridge", "mqtt_mirror"),
     *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream"),
@@ -147,13 +147,15 @@ class Rig:
 
     # -- the robot
 
-    def start(self, ready: bool = True) -> float:
-        """Start the launcher; returns the monotonic time just before. Waits until the robot is up if asked."""
+    def start(self, ready: bool = True, **options: Any) -> float:
+        """Start the launcher; returns the monotonic time just before. Waits until the robot is up if asked.
+
+        ``options`` are those of Popen.
+        """
         began, logged = time.monotonic(), self.log.stat().st_size if self.log.exists() else 0
         with self.log.open("ab") as log:
-            self._robot = subprocess.Popen(
-                [sys.executable, "-m", "pebble.cli", "up", str(self.config)], cwd=ROOT, stderr=log, stdout=log
-            )
+            options = {"cwd": ROOT, "stdout": log, "stderr": log} | options
+            self._robot = subprocess.Popen([sys.executable, "-m", "pebble.cli", "up", str(self.config)], **options)
         if ready:
             self.wait_until_up(began)
             assert until(lambda: self._listens_since(logged), 10), (
@@ -172,10 +174,11 @@ class Rig:
         """Every service is ready, and heartbeats arrive."""
         assert until(lambda: self._up(since), timeout), f"the robot is not up:\n{self.log.read_text()[-4000:]}"
 
-    def stop(self) -> int:
-        """Stop the robot with SIGTERM; returns the launcher's exit code."""
+    def stop(self, *signals: signal.Signals) -> int:
+        """Stop the robot with SIGTERM, or with these; returns the launcher's exit code."""
         assert self._robot is not None
-        self._robot.send_signal(signal.SIGTERM)
+        for number in signals or (signal.SIGTERM,):
+            self._robot.send_signal(number)
         return self._robot.wait(20)
 
     def ensure_stopped(self) -> None:

@@ -161,11 +161,19 @@ class _Client(paho.Client):
         topic = bytes(head[2:end])
         if too_long:
             self.on_too_long(topic, self._in_packet["remaining_length"])
-        elif not self.skips(topic):
+        elif self._is_removal(end) or not self.skips(topic):
             return super()._handle_publish()
         if not first & _ANY_QOS:
             return MQTTErrorCode.MQTT_ERR_SUCCESS
         return self._send_puback(int.from_bytes(head[end : end + 2]))
+
+    def _is_removal(self, end: int) -> bool:
+        """Whether the PUBLISH that arrived, whose topic ends at ``end``, has no payload."""
+        head = self._in_packet["packet"]
+        start = end + (2 if self._in_packet["command"] & _ANY_QOS else 0)
+        if self._protocol == MQTTProtocolVersion.MQTTv5:
+            start += 1 + int(head[start])  # of properties, of which nobody needs 128 bytes
+        return len(head) <= start
 
     def _handle_on_message(self, message: paho.MQTTMessage) -> None:
         """Without paho's search for callbacks by topic."""
@@ -628,7 +636,13 @@ class Connection:
         self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, self._since))
 
     def _skips(self, topic: bytes) -> bool:
-        skipped = self._skips_retained(topic)
+        if self._inbox:
+            return False  # what came before may change the answer
+        try:
+            skipped = self._skips_retained(topic)
+        except Exception:  # foreign code on our thread
+            log.exception("asking whether to skip a retained message of %r failed", topic)
+            return False
         if skipped:
             self._packets += 1
             self.arriving_at = clock.since_boot()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import random
 import signal
+import statistics
 import sys
 import time
 from collections import defaultdict
@@ -110,12 +111,14 @@ def _longest_turn(world: World, began: float) -> float:
     return longest
 
 
-def grown(memory: dict[str, list[float]]) -> list[str]:
-    """Which programs took more in the second half than ever in the first.
+def grown(memory: dict[str, list[float]], *, killed: bool) -> list[str]:
+    """Which programs took more in the second half than in the first.
 
-    Their processes are killed at random times, and floods leave them with different amounts: so the highest counts.
+    Where their processes are ``killed`` at random times, and floods leave them with different amounts, the highest
+    counts; else the median.
     """
-    return [name for name, values in memory.items() if _grows(*halves(values))]
+    measure = max if killed else statistics.median
+    return [name for name, values in memory.items() if _grows(*(measure(half) for half in halves(values)))]
 
 
 def _grows(before: float, after: float) -> bool:
@@ -123,10 +126,9 @@ def _grows(before: float, after: float) -> bool:
     return after > factor * before and after > before + least
 
 
-def halves(values: list[float]) -> tuple[float, float]:
-    """The highest of each."""
+def halves(values: list[float]) -> tuple[list[float], list[float]]:
     middle = max(1, len(values) // 2)
-    return max(values[:middle]), max(values[middle:] or values)
+    return values[:middle], values[middle:] or values
 
 
 def tables(outcomes: list[Outcome], memory: dict[str, list[float]]) -> list[Table]:
@@ -138,9 +140,10 @@ def tables(outcomes: list[Outcome], memory: dict[str, list[float]]) -> list[Tabl
         worst = [max(getattr(one, what) for one in group) for what in ("back_s", "age_s", "turned_s", "lines")]
         wrong = sum(bool(one.problems) for one in group)
         found.add_row(name, str(len(group)), *(f"{value:.2f}" for value in worst), str(wrong))
-    grew = Table("MB of", "first", "highest of the first half", "of the second half", "last")
+    grew = Table("MB of", "first", "median and highest of the first half", "of the second half", "last")
     for name, values in sorted(memory.items()):
-        grew.add_row(name, *(f"{value:.1f}" for value in (values[0], *halves(values), values[-1])))
+        both = (f"{statistics.median(half):.1f}, {max(half):.1f}" for half in halves(values))
+        grew.add_row(name, f"{values[0]:.1f}", *both, f"{values[-1]:.1f}")
     return [found, grew]
 
 
@@ -178,7 +181,7 @@ def main() -> int:
     for table in tables(outcomes, memory):
         terminal.print(table)
     bad = [one for one in outcomes if one.problems]
-    growing = grown(memory) if options.minutes >= 5 else []
+    growing = grown(memory, killed=not options.no_kills) if options.minutes >= 5 else []
     terminal.print(
         f"{options.transport}, seed {options.seed}: {len(outcomes)} attacks, {len(bad)} with something wrong; "
         f"grown: {', '.join(growing) or 'no process'}"

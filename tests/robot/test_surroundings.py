@@ -1,0 +1,138 @@
+"""Robots that start and stop in odd surroundings: without an environment, at any moment, several at once."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.robot.rig import STOP, Rig, descendants
+from tests.support import ROOT, gone, until
+
+pytestmark = pytest.mark.alone
+
+NOWHERE = "/nowhere/at/all"
+ENVIRONMENT = {"PYTHONPATH": str(ROOT)}
+SURROUNDINGS: dict[str, dict[str, Any]] = {
+    "no environment": {"env": ENVIRONMENT},
+    "folders that do not exist": {
+        "env": ENVIRONMENT | dict.fromkeys(("HOME", "TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"), NOWHERE)
+    },
+    "no standard input": {"preexec_fn": lambda: os.close(0)},
+    "no standard streams": {"preexec_fn": lambda: [os.close(number) for number in range(3)]},
+}
+
+
+def drives_and_stops(rig: Rig) -> None:
+    rig.operator.send("incoming/drive-values", {"x": 0.5, "z": 0})
+    assert until(rig.mcu.moving), rig.log.read_text()[-4000:]
+    children = descendants(rig.launcher_pid)
+    assert rig.stop() == 0
+    assert rig.mcu.drives()[-1][1] == STOP
+    assert until(lambda: all(map(gone, children)))
+    assert "Traceback" not in rig.log.read_text()
+
+
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+@pytest.mark.parametrize("surroundings", SURROUNDINGS.values(), ids=SURROUNDINGS)
+def test_a_robot_runs(kind: str, surroundings: dict[str, Any]) -> None:
+    with Rig(kind, start=False) as rig:
+        began = rig.start(ready=False, **surroundings)
+        rig.wait_until_up(began)
+        drives_and_stops(rig)
+
+
+def test_a_robot_runs_in_a_folder_that_was_deleted(tmp_path: Path) -> None:
+    folder = tmp_path / "deleted"
+    folder.mkdir()
+    with Rig("zenoh", start=False) as rig:
+        began = rig.start(ready=False, cwd=folder, env={**os.environ, **ENVIRONMENT}, preexec_fn=folder.rmdir)
+        rig.wait_until_up(began)
+        drives_and_stops(rig)
+
+
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+@pytest.mark.parametrize("files", [12, 20, 40])
+def test_too_few_descriptors_are_an_error_or_enough(kind: str, files: int) -> None:
+    with Rig(kind, start=False) as rig:
+        began = rig.start(ready=False, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (files, files)))
+        ended = until(lambda: gone(rig.launcher_pid), 3.0)
+        if not ended:  # it goes on, and can be stopped
+            assert rig.stop() == 0
+        else:
+            assert rig.stop() != 0
+        assert time.monotonic() - began < 20
+
+
+def test_a_stop_at_any_moment_of_the_start_leaves_nothing() -> None:
+    with Rig("zenoh", start=False) as rig:
+        for index in range(20):
+            rig.start(ready=False)
+            time.sleep(0.04 * index)
+            children = descendants(rig.launcher_pid)
+            began = time.monotonic()
+            rig.stop((signal.SIGTERM, signal.SIGINT, signal.SIGHUP)[index % 3])
+            assert time.monotonic() - began < 5
+            assert until(lambda pids=children: all(map(gone, pids)))  # type: ignore[misc]
+        assert not until(lambda: remains(rig), 0.5)
+        rig.start()
+        drives_and_stops(rig)
+
+
+def remains(rig: Rig) -> list[str]:
+    """Programs of this robot that run."""
+    found = subprocess.run(["pgrep", "-f", str(rig.config)], capture_output=True, text=True, check=False)
+    return found.stdout.split()
+
+
+def test_a_robot_whose_launcher_is_killed_starts_again_at_once() -> None:
+    with Rig("zenoh") as rig:
+        for _ in range(5):
+            children = rig.kill_launcher()
+            rig.start()
+            assert until(lambda pids=children: all(map(gone, pids)))  # type: ignore[misc]
+        drives_and_stops(rig)
+
+
+def test_of_four_starts_at_once_one_runs() -> None:
+    with Rig("zenoh", start=False) as rig:
+        command = [sys.executable, "-m", "pebble.cli", "up", str(rig.config)]
+        others = [
+            subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+            for _ in range(3)
+        ]
+        rig.start(ready=False)
+        everybody: list[Callable[[], bool]] = [lambda pid=one.pid: gone(pid) for one in others]  # type: ignore[misc]
+        everybody.append(lambda: gone(rig.launcher_pid))
+        assert until(lambda: sum(ended() for ended in everybody) == 3)
+        time.sleep(1.0)
+        assert sum(ended() for ended in everybody) == 3
+        for one in others:
+            if gone(one.pid):
+                assert "already runs" in one.communicate()[0]
+            else:
+                one.terminate()
+                assert one.wait(20) == 0
+        rig.ensure_stopped()
+
+
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+@pytest.mark.parametrize(
+    ("options", "signals"), [({"shutdown_timeout_seconds": 0}, 1), ({}, 2)], ids=["no time", "two signals"]
+)
+def test_a_hurried_stop_stops_the_wheels(kind: str, options: dict[str, Any], signals: int) -> None:
+    with Rig(kind, launcher=options) as rig:
+        rig.operator.send("incoming/drive-values", {"x": 0.5, "z": 0})
+        assert until(rig.mcu.moving)
+        children = descendants(rig.launcher_pid)
+        rig.stop(*[signal.SIGTERM] * signals)
+        assert until(lambda: all(map(gone, children)))
+        assert until(lambda: not rig.mcu.turning(), 2.0)
