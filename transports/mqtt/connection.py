@@ -171,7 +171,7 @@ class _Client(paho.Client):
         """Whether the PUBLISH that arrived, whose topic ends at ``end``, has no payload."""
         head = self._in_packet["packet"]
         start = end + (2 if self._in_packet["command"] & _ANY_QOS else 0)
-        if self._protocol == MQTTProtocolVersion.MQTTv5:
+        if self._protocol == MQTTProtocolVersion.MQTTv5 and start < len(head):
             start += 1 + int(head[start])  # of properties, of which nobody needs 128 bytes
         return len(head) <= start
 
