@@ -38,7 +38,8 @@ def _open_missing_streams() -> None:
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free one: that of this stream
             os.set_inheritable(descriptor, True)
-            setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8"))
+            # As Python's own: it stays open when a child replaces the stream, and its descriptor by a pipe.
+            setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", closefd=False))
 
 
 def _run(arguments: list[str]) -> int:

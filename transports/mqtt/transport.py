@@ -202,7 +202,7 @@ class MqttTransport(Transport):
             self.counters,
             as_published=as_published,
             on_answers=self._note_answers,
-            skips_retained=self.skips_retained,
+            skips_retained=lambda topic: self.skips_retained(topic),
         )
 
     def _connect(self, connection: Connection, stopping: threading.Event) -> None:
