@@ -19,6 +19,7 @@ from pebble import camera
 from pebble.config import default_run_folder
 from pebble.errors import PebbleError
 from pebble.transports.frames import FrameInfo, FrameWriter
+from tests.locking import needs_shared_memory
 from tests.support import ROOT
 
 WIDTH, HEIGHT = 320, 240
@@ -80,6 +81,7 @@ def test_by_its_base_topic_its_run_directory_and_its_config(
             assert next(pictures).shape == (HEIGHT, WIDTH, 3)
 
 
+@needs_shared_memory
 def test_views_are_the_cameras_own_memory(filming: Filming, env: dict[str, str]) -> None:
     with camera("goob", env=env, views=True, timeout=5) as pictures:
         picture = next(pictures)

@@ -66,6 +66,7 @@ def hide() -> None:
             if hasattr(module, attribute):
                 delattr(module, attribute)
     os.environ.setdefault("USERNAME", "ann")
+    os.environ.setdefault("HOME", os.devnull)  # where it is not set, Linux would ask for the user's id
     socket.socketpair = _socketpair  # type: ignore[assignment]
     real = builtins.__import__
 

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from pebble.simulation.micropython.loader import FirmwareModules, firmware_root
+from tests.support import ROOT
 
 ROBOT = """
 from common.counter import up
@@ -116,4 +117,4 @@ def test_main_is_executed_as_main(root: Path) -> None:
 
 def test_the_firmware_is_found() -> None:
     assert (firmware_root() / "common/run.py").is_file()
-    assert "pebble" not in firmware_root().parts[-2:], "errors name the file that people edit"
+    assert firmware_root() == ROOT / "firmware", "errors name the file that people edit"

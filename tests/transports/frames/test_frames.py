@@ -19,6 +19,7 @@ from pebble.errors import TransportError
 from pebble.transports import segments
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
 from pebble.transports.frames.frame import encode
+from tests.locking import needs_shared_memory
 from tests.support import some, until
 from tests.transports.frames.frames_net import FramesNet
 
@@ -199,6 +200,7 @@ def test_a_fork_of_a_writer_or_reader_may_not_use_it(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], timeout=20, check=False).returncode == 3
 
 
+@needs_shared_memory
 def test_both_can_be_opened_again(tmp_path: Path) -> None:
     writer, reader = FrameWriter(tmp_path, "camera", capacity=50_000), FrameReader(tmp_path, "camera")
     for number in (1, 2, 3):

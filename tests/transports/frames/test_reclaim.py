@@ -12,6 +12,7 @@ import pytest
 from pebble.transports import segments
 from pebble.transports.frames import Frame, FrameReader, reclaim, views
 from pebble.transports.frames import reader as frame_reader
+from tests.locking import needs_shared_memory
 from tests.support import until
 from tests.transports.frames.frames_net import FramesNet
 
@@ -39,6 +40,7 @@ def _pools() -> int:
     return sum(end - start >= POOL for start, end, _ in segments.mappings())
 
 
+@needs_shared_memory
 def test_the_pools_of_killed_writers_do_not_add_up(net: FramesNet) -> None:
     with FrameReader(net.folder, "camera", views=True) as reader:
         held: dict[int, Any] = {}
@@ -63,6 +65,7 @@ def test_the_pools_of_killed_writers_do_not_add_up(net: FramesNet) -> None:
     assert not any("zenoh" in path and "deleted" in path for path in _open_files())
 
 
+@needs_shared_memory
 def test_a_living_writers_pool_is_not_given_back_when_its_link_broke(net: FramesNet) -> None:
     with FrameReader(net.folder, "camera") as reader:
         writer = net.writer(size=LARGE)
@@ -76,6 +79,7 @@ def test_a_living_writers_pool_is_not_given_back_when_its_link_broke(net: Frames
         assert until(lambda: reclaim.reclaim() >= 0 and _pools() == 0), "it is looked at again"
 
 
+@needs_shared_memory
 def test_a_writer_that_was_taken_for_dead_sends_bytes(net: FramesNet) -> None:
     writer = net.writer(size=LARGE)
     with FrameReader(net.folder, "camera") as reader:
@@ -88,6 +92,7 @@ def test_a_writer_that_was_taken_for_dead_sends_bytes(net: FramesNet) -> None:
         assert until(lambda: writer.ask()["readers"] == 1)
 
 
+@needs_shared_memory
 def test_past_a_limit_frames_come_as_bytes_and_the_reader_reports_it(
     net: FramesNet, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ import zenoh.shm
 from pebble.errors import TransportError
 from pebble.runtime.parent import tied_to_parent
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, views
+from tests.locking import needs_shared_memory
 from tests.support import ROOT, Child, cases, until
 
 LARGE = 500_000  # bytes: the allocator's margin holds no such frame
@@ -168,6 +169,7 @@ with FrameReader(Path(sys.argv[1]), "camera", views=True) as reader:
 """
 
 
+@needs_shared_memory
 def test_a_frame_that_was_held_too_long_is_invalid(tmp_path: Path) -> None:
     """Its process is stopped, so that the writer takes the memory back; afterwards it looks at its frame again."""
     with FrameWriter(tmp_path, "camera", capacity=LARGE, slots=2) as writer:
