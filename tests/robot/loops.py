@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -28,6 +29,7 @@ from tests.tcp_proxy import TcpProxy
 
 _CONNECTIONS = tuple(itertools.product(("in", "out", "both"), ("incoming/drive-values", "incoming/#", "#")))
 _ROBOTS = ("a second robot with crossed brokers", "a second robot at the same broker")
+_UP_S = 15.0
 _DRIVES_S = 2.0
 _STOPPED_S = 1.0
 _LOOKS_S = 2.0
@@ -67,6 +69,16 @@ def cases() -> Iterator[Case]:
                 yield Case(transport, mirroring, way)
 
 
+def started(kind: str, **options: Any) -> Rig:
+    """A robot that can be driven; where all comes back, its bridge mirrors nothing, and operators do not see it."""
+    rig = Rig(kind, mcu="fred", start=False, **options)
+    rig.start(ready=False)
+    if not until(lambda: all(text in rig.log.read_text() for text in ("tty: ready", "[mqtt_bridge]")), _UP_S):
+        rig.close()
+        raise RuntimeError(f"the robot is not up: {rig.log.read_text()}")
+    return rig
+
+
 @contextmanager
 def wired(case: Case) -> Iterator[tuple[Rig, list[Rig], TcpProxy]]:
     """The robot, all robots, and the other way."""
@@ -80,12 +92,12 @@ def wired(case: Case) -> Iterator[tuple[Rig, list[Rig], TcpProxy]]:
             options = ("connection other", f"address 127.0.0.1:{way.port}", topic, "notifications false")
         local = Broker(folder, *options)
         mirror = case.transport == "zenoh"
-        rig = stack.enter_context(Rig(case.transport, mirror=mirror, mcu="fred", remote=remote, local=local))
+        rig = stack.enter_context(started(case.transport, mirror=mirror, remote=remote, local=local))
         robots = [rig]
         if case.way == _ROBOTS[0]:
-            robots.append(stack.enter_context(Rig("mqtt", mcu="fred", remote=local, local=remote)))
+            robots.append(stack.enter_context(started("mqtt", remote=local, local=remote)))
         elif case.way == _ROBOTS[1]:
-            robots.append(stack.enter_context(Rig(case.transport, mirror=mirror, mcu="fred", remote=remote)))
+            robots.append(stack.enter_context(started(case.transport, mirror=mirror, remote=remote)))
         yield rig, robots, way
 
 
