@@ -1,9 +1,14 @@
-"""Whether this user may lock enough memory for frames in shared memory: 8 MB are usual for others than root."""
+"""Whether this user may lock enough memory for frames in shared memory, as ``pebble doctor`` sees it."""
 
 from __future__ import annotations
 
+import os
+import resource
+
 import pytest
 
-from pebble.transports.frames.shared_memory import lockable
+from pebble.doctor import Level
+from pebble.doctor.checks import memory_lock
 
-needs_shared_memory = pytest.mark.skipif(not lockable(64 << 20), reason="may lock too little memory: see ulimit -l")
+_found = memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], root=os.geteuid() == 0)
+needs_shared_memory = pytest.mark.skipif(_found.level is not Level.OK, reason=f"{_found.text}: {_found.fix}")
