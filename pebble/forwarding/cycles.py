@@ -37,6 +37,8 @@ PROBE_PERIOD_S, _PERIOD_IN_STORM_S = 1.0, 0.1  # between two probes of a topic
 _UNANSWERED = 3  # probes, after which the other way is gone
 #: A stop is published again after 0.5 s at the earliest; what comes back is faster.
 _STOP_PERIOD_S = 0.25
+#: Where a mirror and its robot's bridge are on one way, the bridge logs it; it probes every second what circulates.
+_YIELDS_S = 2.5
 
 
 class Finding(Enum):
@@ -70,16 +72,21 @@ class _Way:
 
 
 class Cycles:
-    """Which topics circulate, by the side they come from. Two threads may call it at once."""
+    """Which topics circulate, by the side they come from. Two threads may call it at once.
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
+    ``yields``: nothing is logged as an error if another bridge is on the same way, and probes it.
+    """
+
+    def __init__(self, clock: Callable[[], float], *, yields: bool = False) -> None:
+        self._clock, self._yields = clock, yields
         self._lock = threading.Lock()
         self._ways: dict[tuple[Side, str], _Way] = {}
         self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
-        self._others: dict[tuple[Side, bytes], None] = {}
+        #: Theirs, and when we relayed each; long ago once it comes back, so that its sender is not on the way.
+        self._others: dict[tuple[Side, bytes], float] = {}
         self._stops: dict[tuple[Side, bytes], float] = {}
         self._closed: Final[set[tuple[Side, str]]] = set()
+        self._unlogged: tuple[Side, str, float] | None = None  # circulates, and since when this is known
 
     def closed(self, side: Side, topic: str) -> bool:
         """Whether what comes from ``side`` on ``topic`` and is forwarded comes back there."""
@@ -128,6 +135,7 @@ class Cycles:
     def poll(self) -> list[tuple[Side, str]]:
         """Once a second: what needs a new probe, because it circulated; forget what does so no more."""
         with self._lock:
+            self._log_error()
             due = []
             for key in [key for key in self._closed if self._clock() - self._ways[key].probed_at >= PROBE_PERIOD_S / 2]:
                 if self._ways[key].unanswered >= _UNANSWERED:
@@ -142,9 +150,12 @@ class Cycles:
         sent_to = self._ours.get(number)
         if sent_to is side.other:
             self._close(side, topic)
-        if sent_to is not None or (side, number) in self._others:
+        if (side, number) in self._others:
+            self._others[side, number] = float("-inf")
             return Finding.PROBE
-        _remember(self._others, (side, number), None)
+        if sent_to is not None:
+            return Finding.PROBE
+        _remember(self._others, (side, number), self._clock())
         return Finding.RELAY
 
     def _close(self, side: Side, topic: str) -> None:
@@ -156,6 +167,19 @@ class Cycles:
         if self._closed:
             log.info("%s circulates, too, from the %s side", topic, side.value)
         else:
+            self._unlogged = side, topic, self._clock()
+            self._log_error()
+        self._closed.add((side, topic))
+
+    def _log_error(self) -> None:
+        if self._unlogged is None:
+            return
+        side, topic, since = self._unlogged
+        if self._yields and self._clock() - since < _YIELDS_S:
+            return
+        if self._yields and any(to is side and at >= since for (to, _), at in self._others.items()):
+            log.info("%s circulates from the %s side; another bridge on the same way probes it", topic, side.value)
+        else:
             log.error(
                 "%s circulates: something else forwards it from the %s to the %s side. Commands that circulate are not "
                 "forwarded. Remove it from the other bridge (a broker's `connection`), or the other robot with this id",
@@ -163,7 +187,7 @@ class Cycles:
                 side.other.value,
                 side.value,
             )
-        self._closed.add((side, topic))
+        self._unlogged = None
 
     def _open(self, side: Side, topic: str) -> None:
         self._ways[side, topic].closed = False

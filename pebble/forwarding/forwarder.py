@@ -123,7 +123,7 @@ class Forwarder:
         self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
         self._events = {side: EventBuffer(transports[side], self.counters, clock=clock) for side in Side}
         self._loopback = {side: LoopbackFilter(clock) for side in Side}
-        self._cycles = Cycles(clock)
+        self._cycles = Cycles(clock, yields=not rules.leaves_robot)  # a mirror, to the bridge
         self._returns = {side: LoopbackFilter(clock, _RETURN_S) for side in Side}  # what circulates, once each
         self._retained_until = {side: float("inf") for side in Side}
         self._subscribed_at = {side: float("inf") for side in Side}

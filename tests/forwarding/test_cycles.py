@@ -221,7 +221,7 @@ class TestSeveralBridges:
             world.send(client, DRIVE, MOVE, ZERO)
             world.send(client, FLAG, b"true", retain=True)
             assert world.rests(3000)
-        assert len(errors(caplog)) == 2  # the bridge's and the mirror's
+        assert len(errors(caplog)) == 1  # the bridge's: the mirror relays its probes
         way.cut()
         world.wait(5)
         assert world.arrives(world.robot, DRIVE, b"again")
@@ -306,6 +306,26 @@ class TestCycles:
         assert cycles.closed(REMOTE, TOPIC)
         assert cycles.poll() == []
         assert cycles.receive(REMOTE, TOPIC, MOVE, once=True) is Finding.PASS
+
+    @pytest.mark.parametrize(
+        ("arrives", "logged"),
+        [((), 1), ((REMOTE,), 0), ((LOCAL,), 1), ((REMOTE, REMOTE), 1)],
+        ids=["none", "on the same way", "on another way", "not from that way: it comes back"],
+    )
+    def test_a_mirror_logs_an_error_unless_another_bridge_probes_the_way(
+        self, network: Network, caplog: pytest.LogCaptureFixture, arrives: tuple[Side, ...], logged: int
+    ) -> None:
+        cycles = Cycles(network.clock, yields=True)
+        cycles.receive(REMOTE, TOPIC, cycles.probe(REMOTE, TOPIC), once=True)
+        for _ in range(5):
+            network.now += 1
+            theirs = Cycles(network.clock).probe(LOCAL, FLAG)
+            for side in arrives:
+                cycles.receive(side, FLAG, theirs, once=True)
+            for side, topic in cycles.poll():
+                cycles.receive(side, topic, cycles.probe(side, topic), once=True)
+        assert cycles.closed(REMOTE, TOPIC)
+        assert len(errors(caplog)) == logged
 
     def test_memory_is_bounded(self, cycles: Cycles) -> None:
         for number in range(1200):
