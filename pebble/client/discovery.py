@@ -18,7 +18,7 @@ from pebble.contract import (
     channel_of,
     codec,
 )
-from pebble.contract.identity import parse_topic
+from pebble.contract.identity import is_of_another, parse_topic
 from pebble.contract.payloads import AutonomyStatus, EstopState, Orientation
 from pebble.errors import PayloadError
 from pebble.media.rate_meter import RateMeter
@@ -122,7 +122,7 @@ class DiscoveredRobot:
 
     def _topic(self, section: str, key: str) -> str | None:
         topic = self.capabilities.get(section, {}).get(key)
-        return topic if isinstance(topic, str) else None
+        return topic if isinstance(topic, str) and not is_of_another(topic, self.base) else None
 
 
 class Discovery:

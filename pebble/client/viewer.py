@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 from pebble.contract import AUDIO_CONTROL, CAPABILITIES, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, codec
+from pebble.contract.identity import is_of_another
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, QoS, Transport
@@ -137,7 +138,8 @@ class Viewer:
     def topic(self, medium: Medium, key: str, channel: Channel) -> str:
         """The effective topic that capabilities list under ``key``, else the channel's own."""
         topic = self.capabilities.get(medium, {}).get(key)
-        return topic if isinstance(topic, str) else channel.topic(self.base)
+        own = isinstance(topic, str) and not is_of_another(topic, self.base)
+        return str(topic) if own else channel.topic(self.base)
 
     # -- the transport's threads
 

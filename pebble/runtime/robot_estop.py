@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from pebble.contract import AUTONOMY_COMMAND, CAPABILITIES, DRIVE, ESTOP_STATE, codec
-from pebble.contract.identity import LEVEL
+from pebble.contract import AUTONOMY_COMMAND, CAPABILITIES, DRIVE, ESTOP_STATE, Channel, codec
+from pebble.contract.identity import LEVEL, is_of_another
 from pebble.contract.payloads import EstopState
 from pebble.errors import PayloadError, TransportError
 from pebble.motion.latch import stop_of
@@ -94,10 +94,18 @@ class RobotEstop:
         self.announces, self.available = bool(estop), estop.get("available") is True
         self.owners = _owners(estop.get("owners"))
         self.drives = drive.get("available") is not False
-        self.drive_topic = _topic(drive.get("topic"), DRIVE.topic(self.base))
-        self.script_topic = _topic(_section(value, "autonomy").get("command_topic"), AUTONOMY_COMMAND.topic(self.base))
+        self.drive_topic = self._topic(drive.get("topic"), DRIVE)
+        self.script_topic = self._topic(_section(value, "autonomy").get("command_topic"), AUTONOMY_COMMAND)
         self.has_capabilities = True  # last: other threads may read meanwhile
         return True
+
+    def _topic(self, listed: object, channel: Channel) -> str:
+        default = channel.topic(self.base)
+        try:
+            topic = check_topic(listed) if isinstance(listed, str) else default
+        except TransportError:
+            return default
+        return default if is_of_another(topic, self.base) else topic
 
     def _receive_state(self, owner: str, payload: bytes) -> bool:
         if not _valid_level(owner) or len(payload) > _STATE_BYTES:
@@ -129,13 +137,6 @@ def _owners(listed: object) -> tuple[str, ...]:
     if not all(isinstance(owner, str) and _valid_level(owner) for owner in listed):
         return ()
     return tuple(dict.fromkeys(listed))
-
-
-def _topic(listed: object, default: str) -> str:
-    try:
-        return check_topic(listed) if isinstance(listed, str) else default
-    except TransportError:
-        return default
 
 
 def _clean(state: EstopState) -> EstopState:

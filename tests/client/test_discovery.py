@@ -71,6 +71,18 @@ def test_a_robot_is_ready_once_it_publishes_how_to_drive_it() -> None:
     assert (seen.transport, seen.drive_topic) == ("zenoh", "somewhere/else")
 
 
+def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
+    discovery = Discovery()
+    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5)
+    drive, lights = "pebble/robots/another/incoming/drive-values", "pebble/robots/another/incoming/lights-solid"
+    value = {"drive": {"available": True, "topic": drive}, "lights": {"solid_topic": lights}}
+    publish(
+        discovery, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, now=0.6, retain=True
+    )
+    assert (seen.drive_topic, seen.lights_topic(flash=False), seen.ready(0.6)) == (None, None, False)
+    assert seen.estop.drive_topic == f"{BASE}/incoming/drive-values"
+
+
 def test_battery_and_message_count() -> None:
     discovery = Discovery()
     publish(discovery, "charging-level", {"value": 7.9, "unit": "v"})

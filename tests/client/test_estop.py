@@ -140,6 +140,16 @@ def test_an_old_robot_gets_zeros_and_one_end_of_its_script(section: dict[str, ob
     assert (stop.finished, stop.confirmed, stop.robots[GOOB].progress) == (True, False, Progress.OLD)
 
 
+def test_zeros_and_ends_of_scripts_go_to_no_other_robot() -> None:
+    stop = sender(GOOB)
+    value = {
+        "drive": {"available": True, "topic": "pebble/robots/fred/incoming/drive-values"},
+        "autonomy": {"command_topic": "pebble/robots/fred/incoming/autonomy-command"},
+    }
+    receive(stop, capabilities(GOOB, value), now=0.0)
+    assert topics(stop.tick(0.0)) == [f"{GOOB}/incoming/autonomy-command", f"{GOOB}/incoming/drive-values"]
+
+
 def test_a_robot_whose_broker_refuses_stops_gets_them_and_zeros_and_is_not_old() -> None:
     stop = sender(GOOB)
     receive(stop, capabilities(GOOB, {"drive": {"available": True}, "estop": {"available": False}}), now=0.0)

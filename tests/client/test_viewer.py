@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from pebble.client.viewer import Viewer
+from pebble.contract import VIDEO_CONTROL
 from pebble.errors import PebbleError
 from pebble.transports import QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -127,3 +128,14 @@ def test_with_an_encoding_as_well_a_flag_that_was_up_stays_up(robot: Robot, view
     viewer.close()
     assert until(lambda: robot.requests[-1:] == [b'{"enabled":false}'])
     assert robot.flags == []
+
+
+def test_requests_go_to_no_other_robot() -> None:
+    robot = Robot()
+    foreign = b'"controls":true,"command_topic":"pebble/robots/fred/incoming/front-camera"'
+    capabilities = CAN.replace(b'"controls":true', foreign)
+    robot.transport.publish(f"{BASE}/outgoing/capabilities", capabilities, qos=QoS.DELIVERED, retain=True)
+    with MemoryTransport("viewer", robot.hub) as transport:
+        viewer = Viewer(transport, BASE, lambda _medium, _payload: None)
+        viewer.wait_for_capabilities(5)
+        assert viewer.topic("video", "command_topic", VIDEO_CONTROL) == REQUEST

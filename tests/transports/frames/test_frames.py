@@ -265,6 +265,7 @@ def test_late_frames_of_a_replaced_writer_are_ignored(tmp_path: Path) -> None:
         assert reader.read(0.2) is None
 
 
+@needs_shared_memory
 def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
     picture = np.arange(3 * 100 * 200, dtype=np.uint8).reshape(100, 200, 3)
     flat = picture.tobytes()
