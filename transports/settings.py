@@ -33,6 +33,10 @@ class MqttSettings:
     as_published: bool = False
     reconnect_max_s: float = 0.5  # 0.5 inside the robot, 2.0 towards a remote broker
     silence_s: float = 2.0  # a connection that does not answer for this long is replaced (T19)
+    #: For programs that only listen. The highest QoS to subscribe with: a broker sends any number of retained messages
+    #: at 0, and at 1 no more than it queues (mosquitto: 1,000). And whether it is to send them at all (MQTT 5).
+    max_qos: int = 1
+    sends_retained: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -51,7 +51,7 @@ def target_of(robot: str | None, options: Target) -> Target:
 @contextmanager
 def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
     """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
-    kind, settings, names, where = _resolve(target)
+    kind, settings, names, where = resolve(target)
     transport = create(kind, f"pebble-tool-{os.getpid()}", settings)
     with closing(transport.open(_OPEN_TIMEOUT_S)):
         if transport.state is not State.CONNECTED:
@@ -60,7 +60,8 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
         yield transport, names
 
 
-def _resolve(target: Target) -> tuple[str, Any, Names, str]:
+def resolve(target: Target) -> tuple[str, Any, Names, str]:
+    """The kind of transport and its settings, the names of topics there, and the place in words. Raises PebbleError."""
     if (target.config is None) == (target.url is None):
         raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
     if target.config is not None:

@@ -28,6 +28,10 @@ COMMANDS = {
     "watch": "watch",
     "snapshot": "watch",
     "web": "web",
+    "record": "record",
+    "recordings": "recordings",
+    "replay": "replay",
+    "analyse": "analyse",
     "cert": "cert",
     "flash": "flash",
     "bench": "bench",
@@ -35,7 +39,16 @@ COMMANDS = {
 }
 
 #: What prints its help when nothing follows.
-_GROUPS: tuple[list[str], ...] = ([], ["topic"], ["bench"], ["sim"], ["script"], ["cert"], ["web", "user"])
+_GROUPS: tuple[list[str], ...] = (
+    [],
+    ["topic"],
+    ["bench"],
+    ["sim"],
+    ["script"],
+    ["cert"],
+    ["recordings"],
+    ["web", "user"],
+)
 
 _HELP = """Runs and inspects Pebble robots.
 
@@ -49,6 +62,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble script new follow   write a first program that moves a robot
     pebble watch goob.json     show its camera and play its microphone
     pebble web goob.json       drive, stop and watch robots in a browser
+    pebble record --url URL    record robots; for recordings, replay, analyse
     pebble cert init NAME      make certificates, so that phones can, too
     pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine

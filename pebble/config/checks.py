@@ -162,7 +162,7 @@ def _web(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
             f"`pebble cert init` and `pebble web user add`, write web_interface.tls; or leave out host",
         )
     if web.mqtt_history.enabled:
-        reader.notes.warning((*path, "mqtt_history"), "is enabled, but recording arrives in a later release; skipped")
+        reader.notes.warning((*path, "mqtt_history"), "is not used: enable services.recorder, which records into files")
     if not web.mqtt.host and web.mqtt != WebMqtt():
         reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
     if web.plain_http and web.tls.certificate is not None:

@@ -7,6 +7,7 @@ from msgspec import Meta, field
 from pebble.config.autonomy import AutonomyManager
 from pebble.config.media import AvDaemon, Media, VideoStream
 from pebble.config.planned import Ros1Bridge
+from pebble.config.recorder import Recorder
 from pebble.config.soundboard import SoundboardHandler
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
@@ -279,6 +280,7 @@ class Services(Section, frozen=True, kw_only=True):
     soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()
     autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()
     web_handler: Annotated[WebHandler, doc("Runs the operator page.")] = WebHandler()
+    recorder: Annotated[Recorder, doc("Records the robot.")] = Recorder()
 
 
 class Root(Section, frozen=True, kw_only=True):

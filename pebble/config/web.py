@@ -39,7 +39,7 @@ class WebTls(Section, frozen=True, kw_only=True):
 
 
 class MqttHistory(Section, frozen=True, kw_only=True):
-    """A record of all messages, which a later release brings."""
+    """The original's record of all messages in MongoDB. Not used: `services.recorder` records into files."""
 
     enabled: Annotated[bool, doc("Keep one.")] = False
     uri: Annotated[str, doc("MongoDB to keep it in.")] = "mongodb://127.0.0.1:27017"

@@ -67,6 +67,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
         (services.soundboard_handler.enabled, _service(config, "soundboard_handler", Stage.CONNECTION)),
         (services.web_handler.enabled, _web_handler(config)),
+        (services.recorder.enabled, _service(config, "recorder", Stage.CONNECTION, preloaded=False)),
         *((True, _on_demand(config, name)) for name in config.on_demand_programs()),
     ]
     return tuple(program for enabled, program in table if enabled)

@@ -172,12 +172,14 @@ class TestOriginal:
         assert all(line.partition("no longer used, ")[2] for line in gone)
 
     def test_services_of_later_releases_are_skipped_with_a_warning_each(self) -> None:
-        enabled = {"services": {"ros1_bridge": {"enabled": True}}, "web_interface": {"mqtt_history": {"enabled": True}}}
+        enabled = {"services": {"ros1_bridge": {"enabled": True}}}
         later = [line for line in read({"robot": {"id": "goob"}} | enabled).warnings if "later release" in line]
-        assert sorted(line.partition(":")[0] for line in later) == [
-            "services.ros1_bridge",
-            "web_interface.mqtt_history",
-        ]
+        assert [line.partition(":")[0] for line in later] == ["services.ros1_bridge"]
+
+    def test_its_record_of_messages_names_ours(self) -> None:
+        enabled = {"web_interface": {"mqtt_history": {"enabled": True}}}
+        (warning,) = [line for line in read({"robot": {"id": "goob"}} | enabled).warnings if "mqtt_history" in line]
+        assert warning == "web_interface.mqtt_history: is not used: enable services.recorder, which records into files"
 
     def test_its_page_for_other_machines_needs_a_certificate(self) -> None:
         config = load(ORIGINAL, env={})
@@ -737,7 +739,7 @@ class TestWebInterface:
         ("keys", "expected"),
         [
             ({"mqtt": {"port": 8883}}, "mqtt: not used: it has no host"),
-            ({"mqtt_history": {"enabled": True}}, "mqtt_history: is enabled, but recording arrives in a later release"),
+            ({"mqtt_history": {"enabled": True}}, "mqtt_history: is not used: enable services.recorder"),
         ],
     )
     def test_keys_without_an_effect_are_reported(self, keys: dict[str, Any], expected: str) -> None:

@@ -368,14 +368,14 @@ def test_what_came_while_the_machine_was_suspended_never_arrives(
 def test_a_stop_of_the_process_while_it_reads_counts(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stops, now, read = [0.0], clock.since_boot, Connection._on_message
+    stops, now, read = [0.0], clock.since_boot, Connection._on_publication
     monkeypatch.setattr(clock, "since_boot", lambda: now() + stops[0])
 
     def read_late(*arguments: Any) -> None:
         stops[0] += 0.6
         read(*arguments)
 
-    monkeypatch.setattr(Connection, "_on_message", read_late)
+    monkeypatch.setattr(Connection, "_on_publication", read_late)
     waited: list[float] = []
     robot, operator = clients(broker.port), connect_as(broker, "operator")
     robot.subscribe(topic, lambda message: waited.append(message.waited_s))

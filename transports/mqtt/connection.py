@@ -58,7 +58,8 @@ _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _BATCH = 64  # messages read in a row before they are delivered
-_RETAIN, _ANY_QOS = 0b1, 0b110  # in the first byte of a PUBLISH
+_RETAIN, _ANY_QOS, _QOS_2 = 0b1, 0b110, 0b100  # in the first byte of a PUBLISH
+_NO_TOPIC = 2  # where a PUBLISH goes on that has a topic alias (MQTT 5), or is malformed
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
 
@@ -114,6 +115,7 @@ class _Client(paho.Client):
 
     on_pong: Callable[[], None]
     on_too_long: Callable[[bytes, int], None]  # with the topic of a PUBLISH, and the length of the packet
+    on_publication: Callable[[bytes, bytes, int], None]  # topic, payload and first byte of a PUBLISH, without paho
     skips: Callable[[bytes], bool]  # whether a retained message of this topic is not wanted
     received = 0  # bytes of the packets so far
     _ahead, _ahead_at = b"", 0  # read from the socket in one go, and how much of that paho has had
@@ -153,27 +155,31 @@ class _Client(paho.Client):
         return bool(self._in_packet["have_remaining"]) and self._in_packet["remaining_length"] > MAX_PACKET
 
     def _handle_publish(self) -> MQTTErrorCode:
-        head, first = self._in_packet["packet"], self._in_packet["command"]
+        """Read a PUBLISH without paho's objects, unless it has properties (MQTT 5) or QoS 2, or is malformed. Hot."""
+        packet, first = self._in_packet["packet"], self._in_packet["command"]
         too_long = self._too_long
-        if not (too_long or first & _RETAIN):
-            return super()._handle_publish()
-        end = 2 + int.from_bytes(head[:2])
-        topic = bytes(head[2:end])
+        end = 2 + int.from_bytes(packet[:2])
+        start = end + 2 if first & _ANY_QOS else end
         if too_long:
-            self.on_too_long(topic, self._in_packet["remaining_length"])
-        elif self._is_removal(end) or not self.skips(topic):
-            return super()._handle_publish()
+            self.on_too_long(bytes(packet[2:end]), self._in_packet["remaining_length"])
+        elif not (first & _RETAIN and self._skips_retained(packet, end, start)):
+            if self._protocol == MQTTProtocolVersion.MQTTv5:
+                start += 1  # the length of the properties
+                plain = start <= len(packet) and packet[start - 1] == 0
+            else:
+                plain = start <= len(packet)
+            if not plain or first & _QOS_2 or end == _NO_TOPIC:
+                return super()._handle_publish()
+            self.on_publication(bytes(packet[2:end]), bytes(packet[start:]), first)
         if not first & _ANY_QOS:
             return MQTTErrorCode.MQTT_ERR_SUCCESS
-        return self._send_puback(int.from_bytes(head[end : end + 2]))
+        return self._send_puback(int.from_bytes(packet[end : end + 2]))
 
-    def _is_removal(self, end: int) -> bool:
-        """Whether the PUBLISH that arrived, whose topic ends at ``end``, has no payload."""
-        head = self._in_packet["packet"]
-        start = end + (2 if self._in_packet["command"] & _ANY_QOS else 0)
-        if self._protocol == MQTTProtocolVersion.MQTTv5 and start < len(head):
-            start += 1 + int(head[start])  # of properties, of which nobody needs 128 bytes
-        return len(head) <= start
+    def _skips_retained(self, packet: bytearray, end: int, start: int) -> bool:
+        """Whether the retained PUBLISH that arrived, whose topic ends at ``end``, is not wanted. Removals are."""
+        if self._protocol == MQTTProtocolVersion.MQTTv5 and start < len(packet):
+            start += 1 + packet[start]  # of properties, of which nobody needs 128 bytes
+        return len(packet) > start and self.skips(bytes(packet[2:end]))
 
     def _handle_on_message(self, message: paho.MQTTMessage) -> None:
         """Without paho's search for callbacks by topic."""
@@ -475,14 +481,16 @@ class Connection:
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
         """Subscribe to filters, each with its noLocal option (MQTT 5 only)."""
         topics: list[Any]
-        asked = list(filters)
+        asked, most = list(filters), min(int(qos), self._settings.max_qos)
         if self._modern:
+            handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+            if not self._settings.sends_retained:
+                handling = SubscribeOptions.RETAIN_DO_NOT_SEND
             topics = [
-                (filter_, SubscribeOptions(qos=int(qos), noLocal=no_local, retainAsPublished=self.as_published))
-                for filter_, no_local in asked
+                (filter_, SubscribeOptions(most, no_local, self.as_published, handling)) for filter_, no_local in asked
             ]
         else:
-            topics = [(filter_, int(qos)) for filter_, _ in asked]
+            topics = [(filter_, most) for filter_, _ in asked]
         return self._request(self._client.subscribe, topics, [filter_ for filter_, _ in asked])
 
     def unsubscribe(self, filters: list[str]) -> PendingAck:
@@ -569,6 +577,7 @@ class Connection:
         client.on_unsubscribe = self._on_unsubscribe
         client.on_publish = self._on_publish
         client.on_message = self._on_message
+        client.on_publication = self._on_publication
         return client
 
     def _note_answer(self) -> None:
@@ -624,16 +633,20 @@ class Connection:
             self._delay.acknowledged(sent_at, now)
 
     def _on_message(self, _client: Any, _data: Any, raw: paho.MQTTMessage) -> None:
+        first = (_ANY_QOS if raw.qos else 0) | (_RETAIN if raw.retain else 0)
+        self._on_publication(raw._topic, bytes(raw.payload), first)
+
+    def _on_publication(self, raw_topic: bytes, payload: bytes, first: int) -> None:
         self._packets += 1
         try:
-            topic = raw.topic
+            topic = raw_topic.decode()
         except UnicodeDecodeError:
             self._counters.add("malformed")
             return
-        retain = bool(raw.retain)
+        retain = bool(first & _RETAIN)
         retain_requested = retain if self.as_published else (True if retain else None)
-        qos = QoS(min(raw.qos, 1))
-        self._inbox.append(Message(topic, bytes(raw.payload), qos, retain, retain_requested, self._since))
+        qos = QoS.DELIVERED if first & _ANY_QOS else QoS.LATEST
+        self._inbox.append(Message(topic, payload, qos, retain, retain_requested, self._since))
 
     def _skips(self, topic: bytes) -> bool:
         if self._inbox:

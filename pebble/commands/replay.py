@@ -1,0 +1,307 @@
+"""``pebble replay``: publishes a recording again, harmlessly unless asked for more."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pebble.client.connection import password
+from pebble.client.key_decoder import END, LEFT, RIGHT, SPACE, KeyDecoder
+from pebble.client.names import id_of
+from pebble.client.url import settings_of
+from pebble.commands import show
+from pebble.commands.options import CaCert, PasswordFile
+from pebble.errors import PebbleError
+from pebble.recordings.library import files
+from pebble.recordings.period import SINCE_HELP, UNTIL_HELP, parse_period
+from pebble.recordings.replay.player import FASTEST, SLOWEST, Player
+from pebble.recordings.replay.robots import ReplayedRobots
+from pebble.recordings.replay.rules import SYSTEM, Options, Rules
+from pebble.recordings.replay.source import ReplaySource
+from pebble.transports import Message, Transport, create
+
+if TYPE_CHECKING:
+    from pebble.client.terminal_keys import Terminal
+
+_KEYS = "Space pauses, ← and → go 10 s back and on, + and - change the speed, Ctrl-C ends."
+_STEP_NS = 10 * 10**9
+_FASTER = 2.0
+_WITH_COMMANDS = 1.0  # the lowest speed: a drive command moves a robot until the next one
+_SHOW_PERIOD_S = 0.1
+
+RecordingsArgument = Annotated[
+    list[Path],
+    typer.Argument(help="Recordings, or folders of them.", metavar="FILE|FOLDER…", show_default=False),
+]
+UrlOption = Annotated[
+    str, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL", show_default=False)
+]
+
+
+class Stamps(StrEnum):
+    """What becomes of the stamps in payloads."""
+
+    SHIFT = "shift"
+    AS_IS = "as-is"
+
+
+def replay(
+    recordings: RecordingsArgument,
+    url: UrlOption,
+    base: Annotated[
+        str | None, typer.Option(help=f"First level of the new topics. [default: {SYSTEM}]", metavar="SYSTEM")
+    ] = None,
+    same_base: Annotated[
+        bool, typer.Option("--same-base", help="Under the recorded topics, while these robots are off.")
+    ] = False,
+    speed: Annotated[float, typer.Option(min=SLOWEST, max=FASTEST, help="1: as it was.")] = 1.0,
+    since: Annotated[str | None, typer.Option(help=SINCE_HELP, metavar="TIME")] = None,
+    until: Annotated[str | None, typer.Option(help=UNTIL_HELP, metavar="TIME")] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Wait for the space key.")] = False,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Only recorded topics that match; may be repeated.", metavar="FILTER")
+    ] = None,
+    incoming: Annotated[
+        bool, typer.Option("--incoming", help="Drive commands of people, lights and sounds as well.")
+    ] = False,
+    actions: Annotated[
+        bool, typer.Option("--actions", help="With --incoming: all other commands as well; asks first.")
+    ] = False,
+    keep: Annotated[
+        bool,
+        typer.Option(
+            "--keep", help="Retain what was retained, until the end; a killed process leaves it. Heartbeats never."
+        ),
+    ] = False,
+    stamps: Annotated[Stamps, typer.Option(help="Move the stamps in payloads to now, or leave them.")] = Stamps.SHIFT,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Publish a recording again, at its pace.
+
+    By default it appears under other topics, `replay/` for `pebble/`, without any command, and nothing of it is
+    retained. It does not start, and ends at once, where a robot is live under the same topics. At the end its robots
+    are published as offline; if the process is killed, the broker does it. A replay stops no robot and resets no
+    emergency stop, whatever the options.
+
+    With a terminal: space pauses, the arrows go 10 s back and on, + and - change the speed. Ctrl-C ends.
+
+    \b
+        pebble replay walk.mcap --url mqtt://127.0.0.1
+        pebble replay recordings --url mqtt://broker --since 10:00 --speed 4
+        pebble replay walk.mcap --url mqtt://127.0.0.1 --base test --incoming
+    """
+    options = Options(
+        system=None if same_base else base or SYSTEM,
+        incoming=incoming,
+        actions=actions,
+        retain=keep,
+        shift=stamps is Stamps.SHIFT,
+        only=tuple(only or ()),
+    )
+    terminal = _has_terminal()
+    _check(options, base, url, paused=paused, terminal=terminal)
+    if incoming and speed < _WITH_COMMANDS:
+        raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
+    connection = settings_of(url, password=password(password_file), ca_cert=ca_cert)
+    since_ns, until_ns = parse_period(since, until, now=datetime.now().astimezone())
+    source = ReplaySource(files(recordings))
+    rules = Rules(options, source.channels)
+    if not rules.robots:
+        raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
+    if actions:
+        _confirm(rules)
+    console = _Console()
+    with ExitStack() as stack:
+        stack.enter_context(console.noting_signals())
+        robots = stack.enter_context(
+            ReplayedRobots(_maker(*connection), rules.robots, now=time.monotonic, wall_ms=_wall_ms, wait=console.listen)
+        )
+        player = Player(
+            source,
+            rules,
+            robots.publish,
+            now=time.monotonic,
+            wall_ns=time.time_ns,
+            wait=console.wait,
+            since_ns=since_ns,
+            until_ns=until_ns,
+            speed=speed,
+            slowest=_WITH_COMMANDS if incoming else SLOWEST,
+            loop=loop,
+            paused=paused,
+        )
+        typer.echo(f"{', '.join(show.printable(one) for one in rules.robots)}{': ' + _KEYS if terminal else ''}")
+        sys.stdout.flush()
+        if terminal:
+            stack.enter_context(console.keys())
+        console.attach(player, robots)
+        player.run()
+    typer.echo(f"{player.sent} sent, {player.skipped} skipped")
+    return 0 if console.ended in ("", "SIGINT", END) else 1
+
+
+def register(app: typer.Typer) -> None:
+    app.command("replay")(replay)
+
+
+def _check(options: Options, base: str | None, url: str, *, paused: bool, terminal: bool) -> None:
+    same = options.system is None
+    if same and base is not None:
+        raise PebbleError("--base and --same-base exclude each other")
+    if same and options.retain:
+        raise PebbleError("--keep is for another base: under its own one it would remove a robot's retained messages")
+    if same and url.startswith("zenoh:"):
+        raise PebbleError(
+            "zenoh:RUN_DIR is a robot's own transport, where its programs obey what they receive: --same-base needs mqtt://"
+        )
+    if options.actions and not options.incoming:
+        raise PebbleError("--actions needs --incoming")
+    if paused and not terminal:
+        raise PebbleError("--paused needs a terminal, whose space key goes on")
+
+
+def _confirm(rules: Rules) -> None:
+    """Ask for each robot's id. Raises PebbleError for any other answer."""
+    for base in rules.robots:
+        name = id_of(base).rpartition("/")[2]
+        answer = typer.prompt(f"Type {show.printable(name)} to send the recorded actions to {show.printable(base)}")
+        if answer.strip() != name:
+            raise PebbleError(f"{show.printable(base)}: not confirmed")
+
+
+def _maker(kind: str, settings: object) -> Callable[[str, Message | None], Transport]:
+    def make(name: str, will: Message | None) -> Transport:
+        return create(kind, name.replace("/", "-"), settings, will=will)
+
+    return make
+
+
+def _wall_ms() -> int:
+    return time.time_ns() // 1_000_000
+
+
+def _has_terminal() -> bool:
+    """Whether keys can be read: not in a pipe, and not on Windows."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        return False
+    try:
+        import termios  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+class _Console:
+    """Waits for the player; meanwhile keys, signals and the state of the connection are looked at."""
+
+    def __init__(self) -> None:
+        self.ended = ""  # why, if not by the end of the recording
+        self._player: Player | None = None
+        self._robots: ReplayedRobots | None = None
+        self._terminal: Terminal | None = None
+        self._decoder = KeyDecoder()
+        self._shown_at = 0.0
+        self._problem = ""
+
+    def attach(self, player: Player, robots: ReplayedRobots) -> None:
+        self._player, self._robots = player, robots
+        if self.ended:
+            player.stop()
+
+    @contextmanager
+    def noting_signals(self) -> Iterator[None]:
+        """Signals end the replay; until all is cleaned up no further one ends this process."""
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        before = {number: signal.signal(number, self._on_signal) for number in numbers}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    @contextmanager
+    def keys(self) -> Iterator[None]:
+        from pebble.client.terminal_keys import opened
+
+        with opened() as terminal:
+            self._terminal = terminal
+            try:
+                yield
+            finally:
+                self._terminal = None
+
+    def listen(self, seconds: float) -> None:
+        """Before the player starts, and after it has ended."""
+        if self.ended and self._player is None:
+            raise KeyboardInterrupt
+        time.sleep(seconds)
+
+    def wait(self, seconds: float) -> None:
+        """Raises ReplayError if one of the robots is live."""
+        player, robots = self._player, self._robots
+        if player is None or robots is None:
+            return
+        if self._terminal is None:
+            time.sleep(seconds)
+            self._report(robots.problem)
+        else:
+            self._handle_keys(self._terminal, player, seconds)
+            self._show(self._terminal, player, robots)
+        robots.check()
+        if self.ended and not player.ended:
+            player.stop()
+
+    def _report(self, problem: str) -> None:
+        """Where there is no status line, a line for each change."""
+        if problem != self._problem:
+            self._problem = problem
+            typer.echo(f"pebble: {show.printable(problem) or 'it goes on'}", err=True)
+
+    def _on_signal(self, number: int, _frame: object) -> None:
+        self.ended = self.ended or signal.Signals(number).name
+
+    def _handle_keys(self, terminal: Terminal, player: Player, seconds: float) -> None:
+        due = self._decoder.due
+        data = terminal.read(seconds if due is None else min(seconds, due - time.monotonic()))
+        for key in self._decoder.feed(data, time.monotonic()):
+            self._press(key, player)
+        if terminal.suspended:
+            player.pause()
+            terminal.stand_still()
+        self.ended = self.ended or terminal.ended
+
+    def _press(self, key: str, player: Player) -> None:
+        if key == SPACE:
+            (player.resume if player.paused else player.pause)()
+        elif key in (LEFT, RIGHT):
+            player.seek(player.position_ns + (_STEP_NS if key == RIGHT else -_STEP_NS))
+        elif key in ("+", "="):
+            player.speed *= _FASTER
+        elif key == "-":
+            player.speed /= _FASTER
+        elif key == END:
+            self.ended = END
+
+    def _show(self, terminal: Terminal, player: Player, robots: ReplayedRobots) -> None:
+        if (now := time.monotonic()) - self._shown_at >= _SHOW_PERIOD_S:
+            self._shown_at = now
+            terminal.show(show.printable(status(player, robots.problem)))
+
+
+def status(player: Player, problem: str) -> str:
+    """One line: the time in the recording, the speed, and what was sent."""
+    moment = datetime.fromtimestamp(player.position_ns / 1e9).astimezone()
+    doing = problem or ("paused" if player.paused else f"× {player.speed:g}")
+    time_ = f"{moment:%Y-%m-%d %H:%M:%S}.{moment.microsecond // 100_000}"
+    return f"{time_} · {doing} · {player.sent} sent · {player.skipped} skipped"

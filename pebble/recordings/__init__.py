@@ -1,0 +1,1 @@
+"""Recordings: what robots and operators published, in MCAP files."""

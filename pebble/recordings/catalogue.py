@@ -1,0 +1,119 @@
+"""What recordings hold, without reading all of them where their summaries say it."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from pebble.recordings.files.mcap import FILE_TOPIC, Channel, Recorded, number_in
+from pebble.recordings.files.reader import DAMAGE, MISSING, RecordingError, Summary, mapped, metadata_of, read
+from pebble.recordings.files.rewrite import REWRITTEN
+from pebble.recordings.files.scan import Damage
+from pebble.recordings.library import ACTIVE, merged, robot_of
+from pebble.recordings.recorder.intake import EVENTS
+from pebble.transports.topics import matches
+
+_SHOWN_EVENTS: Final = frozenset({"gap", "clock", "dropped", "pruned", "recovered", "damaged", "removed", "late"})
+
+
+@dataclass(slots=True)
+class FileInfo:
+    """One file."""
+
+    path: Path
+    size: int
+    messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    missing: int = 0
+    finished: bool = True
+    damaged: bool = False
+    topics: Counter[str] = field(default_factory=Counter)  # messages by topic
+    robots: set[str] = field(default_factory=set)
+
+    @property
+    def is_active(self) -> bool:
+        return self.path.name.endswith(ACTIVE)
+
+
+def look_at(path: Path) -> FileInfo:
+    """What a file holds; one without a summary is read as a whole. Raises RecordingError."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from None
+    info = FileInfo(path, size)
+    with mapped(path) as data:
+        summary = Summary.of(data)
+        if summary is None:
+            _read_all(info, data)
+        else:
+            _take_over(info, summary, data)
+    return info
+
+
+def _take_over(info: FileInfo, summary: Summary, data: Any) -> None:
+    statistics = summary.statistics
+    info.messages, info.first_ns, info.last_ns = statistics.messages, statistics.first_ns, statistics.last_ns
+    about = metadata_of(data)
+    info.missing = sum(number_in(about.get(name, {}), MISSING) for name in (DAMAGE, REWRITTEN))
+    info.damaged = DAMAGE in about
+    for number, count in statistics.counts.items():
+        if number in summary.channels:
+            _count(info, summary.channels[number], count)
+
+
+def _read_all(info: FileInfo, data: Any) -> None:
+    damage = Damage()
+    for message in read(data, damage):
+        info.first_ns = info.first_ns or message.log_ns
+        info.last_ns = max(info.last_ns, message.log_ns)
+        info.messages += 1
+        _count(info, message.channel, 1)
+    info.finished, info.missing, info.damaged = False, damage.missing, bool(damage.spans)
+
+
+def _count(info: FileInfo, channel: Channel, count: int) -> None:
+    if channel.topic == FILE_TOPIC:
+        return
+    info.topics[channel.topic] += count
+    robot = robot_of(channel)
+    if robot is not None:
+        info.robots.add(robot)
+
+
+def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
+    """What happened to the recording itself, in the order of time."""
+    for message in merged(paths, chooses=lambda channel: channel.topic == EVENTS):
+        try:
+            event = json.loads(message.payload)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(event, dict) and event.get("event") in _SHOWN_EVENTS:
+            yield {**event, "t": message.log_ns // 10**6}
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """Which messages are wanted; without any condition all of robots, brokers and the recorder."""
+
+    robot: str | None = None  # system/type/id
+    topics: tuple[str, ...] = ()  # filters; one without the robot's identity begins at any robot's
+    text: str | None = None  # somewhere in the payload
+
+    def chooses(self, channel: Channel) -> bool:
+        if self.robot is not None and robot_of(channel) != self.robot:
+            return False
+        return not self.topics or any(_matches(filter_, channel.topic) for filter_ in self.topics)
+
+    def accepts(self, message: Recorded) -> bool:
+        return self.text is None or self.text.encode() in message.payload
+
+
+def _matches(filter_: str, topic: str) -> bool:
+    below = filter_.split("/", 1)[0] in ("incoming", "outgoing")
+    return matches(f"+/+/+/{filter_}" if below else filter_, topic)

@@ -1,0 +1,1 @@
+"""MCAP files: how they are written, read in any state, and finished."""

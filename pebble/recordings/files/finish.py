@@ -1,0 +1,215 @@
+"""Finishes in place what a killed recorder has left: no copy is made, so it works on a full disk.
+
+The torn end is cut off and the summary is written. Damaged bytes between records are covered by a record that every
+reader of MCAP skips; of them only the first nine change.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import msgspec
+
+from pebble.recordings.files import mcap
+from pebble.recordings.files.mcap import HEAD, MESSAGE, Channel, ChunkIndex, DamageError, Metadata, Op, Schema
+from pebble.recordings.files.reader import DAMAGE, MISSING, RecordingError, Summary, mapped, unnamed
+from pebble.recordings.files.scan import Block, Damage, blocks
+from pebble.recordings.files.writer import Contents
+
+_TORN, _DAMAGED = "torn_bytes", "damaged_bytes"
+CANNOT_BE_READ: Final = 3  # exit code
+_LIBRARY: Final = "pebble"
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """What a file holds now."""
+
+    messages: int
+    missing: int  # by their numbers; a torn end may have held more
+    damaged_bytes: int
+    torn_bytes: int
+
+    @property
+    def whole(self) -> bool:
+        return not (self.missing or self.damaged_bytes or self.torn_bytes)
+
+
+def finish(path: Path) -> Finished:
+    """Make ``path`` a finished file. May be interrupted at any moment, and called again.
+
+    Raises RecordingError, OSError.
+    """
+    with path.open("r+b", buffering=0) as file:
+        finished = _finish(file, path)
+        os.fsync(file.fileno())
+        return finished
+
+
+def main(arguments: list[str]) -> int:
+    """``python -m pebble.recordings.files.finish PATH``: prints what the file holds now, as JSON."""
+    try:
+        made = finish(Path(arguments[0]))
+    except (RecordingError, DamageError) as error:
+        sys.stderr.write(f"{error}\n")
+        return CANNOT_BE_READ
+    except (OSError, IndexError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    sys.stdout.buffer.write(msgspec.json.encode(made))
+    return 0
+
+
+def _finish(file: BinaryIO, path: Path) -> Finished:
+    damage, contents = Damage(), _Contents()
+    with mapped(path) as data:
+        for block in blocks(data, damage):
+            contents.add(block, data)
+        if not contents.end_at:
+            raise RecordingError(f"{path}: nothing in it can be read")
+        contents.complete(Summary.of(data))
+        covers = sorted(contents.wrong + damage.spans)
+        damaged = max(contents.covered, contents.damaged_before) + sum(end - begin for begin, end in covers)
+        torn = contents.torn + (0 if damage.finished else len(data) - contents.end_at)
+    finished = Finished(contents.messages, contents.missing, damaged, torn)
+    if damage.finished and not covers:
+        return finished
+    rest = contents.mend_indexes(file, covers)
+    _cover(file, covers, contents.file)
+    file.truncate(contents.end_at)
+    file.seek(contents.end_at)
+    _write(file, rest)
+    contents.end_at += len(rest)
+    if not finished.whole:
+        numbers = {MISSING: finished.missing, _DAMAGED: damaged, _TORN: torn}
+        about = Metadata(DAMAGE, {name: str(number) for name, number in numbers.items()})
+        contents.metadata.append((about, contents.end_at))
+        _write(file, about.pack())
+        contents.end_at += len(about.pack())
+    _write(file, contents.end(contents.end_at))
+    return finished
+
+
+def _cover(file: BinaryIO, spans: list[tuple[int, int]], name: str) -> None:
+    for begin, end in spans:
+        start = b"" if begin else mcap.header(_LIBRARY, name)
+        length = end - begin - len(start) - HEAD.size
+        if length < 0:
+            raise RecordingError(f"{end - begin} damaged bytes are too few to be covered")
+        file.seek(begin)
+        _write(file, start + HEAD.pack(Op.PADDING, length))
+
+
+def _write(file: BinaryIO, data: bytes) -> None:
+    rest = memoryview(data)
+    while rest:
+        rest = rest[file.write(rest) :]
+
+
+class _Contents(Contents):
+    """What was found in a file."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.file = ""  # its name, which its chunks repeat
+        self.end_at = 0  # where the data end that can be kept
+        self.missing = 0  # messages, by their numbers
+        self.wrong: list[tuple[int, int]] = []  # indexes that say something else than their chunk
+        self.covered = self.damaged_before = self.torn = 0  # bytes, when the file was finished before
+        self._mends: list[tuple[int, int, bytes]] = []  # number of a chunk, where its indexes belong, and what they are
+        self._due = self._missed_before = 0
+
+    def add(self, block: Block, data: Any) -> None:
+        if block.op is Op.METADATA:
+            metadata = Metadata.unpack(block.body)
+            if metadata.name == DAMAGE:  # written again behind the data
+                self.torn = mcap.number_in(metadata.items, _TORN)
+                self._missed_before = mcap.number_in(metadata.items, MISSING)
+                self.damaged_before = mcap.number_in(metadata.items, _DAMAGED)
+                return
+            self.metadata.append((metadata, block.at))
+        elif block.op is Op.PADDING:
+            self.covered += block.end - block.at
+        elif block.op is Op.CHUNK:
+            self.file = self.file or mcap.file_of_chunk(block.body)
+            self._add_chunk(block, data)
+        self.end_at = block.end
+
+    def complete(self, summary: Summary | None) -> None:
+        """Take over what only the summary knows, if there is one."""
+        if summary is not None:
+            self.channels = {**summary.channels, **self.channels}
+            before = summary.statistics.messages + self._missed_before
+            self.missing = max(self.missing, before - self.messages)  # the last ones may be missing, too
+        for number in self.counts.keys() - self.channels.keys():
+            self.channels[number] = unnamed(number)
+
+    def mend_indexes(self, file: BinaryIO, covers: list[tuple[int, int]]) -> bytes:
+        """Write the indexes of chunks anew, in place of damaged bytes in ``covers``; returns those of the last chunk.
+
+        Where bytes are lost they have no room: readers by index do not see such a chunk, all others do.
+        """
+        for number, at, indexes in self._mends:
+            place = next((place for place, span in enumerate(covers) if span[0] == at), None)
+            room = 0 if place is None else covers[place][1] - at - len(indexes)
+            if place is not None and (room == 0 or room >= HEAD.size):
+                file.seek(at)
+                _write(file, indexes)
+                covers[place : place + 1] = [(at + len(indexes), covers[place][1])] if room else []
+            elif at == self.end_at:
+                return indexes
+            else:
+                self.chunks[number] = replace(self.chunks[number], start_ns=0, end_ns=0, indexes={}, indexes_length=0)
+        return b""
+
+    def _add_chunk(self, block: Block, data: Any) -> None:
+        entries = self._entries(block.body)
+        times = [log_ns for each in entries.values() for log_ns, _ in each]
+        expected, indexes = b"", {}
+        for channel, each in entries.items():
+            indexes[channel] = block.record_end + len(expected)
+            expected += mcap.message_index(channel, each)
+        if data[block.record_end : block.end] != expected:
+            self._mends.append((len(self.chunks), block.record_end, expected))
+            if block.end > block.record_end:
+                self.wrong.append((block.record_end, block.end))
+        compression, packed = mcap.chunk_compression(data[block.at + HEAD.size : block.record_end])
+        self.chunks.append(
+            ChunkIndex(
+                min(times, default=0),
+                max(times, default=0),
+                block.at,
+                block.record_end - block.at,
+                indexes,
+                len(expected),
+                compression,
+                packed,
+                len(block.body),
+            )
+        )
+
+    def _entries(self, records: bytes) -> dict[int, list[tuple[int, int]]]:
+        """The indexes that belong to the records of a chunk."""
+        entries: dict[int, list[tuple[int, int]]] = {}
+        for op, begin, stop in mcap.records(records):
+            if op == Op.MESSAGE:
+                channel, sequence, log_ns, _ = MESSAGE.unpack_from(records, begin)
+                entries.setdefault(channel, []).append((log_ns, begin - HEAD.size))
+                self.count(channel, log_ns)
+                self.missing += max(0, sequence - self._due)
+                self._due = sequence + 1
+            elif op == Op.CHANNEL:
+                one = Channel.unpack(records[begin:stop])
+                self.channels.setdefault(one.id, one)
+            elif op == Op.SCHEMA:
+                schema = Schema.unpack(records[begin:stop])
+                self.schemas.setdefault(schema.id, schema)
+        return entries
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""The recorder: from a connection to files."""

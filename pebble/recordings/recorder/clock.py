@@ -1,0 +1,43 @@
+"""Times of received messages: wall time that follows jumps of the clock only where the recorder says so. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+_JUMP_NS: Final = 500_000_000
+_FOLLOWED_PER_S: Final = 5_000_000  # nanoseconds per second: clocks drift, and NTP slews by 0.5 ms per second
+
+
+class RecordingClock:
+    """Wall time as an offset to a clock that goes on while the machine is suspended and cannot be set.
+
+    ``wall_ns`` and ``boot_ns`` are those clocks, in nanoseconds.
+    """
+
+    def __init__(self, wall_ns: Callable[[], int], boot_ns: Callable[[], int]) -> None:
+        self._wall_ns, self._boot_ns = wall_ns, boot_ns
+        self._checked_at = boot_ns()
+        self.offset_ns = wall_ns() - self._checked_at
+
+    def at(self, boot_ns: int) -> int:
+        """Wall time, in nanoseconds since 1970, of a moment on the other clock."""
+        return boot_ns + self.offset_ns
+
+    def now(self) -> int:
+        return self.at(self._boot_ns())
+
+    def follow(self) -> float:
+        """To be called once a second. Returns by how many seconds the wall clock was set, 0 if it was not.
+
+        Small differences are followed slowly, so that time never stands still within a file.
+        """
+        now = self._boot_ns()
+        difference = self._wall_ns() - now - self.offset_ns
+        most = (now - self._checked_at) * _FOLLOWED_PER_S // 10**9
+        self._checked_at = now
+        if abs(difference) > _JUMP_NS:
+            self.offset_ns += difference
+            return difference / 1e9
+        self.offset_ns += max(-most, min(most, difference))
+        return 0.0

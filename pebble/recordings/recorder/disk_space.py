@@ -1,0 +1,64 @@
+"""Which recordings make room for new ones. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from pebble.recordings.recorder.folder import Entry
+
+_DAY_S = 86_400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the folder may hold; 0: no limit. ``free_bytes`` stay free on its file system."""
+
+    keep_bytes: int = 0
+    keep_media_days: float = 0.0
+    keep_state_days: float = 0.0
+    free_bytes: int = 2 << 30
+
+
+@dataclass(frozen=True, slots=True)
+class Disk:
+    """The file system of the folder."""
+
+    free_bytes: int
+    has_inodes: bool = True
+
+
+def surplus(entries: Iterable[Entry], limits: Limits, disk: Disk) -> list[Entry]:
+    """What to delete now to keep the limits of space: the oldest first, pictures and sound before state.
+
+    Files that are being written are never among them. The newest file of each kind stays.
+    """
+    listed = list(entries)
+    used, free = sum(entry.size for entry in listed), disk.free_bytes
+    deleted = []
+    for entry in _deletable(listed):
+        too_much = limits.keep_bytes and used > limits.keep_bytes
+        if not too_much and free >= limits.free_bytes and disk.has_inodes:
+            break
+        deleted.append(entry)
+        used -= entry.size
+        free += entry.size
+        disk = Disk(free)
+    return deleted
+
+
+def outdated(entries: Iterable[Entry], limits: Limits, now: float) -> Entry | None:
+    """One file that is older than the limits of age allow; one at a time, because the clock may have been set wrong."""
+    for entry in _deletable(list(entries)):
+        days = limits.keep_media_days if entry.is_media else limits.keep_state_days
+        if days and now - entry.ended > days * _DAY_S:
+            return entry
+    return None
+
+
+def _deletable(entries: list[Entry]) -> list[Entry]:
+    """In the order in which they go."""
+    finished = sorted((entry for entry in entries if not entry.is_active), key=lambda entry: entry.number)
+    media = [entry for entry in finished if entry.is_media]
+    state = [entry for entry in finished if not entry.is_media]
+    return media[:-1] + state[:-1]

@@ -1,0 +1,37 @@
+"""What is to be done again after some time. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+
+class Due:
+    """What is to be done again after some time."""
+
+    def __init__(self, boot_ns: Callable[[], int]) -> None:
+        self._boot_ns = boot_ns
+        self._done: dict[str, int] = {}
+        self._turned = boot_ns()
+        self._awake: int | None = None
+        self._awake_at = self._turned
+
+    def every(self, what: str, seconds: float) -> bool:
+        now = self._boot_ns()
+        if now - self._done.get(what, self._turned) < seconds * 1e9:
+            self._done.setdefault(what, now)
+            return False
+        self._done[what] = now
+        return True
+
+    def late_s(self, expected_s: float) -> float:
+        """By how much longer than expected the last turn took."""
+        now = self._boot_ns()
+        took, self._turned = (now - self._turned) / 1e9, now
+        return took - expected_s
+
+    def suspended_s(self, awake_ns: int) -> float:
+        """For how long the machine was suspended since the last call."""
+        now = self._boot_ns()
+        slept = 0 if self._awake is None else (now - self._awake_at) - (awake_ns - self._awake)
+        self._awake, self._awake_at = awake_ns, now
+        return slept / 1e9

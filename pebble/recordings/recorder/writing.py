@@ -1,0 +1,279 @@
+"""What the recorder's writer thread does: files that are open, room for them, and what happens when there is none."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from collections.abc import Mapping
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from pebble.recordings.files.mcap import Packer
+from pebble.recordings.recorder.background import Background
+from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
+from pebble.recordings.recorder.due import Due
+from pebble.recordings.recorder.finisher import Finisher
+from pebble.recordings.recorder.folder import STATE
+from pebble.recordings.recorder.intake import EVENTS, FORGET, Intake
+from pebble.recordings.recorder.lane import OTHER_MEDIA, Item, OpenFile, lane_of
+from pebble.recordings.recorder.retained import RetainedValues
+from pebble.recordings.stamps import is_media
+from pebble.runtime.rate_limit import RateLimitedLog
+
+if TYPE_CHECKING:
+    from pebble.recordings.recorder.recorder import Recorder
+
+log = logging.getLogger(__name__)
+
+_SPACE_S: Final = 2.0  # between two looks at the disk
+_LISTED_S: Final = 60.0  # between two looks at all files
+_AGE_S: Final = 60.0  # between two files that are deleted for their age
+_IDLE_NS: Final = 60 * 10**9  # a robot's media file without pictures is finished after this
+_MOST_MEDIA: Final = 32  # lanes
+_when = attrgetter("boot_ns")
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+
+
+class _Blocked(NamedTuple):
+    """Why nothing is written, and since when."""
+
+    why: str
+    since_ns: int
+    dropped: int
+    full: bool
+
+
+class Writing:
+    """The open files of one recorder. Not thread-safe."""
+
+    def __init__(self, recorder: Recorder, intake: Intake, background: Background, about: Mapping[str, str]) -> None:
+        self.slowest_flush_s = 0.0
+        self._recorder, self._intake, self._background, self._about = recorder, intake, background, about
+        self._folder, self._options, self._clock = recorder.folder, recorder.options, recorder.clock
+        self._counters = recorder.counters
+        self._packer = Packer(recorder.options.level)
+        self._files: dict[str, OpenFile] = {}  # by lane
+        self._retained = RetainedValues()
+        self._finisher = Finisher(background, recorder.event, self._note_finished)
+        self._blocked: _Blocked | None = None
+        self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
+        self._noted_drops = 0
+        self._changed = False  # files were finished since the folder was listed
+        self._quiet_log = RateLimitedLog(log, period_s=60.0)
+
+    @property
+    def blocked(self) -> str:
+        return "" if self._blocked is None else self._blocked.why
+
+    def mend_leftovers(self) -> int:
+        """Finish what a recorder before this one has left; returns how many files."""
+        left = [entry.path for entry in self._folder.entries() if entry.is_active]
+        for path in left:
+            self._finisher.mend(path)
+        return len(left)
+
+    # -- messages
+
+    def add(self, item: Item) -> None:
+        """Never raises."""
+        try:
+            self._add(item)
+        except Exception:  # noqa: BLE001  one message must not take others with it
+            self._counters["errors"] += 1
+            self._intake.drop(1)
+            self._quiet_log.exception("message", "a message of %s cannot be recorded", item.topic[:100])
+
+    def _add(self, item: Item) -> None:
+        if item.topic == FORGET:
+            self._retained.forget(item.source)
+            return
+        lane = STATE if item.topic == EVENTS else self._lane(item)
+        if lane == STATE and item.topic != EVENTS:
+            self._retained.note(item)
+        if self._blocked is not None:
+            if item.topic == EVENTS:
+                self._intake.put_back(item)
+            else:
+                self._intake.drop(1)
+            return
+        at_ns = self._clock.at(item.boot_ns)
+        try:
+            file = self._open(lane, at_ns)
+        except OSError as error:
+            self._lacking.append(item)
+            self._block(lane, error)
+            return
+        try:
+            file.add(item, at_ns)
+        except OSError as error:
+            self._fail(lane, error)
+
+    def _lane(self, item: Item) -> str:
+        lane = lane_of(item.topic, is_media=is_media(item.payload))
+        media = len(self._files) - (STATE in self._files)
+        return lane if lane == STATE or lane in self._files or media < _MOST_MEDIA else OTHER_MEDIA
+
+    def _open(self, lane: str, at_ns: int) -> OpenFile:
+        """Raises OSError."""
+        file = self._files.get(lane)
+        if file is not None:
+            return file
+        file = OpenFile(self._folder, lane, self._clock.now(), self._about, self._packer)
+        if lane == STATE:
+            try:
+                for value in self._retained.carried():
+                    file.add(value, at_ns)
+            except OSError:
+                file.discard()
+                raise
+        self._files[lane] = file
+        self._watch()
+        return file
+
+    def flush(self) -> None:
+        """Give what was added to the files."""
+        for lane, file in list(self._files.items()):
+            began = self._clock.now()
+            try:
+                self._counters["written"] += file.flush()
+            except OSError as error:
+                self._fail(lane, error)
+                continue
+            self.slowest_flush_s = max(self.slowest_flush_s, (self._clock.now() - began) / 1e9)
+            if not file.is_there():
+                self._forget_removed(lane)
+
+    def rotate(self, *, all_of_them: bool = False) -> None:
+        """Finish the files that are old, large or idle."""
+        now_ns = self._clock.now()
+        for lane, file in list(self._files.items()):
+            old = now_ns - file.began_ns > self._options.rotate_seconds * 1e9
+            idle = lane != STATE and now_ns - max(file.last_ns, file.began_ns) > _IDLE_NS
+            if all_of_them or old or idle or file.writer.size > self._options.rotate_bytes:
+                del self._files[lane]
+                self._watch()
+                self._finisher.finish(file)
+
+    def note_drops(self) -> None:
+        """Write down what was dropped because the queue was full."""
+        total = self._counters["dropped"]
+        if total > self._noted_drops and self._blocked is None:
+            self._recorder.event("dropped", messages=total - self._noted_drops, why="the disk is too slow")
+            self._noted_drops = total
+
+    # -- when files cannot be written
+
+    def _fail(self, lane: str, error: OSError) -> None:
+        """A file is left as it is; what it has not taken is written into the next one."""
+        file = self._files.pop(lane)
+        self._watch()
+        self._lacking += file.take_lacking()
+        self._counters["written"] += file.take_written()
+        file.file.close()
+        self._finisher.mend(file.path)
+        self._block(lane, error)
+
+    def _forget_removed(self, lane: str) -> None:
+        file = self._files.pop(lane)
+        self._watch()
+        file.file.close()
+        self._counters["errors"] += 1
+        self._recorder.event("removed", file=file.path.name, by="another program")
+
+    def _block(self, lane: str, error: OSError) -> None:
+        self._counters["errors"] += 1
+        if error.errno in _FULL:
+            self._stand_still("the disk is full", full=True)
+        else:
+            self._stand_still(f"{error.filename or lane}: {error.strerror}")
+
+    def _stand_still(self, why: str, *, full: bool = False) -> None:
+        if self._blocked is None:
+            self._quiet_log.log("blocked", logging.ERROR, "%s: nothing is recorded until that is mended", why)
+            self._blocked = _Blocked(why, self._clock.now(), self._counters["dropped"], full)
+
+    def try_again(self) -> None:
+        """Write on, if that is possible now."""
+        blocked = self._blocked
+        if blocked is None:
+            return
+        lacking, self._lacking = sorted(self._lacking, key=_when), []
+        try:
+            self._open(STATE, self._clock.at(lacking[0].boot_ns) if lacking else self._clock.now())
+        except OSError:
+            self._lacking = lacking
+            return
+        self._blocked = None
+        for item in lacking:
+            self.add(item)
+        if self._blocked is not None:  # it failed at once
+            self._blocked = blocked
+            return
+        self._finisher.retry()
+        dropped = self._counters["dropped"]
+        self._recorder.gap(blocked.since_ns, blocked.why, messages=dropped - blocked.dropped)
+        self._noted_drops = dropped
+        log.warning("recording again")
+
+    def give_up(self) -> None:
+        """At the end: count what no file has taken."""
+        self._intake.drop(len(self._lacking))
+        self._lacking = []
+        self._finisher.retry()
+
+    # -- room
+
+    def check_space(self, due: Due, *, now_s: float) -> None:
+        """Make room, and stop or go on writing; a few times a minute."""
+        if not (due.every("space", _SPACE_S) or self._changed):
+            return
+        limits = self._options.limits
+        try:
+            self._folder.root.mkdir(mode=0o750, parents=True, exist_ok=True)
+            disk = _disk(self._folder.root)
+        except OSError as error:
+            self._stand_still(f"{self._folder.root}: {error.strerror}")
+            return
+        if disk.free_bytes < limits.free_bytes or not disk.has_inodes or self._changed or due.every("list", _LISTED_S):
+            self._changed = False
+            self._make_room(disk, due, now_s)
+        if due.every("finish", _LISTED_S):
+            self._finisher.retry()
+        if disk.free_bytes < limits.free_bytes // 2 or not disk.has_inodes:
+            self.flush()
+            self.rotate(all_of_them=True)  # while there is room to finish them
+            free, wanted = disk.free_bytes >> 20, limits.free_bytes >> 20
+            self._stand_still(f"the disk is full ({free} MB are free, and {wanted} MB must stay)", full=True)
+        elif self._blocked is not None and (disk.free_bytes >= limits.free_bytes or not self._blocked.full):
+            self.try_again()
+
+    def _make_room(self, disk: Disk, due: Due, now_s: float) -> None:
+        entries, limits = self._folder.entries(), self._options.limits
+        for entry in surplus(entries, limits, disk):
+            self._delete(entry.path, entry.size)
+        if due.every("age", _AGE_S):
+            old = outdated(entries, limits, now_s)
+            if old is not None:
+                self._delete(old.path, old.size)
+
+    def _delete(self, path: Path, size: int) -> None:
+        try:
+            path.unlink()
+        except OSError as error:
+            self._quiet_log.warning("delete", "%s cannot be deleted: %s", path, error.strerror)
+            return
+        self._counters["pruned_bytes"] += size
+        self._recorder.event("pruned", file=path.name, bytes=size)
+
+    def _watch(self) -> None:
+        self._background.watch(list(self._files.values()))
+
+    def _note_finished(self) -> None:
+        self._changed = True
+
+
+def _disk(root: Path) -> Disk:
+    about = os.statvfs(root)
+    return Disk(about.f_bavail * about.f_frsize, about.f_files == 0 or about.f_favail > 0)

@@ -1,0 +1,255 @@
+"""What of a recording may be published again, and how: harmless unless asked twice. Pure.
+
+The rules in their order: nothing of a broker's own; another base; nothing that is an order to a robot, unless asked
+for; nothing retained, unless asked for. Names of topics decide by the contract, so an unknown name counts as the worst
+of its direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from pebble.contract import (
+    AUDIO_STREAM,
+    BRIDGE_PROBE,
+    CAPABILITIES,
+    DRIVE,
+    HEARTBEAT,
+    INCOMING,
+    LIGHTS_FLASH,
+    LIGHTS_SOLID,
+    MCU_DESCRIBE,
+    ONLINE,
+    SOUNDBOARD_COMMAND,
+    channel_of,
+    codec,
+)
+from pebble.contract import Channel as Declared
+from pebble.contract.channels import is_reserved
+from pebble.contract.identity import Identity, ParsedTopic, parse_topic
+from pebble.contract.payloads import Drive
+from pebble.errors import PayloadError, PebbleError, TransportError
+from pebble.recordings.files.mcap import Channel, Recorded
+from pebble.recordings.stamps import shifted
+from pebble.transports import Message, QoS
+from pebble.transports.topics import check_filter, check_topic, matches
+
+SYSTEM: Final = "replay"  # the first level of replayed topics, unless another one is named
+
+#: Commands whose effect ends by itself, or is visible at once. All others, and all that the contract does not know,
+#: are actions: they switch on cameras, mains and scripts, or move what no zero stops.
+_MILD: Final = frozenset({DRIVE, LIGHTS_SOLID, LIGHTS_FLASH, AUDIO_STREAM, SOUNDBOARD_COMMAND})
+_HEARTBEATS: Final = frozenset({ONLINE, HEARTBEAT})
+_PROBE: Final = 24  # bytes of white space at the end of a payload by which bridges look for cycles
+_WATCHED: Final = frozenset({"video", "audio"})  # sections of capabilities that a viewer has to request
+_ZERO: Final = codec.encode(DRIVE, Drive(valid_ms=0))  # final: no script resumes after it
+
+
+class ReplayError(PebbleError):
+    """A replay that must not go on. Example: ``pebble/robots/goob is live: …``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What the user has asked for."""
+
+    system: str | None = SYSTEM  # None: the recorded one
+    incoming: bool = False  # commands that end by themselves
+    actions: bool = False  # all other incoming messages
+    retain: bool = False  # outgoing ones as they were
+    shift: bool = True  # move stamps to now
+    only: tuple[str, ...] = ()  # filters of recorded topics; none: all
+
+
+class Outgoing(NamedTuple):
+    """A message to publish."""
+
+    message: Message
+    moves: bool | None  # of a drive command, whether it moves anything; None: it is none
+
+
+class _Address(NamedTuple):
+    """Where the messages of one recorded channel go."""
+
+    recorded: Identity
+    base: str
+    topic: str
+    declared: Declared | None
+    qos: QoS
+    retain: bool
+
+
+class Rules:
+    """Decides about each message of a recording."""
+
+    def __init__(self, options: Options, channels: Iterable[Channel]) -> None:
+        """``channels``: those of the recording. Raises ReplayError, ConfigError or TransportError."""
+        self._options = options
+        if options.system is not None:
+            Identity(options.system, "robots", "any")
+        for filter_ in options.only:
+            check_filter(filter_)
+        self._found = lru_cache(maxsize=65_536)(self._find)
+        #: The robots that are replayed: recorded base by new base.
+        self.robots: dict[str, str] = {}
+        for channel in channels:
+            self._add(channel)
+
+    def publishes(self, channel: Channel) -> bool:
+        """Whether messages of ``channel`` are published at all."""
+        return self._listed(channel) is not None
+
+    def outgoing(self, recorded: Recorded, by_ns: int) -> Outgoing | None:
+        """The message to publish instead of a recorded one, with stamps moved by ``by_ns``; None: none."""
+        address = self._listed(recorded.channel)
+        if address is None or _is_probe(recorded.payload):
+            return None
+        payload, moves = recorded.payload, None
+        if address.declared is DRIVE:
+            moves = self._moves(payload)
+            if moves is None:
+                return None
+        if address.declared is CAPABILITIES and payload:
+            payload = self._capabilities(payload, address)
+            if not payload:
+                return None
+        if self._options.shift:
+            payload = shifted(payload, by_ns)
+        return Outgoing(Message(address.topic, payload, address.qos, address.retain), moves)
+
+    def _listed(self, channel: Channel) -> _Address | None:
+        """None for robots that the files did not name at the start: they may be live."""
+        address = self._address(channel)
+        return address if address is not None and address.base in self.robots else None
+
+    def _address(self, channel: Channel) -> _Address | None:
+        metadata = channel.metadata
+        return self._found(
+            channel.topic, metadata.get("qos", "0"), metadata.get("retain") == "1", metadata.get("retained") == "1"
+        )
+
+    def _find(self, topic: str, qos: str, retain: bool, retained: bool) -> _Address | None:
+        """``retain``: published so; ``retained``: the recorder received it as an old message."""
+        parsed = None if topic.startswith("$") else parse_topic(topic)
+        if parsed is None or parsed.identity.is_server or not self._wanted(topic):
+            return None
+        declared = channel_of(f"{parsed.direction}/{parsed.metric}")
+        if not self._allowed(parsed, declared, retained):
+            return None
+        identity = parsed.identity
+        if self._options.system is not None:
+            identity = Identity(self._options.system, identity.type, identity.id)
+        new = ParsedTopic(identity, parsed.direction, parsed.metric).topic
+        try:
+            check_topic(new)
+        except TransportError:  # no transport of ours can have recorded it
+            return None
+        keeps = self._options.retain and parsed.direction != INCOMING and declared not in _HEARTBEATS
+        quality = QoS.LATEST if qos == "0" else QoS.DELIVERED
+        return _Address(parsed.identity, identity.base, new, declared, quality, keeps and (retain or retained))
+
+    def _wanted(self, topic: str) -> bool:
+        only = self._options.only
+        return not only or any(matches(filter_, topic) for filter_ in only)
+
+    def _allowed(self, parsed: ParsedTopic, declared: Declared | None, retained: bool) -> bool:
+        if parsed.direction != INCOMING:
+            return self._allowed_outgoing(parsed.metric, declared, retained)
+        if retained or is_reserved(parsed.metric):  # stale; or who may stop and drive the robot, and who resets it
+            return False
+        return self._options.incoming and (self._options.actions or declared in _MILD)
+
+    def _allowed_outgoing(self, metric: str, declared: Declared | None, retained: bool) -> bool:
+        if declared is BRIDGE_PROBE or (retained and declared in _HEARTBEATS):
+            return False
+        # In its own name a robot that is away must not appear free or stopped, nor claim a device.
+        return self._options.system is not None or not (is_reserved(metric) or declared is MCU_DESCRIBE)
+
+    def _moves(self, payload: bytes) -> bool | None:
+        """None for a command that is not to be sent: one that cannot be read, or a script's."""
+        try:
+            command: Drive = codec.decode(DRIVE, payload)
+        except PayloadError:
+            return None
+        # A script's number would bar the runs of the robot's own scripts.
+        return None if command.signed and not self._options.actions else command.moves
+
+    def _capabilities(self, payload: bytes, address: _Address) -> bytes:
+        """Its topics below the new base, and no offers of what is not there; empty if it cannot be read.
+
+        Pages publish to the topics that they find here: unchanged, they would drive the real robot.
+        """
+        try:
+            plain = codec.plain(CAPABILITIES, payload)
+        except PayloadError:
+            return b""
+        if not isinstance(plain, dict) or not isinstance(plain.get("value"), dict):
+            return b""
+        value = {name: self._section(name, each, address) for name, each in plain["value"].items()}
+        return msgspec.json.encode({**plain, "value": value})
+
+    def _section(self, name: str, section: Any, address: _Address) -> Any:
+        section = _rebased(section, f"{address.recorded.base}/", f"{address.base}/")
+        watched = name in _WATCHED and self._options.system is not None
+        return section if watched else _without_controls(section, drives=name == "drive")
+
+    def _add(self, channel: Channel) -> None:
+        address = self._address(channel)
+        if address is None:
+            return
+        base = address.recorded.base
+        if self._options.system == address.recorded.system:
+            raise ReplayError(
+                f"--base {self._options.system} is the base of {base} itself: choose another one, or add --same-base"
+            )
+        if self.robots.setdefault(address.base, base) != base:
+            raise ReplayError(
+                f"{self.robots[address.base]} and {base} would both be {address.base}: choose one by --only '{base}/#'"
+            )
+
+
+def zero(topic: str) -> Message:
+    """What stops a robot that a drive command on ``topic`` may have set in motion."""
+    return Message(topic, _ZERO, QoS.DELIVERED)
+
+
+def is_zero(message: Message) -> bool:
+    """Whether :func:`zero` has made it."""
+    return message.payload == _ZERO
+
+
+def _is_probe(payload: bytes) -> bool:
+    """Whether a bridge looks for cycles by it; also white space alone."""
+    return bool(payload) and payload[-_PROBE:].isspace()
+
+
+def _rebased(plain: Any, old: str, new: str) -> Any:
+    """``plain`` with all topics below ``old`` moved below ``new``; names of topics elsewhere are left out."""
+    if isinstance(plain, dict):
+        return {key: _rebased(value, old, new) for key, value in plain.items() if not _is_elsewhere(key, value, old)}
+    if isinstance(plain, list):
+        return [_rebased(value, old, new) for value in plain if not _is_elsewhere("", value, old)]
+    return new + plain.removeprefix(old) if isinstance(plain, str) and plain.startswith(old) else plain
+
+
+def _is_elsewhere(key: str, value: Any, old: str) -> bool:
+    """Whether it names a topic outside the robot's base, which a config may do."""
+    if not isinstance(value, str):
+        return False
+    return not value.startswith(old) and (key.endswith("topic") or parse_topic(value) is not None)
+
+
+def _without_controls(section: Any, *, drives: bool) -> Any:
+    """No part of a recording obeys a command."""
+    if isinstance(section, list):
+        return [_without_controls(value, drives=drives) for value in section]
+    if not isinstance(section, dict):
+        return section
+    plain = {key: _without_controls(value, drives=drives) for key, value in section.items()}
+    refused = {"controls", "available"} if drives else {"controls"}
+    return {key: False if key in refused else value for key, value in plain.items()}

@@ -1,0 +1,1 @@
+"""What recordings say about robots and networks: index, analysis, report."""

@@ -1,0 +1,316 @@
+"""The questions of an analysis to the index of one robot, in SQL."""
+# ruff: noqa: S608  (what is put into queries are constants of this project, numbers, and names of files in quotes)
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pebble.contract.channels import (
+    AUDIO,
+    AUTONOMY_FILES,
+    CAMERA,
+    DRIVE,
+    HEARTBEAT,
+    LOGS,
+    MEDIA_STATUS,
+    ONLINE,
+    OUTGOING,
+    SOUNDBOARD_FILES,
+)
+from pebble.recordings import media_numbers
+from pebble.recordings.library import FOREVER_NS
+from pebble.recordings.traffic import results as traffic
+from pebble.recordings.traffic.activity import SESSION, Activity
+from pebble.recordings.traffic.duck import parquet
+from pebble.recordings.traffic.results import (
+    LARGEST_LATENCY_S,
+    OFFLINE_AFTER_S,
+    OUTAGE_FACTOR,
+    SESSION_GAP_S,
+    SESSION_MARGIN_S,
+    Bandwidth,
+    Histogram,
+    Intervals,
+    Latency,
+    Outage,
+    Session,
+    Stream,
+)
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
+_BINS, _FINEST_MS = 60, 0.5  # of histograms
+_LARGEST_STEP: Final = 1000  # a larger one is no loss but another beginning
+_WRAP: Final = media_numbers.LIMIT
+_LINUX_ONLY: Final = tuple(one.metric for one in (LOGS, MEDIA_STATUS, SOUNDBOARD_FILES, AUTONOMY_FILES))
+#: What a message takes on the wire beside its payload: its topic, MQTT's own bytes (up to 16 kB), and headers of TCP/IP
+#: without options for each segment of at most 1460 bytes.
+_MQTT_BYTES, _TCP_BYTES, _SEGMENT_BYTES = 4, 40, 1460
+
+
+def _names(texts: Sequence[str]) -> str:
+    return ", ".join(f"'{text}'" for text in texts)
+
+
+def _numbers(numbers: Iterable[int]) -> str:
+    return ", ".join(map(str, sorted(numbers)))
+
+
+def _percentile(value: str, share: float) -> str:
+    """Of rows with a ``place`` in their order, from 0 to ``last``; interpolates linearly.
+
+    The same as ``quantile_cont``, which would hold all values in memory: sorting uses files if need be.
+    """
+    return f"sum({value} * greatest(0, 1 - abs(place - {share} * last)))"
+
+
+_VIDEO, _AUDIO = _numbers(media_numbers.VIDEO), _numbers(media_numbers.AUDIO)
+_FAMILY: Final = f"""CASE
+    WHEN direction = '{OUTGOING}' AND (kind IN ({_VIDEO}) OR metric = '{CAMERA.metric}') THEN '{traffic.VIDEO}'
+    WHEN direction = '{OUTGOING}' AND (kind IN ({_AUDIO}) OR metric = '{AUDIO.metric}') THEN '{traffic.AUDIO}'
+    WHEN direction = '{OUTGOING}' AND metric IN ('{ONLINE.metric}', '{HEARTBEAT.metric}') THEN '{traffic.HEARTBEATS}'
+    WHEN direction = '{OUTGOING}' THEN '{traffic.TELEMETRY}'
+    WHEN kind IN ({_AUDIO}) THEN '{traffic.VOICE}'
+    WHEN metric = '{DRIVE.metric}' THEN '{traffic.DRIVING}'
+    ELSE '{traffic.CONTROL}' END"""
+_SECONDS: Final = f"""
+    CREATE OR REPLACE TEMP TABLE seconds AS
+    SELECT epoch_ns(ts) // 1000000000 AS second, {_FAMILY} AS family, count(*) AS messages,
+           sum({{size}})::BIGINT AS bytes, bit_or(if(activity IN ({_numbers(SESSION)}), 1 << activity, 0)) AS used
+    FROM messages GROUP BY ALL
+"""
+_HEARTBEATS: Final = f"""
+    CREATE OR REPLACE TEMP TABLE heartbeats AS
+    WITH received AS (
+        SELECT epoch_ns(ts) AS ns, epoch_ns(stamp) AS stamp_ns,
+               epoch_ns(ts) - lag(epoch_ns(ts)) OVER (ORDER BY ts) AS before
+        FROM messages WHERE direction = '{OUTGOING}' AND metric = ? AND online IS NOT FALSE
+    )
+    SELECT ns, (ns - stamp_ns) / 1e6 AS latency_ms, stamp_ns % 1000000000 = 0 AS whole,
+           if(EXISTS (FROM breaks WHERE breaks.until_ns > ns - before AND breaks.since_ns < ns), NULL, before)
+           AS interval_ns
+    FROM received
+"""
+_ONLINE: Final = f"""
+    CREATE OR REPLACE TEMP TABLE online AS
+    WITH numbered AS (
+        SELECT ns, sum((interval_ns IS NULL OR interval_ns > {OFFLINE_AFTER_S}e9)::INT) OVER (ORDER BY ns) AS number
+        FROM heartbeats
+    )
+    SELECT min(ns) // 1000000000 AS since, max(ns) // 1000000000 + 1 AS until
+    FROM numbered GROUP BY number ORDER BY since
+"""
+_SESSIONS: Final = f"""
+    CREATE OR REPLACE TEMP TABLE sessions AS
+    WITH active AS (SELECT second, bit_or(used) AS used FROM seconds WHERE used > 0 GROUP BY second),
+    begun AS (SELECT *, second - lag(second) OVER (ORDER BY second) > {SESSION_GAP_S} AS new FROM active),
+    numbered AS (SELECT *, sum(coalesce(new, true)::INT) OVER (ORDER BY second) AS number FROM begun)
+    SELECT min(second) - {SESSION_MARGIN_S} AS since, max(second) + 1 + {SESSION_MARGIN_S} AS until,
+           bit_or(used) AS used
+    FROM numbered GROUP BY number ORDER BY since
+"""
+_BANDWIDTH: Final = f"""
+    WITH placed AS (
+        SELECT seconds.*, CASE WHEN sessions.until > second THEN '{traffic.SESSION}'
+                               WHEN online.until > second THEN '{traffic.IDLE}' ELSE 'offline' END AS time
+        FROM seconds ASOF LEFT JOIN sessions ON second >= sessions.since ASOF LEFT JOIN online ON second >= online.since
+    ), summed AS (
+        SELECT family, time, messages, bytes FROM placed
+        UNION ALL
+        SELECT '{traffic.TOTAL}', any_value(time), sum(messages), sum(bytes) FROM placed GROUP BY second
+    ), timed AS (
+        SELECT family, unnest(['{traffic.ALL}', time]) AS time, messages, bytes, bytes * 8 / 1000 AS kbps FROM summed
+    ), ranked AS (
+        SELECT *, row_number() OVER (PARTITION BY family, time ORDER BY kbps) - 1 AS place,
+               count(*) OVER (PARTITION BY family, time) - 1 AS last
+        FROM timed
+    )
+    SELECT family, time, count(*), {_percentile("kbps", 0.5)}, {_percentile("kbps", 0.95)}, sum(messages)::BIGINT,
+           sum(bytes)::BIGINT
+    FROM ranked GROUP BY family, time
+"""
+_DURATIONS: Final = """
+    WITH common AS (
+        SELECT greatest(0, least(s.until, o.until) - greatest(s.since, o.since)) AS length FROM sessions s, online o
+    )
+    SELECT (SELECT coalesce(sum(until - since), 0) FROM sessions)::BIGINT,
+           ((SELECT coalesce(sum(until - since), 0) FROM online)
+            - (SELECT coalesce(sum(length), 0) FROM common))::BIGINT
+"""
+_INTERVALS: Final = f"""
+    WITH ranked AS (
+        SELECT interval_ns / 1e6 AS ms, row_number() OVER (ORDER BY interval_ns) - 1 AS place,
+               count(*) OVER () - 1 AS last
+        FROM heartbeats WHERE interval_ns <= {OFFLINE_AFTER_S}e9
+    )
+    SELECT count(*), {_percentile("ms", 0.5)}, {_percentile("ms", 0.95)}, {_percentile("ms", 0.99)}, max(ms) FROM ranked
+"""
+_OUTAGES: Final = f"""
+    SELECT ns - interval_ns, interval_ns / 1e6 - $median FROM heartbeats
+    WHERE interval_ns / 1e6 > {OUTAGE_FACTOR} * $median AND interval_ns <= {OFFLINE_AFTER_S}e9 ORDER BY ns
+"""
+_OFFLINE: Final = f"""
+    SELECT count(*), coalesce(sum(interval_ns), 0) / 1e9 FROM heartbeats WHERE interval_ns > {OFFLINE_AFTER_S}e9
+"""
+_PLAUSIBLE: Final = f"abs(latency_ms) <= {LARGEST_LATENCY_S}e3"
+_LATENCY: Final = f"""
+    WITH ranked AS (
+        SELECT latency_ms AS ms, whole, row_number() OVER (ORDER BY latency_ms) - 1 AS place,
+               count(*) OVER () - 1 AS last
+        FROM heartbeats WHERE {_PLAUSIBLE}
+    )
+    SELECT count(*), {", ".join(_percentile("ms", share) for share in (0.01, 0.5, 0.95, 0.99))}, avg(whole::INT)
+    FROM ranked
+"""
+_LATENCIES: Final = f"""
+    SELECT greatest(0, least({_BINS - 1}, floor((latency_ms - $low) / $width)))::INT AS bin, count(*)
+    FROM heartbeats WHERE {_PLAUSIBLE} GROUP BY bin
+"""
+#: A number that is lower by more than half of the range has wrapped: sound goes on with 1, pictures with 0.
+_STREAMS: Final = f"""
+    WITH numbered AS (
+        SELECT metric, kind, number::BIGINT - lag(number) OVER before AS difference,
+               CASE WHEN kind IN ({media_numbers.JSON_PICTURE}, {media_numbers.JPEG}) OR kind IN ({_AUDIO}) THEN kind
+                    ELSE (kind + 1) // 2 END AS encoding, lag(encoding) OVER before AS encoding_before,
+               epoch_ns(ts) - lag(epoch_ns(ts)) OVER before AS received,
+               epoch_ns(stamp) - lag(epoch_ns(stamp)) OVER before AS captured
+        FROM messages WHERE direction = '{OUTGOING}' AND number IS NOT NULL
+        WINDOW before AS (PARTITION BY metric ORDER BY ts)
+    ), stepped AS (
+        SELECT *, CASE WHEN encoding <> encoding_before THEN 0
+                       WHEN difference < -{_WRAP // 2} THEN difference + {_WRAP} - (kind IN ({_AUDIO}))::INT
+                       ELSE difference END AS step,
+               if(step BETWEEN 1 AND {_LARGEST_STEP}, abs(received - captured) / 1e6, NULL) AS jitter
+        FROM numbered
+    ), ranked AS (
+        SELECT *, row_number() OVER (PARTITION BY metric ORDER BY jitter NULLS LAST) - 1 AS place,
+               count(jitter) OVER (PARTITION BY metric) - 1 AS last
+        FROM stepped
+    )
+    SELECT metric, list(DISTINCT kind), count(*),
+           coalesce(sum(step - 1) FILTER (step BETWEEN 2 AND {_LARGEST_STEP}), 0)::BIGINT,
+           count(*) FILTER (step <= 0 OR step > {_LARGEST_STEP}),
+           {_percentile("jitter", 0.5)}, {_percentile("jitter", 0.95)}
+    FROM ranked GROUP BY metric ORDER BY metric
+"""
+_ABOUT: Final = f"""
+    SELECT bool_or(direction = '{OUTGOING}' AND (metric IN ({_names(_LINUX_ONLY)}) OR kind IS NOT NULL)),
+           bool_or(metric = '{ONLINE.metric}'), bool_or(metric IN ('{ONLINE.metric}', '{HEARTBEAT.metric}'))
+    FROM indexed
+"""
+_TOTALS: Final = """
+    SELECT count(*), coalesce(sum(size), 0)::BIGINT, coalesce(epoch_ns(min(ts)), 0), coalesce(epoch_ns(max(ts)), 0)
+    FROM messages
+"""
+
+
+class RobotQueries:
+    """Tables of one robot; the table ``breaks`` (since_ns, until_ns) has to be there."""
+
+    def __init__(self, connection: DuckDBPyConnection, robot: str, *, overhead: bool) -> None:
+        self._connection, self._robot = connection, robot
+        self._size = "size"
+        if overhead:
+            topic = len(f"{robot}//".encode())
+            packet = f"(size + strlen(direction) + strlen(metric) + {topic + _MQTT_BYTES})"
+            self._size = f"({packet} + {_TCP_BYTES} * (({packet} + {_SEGMENT_BYTES - 1}) // {_SEGMENT_BYTES}))"
+        self.machine = ""
+
+    def load(self, parts: Sequence[Path], since_ns: int, until_ns: int) -> None:
+        """Make the tables of the messages in a period."""
+        indexed = f"CREATE OR REPLACE TEMP VIEW indexed AS FROM {parquet(parts)}"
+        inside = ["NOT retained"]
+        if since_ns:
+            inside.append(f"ts >= make_timestamp_ns({since_ns})")
+        if until_ns < FOREVER_NS:
+            inside.append(f"ts < make_timestamp_ns({until_ns})")
+        self._connection.execute(indexed)
+        self._connection.execute(f"CREATE OR REPLACE TEMP VIEW messages AS FROM indexed WHERE {' AND '.join(inside)}")
+        linux, has_online, has_heartbeats = self._row(_ABOUT)
+        self.machine = traffic.LINUX if linux else traffic.MCU if has_heartbeats else traffic.COMPONENT
+        self._connection.execute(_SECONDS.format(size=self._size))
+        self._connection.execute(_HEARTBEATS, [ONLINE.metric if has_online else HEARTBEAT.metric])
+        self._connection.execute(_ONLINE)
+        self._connection.execute(_SESSIONS)
+
+    def totals(self) -> tuple[int, int, int, int]:
+        """Messages, bytes, times of the first and of the last one."""
+        messages, size, first, last = self._row(_TOTALS)
+        return messages, size, first, last
+
+    def durations(self) -> tuple[int, int]:
+        """Seconds of sessions, and idle ones."""
+        session_s, idle_s = self._row(_DURATIONS)
+        return session_s, idle_s
+
+    def offline(self) -> tuple[int, float]:
+        """How often it was offline, and how many seconds in total."""
+        times, seconds = self._row(_OFFLINE)
+        return times, seconds
+
+    def bandwidth(self) -> list[Bandwidth]:
+        found = [Bandwidth(*row) for row in self._rows(_BANDWIDTH)]
+        order = {name: number for number, name in enumerate((*traffic.FAMILIES, *traffic.TIMES))}
+        known = [one for one in found if one.time in order]
+        return sorted(known, key=lambda one: (order[one.family], order[one.time]))
+
+    def sessions(self) -> list[Session]:
+        rows = self._rows("FROM sessions")
+        return [
+            Session(since, until, [_word(one) for one in SESSION if used >> one & 1]) for since, until, used in rows
+        ]
+
+    def online(self) -> list[tuple[int, int]]:
+        """Seconds since 1970 between which heartbeats came."""
+        return [(since, until) for since, until in self._rows("FROM online")]
+
+    def intervals(self) -> Intervals | None:
+        row = self._row(_INTERVALS)
+        return Intervals(*row) if row[0] else None
+
+    def outages(self, median_ms: float) -> list[Outage]:
+        return [Outage(*row) for row in self._rows(_OUTAGES, {"median": median_ms})]
+
+    def latency(self) -> Latency | None:
+        count, floor, median, p95, p99, whole = self._row(_LATENCY)
+        if not count:
+            return None
+        return Latency(count, floor, median, p95, p99, whole, self._histogram(floor, p99))
+
+    def _histogram(self, floor_ms: float, p99_ms: float) -> Histogram:
+        """From 0, or from below if the robot's clock is ahead, to a little above the 99th percentile."""
+        margin = 0.1 * (p99_ms - floor_ms)
+        low, high = min(0.0, floor_ms - margin), p99_ms + margin
+        width = _round_up(max(_FINEST_MS, (high - low) / _BINS))
+        low = low // width * width
+        counts = [0] * _BINS
+        for place, count in self._rows(_LATENCIES, {"low": low, "width": width}):
+            counts[place] = count
+        return Histogram(low, width, counts)
+
+    def streams(self) -> list[Stream]:
+        rows = self._rows(_STREAMS)
+        return [Stream(metric, traffic.encoding_names(kinds), *rest) for metric, kinds, *rest in rows]
+
+    def _rows(self, query: str, parameters: Any = None) -> list[Any]:
+        return self._connection.execute(query, parameters).fetchall()
+
+    def _row(self, query: str) -> Any:
+        return self._connection.execute(query).fetchone()
+
+
+def _word(activity: int) -> str:
+    return Activity(activity).name.lower().replace("_", " ")
+
+
+def _round_up(value: float) -> float:
+    """To 1, 2 or 5 times a power of ten."""
+    power = 1e-3
+    while True:
+        for step in (1, 2, 5):
+            if step * power >= value:
+                return step * power
+        power *= 10

@@ -1,0 +1,76 @@
+"""Records the robot on the robot: ``python -m pebble.services.recorder CONFIG``."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from pebble.errors import ConfigError
+from pebble.recordings.recorder import metrics
+from pebble.recordings.recorder.recorder import Options, Recorder
+from pebble.recordings.recorder.source import Source
+from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings
+from pebble.runtime.process import run
+from pebble.runtime.service import Service, every
+
+_NICE: Final = 10  # whatever drives comes first
+_METRICS_S: Final = 10.0
+_LIMITS: Final = (
+    *("rotate_seconds", "rotate_bytes", "keep_bytes", "keep_media_days", "keep_state_days"),
+    *("free_bytes", "sync_seconds", "level", "media"),
+)
+
+
+class RobotRecorder(Service):
+    """Subscribes to everything on the local transport, and on the remote side where the config says so."""
+
+    name = "recorder"
+
+    def start(self) -> None:
+        section = self.config.services.recorder
+        options = Options(**{name: getattr(section, name) for name in _LIMITS})
+        folder = section.folder or Path("~/recordings").expanduser()
+        os.nice(_NICE)
+        self._recorder = Recorder(folder, options, {"recorder": self.config.base})
+        self._recorder.start()
+        self.on_stop(self._recorder.stop)
+        self._sources = [
+            Source(self._recorder, kind, settings, [f"{self.config.base}/#"], name)
+            for name, kind, settings in self._connections()
+        ]
+        for source in self._sources:
+            source.start(timeout=0.0)
+            self.on_stop(source.close)
+        self.log.info("recording into %s", folder)
+
+    def dropped(self) -> dict[str, int]:
+        return {"recording": self._recorder.counters["dropped"]}
+
+    @every(1.0)
+    def _check(self) -> None:
+        for source in self._sources:
+            source.check()
+
+    @every(_METRICS_S)
+    def _write_metrics(self) -> None:
+        try:
+            metrics.write(self._recorder, self._sources)
+        except OSError as error:
+            self.log.debug("the recorder's numbers cannot be written: %s", error)
+
+    def _connections(self) -> Iterator[tuple[str, str, Any]]:
+        """Name, kind and settings of each."""
+        section, bridge = self.config.services.recorder, self.config.services.mqtt_bridge
+        yield "", self.config.transport.kind, local_settings(self.config)
+        if not section.remote:
+            return
+        if bridge.remote is not None or not bridge.remote_mqtt.host:
+            raise ConfigError("services.recorder.remote: needs services.mqtt_bridge.remote_mqtt.host")
+        yield "remote", "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+
+
+if __name__ == "__main__":
+    sys.exit(run(RobotRecorder))

@@ -1,0 +1,216 @@
+"""Lines of a broker logger become messages, and messages lines; the same bytes come back."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pebble.media.json_video import JsonPicture
+from pebble.recordings.exports import lines
+from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
+from pebble.recordings.files.mcap import Channel, Recorded
+
+T_NS = 1_732_300_000_123_456_789
+TOPIC = "pebble/robots/goob/outgoing/online"
+LINE = {
+    "timestamp": 1732300000.25,
+    "topic": TOPIC,
+    "qos": 1,
+    "retain": False,
+    "payload_size_bytes": 3,
+    "payload_truncated": False,
+    "payload_b64": "AAH/",
+}
+
+
+def recorded(payload: bytes, topic: str = TOPIC, log_ns: int = T_NS, **metadata: str) -> Recorded:
+    return Recorded(Channel(1, topic, "json", {"qos": "0", "retain": "0"} | metadata), 0, log_ns, 0, payload)
+
+
+def written(messages: list[Recorded], **more: bool) -> bytes:
+    out = io.BytesIO()
+    assert write_lines(messages, out, **more) == len(messages)
+    return out.getvalue()
+
+
+def read(raw: bytes) -> list[Imported | BadLine]:
+    return list(read_lines(io.BytesIO(raw)))
+
+
+def test_a_line_of_the_loggers() -> None:
+    raw = json.dumps(LINE).encode() + b"\n"
+    assert read(raw) == [Imported(1_732_300_000_250_000_000, TOPIC, b"\0\1\xff", qos=1)]
+
+
+def test_a_line_of_ours() -> None:
+    line = json.loads(written([recorded(b'{"t": 1, "online": true}', qos="1", retain="1")]))
+    assert line.pop("timestamp") == pytest.approx(T_NS / 1e9)
+    assert base64.b64decode(line.pop("payload_b64")) == b'{"t": 1, "online": true}'
+    assert line == {
+        "topic": TOPIC,
+        "qos": 1,
+        "retain": True,
+        "retained": False,
+        "payload_size_bytes": 24,
+        "payload_truncated": False,
+        "payload_text": '{"t": 1, "online": true}',
+        "payload_json": {"t": 1, "online": True},
+    }
+
+
+@pytest.mark.parametrize(
+    ("payload", "readable"),
+    [
+        (b"true", {"payload_text", "payload_json"}),
+        (b"on", {"payload_text"}),
+        (b"", {"payload_text"}),
+        (b"[NaN]", {"payload_text"}),
+        (b'{"a":\n1}', {"payload_text", "payload_json"}),
+        (b"[" * 100_000, set()),
+        (b"[" * 60_000, {"payload_text"}),
+        (b"9" * 400, {"payload_text", "payload_json"}),
+        (b"\xff\xd8\xff", set()),
+        (JsonPicture(1, True, 1, bytes(range(256)) * 999).pack(), {"payload_text", "payload_json"}),
+    ],
+)
+def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, readable: set[str]) -> None:
+    raw = written([recorded(payload)])
+    assert raw.count(b"\n") == 1
+    assert {name for name in json.loads(raw) if name in ("payload_text", "payload_json")} == readable
+    assert not any(name in json.loads(written([recorded(payload)], text=False)) for name in readable)
+    assert read(raw) == [Imported(T_NS, TOPIC, payload)]
+
+
+@given(
+    st.lists(
+        st.builds(
+            recorded,
+            st.binary(max_size=200) | st.text().map(str.encode) | st.sampled_from([b"{}", b"null", b"\n"]),
+            topic=st.sampled_from([TOPIC, "pebble/infrastructure", "$recorder/events", "a/ü/ö", 'a"b\\c']),
+            log_ns=st.integers(0, 4 * 10**18),
+            qos=st.sampled_from("012"),
+            retain=st.sampled_from("01"),
+        ),
+        max_size=5,
+    )
+)
+def test_there_and_back(messages: list[Recorded]) -> None:
+    back = read(written(messages))
+    assert [(one.log_ns, one.topic, one.payload, one.metadata) for one in back if isinstance(one, Imported)] == [
+        (one.log_ns, one.channel.topic, one.payload, one.channel.metadata) for one in messages
+    ]
+
+
+def test_flags_there_and_back() -> None:
+    flags = [
+        {"qos": "1", "retain": "1"},
+        {"qos": "0", "retain": "1", "retained": "1"},
+        {"qos": "2", "retain": "0", "truncated": "1"},
+    ]
+    back = read(written([recorded(b"x", **one) for one in flags]))
+    assert [one.metadata for one in back if isinstance(one, Imported)] == flags
+
+
+def test_the_loggers_retain_is_a_message_from_before_its_subscription() -> None:
+    (message,) = read(json.dumps(LINE | {"retain": True}).encode())
+    assert isinstance(message, Imported)
+    assert message.metadata == {"qos": "1", "retain": "1", "retained": "1"}
+
+
+def test_a_payload_that_the_logger_cut_is_marked() -> None:
+    (message,) = read(json.dumps(LINE | {"payload_truncated": True, "payload_size_bytes": 9000}).encode())
+    assert isinstance(message, Imported)
+    assert message.truncated
+    assert message.metadata["truncated"] == "1"
+
+
+@pytest.mark.parametrize(
+    ("stamp", "expected_ns"),
+    [
+        ("1732300000", 1_732_300_000 * 10**9),
+        ("1732300000.123456789", 1_732_300_000_123_456_789),
+        ("1.7323e9", 1_732_300_000 * 10**9),
+        ("1732300000123", 1_732_300_000_123 * 10**6),
+        ("0", 0),
+        ('"2024-11-22T18:26:40Z"', 1_732_300_000 * 10**9),
+        ('"2024-11-22T18:26:40.250000+00:00"', 1_732_300_000_250_000_000),
+        ('"2024-11-22T19:26:40.000001+01:00"', 1_732_300_000_000_001_000),
+        ('"2024-11-22 18:26:40"', 1_732_300_000 * 10**9),
+    ],
+)
+def test_stamps(stamp: str, expected_ns: int) -> None:
+    raw = json.dumps(LINE | {"timestamp": "STAMP"}).replace('"STAMP"', stamp).encode()
+    assert [one.log_ns for one in read(raw) if isinstance(one, Imported)] == [expected_ns]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"hello",
+        b"{}",
+        b"[1, 2]",
+        b"\xff\xfe",
+        b"[" * 200_000,
+        json.dumps(LINE).encode()[:-9],
+        json.dumps(LINE | {"topic": "a/#"}).encode(),
+        json.dumps(LINE | {"topic": ""}).encode(),
+        json.dumps(LINE | {"topic": "$"}).encode(),
+        json.dumps(LINE | {"topic": 5}).encode(),
+        json.dumps(LINE | {"qos": 3}).encode(),
+        json.dumps(LINE | {"payload_b64": "%%"}).encode(),
+        json.dumps(LINE | {"timestamp": None}).encode(),
+        json.dumps(LINE | {"timestamp": "yesterday"}).encode(),
+        json.dumps(LINE | {"timestamp": "0001-01-01T00:00:00"}).encode(),
+        json.dumps(LINE | {"timestamp": -1}).encode(),
+        json.dumps(LINE | {"timestamp": 1e300}).encode(),
+        json.dumps(LINE).replace("1732300000.25", "1e999999999").encode(),
+        json.dumps(LINE).replace("1732300000.25", "NaN").encode(),
+    ],
+)
+def test_bad_lines_are_reported_and_the_others_read(line: bytes) -> None:
+    good = json.dumps(LINE).encode()
+    first, bad, last = read(good + b"\n" + line + b"\r\n\n" + good)
+    assert isinstance(bad, BadLine)
+    assert bad.number == 2
+    assert bad.problem
+    assert first == last == Imported(1_732_300_000_250_000_000, TOPIC, b"\0\1\xff", qos=1)
+
+
+def test_a_line_that_is_too_long_is_skipped_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lines, "_LONGEST", 1000)
+    monkeypatch.setattr(lines, "_SKIPPED_AT_ONCE", 300)
+    good = json.dumps(LINE).encode()
+    file = _Watched(b"\n".join([good, b"x" * 5000, good, good + b" " * (999 - len(good)), b"x" * 1000]))
+    found = list(read_lines(file))
+    assert [type(one).__name__ for one in found] == ["Imported", "BadLine", "Imported", "Imported", "BadLine"]
+    assert file.most <= 1000
+
+
+class _Watched(io.BytesIO):
+    """A file that knows the longest piece that was read."""
+
+    most = 0
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        line = super().readline(size)
+        self.most = max(self.most, len(line))
+        return line
+
+
+def test_messages_are_written_as_they_come() -> None:
+    out, sizes, times = io.BytesIO(), [], []
+
+    def coming() -> Iterator[Recorded]:
+        for number in range(3):
+            sizes.append(len(out.getvalue()))
+            yield recorded(b"x" * 100, log_ns=T_NS + number)
+
+    write_lines(coming(), out, on_time=times.append)
+    assert sizes[0] == 0 < sizes[1] < sizes[2]
+    assert times == [T_NS, T_NS + 1, T_NS + 2]

@@ -1,0 +1,219 @@
+"""MCAP files: as other readers want them, and in any state of damage."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from pebble.recordings.files.finish import Finished, finish
+from pebble.recordings.files.mcap import FILE_TOPIC, Packer
+from pebble.recordings.files.reader import RecordingError, Summary, mapped
+from pebble.recordings.files.scan import Damage
+from pebble.recordings.files.writer import McapWriter
+from tests.recordings.messages import START_NS, STEP_NS, contents, is_part_of, write
+
+MESSAGES = 2000
+
+
+def counted_by_mcap(path: Path) -> tuple[int, int]:
+    """By the package ``mcap``, with all checksums: messages in the statistics, and messages read."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        read = sum(1 for _ in reader.iter_messages())
+        file.seek(0)
+        assert sum(1 for _ in StreamReader(file, validate_crcs=True).records)
+        return summary.statistics.message_count, read
+
+
+class TestWhole:
+    @pytest.mark.parametrize("level", [0, 3])
+    def test_other_readers_read_it(self, tmp_path: Path, level: int) -> None:
+        path = tmp_path / "a.mcap"
+        written = write(path, level=level)
+        assert counted_by_mcap(path) == (MESSAGES, MESSAGES)
+        damage = Damage()
+        assert contents(path, damage) == written
+        assert (damage.found, damage.finished) == (False, True)
+
+    def test_an_empty_one(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        write(path, 0)
+        assert counted_by_mcap(path) == (0, 0)
+        assert finish(path) == Finished(0, 0, 0, 0)
+
+    def test_only_the_chunks_of_a_period_are_read(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        written = write(path)
+        since, until = START_NS + 500 * STEP_NS, START_NS + 700 * STEP_NS
+        assert contents(path, since_ns=since, until_ns=until) == written[500:700]
+
+    def test_only_the_chosen_channels_are_read(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        topic = "pebble/robots/r3/outgoing/t3"
+        expected = [one for one in write(path) if one[0] == topic]
+        assert contents(path, chooses=lambda channel: channel.topic == topic) == expected
+
+
+def cut(raw: bytearray, rng: random.Random) -> None:
+    del raw[rng.randrange(len(raw)) :]
+
+
+def flip(raw: bytearray, rng: random.Random, bits: int = 8) -> None:
+    for _ in range(bits):
+        raw[rng.randrange(len(raw))] ^= 1 << rng.randrange(8)
+
+
+def zero_a_page(raw: bytearray, rng: random.Random) -> None:
+    begin = rng.randrange(len(raw))
+    raw[begin : begin + 4096] = bytes(len(raw[begin : begin + 4096]))
+
+
+def end_in_garbage(raw: bytearray, rng: random.Random) -> None:
+    cut(raw, rng)
+    raw += rng.randbytes(rng.randrange(5000))
+
+
+def end_in_zeros(raw: bytearray, rng: random.Random) -> None:
+    cut(raw, rng)
+    raw += bytes(rng.randrange(20_000))
+
+
+def lose_a_part(raw: bytearray, rng: random.Random) -> None:
+    begin = rng.randrange(len(raw))
+    del raw[begin : begin + rng.randrange(60_000)]
+
+
+DAMAGES = [cut, flip, zero_a_page, end_in_garbage, end_in_zeros, lose_a_part]
+
+
+class TestDamaged:
+    @pytest.mark.parametrize("level", [0, 3])
+    @pytest.mark.parametrize("finished", [False, True])
+    @pytest.mark.parametrize("damage", DAMAGES)
+    def test_all_that_is_left_is_read_and_what_is_missing_is_known(
+        self, tmp_path: Path, damage: Callable[[bytearray, random.Random], None], finished: bool, level: int
+    ) -> None:
+        rng, path = random.Random(f"{damage.__name__}{finished}{level}"), tmp_path / "a.mcap"
+        written = write(path, finish=finished, level=level)
+        whole = path.read_bytes()
+        for _ in range(12):
+            raw = bytearray(whole)
+            damage(raw, rng)
+            path.write_bytes(raw)
+            found = Damage()
+            read = contents(path, found)
+            if not found.orphans:
+                assert is_part_of(read, written)
+            try:
+                made = finish(path)
+            except RecordingError:
+                assert not read
+                continue
+            assert contents(path) == read
+            assert counted_by_mcap(path) == (made.messages, len(read))
+            assert made.messages == len(read)
+            assert finish(path) == made
+            if made.damaged_bytes == 0 and made.torn_bytes == 0:
+                assert read == written
+            elif finished and damage in (flip, zero_a_page) and Summary.of(raw) is not None:
+                assert made.missing == len(written) - len(read)
+
+    @pytest.mark.parametrize("level", [0, 3])
+    def test_one_bit_costs_two_chunks_at_most(self, tmp_path: Path, level: int) -> None:
+        rng, path = random.Random(level), tmp_path / "a.mcap"
+        written = write(path, finish=False, level=level)
+        whole = path.read_bytes()
+        for _ in range(150):
+            raw = bytearray(whole)
+            flip(raw, rng, 1)
+            path.write_bytes(raw)
+            found = Damage()
+            read = contents(path, found)
+            assert len(written) - len(read) <= 200
+            assert found.missing + 200 >= len(written) - len(read)
+
+    def test_bits_of_what_has_no_checksum(self, tmp_path: Path) -> None:
+        """A bit of each byte of opcodes and lengths: a wrong record must not hide the others."""
+        rng, path = random.Random(3), tmp_path / "a.mcap"
+        written = write(path, 600, finish=False)
+        whole = path.read_bytes()
+        for begin in _records(whole):
+            for at in range(begin, begin + 9):
+                raw = bytearray(whole)
+                raw[at] ^= 1 << rng.randrange(8)
+                path.write_bytes(raw)
+                assert len(contents(path)) >= len(written) - 100, at
+
+    def test_finishing_may_be_interrupted_at_any_byte(self, tmp_path: Path) -> None:
+        rng, path = random.Random(5), tmp_path / "a.mcap"
+        write(path, finish=False)
+        raw = bytearray(path.read_bytes())
+        zero_a_page(raw, rng)
+        path.write_bytes(raw)
+        read = contents(path)
+        begun = finish(path)
+        done = path.read_bytes()
+        for _ in range(100):
+            path.write_bytes(done[: rng.randrange(len(raw) - 20_000, len(done))])
+            if path.stat().st_size < len(raw):
+                path.write_bytes(raw[: path.stat().st_size])
+                continue
+            assert finish(path).messages == begun.messages
+            assert contents(path) == read
+            assert counted_by_mcap(path)[0] == begun.messages
+
+    @pytest.mark.parametrize("level", [0, 3])
+    def test_a_recording_inside_a_payload_is_not_taken_for_one_of_the_file(self, tmp_path: Path, level: int) -> None:
+        inner, path = tmp_path / "inner.mcap", tmp_path / "a.mcap"
+        write(inner, 500, level=0)
+        foreign = inner.read_bytes()
+        rng = random.Random(7)
+        with path.open("wb", buffering=0) as file:
+            writer = McapWriter(file, library="pebble test", packer=Packer(level))
+            channel = writer.channel("pebble/robots/goob/incoming/file", "application/octet-stream", {})
+            for number in range(20):
+                writer.add(channel, START_NS + number * STEP_NS, foreign if number % 5 == 2 else rng.randbytes(50_000))
+                writer.flush()
+        whole = path.read_bytes()
+        for _ in range(60):
+            raw = bytearray(whole)
+            zero_a_page(raw, rng)
+            path.write_bytes(raw)
+            assert {topic for topic, _ in contents(path)} <= {"pebble/robots/goob/incoming/file"}
+
+    def test_nothing_but_garbage(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        for garbage in (b"", bytes(5000), random.Random(1).randbytes(5000), b"\x89MCAP0\r\n"):
+            path.write_bytes(garbage)
+            assert contents(path) == []
+            with pytest.raises(RecordingError):
+                finish(path)
+            assert path.read_bytes() == garbage
+
+
+def _records(raw: bytes) -> list[int]:
+    found, at = [], 8
+    while at < len(raw):
+        found.append(at)
+        at += 9 + int.from_bytes(raw[at + 1 : at + 9], "little")
+    return found[1:]
+
+
+def test_each_file_has_a_name_of_its_own(tmp_path: Path) -> None:
+    names = set()
+    for number in range(2):
+        path = tmp_path / f"{number}.mcap"
+        write(path, 5)
+        with mapped(path) as data:
+            summary = Summary.of(data)
+        assert summary is not None
+        names |= {channel.metadata["file"] for channel in summary.channels.values() if channel.topic == FILE_TOPIC}
+    assert len(names) == 2

@@ -1,0 +1,49 @@
+"""Recordings made by the writer itself, for tests of what reads them."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from pebble.recordings.files.mcap import Packer
+from pebble.recordings.files.reader import mapped, read
+from pebble.recordings.files.scan import Damage
+from pebble.recordings.files.writer import McapWriter
+
+START_NS = 1_790_000_000_000_000_000
+STEP_NS = 10_000_000
+
+
+def write(
+    path: Path, messages: int = 2000, *, finish: bool = True, level: int = 3, channels: int = 20, each: int = 100
+) -> list[tuple[str, bytes]]:
+    """A file with random payloads, one chunk for every ``each`` of them; returns topics and payloads."""
+    rng = random.Random(messages)
+    written = []
+    with path.open("wb", buffering=0) as file:
+        writer = McapWriter(file, library="pebble test", packer=Packer(level))
+        writer.metadata("pebble.recording", {"format": "1"})
+        topics = [f"pebble/robots/r{number}/outgoing/t{number}" for number in range(channels)]
+        numbers = [writer.channel(topic, "json", {"qos": "0"}) for topic in topics]
+        for number in range(messages):
+            channel, payload = rng.randrange(channels), rng.randbytes(rng.randrange(200))
+            writer.add(numbers[channel], START_NS + number * STEP_NS, payload, 5)
+            written.append((topics[channel], payload))
+            if number % each == each - 1:
+                writer.flush()
+        writer.finish() if finish else writer.flush()
+    return written
+
+
+def contents(path: Path, damage: Damage | None = None, **options: Any) -> list[tuple[str, bytes]]:
+    """Topics and payloads of what can be read."""
+    with mapped(path) as data:
+        return [(message.channel.topic, message.payload) for message in read(data, damage, **options)]
+
+
+def is_part_of(some: Iterable[Any], whole: Iterable[Any]) -> bool:
+    """Whether ``some`` are in ``whole``, in its order."""
+    rest = iter(whole)
+    return all(one in rest for one in some)

@@ -1,0 +1,490 @@
+"""The recorder on real files: what it writes, and what becomes of it when the disk, the clock or the power fails."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.recordings import library
+from pebble.recordings.files.finish import finish
+from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.reader import RecordingError, mapped, metadata_of, read
+from pebble.recordings.recorder import lane as lane_module
+from pebble.recordings.recorder.folder import Folder
+from pebble.recordings.recorder.intake import EVENTS, Clocks
+from pebble.recordings.recorder.recorder import Options, Recorder
+from tests.support import until
+
+BASE = "pebble/robots/goob"
+ONLINE, CAMERA = f"{BASE}/outgoing/online", f"{BASE}/outgoing/front-camera"
+STATUS = f"{BASE}/outgoing/status"
+PICTURE = b"PBVD\x01\x05\x01" + bytes(12)
+QUICK = Options(free_bytes=0, flush_seconds=0.2, sync_seconds=0.3)
+
+
+def recorded(root: Path) -> list[Recorded]:
+    return list(library.merged(library.files([root])))
+
+
+def payloads(root: Path, topic: str = ONLINE) -> list[bytes]:
+    return [message.payload for message in recorded(root) if message.channel.topic == topic]
+
+
+def events(root: Path, name: str) -> list[dict[str, Any]]:
+    found = [json.loads(message.payload) for message in recorded(root) if message.channel.topic == EVENTS]
+    return [event for event in found if event["event"] == name]
+
+
+class Running:
+    """A recorder with a robot."""
+
+    def __init__(self, root: Path, options: Options = QUICK, clocks: Clocks | None = None) -> None:
+        self.root, self.recorder = root, Recorder(root, options, {"recorder": "test"}, clocks)
+        self.sent = 0
+        self.recorder.start()
+
+    def send(self, count: int = 1, topic: str = ONLINE, payload: bytes = b"%d", *, retain: bool = False) -> None:
+        for _ in range(count):
+            self.recorder.receive(topic, payload.replace(b"%d", b"%d" % self.sent), 1, retain)
+            self.sent += 1
+
+    def written(self, count: int) -> bool:
+        return until(lambda: self.recorder.counters["written"] >= count, 10)
+
+    def stop(self) -> None:
+        self.recorder.stop()
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[Running]:
+    one = Running(tmp_path / "rec")
+    yield one
+    one.stop()
+
+
+class TestFiles:
+    def test_all_is_written_in_order_with_its_flags(self, running: Running) -> None:
+        running.send(500)
+        running.recorder.receive(f"{BASE}/incoming/flags/mqtt-video", b"true", 1, retain=True, retained=True)
+        running.recorder.receive("a/b", b"\x00\x01", None, retain=None)
+        running.stop()
+        found = recorded(running.root)
+        assert payloads(running.root) == [b"%d" % number for number in range(500)]
+        flags = {message.channel.topic: (message.channel.encoding, dict(message.channel.metadata)) for message in found}
+        assert flags[ONLINE] == ("json", {"qos": "1", "retain": "0"})
+        assert flags[f"{BASE}/incoming/flags/mqtt-video"] == ("json", {"qos": "1", "retain": "1", "retained": "1"})
+        assert flags["a/b"] == ("application/octet-stream", {})
+        assert [event["event"] for event in map(json.loads, payloads(running.root, EVENTS))] == ["start", "stop"]
+
+    def test_each_robots_media_have_files_of_their_own(self, running: Running) -> None:
+        running.send()
+        running.send(topic=CAMERA, payload=PICTURE)
+        running.send(topic=f"a/{'x' * 300}/b/cam", payload=PICTURE)
+        for number in range(50):
+            running.send(topic=f"pebble/robots/r{number}/outgoing/front-camera", payload=PICTURE)
+        running.stop()
+        names = sorted(path.name.split(".", 1)[1] for path in library.files([running.root]))
+        assert {"state.mcap", "media.pebble.robots.goob.mcap", "media._other.mcap"} < set(names)
+        assert len(names) == 33
+        assert len(recorded(running.root)) == 2 + 1 + 1 + 1 + 50
+
+    def test_state_has_its_file_however_many_send_pictures(self, tmp_path: Path) -> None:
+        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.2, rotate_seconds=0.5))
+        for number in range(40):
+            running.send(topic=f"pebble/robots/r{number % 40}/outgoing/front-camera", payload=PICTURE)
+        assert running.written(40)
+        time.sleep(1.0)  # it is rotated
+        running.send(5)
+        running.stop()
+        state = [path for path in library.files([running.root]) if ".state." in path.name]
+        assert len([m for m in library.merged(state) if m.channel.topic == ONLINE]) == 5
+
+    def test_times_are_those_of_reception(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """However long the disk holds up the writer, and whatever happens to the recording meanwhile."""
+        monkeypatch.setattr(lane_module._Raw, "write", _slowly(lane_module._Raw.write, 0.4))
+        running = Running(tmp_path / "rec")
+        for _ in range(60):
+            running.send(payload=b'{"t":%d}' % (time.time_ns() // 10**6))
+            running.recorder.event("late", max_ms=1)
+            time.sleep(0.02)
+        running.stop()
+        online = [message for message in recorded(running.root) if message.channel.topic == ONLINE]
+        assert len(online) == 60
+        assert max(abs(message.log_ns - message.publish_ns) for message in online) < 100e6
+
+    @pytest.mark.parametrize("retain", [False, None])
+    def test_carried_values_are_those_of_each_broker_and_the_newest(self, tmp_path: Path, retain: bool | None) -> None:
+        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.2, rotate_seconds=0.5))
+        flag, receive = f"{BASE}/incoming/flags/mqtt-video", running.recorder.receive
+        receive(flag, b"true", None, True, retained=True)
+        receive(flag, b"false", 1, retain)
+        receive(ONLINE, b"one", 1, True, source="one")
+        receive(ONLINE, b"two", 1, True, source="two")
+        receive(STATUS, b"gone", None, True, retained=True, source="two")
+        running.recorder.forget_retained("two")
+        receive(ONLINE, b"three", None, True, retained=True, source="two")
+        time.sleep(1.5)
+        running.stop()
+        carried = {m.payload for m in recorded(running.root) if m.channel.metadata.get("retained") == "carried"}
+        assert carried == {b"false" if retain is None else b"true", b"one", b"three"}
+
+    def test_no_media(self, tmp_path: Path) -> None:
+        running = Running(tmp_path / "rec", Options(free_bytes=0, media=False))
+        running.send()
+        running.send(topic=CAMERA, payload=PICTURE)
+        running.stop()
+        assert [path.name.split(".")[1] for path in library.files([tmp_path])] == ["state"]
+
+    def test_files_are_rotated_and_the_next_begins_with_the_retained_values(self, tmp_path: Path) -> None:
+        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.1, rotate_seconds=1.0))
+        running.send(topic=f"{BASE}/outgoing/status", payload=b'{"a": 1}', retain=True)
+        running.send(topic=f"{BASE}/outgoing/gone", payload=b"1", retain=True)
+        running.send(topic=f"{BASE}/outgoing/gone", payload=b"", retain=True)
+        for _ in range(30):
+            running.send()
+            time.sleep(0.05)
+        running.stop()
+        files = library.files([running.root])
+        assert len(files) >= 2
+        with mapped(files[-1]) as data:
+            assert metadata_of(data)["pebble.recording"]["lane"] == "state"
+        again = [m for m in library.merged(files[1:2]) if m.channel.metadata.get("retained") == "carried"]
+        assert [message.payload for message in again] == [b'{"a": 1}']
+        live = [m.payload for m in recorded(running.root) if m.channel.topic == ONLINE]
+        assert live == [b"%d" % number for number in range(3, 33)]
+
+    def test_a_stranger_may_invent_topics(self, running: Running) -> None:
+        for number in range(6000):
+            running.recorder.receive(f"pebble/robots/evil{number % 7}/outgoing/{number}", b"%d" % number, 0, False)
+        running.send()
+        running.stop()
+        found = recorded(running.root)
+        evil = {message.channel.topic: message.payload for message in found if "evil" in message.channel.topic}
+        assert len(evil) == 6000
+        assert all(topic.endswith(payload.decode()) for topic, payload in evil.items())
+        assert len({message.channel.id for message in found}) <= 4100
+        assert len(payloads(running.root)) == 1
+
+    @pytest.mark.parametrize("payload", [b"PBAT" + b"\xff" * 20, b"PBVD" + b"\xff" * 20, b'{"t": -1e999}', b"", b"{"])
+    def test_no_payload_ends_it(self, running: Running, payload: bytes) -> None:
+        running.send(topic=f"{BASE}/outgoing/x", payload=payload)
+        running.send()
+        running.stop()
+        assert payloads(running.root, f"{BASE}/outgoing/x") == [payload]
+        assert payloads(running.root) == [b"1"]
+        assert running.recorder.counters["errors"] == 0
+
+    def test_events_cannot_be_forged(self, running: Running) -> None:
+        running.recorder.receive(EVENTS, b'{"event":"gap"}', 1, False)
+        running.stop()
+        assert events(running.root, "gap") == []
+        assert running.recorder.counters["refused"] == 1
+
+    def test_the_folder_has_one_recorder(self, running: Running) -> None:
+        with pytest.raises(RecordingError, match="another recorder writes here"):
+            Recorder(running.root, QUICK).start()
+        assert Folder.is_in_use(running.root)
+        running.stop()
+        assert not Folder.is_in_use(running.root)
+
+
+class TestDisk:
+    def test_a_slow_disk_blocks_no_sender_and_costs_pictures_first(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(lane_module._Raw, "write", _slowly(lane_module._Raw.write, 0.7))
+        running = Running(tmp_path / "rec", Options(free_bytes=0, queue_bytes=600_000, flush_seconds=0.2))
+        running.send()
+        assert until(lambda: running.recorder.waiting == 0, 10)
+        began = time.monotonic()
+        for _ in range(300):
+            running.send(topic=CAMERA, payload=PICTURE + bytes(5000))
+            running.send()
+        assert time.monotonic() - began < 1.0
+        dropped = running.recorder.counters["dropped"]
+        running.stop()
+        assert dropped > 100
+        assert len(payloads(running.root)) == 301
+        assert sum(event["messages"] for event in events(running.root, "dropped")) == dropped
+
+    def test_a_full_disk_loses_only_what_comes_meanwhile_and_the_count_is_written_down(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        full, write = threading.Event(), lane_module._Raw.write
+
+        def raw_write(self: Any, data: memoryview) -> int | None:
+            if full.is_set():
+                if len(data) < 50:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                return write(self, data[:40])  # a part of it still fits
+            return write(self, data)
+
+        monkeypatch.setattr(lane_module._Raw, "write", raw_write)
+        running = Running(tmp_path / "rec")
+        running.send(100)
+        assert running.written(100)
+        full.set()
+        running.send(50)
+        assert until(lambda: bool(running.recorder.blocked), 10)
+        running.send(70)
+        assert until(lambda: running.recorder.counters["dropped"] == 70, 10)
+        full.clear()
+        assert until(lambda: not running.recorder.blocked, 10)
+        running.send(10)
+        running.stop()
+        expected = [b"%d" % number for number in (*range(150), *range(220, 230))]
+        assert sorted(payloads(running.root), key=int) == expected
+        gap = events(running.root, "gap")
+        assert [event["messages"] for event in gap] == [70]
+        assert len(events(running.root, "recovered")) == 1
+
+    def test_the_oldest_media_go_first_and_what_is_not_ours_stays(self, tmp_path: Path) -> None:
+        root = tmp_path / "rec"
+        foreign = root / "2026" / "mine.mcap"
+        foreign.parent.mkdir(parents=True)
+        foreign.write_bytes(bytes(100_000))
+        options = Options(free_bytes=0, flush_seconds=0.1, rotate_seconds=0.4, keep_bytes=60_000, level=0)
+        running = Running(root, options)
+        for _ in range(60):
+            running.send(topic=CAMERA, payload=PICTURE + random.Random(1).randbytes(3000))
+            running.send()
+            time.sleep(0.05)
+        running.stop()
+        entries = Folder(root).entries()
+        assert foreign.exists()
+        assert sum(entry.size for entry in entries) < 60_000 + 60_000
+        assert len(events(root, "pruned")) >= 2
+        assert all("media" in event["file"] for event in events(root, "pruned")[:2])
+        assert len(payloads(root)) == 60
+
+    def test_a_folder_that_is_removed_is_made_again(self, running: Running) -> None:
+        running.send(5)
+        assert running.written(5)
+        shutil.rmtree(running.root / "20" if (running.root / "20").exists() else next(running.root.glob("2*")))
+        running.send()
+        assert until(lambda: running.recorder.counters["event_removed"] == 1, 10)
+        running.send(5)
+        running.stop()
+        assert len(payloads(running.root)) >= 5
+
+    def test_a_file_that_cannot_be_opened_costs_what_comes_meanwhile_and_no_more(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        create, refused = Folder.create, threading.Event()
+
+        def fails(self: Folder, lane: str, now_ns: int) -> Any:
+            if lane != "state" and not refused.is_set():
+                refused.set()
+                raise OSError(errno.EIO, "Input/output error")
+            return create(self, lane, now_ns)
+
+        monkeypatch.setattr(Folder, "create", fails)
+        running = Running(tmp_path / "rec")
+        running.send(50)
+        running.send(topic=CAMERA, payload=PICTURE)
+        assert until(lambda: bool(running.recorder.blocked), 10)
+        running.send(30)
+        assert until(lambda: not running.recorder.blocked, 10)
+        running.send(50)
+        running.stop()
+        dropped = running.recorder.counters["dropped"]
+        assert len(payloads(running.root)) + len(payloads(running.root, CAMERA)) + dropped == 131
+        assert dropped <= 30
+        assert payloads(running.root, CAMERA) == [PICTURE]
+        assert [event["messages"] for event in events(running.root, "gap")] == [dropped]
+
+    def test_what_a_full_disk_never_took_is_counted_at_the_end(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(self: Any, data: memoryview) -> int | None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        running = Running(tmp_path / "rec")
+        running.send(20)
+        assert running.written(20)
+        monkeypatch.setattr(lane_module._Raw, "write", full)
+        running.send(30)
+        assert until(lambda: bool(running.recorder.blocked), 10)
+        running.send(40)
+        running.stop()
+        assert running.recorder.counters["dropped"] == 70
+        assert len(payloads(running.root)) == 20
+
+    def test_no_room_from_the_start(self, tmp_path: Path) -> None:
+        running = Running(tmp_path / "rec", Options(free_bytes=1 << 60))
+        assert until(lambda: "the disk is full" in running.recorder.blocked, 10)
+        running.send(10)
+        assert until(lambda: running.recorder.counters["dropped"] == 10, 10)
+        running.stop()
+
+
+def _slowly(write: Any, seconds: float) -> Any:
+    def slow(self: Any, data: memoryview) -> int | None:
+        time.sleep(seconds)
+        return int(write(self, data))
+
+    return slow
+
+
+class TestClock:
+    @pytest.mark.parametrize("by_s", [-3600.0, 3600.0, 40 * 86_400.0])
+    def test_a_jump_begins_a_new_file_and_time_never_goes_back_in_one(self, tmp_path: Path, by_s: float) -> None:
+        shift = [0]
+        running = Running(tmp_path / "rec", clocks=Clocks(wall_ns=lambda: time.time_ns() + shift[0]))
+        running.send(20)
+        assert running.written(20)
+        shift[0] = int(by_s * 1e9)
+        for _ in range(20):
+            running.send()
+            time.sleep(0.03)
+        running.stop()
+        files = library.files([running.root])
+        assert len(files) == 2
+        for path in files:
+            with mapped(path) as data:
+                times = [message.log_ns for message in read(data)]
+            assert times == sorted(times)
+        jump = events(running.root, "clock")
+        assert [round(event["by_s"]) for event in jump] == [round(by_s)]
+        assert len(payloads(running.root)) == 40
+
+    def test_a_suspended_machine_is_a_gap(self, tmp_path: Path) -> None:
+        asleep = [0]
+        clocks = Clocks(wall_ns=lambda: time.time_ns() + asleep[0], boot_ns=lambda: time.monotonic_ns() + asleep[0])
+        running = Running(tmp_path / "rec", clocks=clocks)
+        running.send(5)
+        assert running.written(5)
+        time.sleep(0.5)
+        asleep[0] = 8 * 3600 * 10**9
+        running.send(5)
+        assert until(lambda: running.recorder.counters["event_gap"] == 1, 10)
+        running.stop()
+        (gap,) = events(running.root, "gap")
+        assert gap["why"] == "suspended"
+        assert gap["until"] - gap["since"] == pytest.approx(8 * 3600_000, abs=2000)
+        assert len(payloads(running.root)) == 10
+
+
+_CHILD = """
+import sys, time
+from pathlib import Path
+from pebble.recordings.recorder.recorder import Options, Recorder
+recorder = Recorder(Path(sys.argv[1]), Options(free_bytes=0, sync_seconds=0.3))
+recorder.start()
+number = 0
+while True:
+    recorder.receive("pebble/robots/goob/outgoing/online", b"%d" % number, 1, False)
+    recorder.receive("pebble/robots/goob/outgoing/front-camera", b"PBVD" + b"\\x00" * 15 + b"%d" % number, 0, False)
+    print(number, flush=True)
+    number += 1
+    time.sleep(0.002)
+"""
+
+
+class TestEnds:
+    def test_killed_at_any_moment_it_loses_a_second_at_most(self, tmp_path: Path) -> None:
+        """What a killed recorder leaves is finished by the next one."""
+        root, rng, lost = tmp_path / "rec", random.Random(4), []
+        for _ in range(6):
+            with subprocess.Popen([sys.executable, "-c", _CHILD, root], stdout=subprocess.PIPE, text=True) as child:
+                assert child.stdout is not None
+                child.stdout.readline()
+                time.sleep(rng.uniform(0.2, 2.5))
+                child.kill()
+                last = int(child.stdout.read().split()[-2])
+            active = [entry.path for entry in Folder(root).entries() if entry.is_active]
+            found = [
+                int(message.payload)
+                for path in active
+                for message in library.merged([path])
+                if message.channel.topic == ONLINE
+            ]
+            assert found == list(range(len(found)))
+            lost.append(last + 1 - len(found))
+        assert max(lost) <= 2.5 / 0.002  # a generous bound; 1.2 s are expected
+        running = Running(root)
+        assert until(
+            lambda: not [entry for entry in Folder(root).entries() if entry.is_active and entry.number <= 12], 10
+        )
+        running.stop()
+        assert not list(root.rglob("*.damaged"))
+        for path in library.files([root]):
+            finish(path)
+
+    def test_power_is_lost(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Images of the disk: what was synced, and random pages of the rest. Each opens, and says what is missing."""
+        disk = _Disk(monkeypatch)
+        running = Running(tmp_path / "rec", Options(free_bytes=0, flush_seconds=0.05, sync_seconds=2.0, level=1))
+        rng = random.Random(9)
+        ends = time.monotonic() + 5.0
+        while time.monotonic() < ends:
+            running.send(20, payload=b'{"t": %d, "x": "' + rng.randbytes(150).hex().encode() + b'"}')
+            time.sleep(0.01)
+        log = list(disk.log)
+        running.stop()
+        path = tmp_path / "image.mcap"
+        complete = {message.sequence: message.payload for message in recorded(running.root)}
+        missing, images = 0, int(os.environ.get("PEBBLE_POWER_LOSSES", "100"))
+        for _ in range(images):
+            image, synced = disk.image(log, rng)
+            path.write_bytes(image)
+            try:
+                made = finish(path)
+            except RecordingError:  # nothing of the first second had arrived
+                assert synced < 5000
+                continue
+            found = {message.sequence: message.payload for message in library.merged([path])}
+            assert all(complete[number] == payload for number, payload in found.items())
+            assert made.missing == max(found, default=-1) + 1 - len(found)
+            missing += made.missing > 0
+            path.write_bytes(image[:synced])
+            if synced > 5000:
+                finish(path)
+            assert {message.sequence for message in library.merged([path])} <= found.keys()
+        assert missing > images // 20  # it is tried
+
+
+class _Disk:
+    """Notes what one file's writes and syncs are."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.log: list[bytes | None] = []  # None: synced
+        write, fdatasync = lane_module._Raw.write, os.fdatasync
+
+        def raw_write(raw: Any, data: memoryview) -> int | None:
+            self.log.append(bytes(data))
+            return write(raw, data)
+
+        def sync(descriptor: int) -> None:
+            fdatasync(descriptor)
+            self.log.append(None)
+
+        monkeypatch.setattr(lane_module._Raw, "write", raw_write)
+        monkeypatch.setattr(os, "fdatasync", sync)
+
+    @staticmethod
+    def image(log: list[bytes | None], rng: random.Random) -> tuple[bytes, int]:
+        """The file after a power cut at a random moment, and how many bytes of it were synced."""
+        raw, synced = bytearray(), 0
+        for one in log[: rng.randrange(1, len(log))]:
+            if one is None:
+                synced = len(raw)
+            else:
+                raw += one
+        raw = raw[: rng.randrange(synced, len(raw) + 1)]
+        for page in range(-(-synced // 4096) * 4096, len(raw), 4096):
+            if rng.random() < rng.choice((0.1, 0.5)):
+                raw[page : page + 4096] = bytes(len(raw[page : page + 4096]))
+        return bytes(raw), synced

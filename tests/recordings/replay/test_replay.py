@@ -1,0 +1,322 @@
+"""``pebble replay`` as a process, with a real mosquitto and a real terminal."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pebble.bench.percentiles import percentile
+from pebble.recordings.replay import robots as replayed_robots
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.commands.command_line import Run, program
+from tests.commands.conftest import run as run
+from tests.commands.test_drive import Console
+from tests.recordings.lateness import lateness
+from tests.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
+from tests.support import Broker, until
+
+REPLAYED = "replay/robots/goob"
+ONLINE, STATUS, LOGS = (f"{REPLAYED}/outgoing/{metric}" for metric in ("online", "status", "logs"))
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("broker"), "max_queued_messages 0")
+    yield broker
+    broker.stop()
+
+
+class Operator:
+    """Receives everything."""
+
+    def __init__(self, broker: Broker) -> None:
+        self._settings = MqttSettings(host="127.0.0.1", port=broker.port)
+        self.transport = create("mqtt", "operator", self._settings).open()
+        self.received: list[tuple[float, Message]] = []
+        self.transport.subscribe("#", self._take, direct=True)
+
+    def _take(self, message: Message) -> None:
+        self.received.append((time.monotonic(), message))
+
+    def payloads(self, topic: str) -> list[bytes]:
+        return [message.payload for _, message in list(self.received) if message.topic == topic]
+
+    def states(self, topic: str = ONLINE) -> list[object]:
+        return [json.loads(payload).get("online", True) for payload in self.payloads(topic)]
+
+    def publish_heartbeats(self) -> None:
+        """As a live robot does, for 1.5 s."""
+        for _ in range(15):
+            self.transport.publish(ONLINE, js(t=time.time_ns() // 10**6), qos=QoS.DELIVERED, retain=True)
+            time.sleep(0.1)
+
+    def retained(self) -> dict[str, bytes]:
+        """What a new subscriber is sent."""
+        found: dict[str, bytes] = {}
+        with create("mqtt", "late", self._settings) as late:
+            late.subscribe("#", lambda message: _note(message, found), direct=True)
+        return found
+
+
+def _note(message: Message, found: dict[str, bytes]) -> None:
+    if message.retain:
+        found[message.topic] = message.payload
+
+
+@pytest.fixture
+def operator(broker: Broker) -> Iterator[Operator]:
+    operator = Operator(broker)
+    yield operator
+    for topic in operator.retained():
+        operator.transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+    operator.transport.close()
+
+
+@pytest.fixture
+def at(broker: Broker) -> tuple[str, str]:
+    return "--url", f"mqtt://127.0.0.1:{broker.port}"
+
+
+def walk(folder: Path, seconds: int = 60) -> Path:
+    """Heartbeats, a retained state, a log and drive commands."""
+    lines = [Line(0, f"{GOOB}/outgoing/status", js(t=ms(0), value={}), 1, retained=True)]
+    for number in range(seconds * 4):
+        at = number / 4
+        lines.append(Line(at, f"{GOOB}/outgoing/online", js(t=ms(at)), 1, retain=True))
+        lines.append(Line(at + 0.01, f"{GOOB}/outgoing/logs", js(t=ms(at), n=number)))
+        lines.append(Line(at + 0.02, f"{GOOB}/incoming/drive-values", js(x=0, z=0.5), 1))
+    return write(folder / "walk.mcap", lines)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process it listens more briefly."""
+    monkeypatch.setattr(replayed_robots, "LISTEN_S", 0.3)
+    monkeypatch.setattr(replayed_robots, "_OPEN_S", 1.0)
+
+
+@contextmanager
+def meanwhile(job: Callable[[], object]) -> Iterator[None]:
+    """``job`` on a thread of its own."""
+    thread = threading.Thread(target=job)
+    thread.start()
+    yield
+    thread.join(20)
+
+
+def ends(process: subprocess.Popen[str], timeout: float = 20) -> tuple[int, str, str]:
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        process.kill()
+    return process.returncode, out, err
+
+
+def test_replayed_at_ten_times_its_speed_it_is_the_same(
+    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run, quick: None
+) -> None:
+    lines = demo(20)
+    path = write(tmp_path / "demo.mcap", lines)
+    began = time.monotonic()
+    code = run("replay", path, *at, "--same-base", "--incoming", "--stamps", "as-is", "--speed", "10")
+    assert (code, run.err) == (0, "")
+    assert time.monotonic() - began > 2
+    assert run.out.splitlines() == [f"{GOOB}, {FRED}", f"{len(lines)} sent, 0 skipped"]
+    assert until(lambda: operator.states(f"{FRED}/outgoing/online")[-1] is False)
+    for topic in {line.topic for line in lines}:
+        sent = [line.payload for line in lines if line.topic == topic]
+        assert operator.payloads(topic)[: len(sent)] == sent, topic
+        assert len(operator.payloads(topic)) - len(sent) == topic.endswith("online")
+    qualities = {line.topic: line.qos for line in lines}
+    assert all(message.qos == qualities[message.topic] for _, message in operator.received)
+    assert operator.retained() == {}
+
+
+def test_by_default_it_is_harmless_and_current(
+    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run, quick: None
+) -> None:
+    period = ("--since", "2023-11-14T22:13:30Z", "--until", "+5s")  # from 10 s after its begin
+    assert (run("replay", walk(tmp_path), *at, *period, "--speed", "10"), run.err) == (0, "")
+    assert until(lambda: operator.states() == [*[True] * 20, False])
+    assert {message.topic for _, message in operator.received} == {ONLINE, STATUS, LOGS}
+    assert [json.loads(payload)["n"] for payload in operator.payloads(LOGS)] == list(range(40, 60))
+    late = [time.time() * 1000 - json.loads(payload)["t"] for payload in operator.payloads(ONLINE)]
+    assert all(-1000 < each < 20_000 for each in late)
+    assert len(operator.payloads(STATUS)) == 1
+    assert operator.retained() == {}
+
+
+def test_ctrl_c_leaves_no_retained_topic_and_nothing_that_moves(
+    tmp_path: Path, operator: Operator, at: tuple[str, str]
+) -> None:
+    process = program("replay", walk(tmp_path), *at, "--keep", "--incoming")
+    assert until(lambda: len(operator.payloads(LOGS)) > 2)
+    assert set(operator.retained()) == {STATUS}
+    process.send_signal(signal.SIGINT)
+    code, _, err = ends(process)
+    assert (code, err) == (0, "")
+    assert operator.retained() == {}
+    assert until(lambda: operator.states()[-1] is False, 3)
+    assert json.loads(operator.payloads(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0
+
+
+def test_when_it_is_killed_the_broker_publishes_that_its_robot_is_offline(
+    tmp_path: Path, operator: Operator, at: tuple[str, str]
+) -> None:
+    process = program("replay", walk(tmp_path), *at)
+    assert until(lambda: len(operator.payloads(LOGS)) > 2)
+    process.kill()
+    process.communicate()
+    assert until(lambda: operator.states()[-1] is False, 5)
+    assert operator.retained() == {}
+
+
+def test_it_refuses_to_begin_while_a_robot_is_live(
+    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run, quick: None
+) -> None:
+    with meanwhile(operator.publish_heartbeats):
+        assert run("replay", walk(tmp_path), *at) == 1
+    assert run.out == ""
+    assert run.err == f"pebble: {REPLAYED} is live: switch it off, or choose a --base at which there is no robot\n"
+    assert operator.payloads(LOGS) == []
+    assert False not in operator.states()
+
+
+def test_it_ends_when_a_robot_comes_online(
+    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run, quick: None
+) -> None:
+    def come_online() -> None:
+        assert until(lambda: len(operator.payloads(LOGS)) > 2)
+        operator.publish_heartbeats()
+
+    with meanwhile(come_online):
+        assert run("replay", walk(tmp_path), *at) == 1
+    assert run.err == f"pebble: {REPLAYED} is live: the replay has ended, so that it is not mistaken for the robot\n"
+    assert 3 <= len(operator.payloads(LOGS)) <= 8
+    assert False not in operator.states()
+
+
+def test_a_broker_that_restarts_gets_the_rest_and_nothing_retained(tmp_path: Path, run: Run, quick: None) -> None:
+    broker = Broker(tmp_path)
+    operator = Operator(broker)
+
+    def restart() -> None:
+        assert until(lambda: len(operator.payloads(LOGS)) > 2)
+        broker.kill()
+        time.sleep(0.2)
+        broker.start()  # it ends with this thread
+        assert until(lambda: operator.states()[-1] is False, 20)
+        left.update(operator.retained())
+
+    left: dict[str, bytes] = {}
+    with meanwhile(restart):
+        assert run("replay", walk(tmp_path, 3), "--keep", "--url", f"mqtt://127.0.0.1:{broker.port}") == 0
+    numbers = [json.loads(payload)["n"] for payload in operator.payloads(LOGS)]
+    assert numbers == sorted(numbers)
+    assert numbers[-1] == 11
+    assert len(numbers) >= 10
+    assert run.err.splitlines()[-2:] == ["pebble: connected again, listening for the robots", "pebble: it goes on"]
+    assert left == {}
+    operator.transport.close()
+    broker.stop()
+
+
+def test_keys_on_a_terminal(tmp_path: Path, operator: Operator, at: tuple[str, str]) -> None:
+    command = [*(sys.executable, "-m", "pebble.cli", "replay", str(walk(tmp_path))), *at, "--paused"]
+    console = Console(*command)
+    try:
+        assert console.sees("Space pauses")
+        assert console.sees("paused · 0 sent")
+        console.type(b" ")
+        assert until(lambda: len(operator.payloads(LOGS)) > 2)
+        console.type(b" ")
+        assert console.sees("paused · ")
+        count = len(operator.payloads(LOGS))
+        console.type(b"\x1b[C\x1b[C+ ")  # 20 s on, twice as fast
+        assert until(lambda: len(operator.payloads(LOGS)) > count + 2)
+        assert json.loads(operator.payloads(LOGS)[-1])["n"] > 80
+        assert console.sees("× 2 · ")
+        console.type(b"\x03")
+        assert console.process.wait(10) == 0
+        assert console.sees(" skipped")
+    finally:
+        console.close()
+    assert until(lambda: operator.states()[-1] is False, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("--base", "x", "--same-base"), "--base and --same-base exclude each other"),
+        (("--same-base", "--keep"), "--keep is for another base"),
+        (("--actions",), "--actions needs --incoming"),
+        (("--incoming", "--speed", "0.5"), "--speed 0.5 would drive a robot for longer"),
+        (("--paused",), "--paused needs a terminal"),
+        (("--base", "pebble"), "--base pebble is the base of pebble/robots/goob itself"),
+        (("--base", "a/b"), "robot.system: must be a topic level"),
+        (("--only", "other/#"), "there is nothing to publish"),
+        (("--only", "a/#/b"), "# must stand alone"),
+        (("--since", "yesterday-ish"), "yesterday-ish"),
+    ],
+)
+def test_errors_are_one_line(tmp_path: Path, run: Run, arguments: tuple[str, ...], problem: str) -> None:
+    assert run("replay", walk(tmp_path, 1), "--url", "mqtt://127.0.0.1:9", *arguments) == 1
+    assert problem in run.err
+    assert len(run.err.splitlines()) == 1
+
+
+def test_other_places_are_errors_too(tmp_path: Path, run: Run, quick: None) -> None:
+    assert run("replay", walk(tmp_path, 1), "--url", f"zenoh:{tmp_path}", "--same-base") == 1
+    assert "is a robot's own transport" in run.err
+    assert run("replay", tmp_path / "none.mcap", "--url", "mqtt://127.0.0.1:9") == 1
+    assert "none.mcap: No such file or directory" in run.err
+    assert run("replay", walk(tmp_path, 1), "--url", "mqtt://127.0.0.1:9") == 1
+    assert "cannot connect" in run.err
+    assert run("replay", walk(tmp_path, 1)) == 2
+
+
+@pytest.mark.parametrize(("answer", "code", "sent"), [("fred\n", 1, []), ("", 130, []), ("goob\n", 0, [b"true"])])
+def test_actions_need_the_name_of_the_robot(
+    tmp_path: Path,
+    operator: Operator,
+    at: tuple[str, str],
+    run: Run,
+    quick: None,
+    monkeypatch: pytest.MonkeyPatch,
+    answer: str,
+    code: int,
+    sent: list[bytes],
+) -> None:
+    path = write(tmp_path / "x.mcap", [Line(0, f"{GOOB}/incoming/flags/reboot", b"true", 1)])
+    monkeypatch.setattr(sys, "stdin", io.StringIO(answer))
+    assert run("replay", path, *at, "--incoming", "--actions") == code
+    assert until(lambda: operator.payloads(f"{REPLAYED}/incoming/flags/reboot") == sent)
+
+
+def test_messages_are_not_late(tmp_path: Path, broker: Broker, quick: None) -> None:
+    late, _ = lateness(write(tmp_path / "x.mcap", demo(10, [GOOB])), broker.port, 10.0)
+    assert percentile(late, 50) < 50  # milliseconds; measured 0.3, and 1 for the 99th
+
+
+def test_a_broker_that_delivers_nothing_ends_it(
+    tmp_path: Path, run: Run, quick: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replayed_robots, "_RETURN_S", 0.5)
+    (tmp_path / "acl").write_text("topic write #\n")
+    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
+    assert run("replay", walk(tmp_path), "--url", f"mqtt://127.0.0.1:{broker.port}") == 1
+    assert run.err == (
+        f"pebble: the broker does not deliver {REPLAYED}/outgoing/# to this login, or not from it: "
+        "a live robot would not be noticed\n"
+    )
+    broker.stop()
