@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import stat
@@ -80,14 +79,13 @@ class Folder:
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
         """Whether a recorder writes there."""
-        try:
-            with (root / LOCK).open("rb") as lock:
-                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except FileNotFoundError:
+        if not (root / LOCK).exists():
             return False
-        except OSError:
+        try:
+            with _locked(root / LOCK, ""):
+                return False
+        except RecordingError:
             return True
-        return False
 
     def create(self, lane: str, now_ns: int) -> tuple[BinaryIO, Path]:
         """A new file that is being written. Raises OSError."""
@@ -123,6 +121,10 @@ class Folder:
 @contextmanager
 def _locked(path: Path, used: str) -> Iterator[None]:
     """Raises RecordingError(used) if another process holds it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        raise RecordingError("recording needs a system with file locks, such as Linux or macOS") from None
     try:
         file = path.open("a+b")
     except OSError as error:

@@ -12,6 +12,8 @@ from pebble.recordings.recorder.recorder import Recorder
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 from pebble.transports.topics import matches
 
+#: Topics of a replay: recorded only where a filter names them.
+REPLAYED: Final = "replay/"
 #: How long a connection for retained messages waits for the next one before it ends.
 _QUIET_S: Final = 1.0
 _LONGEST_S: Final = 60.0
@@ -29,6 +31,7 @@ class Source:
     def __init__(self, recorder: Recorder, kind: str, settings: Any, filters: Iterable[str], name: str = "") -> None:
         self._recorder, self._kind, self._name = recorder, kind, name
         self._filters = list(dict.fromkeys(filters))
+        self._ignored = () if any(one.startswith(REPLAYED) for one in self._filters) else (REPLAYED,)
         self._settings = settings
         self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
         self._losses: dict[str, int] = {}
@@ -103,6 +106,8 @@ class Source:
             self._recorder.event("lost", why=self.problem, **self._about)
 
     def _receive(self, message: Message) -> None:
+        if message.topic.startswith(self._ignored):
+            return
         is_live = self._transport.as_published or not message.retain
         if is_live:
             self._recorder.receive(
@@ -112,6 +117,8 @@ class Source:
             self._record_retained(message)
 
     def _record_retained(self, message: Message) -> None:
+        if message.topic.startswith(self._ignored):
+            return
         self._recorder.receive(message.topic, message.payload, None, True, retained=True, source=self._name)
 
 

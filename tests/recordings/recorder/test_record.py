@@ -95,10 +95,12 @@ def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(tmp_pat
         publish_all(robot, reference)
         robot.publish(STATUS, b"{}", qos=QoS.DELIVERED, retain=True)
         robot.publish("pebble/infrastructure", b"1")
+        robot.publish("replay/robots/goob/outgoing/online", b"{}", retain=True)
         time.sleep(2.5)  # the retained messages are fetched beside
     found = recorded(tmp_path / "rec")
     for topic in (AUDIO, DRIVE):
         assert of(found, topic) == reference.of(topic)
+    assert not of(found, "replay/robots/goob/outgoing/online")
     live = [message for message in found if not message.channel.metadata.get("retained")]
     assert of(live, ONLINE) == reference.of(ONLINE)
     flags = {message.channel.topic: dict(message.channel.metadata) for message in live}

@@ -270,14 +270,19 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
     rig.close()
 
 
+def _by_quality(messages: Arrived) -> Arrived:
+    """Each topic's messages of QoS 0, then those of QoS 1: between the two there is no order (T8)."""
+    return {topic: sorted(each, key=lambda message: message[1]) for topic, each in messages.items()}
+
+
 def crosses_once(rig: Rig, situation: str) -> None:
-    """The whole table passes as published, in order, once each, and what is retained can be found."""
+    """The whole table passes as published, in the order of each quality, once each, and what is retained can be found."""
     assert until(lambda: rig.synchronized)
     rig.publish_table(situation)
     due = rig.expected(situation)
     until(lambda: sum(map(len, rig.arrived(situation).values())) >= sum(map(len, due.values())), 5)
     Quiet(*rig.clients.values()).wait(0.1)
-    assert rig.arrived(situation) == due
+    assert _by_quality(rig.arrived(situation)) == _by_quality(due)
     for side in Side:
         cells = [cell for cell in TABLE if cell.side is side.other and cell.passes(rig.service)]
         newest = {cell.topic: cell.payload(situation) for cell in cells if cell.arrives(situation)[2]}
