@@ -276,7 +276,7 @@ def _by_quality(messages: Arrived) -> Arrived:
 
 
 def crosses_once(rig: Rig, situation: str) -> None:
-    """The whole table passes as published, in the order of each quality, once each, and what is retained can be found."""
+    """The whole table passes as published, each quality in order, once each, and what is retained can be found."""
     assert until(lambda: rig.synchronized)
     rig.publish_table(situation)
     due = rig.expected(situation)
