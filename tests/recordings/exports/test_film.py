@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -164,21 +161,6 @@ def test_pictures_and_sound_are_where_their_stamps_are(
     assert film.flash_ms == pytest.approx(FLASH * STEP_MS, abs=1)
     assert film.click_ms == pytest.approx(film.flash_ms, abs=80)
     assert list(tmp_path.iterdir()) == [target]
-
-
-@pytest.mark.skipif(shutil.which("ffprobe") is None, reason="needs ffprobe")
-@pytest.mark.parametrize("ending", [".mkv", ".mp4"])
-def test_ffprobe_accepts_it(tmp_path: Path, ending: str) -> None:
-    target = tmp_path / f"walk{ending}"
-    write_film(in_order(pictures("h264", range(30)), sound("pcm", 16_000, 2.0)), target, ROBOT)
-    probed = subprocess.run(
-        ["ffprobe", "-v", "error", "-of", "json", "-show_format", str(target)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert probed.stderr == ""
-    assert float(json.loads(probed.stdout)["format"]["duration"]) == pytest.approx(2.0, abs=0.2)
 
 
 def test_copied_pictures_are_the_ones_that_were_sent(tmp_path: Path) -> None:
