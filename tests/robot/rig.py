@@ -248,7 +248,9 @@ class Rig:
         now, parts = time.monotonic(), []
         for suffix in ("outgoing/status", "outgoing/online", ""):
             one = self.operator.last(suffix)
-            parts.append(f"no {suffix}" if one is None else f"{now - one.at:.1f} s ago {one.topic} {one.payload[:300]!r}")
+            parts.append(
+                f"no {suffix}" if one is None else f"{now - one.at:.1f} s ago {one.topic} {one.payload[:300]!r}"
+            )
         return "; ".join(parts)
 
     # -- its config
