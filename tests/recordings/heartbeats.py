@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import random
 import signal
 import statistics
@@ -63,7 +64,7 @@ class Heartbeats:
             operator.step()
             time.sleep(_PERIOD_S)
         found = [list(times) for times in self.at.values()]
-        return [1000 * (after - before) for times in found for before, after in zip(times, times[1:], strict=False)]
+        return [1000 * (after - before) for times in found for before, after in itertools.pairwise(times)]
 
 
 def main() -> None:
