@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import secrets
 import tempfile
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta, Struct
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from pebble.contract.identity import Identity
@@ -30,6 +31,7 @@ _NONE: Final = "this server has no recordings: start it with --recordings DIR"
 _LONGEST_EXPORT_MS: Final = 3_600_000.0
 _ACTIVE_S: Final = 30.0  # a timeline of files that are being written is made anew after this time
 _TIMELINES: Final = 16  # that are remembered
+_PIECE: Final = 64 << 10
 _LATEST_MS: Final = 9.0e12  # in the year 2255
 
 _Ref = Annotated[str, Meta(max_length=200)]
@@ -225,7 +227,8 @@ async def _segment(request: Request, recordings: Recordings) -> Response:
     ask = recordings.process.ask
     made = await ask(questions.segment, _robot(request), at_ms, for_ms, seek=seek, media=media)
     headers = {"x-next": "" if made.next_ms is None else repr(made.next_ms), "x-complete": str(int(made.complete))}
-    return Response(made.data, media_type="application/octet-stream", headers=headers)
+    headers["content-length"] = str(len(made.data))
+    return StreamingResponse(_pieces(made.data), media_type="application/octet-stream", headers=headers)
 
 
 async def _frame(request: Request, recordings: Recordings) -> Response:
@@ -280,6 +283,13 @@ async def _end_export(request: Request, recordings: Recordings) -> Response:
     if recordings.export_of(request.path_params["id"]) is not None:
         await recordings.end_export()
     return JSONResponse({})
+
+
+async def _pieces(data: bytes) -> AsyncIterator[bytes]:
+    """Commands and stops of other pages pass in between."""
+    for begin in range(0, len(data), _PIECE):
+        yield data[begin : begin + _PIECE]
+        await asyncio.sleep(0)
 
 
 def _json(data: bytes) -> Response:
