@@ -163,7 +163,8 @@ class _Contents(Contents):
             elif at == self.end_at:
                 return indexes
             else:
-                self.chunks[number] = replace(self.chunks[number], start_ns=0, end_ns=0, indexes={}, indexes_length=0)
+                index = ChunkIndex.unpack(self.chunks[number][HEAD.size :])
+                self.chunks[number] = replace(index, start_ns=0, end_ns=0, indexes={}, indexes_length=0).pack()
         return b""
 
     def _add_chunk(self, block: Block, data: Any) -> None:
@@ -189,7 +190,7 @@ class _Contents(Contents):
                 compression,
                 packed,
                 len(block.body),
-            )
+            ).pack()
         )
 
     def _entries(self, records: bytes) -> dict[int, list[tuple[int, int]]]:

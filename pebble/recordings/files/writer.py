@@ -29,7 +29,7 @@ class Contents:
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.chunks: list[ChunkIndex] = []
+        self.chunks: list[bytes] = []  # packed: as objects those of an hour would take 20 MB
         self.metadata: list[tuple[Metadata, int]] = []  # and where each is
         self.counts: dict[int, int] = {}
         self.messages = self.first_ns = self.last_ns = 0
@@ -56,7 +56,7 @@ class Contents:
             (Op.SCHEMA, [schema.pack() for schema in self.schemas.values()]),
             (Op.CHANNEL, [channel.pack() for channel in self.channels.values()]),
             (Op.STATISTICS, [statistics.pack()]),
-            (Op.CHUNK_INDEX, [chunk.pack() for chunk in self.chunks]),
+            (Op.CHUNK_INDEX, self.chunks),
             (Op.METADATA_INDEX, [mcap.metadata_index(metadata, where) for metadata, where in self.metadata]),
         )
         return mcap.end(at, groups)
@@ -161,9 +161,8 @@ class McapWriter:
         self._write(chunk)
         self.flushed = self.contents.messages
         self._write(b"".join(parts))
-        self.contents.chunks.append(
-            ChunkIndex(start, end, at, len(chunk), indexes, length, self._packer.name, packed, len(records))
-        )
+        index = ChunkIndex(start, end, at, len(chunk), indexes, length, self._packer.name, packed, len(records))
+        self.contents.chunks.append(index.pack())
 
     def _write(self, data: bytes) -> None:
         rest = memoryview(data)
