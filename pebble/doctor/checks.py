@@ -23,6 +23,7 @@ from pebble.doctor.broker_probe import REFUSED_LOGINS, ProbeResult, probe
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
 from pebble.doctor.reachable import beyond_loopback, own_addresses
+from pebble.doctor.recordings import recorder
 from pebble.errors import PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.settings import MqttSettings
@@ -61,6 +62,7 @@ def _robot(config: Config) -> Iterator[Finding]:
     yield from media(config, Path("/dev"))
     yield from loudspeaker(config)
     yield from operator_page(config)
+    yield from recorder(config)
     for name, mqtt in _brokers(config):
         settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
         yield from broker(name, settings)

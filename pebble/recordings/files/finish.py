@@ -17,12 +17,14 @@ import msgspec
 from pebble.recordings.files import mcap
 from pebble.recordings.files.mcap import HEAD, MESSAGE, Channel, ChunkIndex, DamageError, Metadata, Op, Schema
 from pebble.recordings.files.reader import DAMAGE, MISSING, RecordingError, Summary, mapped, unnamed
+from pebble.recordings.files.reading_lock import own
 from pebble.recordings.files.scan import Block, Damage, blocks
 from pebble.recordings.files.writer import Contents
 
 _TORN, _DAMAGED = "torn_bytes", "damaged_bytes"
 CANNOT_BE_READ: Final = 3  # exit code
 _LIBRARY: Final = "pebble"
+_READERS_S: Final = 5.0  # that finishing waits for readers
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class Finished:
 def finish(path: Path) -> Finished:
     """Make ``path`` a finished file. May be interrupted at any moment, and called again.
 
-    Raises RecordingError, OSError.
+    Raises RecordingError; OSError, also while it is being read.
     """
     with path.open("r+b", buffering=0) as file:
         finished = _finish(file, path)
@@ -78,6 +80,7 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
     finished = Finished(contents.messages, contents.missing, damaged, torn)
     if damage.finished and not covers:
         return finished
+    own(file, path, _READERS_S)
     rest = contents.mend_indexes(file, covers)
     _cover(file, covers, contents.file)
     file.truncate(contents.end_at)

@@ -14,8 +14,10 @@ from typing import Any, Final
 from pebble.errors import PebbleError
 from pebble.recordings.files import mcap
 from pebble.recordings.files.mcap import MESSAGE, Channel, ChunkIndex, DamageError, Metadata, Op, Recorded, Statistics
+from pebble.recordings.files.reading_lock import share
 from pebble.recordings.files.scan import Block, Damage, blocks
 
+SUFFIX: Final = ".mcap"  # of a file that is finished
 #: The topic of messages whose channel is not named anywhere in a damaged file, before its number.
 UNNAMED: Final = "$recorder/unnamed/"
 
@@ -39,6 +41,8 @@ def mapped(path: Path) -> Iterator[Any]:
     """The bytes of a file. Raises RecordingError."""
     try:
         with path.open("rb") as file:
+            if not path.name.endswith(SUFFIX):
+                share(file)
             if not os.fstat(file.fileno()).st_size:
                 yield b""
                 return

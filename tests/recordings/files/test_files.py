@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -217,3 +219,34 @@ def test_each_file_has_a_name_of_its_own(tmp_path: Path) -> None:
         assert summary is not None
         names |= {channel.metadata["file"] for channel in summary.channels.values() if channel.topic == FILE_TOPIC}
     assert len(names) == 2
+
+
+READER = """
+import sys, time
+from pathlib import Path
+from pebble.recordings.files.reader import mapped
+
+with mapped(Path(sys.argv[1])) as data:
+    print("mapped", flush=True)
+    sys.stdin.readline()
+    print(sum(data[at] for at in range(0, len(data), 512)), flush=True)
+"""
+
+
+def test_a_file_is_not_cut_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader of memory behind the end of its file is ended by SIGBUS."""
+    path = tmp_path / "x.mcap.active"
+    write(path, finish=False)
+    with path.open("ab") as file:
+        file.write(bytes(5_000_000))
+    reader = subprocess.Popen(
+        [sys.executable, "-c", READER, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert reader.stdout is not None
+    assert reader.stdout.readline() == "mapped\n"
+    monkeypatch.setattr("pebble.recordings.files.finish._READERS_S", 0.3)
+    with pytest.raises(OSError, match="is being read: try again later"):
+        finish(path)
+    reader.communicate("\n", 10)
+    assert reader.returncode == 0
+    assert finish(path).torn_bytes == 5_000_000
