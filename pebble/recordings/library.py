@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from pebble.recordings.files.mcap import MAGIC, Channel, Recorded
-from pebble.recordings.files.reader import SUFFIX, Chooses, RecordingError, Summary, mapped, read
+from pebble.recordings.files.reader import SUFFIX as SUFFIX
+from pebble.recordings.files.reader import Chooses, RecordingError, Summary, mapped, read
 from pebble.recordings.files.scan import Damage
 
 ACTIVE: Final = ".mcap.active"  # is being written, or was left by a recorder that was killed

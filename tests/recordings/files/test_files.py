@@ -249,4 +249,4 @@ def test_a_file_is_not_cut_while_it_is_read(tmp_path: Path, monkeypatch: pytest.
         finish(path)
     reader.communicate("\n", 10)
     assert reader.returncode == 0
-    assert finish(path).torn_bytes == 5_000_000
+    assert finish(path).torn_bytes >= 5_000_000
