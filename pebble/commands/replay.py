@@ -21,6 +21,7 @@ from pebble.client.url import settings_of
 from pebble.commands import show
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.errors import PebbleError
+from pebble.recordings.catalogue import look_at
 from pebble.recordings.library import files
 from pebble.recordings.period import SINCE_HELP, UNTIL_HELP, parse_period
 from pebble.recordings.replay.player import FASTEST, SLOWEST, Player
@@ -115,10 +116,13 @@ def replay(
         raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
     connection = settings_of(url, password=password(password_file), ca_cert=ca_cert)
     since_ns, until_ns = parse_period(since, until, now=datetime.now().astimezone())
-    source = ReplaySource(files(recordings))
+    paths = files(recordings)
+    source = ReplaySource(paths)
     rules = Rules(options, source.channels)
     if not rules.robots:
         raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
+    if missing := sum(look_at(path).missing for path in paths):
+        typer.echo(f"pebble: {missing:,} messages are missing in this recording: files were damaged", err=True)
     if actions:
         _confirm(rules)
     console = _Console()

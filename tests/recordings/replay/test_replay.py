@@ -16,12 +16,14 @@ from pathlib import Path
 import pytest
 
 from pebble.bench.percentiles import percentile
+from pebble.recordings.files.finish import finish
 from pebble.recordings.replay import robots as replayed_robots
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run, program
 from tests.commands.conftest import run as run
 from tests.commands.test_drive import Console
 from tests.recordings.lateness import lateness
+from tests.recordings import messages
 from tests.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
 from tests.support import Broker, until
 
@@ -283,6 +285,20 @@ def test_other_places_are_errors_too(tmp_path: Path, run: Run, quick: None) -> N
     assert run("replay", walk(tmp_path, 1), "--url", "mqtt://127.0.0.1:9") == 1
     assert "cannot connect" in run.err
     assert run("replay", walk(tmp_path, 1)) == 2
+
+
+def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], run: Run, quick: None) -> None:
+    path = tmp_path / "x.mcap"
+    messages.write(path, 400, channels=3)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 20] = bytes(20)
+    path.write_bytes(data)
+    missing = finish(path).missing
+    assert missing == 100
+    assert run("replay", path, *at, "--speed", "100") == 0
+    assert run.err == "pebble: 100 messages are missing in this recording: files were damaged\n"
+    assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
 
 
 @pytest.mark.parametrize(("answer", "code", "sent"), [("fred\n", 1, []), ("", 130, []), ("goob\n", 0, [b"true"])])
