@@ -36,6 +36,7 @@ from pebble.web.guard import CONTENT_SECURITY_POLICY
 from pebble.web.messages import FromPage
 from pebble.web.static_files import StaticFiles
 from tests.support import ROOT, free_port, until
+from tests.web.archive_double import ArchiveDouble
 
 PING_S = 0.5
 PICTURE_S = 0.1
@@ -72,12 +73,16 @@ class CannedServer:
         self.received: list[dict[str, Any]] = []  # what pages sent, without the answers to pings
         self.posted: list[tuple[str, Any]] = []
         self.reachable = True
+        self.archive = ArchiveDouble()
         self._changed: list[tuple[asyncio.Event, asyncio.AbstractEventLoop]] = []
         app = Starlette(
             routes=[
                 Route("/", self._page),
                 Route("/login", self._page),
                 Route("/r/{ref:path}", self._page),
+                Route("/replay", self._page),
+                Route("/replay/{ref:path}", self._page),
+                *self.archive.routes(),
                 Route("/static/{version}/{name:path}", self._static),
                 Route("/stream", self._stream),
                 Route("/api/snapshot.jpg", self._snapshot),

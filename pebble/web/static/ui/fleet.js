@@ -1,6 +1,6 @@
 // All components at a glance: who is there, who drives, what is stopped.
 
-import { RouteLink, Liveness } from "./header.js";
+import { RecordingsLink, RouteLink, Liveness } from "./header.js";
 import {
   Boundary,
   html,
@@ -64,7 +64,7 @@ export function Fleet() {
           : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${present.length} online` : ""}`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
       </h1>
-      ${total > 0 && html`<${FleetTools} filter=${filter} onFilter=${setFilter} />`}
+      ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} />` : html`<${RecordingsLink} className="button" />`}
     </div>
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
@@ -131,6 +131,7 @@ function FleetTools({ filter, onFilter }) {
       /><span>Thumbnails</span></label
     >`}
     <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}>${WATCHES ? "Show all controls" : "Only watch"}</a>
+    <${RecordingsLink} className="button" />
     <button type="button" class="to-phone" data-test="phone" onClick=${() => panels.show("phone")}>
       <${Icon} name="phone" />Open on a phone
     </button>

@@ -1,21 +1,21 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
-import { Route } from "./models.js";
+import { Route, WATCHES } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
 
-export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
+export function Header({ at, replay, layout, panel, onPanel, drawer, onDrawer }) {
   const { commands, driver } = usePage();
   const wide = layout === "desktop";
   return html`<header class="top">
     <div class="where">
-      ${at ? html`<${BackLink} />` : html`<${Brand} />`}
+      ${at || replay !== null ? html`<${BackLink} />` : html`<${Brand} />`}
       ${at && html`<${Picker} at=${at} />`}
     </div>
     ${at && wide && html`<${Vital} at=${at} />`}
     <div class="top-space"></div>
-    ${wide && html`<${ConnectionState} />`}
+    ${at && wide && html`<${RecordingsLink} at=${at} />`} ${wide && html`<${ConnectionState} />`}
     <${Boundary} what="Notices"><${Notices} wide=${wide} /><//>
     ${layout === "immersive" &&
     html`<button
@@ -62,19 +62,29 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
 
 /** Follow a link to a component, or the fleet, without loading the page again. */
-export function RouteLink({ to, className, label, children }) {
+export function RouteLink({ to = "", path = Route.path(to), className = "", label = undefined, children }) {
   const { route } = usePage();
   const go = (event) => {
     if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
     event.preventDefault();
-    route.go(to);
+    route.open(path);
   };
-  return html`<a class=${className} href=${Route.path(to)} aria-label=${label} onClick=${go}>${children}</a>`;
+  return html`<a class=${className} href=${path} aria-label=${label} onClick=${go}>${children}</a>`;
 }
 
 const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: all robots"
   ><${Icon} name="back" /><span>Fleet</span><//
 >`;
+
+/** To what was recorded, if this server has recordings. */
+export function RecordingsLink({ at = "", className = "button quiet" }) {
+  const { connection } = usePage();
+  useModel(connection, (one) => one.you);
+  if (!connection.you?.recordings || WATCHES) return null;
+  return html`<${RouteLink} path=${Route.recordings(at)} className=${`${className} to-recordings`}
+    ><${Icon} name="recordings" />Recordings<//
+  >`;
+}
 
 function Picker({ at }) {
   const { route } = usePage();

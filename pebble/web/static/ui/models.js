@@ -96,6 +96,22 @@ export class Route extends Model {
     }
   }
 
+  /** Of which component the recordings are shown; "" one is to be chosen; null: no recordings are. @returns {string | null} */
+  get replay() {
+    const path = location.pathname;
+    if (path !== "/replay" && !path.startsWith("/replay/")) return null;
+    try {
+      return decodeURIComponent(path.slice(8));
+    } catch {
+      return "";
+    }
+  }
+
+  /** @param {string} ref @returns {string} the address of its recordings */
+  static recordings(ref) {
+    return `/replay${ref && Route.path(ref, false).slice(2)}`;
+  }
+
   /** @param {string} ref @returns {string} the address of its screen, which only watches if this one does */
   static path(ref, watches = WATCHES) {
     const path = ref ? `/r/${ref.split("/").map(encodeURIComponent).join("/")}` : "/";
@@ -103,8 +119,12 @@ export class Route extends Model {
   }
 
   go(ref) {
-    if (ref === this.ref) return;
-    history.pushState(null, "", Route.path(ref));
+    if (ref !== this.ref || this.replay !== null) this.open(Route.path(ref));
+  }
+
+  /** @param {string} path */
+  open(path) {
+    history.pushState(null, "", path);
     scrollTo(0, 0);
     this.changed();
   }
