@@ -23,6 +23,7 @@ from starlette.routing import Route
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.media.speech import Speech
+from tests.support import ROOT
 
 ROBOT = "pebble/robots/goob"
 DAY = "2026-11-22"
@@ -111,13 +112,12 @@ _pictures: list[bytes] = []
 
 
 def _jpeg(number: int) -> bytes:
-    """A grey field whose lightness tells the time: (number % 50) * 5, and a bar that moves."""
+    """The simulated world, seen by a camera that turns: another one for each number, fifty in all."""
     if not _pictures:
+        whole = Image.open(ROOT / "docs" / "simulated-world.jpg")
         for index in range(50):
-            image = Image.new("RGB", (320, 180), (5 * index,) * 3)
-            image.paste((40, 160, 90), (6 * index, 60, 6 * index + 24, 120))
             target = io.BytesIO()
-            image.save(target, "JPEG", quality=80)
+            whole.crop((4 * index, 60, 4 * index + 480, 330)).resize((480, 270)).save(target, "JPEG", quality=70)
             _pictures.append(target.getvalue())
     return _pictures[number % 50]
 

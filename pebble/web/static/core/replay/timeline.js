@@ -87,27 +87,42 @@ export class View {
 /**
  * What each column of pixels shows: the bits of its steps together, and the most kbit/s.
  * @param {import("./archive.js").Timeline} timeline @param {View} view @param {number} width
- * @returns {{bits: Uint8Array, kbits: Float64Array, most: number}} ``most``: of the whole day
+ * @returns {{bits: Uint8Array, kbits: Float64Array}}
  */
-export function columns({ from, step, activity, video, audio, rest }, view, width) {
+export function columns(timeline, view, width) {
+  const { from, step, activity } = timeline;
   const bits = new Uint8Array(width);
   const kbits = new Float64Array(width);
-  const sum = (index) => (video[index] ?? 0) + (audio[index] ?? 0) + (rest[index] ?? 0);
   const first = Math.max(0, Math.floor((view.from - from) / step));
   const last = Math.min(activity.length - 1, Math.floor((view.to - from) / step));
   for (let index = first; index <= last; index++) {
     const at = from + index * step;
     const left = Math.max(0, Math.floor(view.x(at, width)));
     const right = Math.min(width, Math.max(left + 1, Math.floor(view.x(at + step, width))));
-    const value = sum(index);
+    const value = kbitsAt(timeline, index);
     for (let x = left; x < right; x++) {
       bits[x] |= activity[index];
       if (value > kbits[x]) kbits[x] = value;
     }
   }
-  let most = 1;
-  for (let index = 0; index < activity.length; index++) most = Math.max(most, sum(index));
-  return { bits, kbits, most };
+  return { bits, kbits };
+}
+
+/** @param {import("./archive.js").Timeline} timeline @param {number} index @returns {number} of everything together */
+const kbitsAt = ({ video, audio, rest }, index) => (video[index] ?? 0) + (audio[index] ?? 0) + (rest[index] ?? 0);
+
+/** @param {import("./archive.js").Timeline} timeline @returns {number} the most kbit/s of the day; at least 1 */
+export const mostKbits = (timeline) =>
+  timeline.activity.reduce((most, _, index) => Math.max(most, kbitsAt(timeline, index)), 1);
+
+const MARGIN = 0.04; // of what is seen
+
+/** What of a day is worth being seen first. @param {import("./archive.js").Timeline} timeline @param {View} view @returns {[number, number]} from, span */
+export function extentOf({ from, step, activity }, view) {
+  const first = activity.findIndex((bits) => bits !== 0);
+  if (first < 0) return [view.start, DAY_MS];
+  const span = step * (activity.findLastIndex((bits) => bits !== 0) + 1 - first);
+  return [from + first * step - MARGIN * span, (1 + 2 * MARGIN) * span];
 }
 
 /** @param {{since: number, until: number}[]} list @param {number} ms @returns {any} the one that holds this time */

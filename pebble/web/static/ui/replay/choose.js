@@ -6,9 +6,10 @@ import { RouteLink } from "../header.js";
 import { Route } from "../models.js";
 import { Icon } from "../parts.js";
 import { iconOf } from "../fleet.js";
-import { nameOf, shortTime } from "../words.js";
+import { clockTime, nameOf, shortTime } from "../words.js";
 
 const date = new Intl.DateTimeFormat("en-GB", { weekday: "short", day: "numeric", month: "short", year: "numeric" });
+const short = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short" });
 const utc = new Intl.DateTimeFormat("en-GB", {
   weekday: "long",
   day: "numeric",
@@ -19,6 +20,9 @@ const utc = new Intl.DateTimeFormat("en-GB", {
 
 /** @param {number} ms epoch @returns {string} Sun, 22 Nov 2026 */
 export const dayWords = (ms) => date.format(ms);
+
+/** @param {number} ms epoch @returns {string} 22 Nov, 10:03:12 */
+export const timeWords = (ms) => `${short.format(ms)}, ${clockTime(ms)}`;
 
 /** @param {string} day "2026-11-22" @returns {string} Sunday 22 November 2026 */
 const longDay = (day) => utc.format(Date.parse(`${day}T00:00:00Z`));

@@ -5,7 +5,7 @@ import { CHAIN, INCOMING, PICTURE, SOUND, STATE } from "../../core/replay/frames
 import { Incoming } from "../../core/replay/incoming.js";
 import { Heartbeats } from "../../core/replay/liveness.js";
 import { Player, SPEEDS } from "../../core/replay/player.js";
-import { View, dayOf } from "../../core/replay/timeline.js";
+import { View, dayOf, extentOf } from "../../core/replay/timeline.js";
 import { Store } from "../../core/store.js";
 import { ReplayPictures } from "../../media/replay-pictures.js";
 import { ReplaySound } from "../../media/replay-sound.js";
@@ -175,6 +175,7 @@ export class Replay extends Model {
     this.changed();
     try {
       this.timeline = await this.archive.timeline(day, this.ref, (share) => this.index(share), signal);
+      this.view.show(...extentOf(this.timeline, this.view));
       then();
     } catch (error) {
       if (signal.aborted) return;

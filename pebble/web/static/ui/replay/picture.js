@@ -73,7 +73,7 @@ export function long(ms) {
 }
 
 function Bar({ at, replay, player }) {
-  const words = player.seeking || player.waiting ? "loading…" : player.ended ? "end of the recording" : player.playing ? "" : "paused";
+  const words = player.seeking || player.waiting ? "loading…" : player.ended ? "end of the recording" : "";
   return html`<div class="picture-bar replay-bar">
     <div class="replay-keys" role="group" aria-label="Play">
       <button type="button" data-test="back-10" aria-label="10 seconds back" onClick=${() => replay.step(-10_000)}>−10 s</button>

@@ -17,8 +17,8 @@ import {
 } from "../hooks.js";
 import { CardView, Offers } from "../models.js";
 import { Card, Icon, Part } from "../parts.js";
-import { clockTime, nameOf } from "../words.js";
-import { Choose, Elsewhere, dayWords } from "./choose.js";
+import { nameOf } from "../words.js";
+import { Choose, Elsewhere, timeWords } from "./choose.js";
 import { Download } from "./download.js";
 import { Replay } from "./model.js";
 import { Picture } from "./picture.js";
@@ -149,10 +149,10 @@ function Badge({ at, replay }) {
   useModel(replay);
   useTick(100);
   const { seeks, position } = replay.player;
-  const time = seeks ? `${dayWords(position)}, ${clockTime(position)}` : "…";
+  const time = seeks ? timeWords(position) : "…";
   return html`<div class="replay-badge" data-test="badge">
     <${Icon} name="recordings" />
-    <p><b>Recording of ${time}</b> <span>This is the past of ${nameOf(at)}. Nothing here reaches the robot.</span></p>
+    <p><b>Recording of ${time}</b> <span>The past of ${nameOf(at)}: nothing here reaches the robot.</span></p>
     <${RouteLink} to=${at} className="replay-live" label=${`Live page of ${nameOf(at)}`}>Live page<//>
   </div>`;
 }
@@ -165,7 +165,8 @@ function Cards({ at }) {
   const cards = CARDS.filter((card) => !card.sends && !LEFT_OUT.includes(card.id) && card.wants(offers));
   const shown = cards.filter(({ id }) => !view.hidden.has(id));
   const narrow = shown.filter(({ wide }) => !wide);
-  const columns = [0, 1].map((odd) => narrow.filter((_, index) => index % 2 === odd)).filter((one) => one.length);
+  const half = Math.ceil(narrow.length / 2);
+  const columns = [narrow.slice(0, half), narrow.slice(half)].filter((one) => one.length);
   const draw = (card) => html`<${Card} key=${card.id} id=${card.id} title=${card.title} icon=${card.icon} view=${view}>
     <${Boundary} what=${card.title}><${Part} part=${card.part} now at=${at} offers=${offers} view=${view} /><//>
   <//>`;

@@ -1,7 +1,7 @@
 // The day on a canvas: what was going on, what is missing, and where the replay is.
 
 import { Archive } from "../../core/replay/archive.js";
-import { ROWS, columns, holding } from "../../core/replay/timeline.js";
+import { ROWS, columns, holding, mostKbits } from "../../core/replay/timeline.js";
 import { html, useEffect, useModel, useRef, useState, useTick } from "../hooks.js";
 import { clockTime, shortTime } from "../words.js";
 import { dayWords } from "./choose.js";
@@ -55,7 +55,7 @@ export function TimelineCard({ replay, layout }) {
       <ul class="timeline-rows" aria-hidden="true">
         <li class="timeline-used">Used</li>
         ${ROWS.map(({ id, title }) => html`<li key=${id} class=${`row-${id}`}>${title}</li>`)}
-        <li class="timeline-rate">Bandwidth</li>
+        <li class="timeline-rate">Bandwidth<br />${timeline && rateWords(mostKbits(timeline))}</li>
       </ul>
       <div class="timeline-place">
         <canvas
@@ -79,6 +79,8 @@ export function TimelineCard({ replay, layout }) {
     <${Legend} timeline=${timeline} phone=${layout === "portrait"} />
   </section>`;
 }
+
+const rateWords = (most) => `≤ ${most >= 1000 ? `${(most / 1000).toFixed(1)} Mbit/s` : `${Math.round(most)} kbit/s`}`;
 
 function coverWords(indexing, problem) {
   if (problem) return `✖ ${problem}`;
@@ -273,9 +275,9 @@ class Painter {
     this.axis();
     if (!timeline) return;
     for (const { since, until } of timeline.sessions) this.area(since, until, colours.accent, AXIS, AXIS + SESSIONS - 2);
-    const { bits, kbits, most } = columns(timeline, this.view, Math.ceil(this.width));
+    const { bits, kbits } = columns(timeline, this.view, Math.ceil(this.width));
     ROWS.forEach(({ bit, id }, index) => this.row(bits, bit, colours[`row-${id}`], rowTop(index)));
-    this.band(kbits, most);
+    this.band(kbits, mostKbits(timeline));
     for (const { since, until } of timeline.outages) this.hatch(since, until, colours.dim, 9, rowTop(0), rowTop(0) + ROW);
     for (const { since, until } of timeline.gaps) this.hatch(since, until, colours.bad, 6, AXIS, HEIGHT);
   }
@@ -328,16 +330,12 @@ class Painter {
   }
 
   band(kbits, most) {
-    const { context, colours, width } = this;
+    const { context, colours } = this;
     context.fillStyle = colours.accent;
     kbits.forEach((value, x) => {
       const height = Math.max(value > 0 ? 1 : 0, (value / most) * (BAND - 6));
       context.fillRect(x, HEIGHT - height, 1, height);
     });
-    context.fillStyle = colours.dim;
-    context.textAlign = "right";
-    const words = most >= 1000 ? `${(most / 1000).toFixed(1)} Mbit/s` : `${Math.round(most)} kbit/s`;
-    context.fillText(words, width - 4, HEIGHT - BAND + 8);
   }
 
   hatch(since, until, colour, apart, top, bottom) {
