@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, Final
 
 from pebble.errors import ConfigError
@@ -32,7 +31,7 @@ class RobotRecorder(Service):
     def start(self) -> None:
         section = self.config.services.recorder
         options = Options(**{name: getattr(section, name) for name in _LIMITS})
-        folder = section.folder or Path("~/recordings").expanduser()
+        folder = section.place
         os.nice(_NICE)
         self._recorder = Recorder(folder, options, {"recorder": self.config.base})
         self._recorder.start()

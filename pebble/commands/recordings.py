@@ -23,6 +23,7 @@ from pebble.commands import show
 from pebble.errors import PebbleError
 from pebble.recordings import catalogue
 from pebble.recordings.catalogue import FileInfo, Query
+from pebble.recordings.exports.copy import write_copy
 from pebble.recordings.exports.film import unfinished, write_film, write_wav
 from pebble.recordings.exports.foxglove import write_foxglove
 from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
@@ -30,7 +31,7 @@ from pebble.recordings.exports.mongo import read_mongo, write_mongo
 from pebble.recordings.files.finish import finish as finish_file
 from pebble.recordings.files.mcap import Recorded
 from pebble.recordings.files.reader import RecordingError
-from pebble.recordings.files.rewrite import Copy, rewrite
+from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.files.writer import LIBRARY, McapWriter
 from pebble.recordings.library import FOREVER_NS, files, merged, robot_of, span
 from pebble.recordings.period import SINCE_HELP, UNTIL_HELP, parse_period
@@ -393,29 +394,8 @@ def _export(form: Form, messages: Iterable[Recorded], target: Path, robot: str, 
         elif form is Form.MONGO:
             count = write_mongo(messages, out, on_time=on_time)
         else:
-            count = _copy(messages, out, on_time)
+            count = write_copy(messages, out, on_time=on_time)
     return f"{target}: {count:,} messages"
-
-
-def _copy(messages: Iterable[Recorded], out: BinaryIO, on_time: Callable[[int], None]) -> int:
-    writer = McapWriter(_Whole(out), library=LIBRARY)
-    writer.metadata("pebble.recording", {"format": "1", "exported": "1"})
-    copy = Copy(writer)
-    for message in messages:
-        copy.add(message)
-        on_time(message.log_ns)
-    writer.finish()
-    return writer.contents.messages
-
-
-class _Whole:
-    """A buffered file as a writer's sink."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-
-    def write(self, data: memoryview, /) -> int | None:
-        return self._file.write(data)
 
 
 def _import(found: Iterable[Imported | BadLine], writer: McapWriter) -> Counter[str]:

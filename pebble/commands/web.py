@@ -56,6 +56,9 @@ def serve(
         typer.Option(help="A further host name by which browsers may address the page; repeatable.", metavar="NAME"),
     ] = None,
     people: PeopleOption = None,
+    recordings: Annotated[
+        Path | None, typer.Option(help="Folder of `pebble record`, to look at on the page.", metavar="DIR")
+    ] = None,
 ) -> int:
     """Serve the operator page: drive, stop and watch robots in a browser, also on a phone.
 
@@ -74,7 +77,9 @@ def serve(
     require_packages()
     folder = None if tls is None else tls.absolute()
     empty = folder is not None and not _has_certificate(folder)
-    options = {"host": host, "port": port, "names": tuple(name or ()), "people": people}
+    if recordings is not None and not recordings.is_dir():
+        raise PebbleError(f"--recordings {recordings}: there is no such folder")
+    options = {"host": host, "port": port, "names": tuple(name or ()), "people": people, "recordings": recordings}
     if url is not None:
         settings, plain = _of_url(_broker(url, password_file, ca_cert), options, None if empty else folder), False
     else:

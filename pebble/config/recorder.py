@@ -1,5 +1,6 @@
 """The config section of the robot's own recorder."""
 
+from pathlib import Path
 from typing import Annotated
 
 from msgspec import Meta
@@ -23,3 +24,8 @@ class Recorder(ServiceSection, frozen=True, kw_only=True):
     free_bytes: Annotated[Bytes, doc("What stays free on the disk.")] = 1 << 30
     sync_seconds: Annotated[Interval, doc("How often all is made durable: a power cut loses as much.")] = 5.0
     level: Annotated[int, Meta(ge=0, le=19, description="Zstandard's level; 0: no compression.")] = 3
+
+    @property
+    def place(self) -> Path:
+        """The folder, also where none is named."""
+        return self.folder or Path("~/recordings").expanduser()

@@ -72,6 +72,9 @@ class WebInterface(Section, frozen=True, kw_only=True):
     ] = False
     plain_http_drive: Annotated[bool, doc("Allow driving from there, too.")] = False
     mqtt: Annotated[WebMqtt, doc("The broker that robots connect to.")] = WebMqtt()
+    recordings: Annotated[
+        File | None, doc("Folder of recordings to look at on the page; unset: that of services.recorder, if it runs.")
+    ] = None
     robots: Annotated[tuple[dict[str, Any], ...], doc("Hints about robots, in the original's format.")] = ()
     robot_discovery: Annotated[dict[str, Any], doc("Read and ignored: robots are found by their messages.")] = field(
         default_factory=dict

@@ -22,10 +22,11 @@ from starlette.websockets import WebSocket
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
-from pebble.web import login, robot_streams
+from pebble.web import login, recordings, robot_streams
 from pebble.web.control import CHECK_S, Control
 from pebble.web.guard import CONTENT_SECURITY_POLICY, Guard
 from pebble.web.messages import EstopOp
+from pebble.web.recordings import Recordings
 from pebble.web.server import Server
 from pebble.web.settings import WebSettings
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles
@@ -42,9 +43,11 @@ def create_app(settings: WebSettings) -> Starlette:
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         audit = Audit(settings.people)
+        archive = None if settings.recordings is None else Recordings(settings.recordings)
         server = Server(settings, people, audit)
         state = app.state
         state.server, state.audit, state.driving, state.stops = server, audit, server.driving, server.stops
+        state.recordings = archive
         state.robots, state.broker, state.media, state.sound = server.robots, server.broker, server.media, server.sound
         await server.open()
         try:
@@ -52,6 +55,8 @@ def create_app(settings: WebSettings) -> Starlette:
         finally:
             await server.close()
             audit.close()
+            if archive is not None:
+                await archive.close()
 
     app = _app(settings, lifespan)
     app.state.settings, app.state.people = settings, people
@@ -64,12 +69,15 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
         routes=[
             Route("/", _page),
             Route("/r/{ref:path}", _page),
+            Route("/replay", _page),
+            Route("/replay/{ref:path}", _page),
             Route("/static/{version}/{name:path}", _static),
             Route("/ca.pem", _authority),
             Route("/healthz", _health),
             Route("/api/snapshot.jpg", _snapshot),
             Route("/api/estop", _estop, methods=["POST"]),
             *login.routes(),
+            *recordings.routes(),
             WebSocketRoute("/ws/control", _control),
             WebSocketRoute("/ws/media", _media),
             WebSocketRoute("/ws/sound", _sound),

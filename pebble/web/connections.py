@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import re
 import socket
 from collections import Counter
 from ipaddress import ip_address
@@ -26,6 +27,8 @@ MAX_EACH = 32  # from one address that is not of this machine
 HANDSHAKE_S = 10.0  # for TLS
 HEAD_S = 10.0  # for the head of a request, from its first byte on
 RESPONSE_S = 60.0  # for the rest of the request, and until the response is read
+DOWNLOAD_S = 3600.0  # for a film
+_DOWNLOAD = re.compile(r"/archive/exports/[^/]+/file").fullmatch
 FLUSH_S = 5.0  # for what is still unread when a connection is closed
 _MAX_UNREAD = 256 * 1024  # bytes of answers to a client's own pings
 
@@ -104,7 +107,7 @@ class HttpProtocol(H11Protocol):
         elif self.transport.is_closing():
             _abort_later(self.transport)
         else:
-            self._limit(HEAD_S if self.conn.their_state is h11.IDLE else RESPONSE_S)
+            self._limit(HEAD_S if self.conn.their_state is h11.IDLE else self._response_s())
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._unlimit()
@@ -121,6 +124,10 @@ class HttpProtocol(H11Protocol):
     def timeout_keep_alive_handler(self) -> None:
         super().timeout_keep_alive_handler()
         _abort_later(self.transport)
+
+    def _response_s(self) -> float:
+        path = self.scope.get("path", "") if self.scope else ""
+        return DOWNLOAD_S if _DOWNLOAD(path) else RESPONSE_S
 
     def _limit(self, seconds: float) -> None:
         """The same limit does not begin anew, or a byte per second would do."""

@@ -125,6 +125,7 @@ class Control:
                 token=self._tab.token,
                 now=1000 * time.time(),
                 drives=self._drives,
+                recordings=settings.recordings is not None,
             )
         )
         if "drive" in rights(self._session.role):

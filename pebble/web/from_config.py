@@ -39,6 +39,7 @@ def settings_of(config: Config) -> WebSettings:
         key=web.tls.key,
         authority=web.tls.ca,
         plain_http_drive=web.plain_http_drive,
+        recordings=_recordings(config),
     )
 
 
@@ -84,6 +85,13 @@ def _has_login(web: WebInterface) -> bool:
 
 def _people(config: Config) -> Path:
     return config.web_interface.people or config.state_dir() / PEOPLE
+
+
+def _recordings(config: Config) -> Path | None:
+    recorder = config.services.recorder
+    if config.web_interface.recordings is not None:
+        return config.web_interface.recordings
+    return recorder.place if recorder.enabled else None
 
 
 def _broker(config: Config) -> Mqtt:

@@ -230,6 +230,7 @@ class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
     login: bool  # whether there is anything to log out of
     token: str
     now: float
+    recordings: bool = False  # whether this server has some to look at
     drives: bool = True  # False: the page came over plain http from another machine, where driving is switched off
 
 

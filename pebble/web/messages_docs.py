@@ -53,6 +53,49 @@ the first one begins the talk |
 | page | `u8 2`, `u32 talk`: it ends |
 """
 
+_RECORDINGS = """## Recordings
+
+Over HTTP, where the server has a folder of recordings; `robot` is `system/type/id`, times are epoch \
+milliseconds. Nothing \
+is sent to a robot. What is wrong is answered with one line of text: 400 a parameter, 401 without a session, \
+404 without \
+a folder, 409 too much at once, 422 what recordings cannot answer.
+
+| request | answer |
+|---|---|
+| `GET /archive/days` | JSON, the newest first: `day` (of UTC), `robots`, `bytes`, `first`, `last`, `gaps` |
+| `GET /archive/timeline?day=&robot=` | JSON: `from`, `step`, for each step `activity`, `video`, `audio`, \
+`rest` (kbit/s); \
+`gaps`, `outages`, `sessions` with `since` and `until`. 202 with `indexing`, a share, while the day is indexed: \
+ask again |
+| `GET /archive/segment?robot=&at=&for=[&seek=1][&media=0]` | messages of at most ten seconds, see below; \
+`X-Next`: where \
+to go on, after a gap the robot's next message, empty at the end; `X-Complete: 0`: pictures were left out, \
+beyond 8 MB |
+| `GET /archive/frame?robot=&at=[&w=]` | JPEG of the picture at that time, `X-Captured-Ms`; 404 if none is ten \
+seconds old or less |
+| `GET /archive/strip?robot=&since=&step=&count=&w=` | one JPEG of thumbnails side by side, 16:9 |
+| `POST /archive/exports` | body `{"robot", "since", "until", "as"}`, `as`: mkv, mp4 or mcap; 202 with `id`. \
+One at a time, \
+of at most an hour |
+| `GET /archive/exports/ID` | `state` (running, ready, failed), `done`, `why`, `name`, `bytes`; `…/file` is the \
+file |
+| `POST /archive/exports/ID/end` | ends or removes it |
+
+`activity` is a sum: 1 online, 2 driven, 4 lights, 8 a sound was played, 16 a script was started, 32 a warning \
+in the log, \
+64 pictures, 128 sound.
+
+A segment is a row of messages, in big-endian numbers: `u32` length of what follows, `f64` when it was \
+received, `u8` \
+flags, `u16` length of the metric, the metric, the payload as it came. Flags: 1 from before the segment, the \
+newest value \
+of its metric (an empty one: it was removed) or a line of the log; 2 a picture from before the segment, from \
+the last key \
+frame on; 4 it was sent to the robot; 8 a picture; 16 sound. Those with 1 and 2 come only with `seek=1`, and \
+first.
+"""
+
 
 def markdown() -> str:
     """docs/web-messages.md."""
@@ -61,7 +104,7 @@ def markdown() -> str:
     parts += ["## From the page\n", *map(_section, get_args(messages.FromPage))]
     parts += ["## From the server\n", *map(_section, get_args(messages.ToPage))]
     parts += ["## Metrics of the server\n", *map(_section, _views())]
-    return "\n".join([*parts, _MEDIA, _SOUND, _section(messages.TalkAnswer)])
+    return "\n".join([*parts, _MEDIA, _SOUND, _section(messages.TalkAnswer), _RECORDINGS])
 
 
 def declarations() -> str:

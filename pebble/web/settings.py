@@ -23,5 +23,6 @@ class WebSettings:
     people: Path | None = None  # the database of users, sessions and settings; None: in memory
     certificate: Path | None = None
     key: Path | None = None
+    recordings: Path | None = None  # the folder of a recorder, to look at; None: none
     authority: Path | None = None  # offered for download, so that phones can trust it
     plain_http_drive: bool = True  # False: over plain http from another machine nothing drives

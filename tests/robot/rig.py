@@ -172,7 +172,9 @@ class Rig:
 
     def wait_until_up(self, since: float, timeout: float = 15.0) -> None:
         """Every service is ready, and heartbeats arrive."""
-        assert until(lambda: self._up(since), timeout), f"the robot is not up:\n{self.log.read_text()[-4000:]}"
+        assert until(lambda: self._up(since), timeout), (
+            f"the robot is not up: {self._newest()}\n{self.log.read_text()[-4000:]}"
+        )
 
     def stop(self, *signals: signal.Signals) -> int:
         """Stop the robot with SIGTERM, or with these; returns the launcher's exit code."""
@@ -240,6 +242,16 @@ class Rig:
             return False
         states = [service["state"] for service in status.json["value"]["services"].values()]
         return bool(states) and set(states) == {"ready"} and heartbeat.json.get("online") is not False
+
+    def _newest(self) -> str:
+        """What the operator received last, and how long ago."""
+        now, parts = time.monotonic(), []
+        for suffix in ("outgoing/status", "outgoing/online", ""):
+            one = self.operator.last(suffix)
+            parts.append(
+                f"no {suffix}" if one is None else f"{now - one.at:.1f} s ago {one.topic} {one.payload[:300]!r}"
+            )
+        return "; ".join(parts)
 
     # -- its config
 

@@ -27,7 +27,7 @@ _EVENTS: Final = """
 """
 
 
-class _Recorder(Struct):
+class RecorderEvents(Struct):
     """What recorders noted about themselves."""
 
     gaps: list[Gap]
@@ -59,10 +59,7 @@ def analyse(
     into memory are made below ``scratch``. Raises RecordingError, also if there is no message.
     """
     with connected(scratch, memory_mb=_MEMORY_MB, threads=_THREADS) as connection:
-        recorder = _recorder(connection, sources.events, since_ns, until_ns)
-        connection.execute("CREATE TEMP TABLE breaks (since_ns BIGINT, until_ns BIGINT)")
-        for one in recorder.breaks():
-            connection.execute("INSERT INTO breaks VALUES (?, ?)", one)
+        recorder = recorder_events(connection, sources.events, since_ns, until_ns)
         robots, presences, spans = [], [], []
         for number, (name, parts) in enumerate(sorted(sources.parts.items())):
             progress(name, number / len(sources.parts))
@@ -101,7 +98,7 @@ def _presence(robot: RobotTraffic, online: Sequence[tuple[int, int]]) -> Presenc
     return Presence(usual_ms * 1e6, spans, [outage.since_ns for outage in robot.outages])
 
 
-def _mark(robots: Sequence[RobotTraffic], presences: Sequence[Presence], recorder: _Recorder) -> None:
+def _mark(robots: Sequence[RobotTraffic], presences: Sequence[Presence], recorder: RecorderEvents) -> None:
     for robot, marks in zip(robots, shared(presences), strict=True):
         usual_ms = 0.0 if robot.intervals is None else robot.intervals.median_ms
         for outage, is_shared in zip(robot.outages, marks, strict=True):
@@ -109,8 +106,9 @@ def _mark(robots: Sequence[RobotTraffic], presences: Sequence[Presence], recorde
             outage.recorder_late = recorder.was_late(outage, usual_ms)
 
 
-def _recorder(connection: Any, events: Sequence[Path], since_ns: int, until_ns: int) -> _Recorder:
-    found = _Recorder([], [], [])
+def recorder_events(connection: Any, events: Sequence[Path], since_ns: int, until_ns: int) -> RecorderEvents:
+    """What recorders noted in a period; makes the table ``breaks`` that `RobotQueries` needs."""
+    found = RecorderEvents([], [], [])
     rows = connection.execute(_EVENTS.format(events=parquet(events))).fetchall() if events else []
     for event, ns, since, until, why, messages, late_ms in rows:
         if event == "gap" and since is not None and until is not None and since < until_ns and until >= since_ns:
@@ -122,4 +120,7 @@ def _recorder(connection: Any, events: Sequence[Path], since_ns: int, until_ns: 
             found.late.append((ns - round(late_ms * 1e6) - _TICK_NS, ns))
         elif event == "dropped" and since_ns <= ns < until_ns:
             found.dropped += messages
+    connection.execute("CREATE TEMP TABLE breaks (since_ns BIGINT, until_ns BIGINT)")
+    for one in found.breaks():
+        connection.execute("INSERT INTO breaks VALUES (?, ?)", one)
     return found

@@ -155,6 +155,7 @@ export interface Welcome {
   login: boolean;
   token: string;
   now: number;
+  recordings?: boolean;
   drives?: boolean;
 }
 

@@ -1,0 +1,32 @@
+"""Exports a stretch as a recording of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import BinaryIO
+
+from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.rewrite import Copy
+from pebble.recordings.files.writer import LIBRARY, McapWriter
+
+
+def write_copy(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Callable[[int], None]) -> int:
+    """Write ``messages`` as MCAP; returns how many there were. ``on_time`` gets the time of each."""
+    writer = McapWriter(_Whole(out), library=LIBRARY)
+    writer.metadata("pebble.recording", {"format": "1", "exported": "1"})
+    copy = Copy(writer)
+    for message in messages:
+        copy.add(message)
+        on_time(message.log_ns)
+    writer.finish()
+    return writer.contents.messages
+
+
+class _Whole:
+    """A buffered file as a writer's sink."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def write(self, data: memoryview, /) -> int | None:
+        return self._file.write(data)

@@ -1,0 +1,147 @@
+"""What a process asks another one about recordings: functions that take and return plain data.
+
+The process that answers (:class:`pebble.web.archive_process.ArchiveProcess`) has one archive; unpacking files would
+otherwise delay the loop that passes on drive commands.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from pebble.errors import PebbleError
+from pebble.recordings.exports.copy import write_copy
+from pebble.recordings.exports.film import unfinished, write_film
+from pebble.recordings.library import ACTIVE, merged, robot_of
+from pebble.recordings.seek.archive import Archive
+from pebble.recordings.seek.days import Days
+from pebble.recordings.seek.segment import Segment
+from pebble.recordings.seek.segment import segment as make_segment
+from pebble.recordings.seek.thumbnails import Frame
+from pebble.recordings.seek.thumbnails import frame as make_frame
+from pebble.recordings.seek.thumbnails import strip as make_strip
+from pebble.recordings.traffic.index import FOLDER
+from pebble.recordings.traffic.timeline import timeline as make_timeline
+from pebble.runtime.parent import end_with_parent
+
+FILMS: Final = frozenset({"mkv", "mp4"})
+_LONGEST_WHY: Final = 500  # characters: a message is sent as a whole
+_NICE: Final = 10  # driving comes first
+_archive: Archive
+_days: Days
+
+
+def begin(folder: Path) -> None:
+    """Make this process the one that answers."""
+    global _archive, _days
+    _in_background(_NICE)
+    _archive = Archive(folder)
+    _days = Days(_archive)
+
+
+def days() -> bytes:
+    """JSON."""
+    return msgspec.json.encode(_days.all())
+
+
+def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
+    """The recordings of a robot in a period, and whether one of them is still being written."""
+    found = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
+    return found, any(path.endswith(ACTIVE) for path in found)
+
+
+def segment(robot: str, at_ms: float, for_ms: float, *, seek: bool, media: bool) -> Segment:
+    return make_segment(_archive, robot, at_ms, for_ms, seek=seek, media=media)
+
+
+def frame(robot: str, at_ms: float, width: int) -> Frame | None:
+    return make_frame(_archive, robot, at_ms, width)
+
+
+def strip(robot: str, since_ms: float, step_ms: float, count: int, width: int) -> bytes:
+    return make_strip(_archive, robot, since_ms, step_ms, count, width)
+
+
+# -- jobs, each in a process of its own: they take long
+
+
+def make_timeline_job(
+    answer: Connection, folder: Path, paths: list[str], target: Path, robot: str, period: tuple[int, int]
+) -> None:
+    """Index what is not indexed, and write the timeline to ``target``, as JSON."""
+    _in_background(_NICE)
+
+    def work() -> None:
+        if os.access(folder, os.W_OK):
+            (folder / FOLDER).mkdir(mode=0o750, exist_ok=True)
+        places, progress = [Path(path) for path in paths], _Progress(answer)
+        with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+            made = make_timeline(places, Path(scratch), robot, *period, progress.share)
+        target.write_bytes(msgspec.json.encode(made))
+
+    _answer(answer, work)
+
+
+def export_job(
+    answer: Connection, paths: list[str], target: Path, robot: str, period: tuple[int, int], form: str
+) -> None:
+    """Write a film, or MCAP, of a stretch to ``target``."""
+    _in_background(_NICE)
+    since_ns, until_ns = period
+
+    def work() -> None:
+        messages = merged(
+            [Path(path) for path in paths],
+            since_ns=since_ns,
+            until_ns=until_ns,
+            chooses=lambda channel: robot_of(channel) == robot,
+        )
+        progress = _Progress(answer)
+
+        def on_time(log_ns: int) -> None:
+            progress.share("", (log_ns - since_ns) / (until_ns - since_ns))
+
+        if form in FILMS:
+            write_film(messages, target, robot, on_time=on_time)
+        else:
+            with unfinished(target, overwrite=False) as path, path.open("wb") as out:
+                if not write_copy(messages, out, on_time=on_time):
+                    raise PebbleError(f"there is no message of {robot} in this stretch")
+
+    _answer(answer, work)
+
+
+class _Progress:
+    """Sends the share of the work that is done, in steps of a percent."""
+
+    def __init__(self, answer: Connection) -> None:
+        self._answer, self._sent = answer, -1
+
+    def share(self, _what: str, share: float) -> None:
+        percent = int(100 * max(0.0, min(1.0, share)))
+        if percent > self._sent:
+            self._sent = percent
+            self._answer.send(("done", percent / 100))
+
+
+def _answer(answer: Connection, work: Callable[[], None]) -> None:
+    try:
+        work()
+        answer.send(("ready", None))
+    except PebbleError as error:
+        answer.send(("failed", str(error).partition("\n")[0][:_LONGEST_WHY]))
+    except OSError as error:
+        answer.send(("failed", f"{error.filename or 'a file'}: {error.strerror or error}"[:_LONGEST_WHY]))
+
+
+def _in_background(nice: int) -> None:
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in a terminal reaches the whole group: the parent ends this
+    os.nice(nice)

@@ -1,0 +1,124 @@
+"""The processes that read recordings for pages: one that answers at once, and one for each long job."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from pebble.errors import PebbleError
+from pebble.recordings.seek import questions
+
+log = logging.getLogger(__name__)
+
+MOST_WAITING: Final = 64  # questions
+_SPAWN: Final = multiprocessing.get_context("spawn")
+_END_S: Final = 2.0
+
+AnswerT = TypeVar("AnswerT")
+
+
+class BusyError(PebbleError):
+    """There are too many questions."""
+
+
+class ArchiveProcess:
+    """Answers questions about one folder, one after the other; it is started by the first."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._pool: ProcessPoolExecutor | None = None
+        self._waiting = 0
+
+    async def ask(self, question: Callable[..., AnswerT], *arguments: Any, **options: Any) -> AnswerT:
+        """The answer of a function of :mod:`pebble.recordings.seek.questions`. Raises PebbleError."""
+        if self._waiting >= MOST_WAITING:
+            raise BusyError("too many questions about recordings at once: try again")
+        self._waiting += 1
+        try:
+            return await asyncio.wrap_future(self._started().submit(_Call(question, options), *arguments))
+        except BrokenProcessPool:
+            self.close()
+            raise PebbleError("the process that reads recordings has ended: try again") from None
+        finally:
+            self._waiting -= 1
+
+    def close(self) -> None:
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            processes = list((pool._processes or {}).values())  # those of a pool are not public
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.kill()
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(
+                1, mp_context=_SPAWN, initializer=questions.begin, initargs=(self._folder,)
+            )
+        return self._pool
+
+
+class _Call:
+    """A function with keywords, as a pool takes it."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self._function, self._options = function, options
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._function(*arguments, **self._options)
+
+
+class Job:
+    """One long job in a process of its own; what it makes is in a file."""
+
+    def __init__(self, function: Callable[..., None], *arguments: Any) -> None:
+        """``function`` takes a Connection, then ``arguments``. Call it on the event loop."""
+        self.done = 0.0  # the share of the work
+        self.ready = False
+        self.why = ""  # it failed
+        self._answers, theirs = _SPAWN.Pipe(duplex=False)
+        self._process = _SPAWN.Process(target=function, args=(theirs, *arguments), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._task = asyncio.create_task(self._follow(self._answers))
+
+    @property
+    def running(self) -> bool:
+        return not self._task.done()
+
+    async def end(self) -> None:
+        """End it, if it still runs."""
+        self._process.kill()
+        await asyncio.gather(self._task, return_exceptions=True)
+
+    async def _follow(self, answers: Connection) -> None:
+        loop, readable = asyncio.get_running_loop(), asyncio.Event()
+        loop.add_reader(answers.fileno(), readable.set)
+        try:
+            while not self.ready and not self.why:
+                await readable.wait()
+                readable.clear()
+                while not self.ready and not self.why and answers.poll():
+                    self._take(*answers.recv())  # it is short, and comes as a whole
+        except EOFError:
+            self.why = self.why or "it was ended"
+        finally:
+            loop.remove_reader(answers.fileno())
+            answers.close()
+            await asyncio.to_thread(self._process.join, _END_S)
+            self._process.kill()
+
+    def _take(self, what: str, value: Any) -> None:
+        if what == "done":
+            self.done = value
+        elif what == "ready":
+            self.ready = True
+        else:
+            self.why = value

@@ -1,0 +1,316 @@
+"""The routes of recordings: days, timelines, what a robot published at any time, thumbnails, films. Nothing is sent."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import secrets
+import tempfile
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from pebble.contract.identity import Identity
+from pebble.errors import PebbleError
+from pebble.recordings.seek import questions
+from pebble.recordings.seek.segment import LONGEST_MS
+from pebble.recordings.seek.thumbnails import MOST, WIDEST
+from pebble.transports.clock import since_boot as clock
+from pebble.web import login
+from pebble.web.archive_process import ArchiveProcess, BusyError, Job
+
+_NONE: Final = "this server has no recordings: start it with --recordings DIR"
+_LONGEST_EXPORT_MS: Final = 3_600_000.0
+_ACTIVE_S: Final = 30.0  # a timeline of files that are being written is made anew after this time
+_TIMELINES: Final = 16  # that are remembered
+_PIECE: Final = 64 << 10
+_LATEST_MS: Final = 9.0e12  # in the year 2255
+
+_Ref = Annotated[str, Meta(max_length=200)]
+
+
+class ExportRequest(Struct, frozen=True, rename={"form": "as"}):
+    """The body of POST /archive/exports; times in epoch milliseconds."""
+
+    robot: _Ref
+    since: float
+    until: float
+    form: Literal["mkv", "mp4", "mcap"]
+
+
+_export_decoder = msgspec.json.Decoder(ExportRequest)
+
+
+@dataclass(slots=True)
+class _Timeline:
+    """One that is being made, or was made; ``made``: JSON, while a newer one is made that of before."""
+
+    paths: list[str]
+    active: bool
+    target: Path
+    job: Job
+    began_at: float  # seconds since the machine was started
+    made: bytes | None = None
+
+    def take(self) -> bytes | None:
+        """The newest there is."""
+        if self.job.ready and self.target.exists():
+            self.made = self.target.read_bytes()
+            self.target.unlink()
+        return self.made
+
+
+@dataclass(slots=True)
+class _Export:
+    """The one export that there is."""
+
+    id: str
+    name: str
+    target: Path
+    job: Job
+
+
+class BadQuestionError(PebbleError):
+    """A parameter that is missing or no such value. Example: ``at: a number of milliseconds is needed``."""
+
+
+class Recordings:
+    """What one server offers of a folder of recordings. Everything runs on the event loop."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.process = ArchiveProcess(folder)
+        self._scratch = tempfile.TemporaryDirectory(prefix="pebble-replay-")
+        self._timelines: dict[tuple[str, str], _Timeline] = {}
+        self._export: _Export | None = None
+
+    async def close(self) -> None:
+        self.process.close()
+        for one in self._timelines.values():
+            await one.job.end()
+        if self._export is not None:
+            await self._export.job.end()
+        self._scratch.cleanup()
+
+    async def timeline(self, day: str, robot: str) -> bytes | float:
+        """JSON, or the share of the work that is done. Raises PebbleError."""
+        key, period = (day, robot), _period_of(day)
+        paths, active = await self.process.ask(questions.files, robot, *period)
+        known = self._timelines.pop(key, None)
+        if known is None or self._is_old(known, paths, active=active):
+            before = None if known is None else known.take()
+            known = self._begin(robot, period, paths, active=active, before=before)
+        if known.job.why:
+            raise PebbleError(known.job.why)
+        self._timelines[key] = known  # the last one used is the last one forgotten
+        await self._forget()
+        made = known.take()
+        return known.job.done if made is None else made
+
+    async def export(self, wanted: ExportRequest) -> str:
+        """Begin an export; returns its id. Raises PebbleError, BusyError while one runs."""
+        if self._export is not None and self._export.job.running:
+            raise BusyError("another export runs: wait for it, or end it")
+        if not 0 <= wanted.since < wanted.until <= wanted.since + _LONGEST_EXPORT_MS:
+            raise BadQuestionError("an export is of at most one hour, and ends after it begins")
+        period = round(wanted.since * 1e6), round(wanted.until * 1e6)
+        paths, _ = await self.process.ask(questions.files, wanted.robot, *period)
+        if not paths:
+            raise PebbleError(f"nothing is recorded of {wanted.robot} in this time")
+        await self.end_export()
+        number = secrets.token_hex(8)
+        target = Path(self._scratch.name, f"{number}.{wanted.form}")
+        job = Job(questions.export_job, paths, target, wanted.robot, period, wanted.form)
+        began = datetime.fromtimestamp(wanted.since / 1000, UTC).strftime("%Y%m%dT%H%M%SZ")
+        name = f"{wanted.robot.rpartition('/')[2]}-{began}.{wanted.form}"
+        self._export = _Export(number, name, target, job)
+        return number
+
+    def export_of(self, number: str) -> _Export | None:
+        return self._export if self._export is not None and self._export.id == number else None
+
+    async def end_export(self) -> None:
+        one, self._export = self._export, None
+        if one is not None:
+            await one.job.end()
+            one.target.unlink(missing_ok=True)
+
+    def _begin(
+        self, robot: str, period: tuple[int, int], paths: list[str], *, active: bool, before: bytes | None
+    ) -> _Timeline:
+        target = Path(self._scratch.name, f"{secrets.token_hex(8)}.json")
+        job = Job(questions.make_timeline_job, self.folder, paths, target, robot, period)
+        return _Timeline(paths, active, target, job, clock(), before)
+
+    def _is_old(self, known: _Timeline, paths: list[str], *, active: bool) -> bool:
+        if known.job.running:
+            return False
+        changed = paths != known.paths or known.active or active
+        return bool(known.job.why) or (changed and clock() - known.began_at > _ACTIVE_S)
+
+    async def _forget(self) -> None:
+        while len(self._timelines) > _TIMELINES:
+            old = self._timelines.pop(next(iter(self._timelines)))
+            await old.job.end()
+            old.target.unlink(missing_ok=True)
+
+
+def _period_of(day: str) -> tuple[int, int]:
+    try:
+        begin = datetime.strptime(day, "%Y-%m-%d").replace(tzinfo=UTC)
+        end = begin + timedelta(days=1)
+    except (ValueError, OverflowError):
+        raise BadQuestionError(f'day: "{day[:20]}" is none: write 2026-11-20') from None
+    return int(begin.timestamp()) * 10**9, int(end.timestamp()) * 10**9
+
+
+# -- routes
+
+_Answers = Callable[[Request, Recordings], Awaitable[Response]]
+
+
+def routes() -> list[Route]:
+    return [
+        Route("/archive/days", _answered(_days)),
+        Route("/archive/timeline", _answered(_timeline)),
+        Route("/archive/segment", _answered(_segment)),
+        Route("/archive/frame", _answered(_frame)),
+        Route("/archive/strip", _answered(_strip)),
+        Route("/archive/exports", _answered(_begin_export), methods=["POST"]),
+        Route("/archive/exports/{id}", _answered(_export)),
+        Route("/archive/exports/{id}/file", _answered(_file)),
+        Route("/archive/exports/{id}/end", _answered(_end_export), methods=["POST"]),
+    ]
+
+
+def _answered(answers: _Answers) -> Callable[[Request], Awaitable[Response]]:
+    """Only with a session, and one line for everything that is wrong."""
+
+    async def endpoint(request: Request) -> Response:
+        if login.session_of(request) is None:
+            return PlainTextResponse("log in first", 401)
+        recordings: Recordings | None = request.app.state.recordings
+        if recordings is None:
+            return PlainTextResponse(_NONE, 404)
+        try:
+            return await answers(request, recordings)
+        except BadQuestionError as error:
+            return PlainTextResponse(str(error), 400)
+        except BusyError as error:
+            return PlainTextResponse(str(error), 409)
+        except PebbleError as error:
+            return PlainTextResponse(str(error), 422)
+
+    return endpoint
+
+
+async def _days(_: Request, recordings: Recordings) -> Response:
+    return _json(await recordings.process.ask(questions.days))
+
+
+async def _timeline(request: Request, recordings: Recordings) -> Response:
+    made = await recordings.timeline(request.query_params.get("day", ""), _robot(request))
+    return JSONResponse({"indexing": made}, 202) if isinstance(made, float) else _json(made)
+
+
+async def _segment(request: Request, recordings: Recordings) -> Response:
+    at_ms, for_ms = _number(request, "at", _LATEST_MS), _number(request, "for", LONGEST_MS)
+    seek, media = request.query_params.get("seek") == "1", request.query_params.get("media") != "0"
+    ask = recordings.process.ask
+    made = await ask(questions.segment, _robot(request), at_ms, for_ms, seek=seek, media=media)
+    headers = {"x-next": "" if made.next_ms is None else repr(made.next_ms), "x-complete": str(int(made.complete))}
+    headers["content-length"] = str(len(made.data))
+    return StreamingResponse(_pieces(made.data), media_type="application/octet-stream", headers=headers)
+
+
+async def _frame(request: Request, recordings: Recordings) -> Response:
+    at_ms, width = _number(request, "at", _LATEST_MS), int(_number(request, "w", WIDEST, 0.0))
+    made = await recordings.process.ask(questions.frame, _robot(request), at_ms, width)
+    if made is None:
+        return PlainTextResponse("there is no picture at this time", 404)
+    return Response(made.jpeg, media_type="image/jpeg", headers={"x-captured-ms": repr(made.captured_ms)})
+
+
+async def _strip(request: Request, recordings: Recordings) -> Response:
+    since_ms, step_ms = _number(request, "since", _LATEST_MS), _number(request, "step", 86_400_000.0)
+    count, width = int(_number(request, "count", MOST)), int(_number(request, "w", 320, 160.0))
+    if not count or width < 16:
+        raise BadQuestionError("count is at least 1, and w at least 16")
+    return Response(
+        await recordings.process.ask(questions.strip, _robot(request), since_ms, step_ms, count, width),
+        media_type="image/jpeg",
+    )
+
+
+async def _begin_export(request: Request, recordings: Recordings) -> Response:
+    try:
+        wanted = _export_decoder.decode(await request.body())
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadQuestionError(str(error)) from None
+    number = await recordings.export(wanted)
+    session = login.session_of(request)
+    user, address = "" if session is None else session.user, "" if request.client is None else request.client.host
+    detail = f"{wanted.form}, {round((wanted.until - wanted.since) / 1000)} s from {round(wanted.since / 1000)}"
+    request.app.state.audit.write("export", ref=wanted.robot, user=user, address=address, detail=detail)
+    return JSONResponse({"id": number}, 202)
+
+
+async def _export(request: Request, recordings: Recordings) -> Response:
+    one = recordings.export_of(request.path_params["id"])
+    if one is None:
+        return PlainTextResponse("there is no such export", 404)
+    state = "running" if one.job.running else "ready" if one.job.ready else "failed"
+    size = one.target.stat().st_size if state == "ready" else 0
+    return JSONResponse({"state": state, "done": one.job.done, "why": one.job.why, "name": one.name, "bytes": size})
+
+
+async def _file(request: Request, recordings: Recordings) -> Response:
+    one = recordings.export_of(request.path_params["id"])
+    if one is None or one.job.running or not one.job.ready:
+        return PlainTextResponse("there is no such export, or it is not ready", 404)
+    return FileResponse(one.target, filename=one.name, media_type="application/octet-stream")
+
+
+async def _end_export(request: Request, recordings: Recordings) -> Response:
+    if recordings.export_of(request.path_params["id"]) is not None:
+        await recordings.end_export()
+    return JSONResponse({})
+
+
+async def _pieces(data: bytes) -> AsyncIterator[bytes]:
+    """Commands and stops of other pages pass in between."""
+    for begin in range(0, len(data), _PIECE):
+        yield data[begin : begin + _PIECE]
+        await asyncio.sleep(0)
+
+
+def _json(data: bytes) -> Response:
+    return Response(data, media_type="application/json")
+
+
+def _robot(request: Request) -> str:
+    text = request.query_params.get("robot", "")
+    levels = text.split("/")
+    try:
+        return Identity(*levels).base
+    except (TypeError, ValueError, PebbleError):
+        raise BadQuestionError(f'robot: "{text[:100]}" is none: write system/type/id') from None
+
+
+def _number(request: Request, name: str, most: float, otherwise: float | None = None) -> float:
+    text: Any = request.query_params.get(name, otherwise)
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not 0 <= value <= most:
+        raise BadQuestionError(f"{name}: a number from 0 to {most:g} is needed")
+    return value

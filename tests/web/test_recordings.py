@@ -1,0 +1,232 @@
+"""Recordings as the server offers them to pages: over HTTP, read in another process, and only read."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import httpx
+import pytest
+
+from pebble.fleet.people import People
+from pebble.fleet.roles import Role
+from pebble.recordings.library import files
+from pebble.recordings.seek.segment import Flag, unpacked
+from pebble.web import recordings as routes
+from tests.recordings.playing import GOOB, js, ms
+from tests.recordings.seek.filming import CAMERA, FPS, film
+from tests.support import Broker, until
+from tests.web.served import Served
+
+SECONDS = 40
+DAY = "2023-11-14"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return film(tmp_path_factory.mktemp("recordings"), "h264", SECONDS)
+
+
+@pytest.fixture(scope="module")
+def archive(broker: Broker, folder: Path) -> Iterator[Served]:
+    with Served(broker.port, recordings=folder) as running:
+        yield running
+
+
+def get(served: Served, path: str, **parameters: Any) -> httpx.Response:
+    return httpx.get(f"{served.origin}/archive/{path}", params=parameters, timeout=30)
+
+
+def post(served: Served, path: str, body: Any) -> httpx.Response:
+    return httpx.post(f"{served.origin}/archive/{path}", json=body, headers={"origin": served.origin}, timeout=30)
+
+
+def test_days_and_their_robots(archive: Served) -> None:
+    (day,) = get(archive, "days").json()
+    assert (day["day"], day["robots"], day["gaps"]) == (DAY, [GOOB], 0)
+    assert (day["first"], day["last"]) == (ms(0), ms(SECONDS - 0.02))
+
+
+def test_a_timeline_is_indexed_once(archive: Served, folder: Path) -> None:
+    pytest.importorskip("duckdb")
+    answers: list[httpx.Response] = []
+
+    def made() -> bool:
+        answers.append(get(archive, "timeline", day=DAY, robot=GOOB))
+        return answers[-1].status_code == 200
+
+    assert until(made, 30, step=0.2), answers[-1].text
+    assert {answer.status_code for answer in answers[:-1]} <= {202}
+    found = answers[-1].json()
+    assert found["from"] == ms(0) // 10_000 * 10_000
+    assert found["step"] == 10_000
+    online, driven, pictures, sound = 1, 2, 64, 128
+    assert [step & (online | driven | pictures | sound) for step in found["activity"]] == [
+        online | driven | pictures | sound
+    ] * len(found["activity"])
+    assert len(found["activity"]) == len(found["video"]) == len(found["audio"]) == len(found["rest"]) == 4
+    assert found["audio"][1] == pytest.approx(50 * 664 * 8 / 1000, abs=0.1)  # as in the paper, Table 4.1
+    assert [round(one["until"] - one["since"]) // 1000 for one in found["sessions"]] == [SECONDS + 10]
+    assert (folder / "index").is_dir()
+    began = time.monotonic()
+    assert get(archive, "timeline", day=DAY, robot=GOOB).status_code == 200
+    assert time.monotonic() - began < 2.0
+
+
+def test_a_segment_is_what_was_recorded(archive: Served) -> None:
+    answer = get(archive, "segment", robot=GOOB, at=ms(11), **{"for": 2000, "seek": 1})
+    found = list(unpacked(answer.content))
+    assert float(answer.headers["x-next"]) == ms(13)
+    assert answer.headers["x-complete"] == "1"
+    assert sum(bool(flags & Flag.CHAIN) for _, flags, _, _ in found) == FPS  # key frames come every two seconds
+    assert get(archive, "segment", robot=GOOB, at=ms(100), **{"for": 2000}).headers["x-next"] == ""
+
+
+def test_a_picture_a_strip_of_them_and_nothing_where_there_is_none(archive: Served) -> None:
+    answer = get(archive, "frame", robot=GOOB, at=ms(20), w=160)
+    assert answer.headers["content-type"] == "image/jpeg"
+    assert abs(float(answer.headers["x-captured-ms"]) - ms(20)) < 1000 / FPS
+    assert av.open(io.BytesIO(answer.content), format="mjpeg").streams.video[0].width == 160
+    assert get(archive, "frame", robot=GOOB, at=ms(-60)).status_code == 404
+    strip = get(archive, "strip", robot=GOOB, since=ms(0), step=10_000, count=4, w=160)
+    assert av.open(io.BytesIO(strip.content), format="mjpeg").streams.video[0].width == 640
+
+
+@pytest.mark.parametrize("form", ["mkv", "mp4", "mcap"])
+def test_a_stretch_is_exported_and_fetched(archive: Served, tmp_path: Path, form: str) -> None:
+    answer = post(archive, "exports", {"robot": GOOB, "since": ms(5), "until": ms(15), "as": form})
+    assert answer.status_code == 202, answer.text
+    place = f"exports/{answer.json()['id']}"
+    assert until(lambda: get(archive, place).json()["state"] != "running", 60, step=0.1)
+    state = get(archive, place).json()
+    assert (state["state"], state["why"], state["done"]) == ("ready", "", pytest.approx(1.0, abs=0.02))
+    fetched = get(archive, f"{place}/file")
+    assert f"goob-20231114T221325Z.{form}" in fetched.headers["content-disposition"]
+    assert len(fetched.content) == state["bytes"]
+    target = tmp_path / f"x.{form}"
+    target.write_bytes(fetched.content)
+    seconds = files([target]) if form == "mcap" else av.open(str(target)).duration / 1e6
+    assert seconds == ([target] if form == "mcap" else pytest.approx(10, abs=0.2))
+    assert post(archive, f"{place}/end", {}).status_code == 200
+    assert get(archive, place).status_code == 404
+
+
+def test_one_export_at_a_time_and_it_can_be_ended(archive: Served) -> None:
+    wanted = {"robot": GOOB, "since": ms(0), "until": ms(SECONDS), "as": "mp4"}
+    first = post(archive, "exports", wanted).json()["id"]
+    assert post(archive, "exports", wanted).status_code == 409
+    post(archive, f"exports/{first}/end", {})
+    second = post(archive, "exports", wanted)
+    assert second.status_code == 202
+    post(archive, f"exports/{second.json()['id']}/end", {})
+
+
+@pytest.mark.parametrize(
+    ("path", "parameters", "line"),
+    [
+        ("segment", {"robot": GOOB, "at": "soon", "for": 2000}, "at: a number from 0 to"),
+        ("segment", {"robot": GOOB, "at": "nan", "for": 2000}, "at: a number from 0 to"),
+        ("segment", {"robot": GOOB, "at": 0, "for": 3_600_000}, "for: a number from 0 to 10000 is needed"),
+        ("segment", {"robot": "goob", "at": 0, "for": 1}, 'robot: "goob" is none: write system/type/id'),
+        ("segment", {"robot": "a/b/#", "at": 0, "for": 1}, 'robot: "a/b/#" is none'),
+        ("timeline", {"robot": GOOB, "day": "../../etc"}, 'day: "../../etc" is none: write 2026-11-20'),
+        ("strip", {"robot": GOOB, "since": 0, "step": 1, "count": 999}, "count: a number from 0 to 24"),
+        ("strip", {"robot": GOOB, "since": 0, "step": 1, "count": 0}, "count is at least 1"),
+        ("frame", {"robot": GOOB}, "at: a number from 0 to"),
+    ],
+)
+def test_a_bad_question_gets_one_line(archive: Served, path: str, parameters: dict[str, Any], line: str) -> None:
+    answer = get(archive, path, **parameters)
+    assert answer.status_code == 400
+    assert line in answer.text
+    assert "\n" not in answer.text
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"robot": GOOB, "since": 0, "until": 1e12, "as": "mkv"},
+        {"robot": GOOB, "since": 5, "until": 4, "as": "mkv"},
+        7,
+    ],
+)
+def test_a_bad_export_is_refused(archive: Served, body: Any) -> None:
+    assert post(archive, "exports", body).status_code == 400
+
+
+def test_nothing_to_export_is_one_line(archive: Served) -> None:
+    answer = post(archive, "exports", {"robot": "pebble/robots/no", "since": 5, "until": 9, "as": "mkv"})
+    assert (answer.status_code, answer.text) == (422, "nothing is recorded of pebble/robots/no in this time")
+
+
+def test_without_a_folder_and_without_a_session(broker: Broker, folder: Path, tmp_path: Path) -> None:
+    with Served(broker.port) as plain:
+        answer = get(plain, "days")
+        assert (answer.status_code, answer.text) == (
+            404,
+            "this server has no recordings: start it with --recordings DIR",
+        )
+        with plain.page() as page:
+            assert page.welcome["recordings"] is False
+    people = People(tmp_path / "people.sqlite")
+    people.add("ann", "a long password", Role.VIEWER)
+    people.close()
+    with Served(broker.port, recordings=folder, login=True, people=tmp_path / "people.sqlite") as closed:
+        paths = [route.path.replace("{id}", "1") for route in routes.routes() if "POST" not in (route.methods or ())]
+        assert {httpx.get(closed.origin + path).status_code for path in paths} == {401}
+        assert post(closed, "exports", {}).status_code == 401
+
+
+def test_the_page_knows_that_there_are_some(archive: Served) -> None:
+    with archive.page() as page:
+        assert page.welcome["recordings"] is True
+    assert httpx.get(f"{archive.origin}/replay/{GOOB}?at=1").status_code == 200
+
+
+def test_the_process_that_reads_ends_with_the_server_and_is_replaced_if_it_dies(broker: Broker, folder: Path) -> None:
+    with Served(broker.port, recordings=folder) as running:
+        assert get(running, "days").status_code == 200
+        (first,) = running.app.state.recordings.process._pool._processes
+        os.kill(first, 9)
+        assert until(lambda: get(running, "days").status_code == 200, 10)
+        (second,) = running.app.state.recordings.process._pool._processes
+    assert second != first
+    assert until(lambda: not Path(f"/proc/{second}").exists() or _is_zombie(second), 5)
+
+
+def test_recorded_commands_reach_no_robot(archive: Served, broker: Broker, folder: Path) -> None:
+    """Every route is asked for a time with drive commands; nothing is published below the robot's base."""
+    from tests.recordings.recorder.test_record import Reference
+
+    reference = Reference(broker.port)
+    for seek in (0, 1):
+        get(archive, "segment", robot=GOOB, at=ms(3), **{"for": 5000, "seek": seek})
+    for path, more in (("frame", {"at": ms(3)}), ("strip", {"since": ms(0), "step": 1000, "count": 3})):
+        get(archive, path, robot=GOOB, **more)
+    marker = f"{GOOB}/outgoing/marker"
+    reference.transport.publish(marker, b"{}")
+    assert until(lambda: reference.of(marker) == [b"{}"], 5)
+    assert {message.topic for message in reference.received if message.topic.startswith(GOOB)} == {marker}
+    reference.transport.close()
+
+
+def test_what_was_recorded_may_be_read_with_the_json_that_the_page_reads(archive: Served) -> None:
+    answer = get(archive, "segment", robot=GOOB, at=ms(1), **{"for": 1000})
+    imu = [payload for _, _, metric, payload in unpacked(answer.content) if metric == "sensors/imu"]
+    assert imu == [js(t=ms(1 + 0.1 * number), n=50 + 5 * number) for number in range(10)]
+    assert json.loads(imu[0])["n"] == 50
+    assert CAMERA.endswith("front-camera")
+
+
+def _is_zombie(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
