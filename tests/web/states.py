@@ -12,8 +12,8 @@ import msgspec
 
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.web.archive_double import GAP, START
 from tests.web.canned import State, Value
+from tests.web.recorded import GAP, START
 
 GOOB, FRED, LAMP, BENJR = (f"pebble/robots/{name}" for name in ("goob", "fred", "minilamp", "benjr"))
 TOWER, EVE, SAT = "pebble/towers/tower-1", "pebble/people/eve", "pebble/satellites/cube-3"
@@ -358,7 +358,7 @@ def with_stream(address: str) -> Callable[[int], Value]:
 
 
 #: The server has recordings.
-REPLAYING = State("/replay", fleet, LIVE, {"recordings": True})
+REPLAYING = State("/replay", fleet, LIVE, {"recordings": True}, recordings=True)
 
 STATES: dict[str, State] = {
     "fleet": State("/", changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),

@@ -25,10 +25,10 @@ export class Incoming {
 
   /** @param {number} at @param {string} metric @param {unknown} value parsed; undefined: it is no JSON @param {number} bytes */
   take(at, metric, value, bytes) {
-    if (metric === "drive") this.drive = { at, ...vectorOf(value) };
+    if (metric === "drive-values") this.drive = { at, ...vectorOf(value) };
     const text = value === undefined ? `${bytes} bytes` : cut(JSON.stringify(value) ?? "");
     const last = this.lines.findLast((line) => line.metric === metric);
-    if (last && at - last.at < AGAIN_MS && (metric === "drive" || value === undefined || last.text === text)) {
+    if (last && at - last.at < AGAIN_MS && (metric === "drive-values" || value === undefined || last.text === text)) {
       Object.assign(last, { at, text, count: last.count + 1 });
       return;
     }

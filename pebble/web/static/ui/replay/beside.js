@@ -2,8 +2,7 @@
 
 import { holding } from "../../core/replay/timeline.js";
 import { html, useModel, useTick } from "../hooks.js";
-import { clockTime, number } from "../words.js";
-import { long } from "./picture.js";
+import { clockTime, number, span } from "../words.js";
 
 const HELD_MS = 500; // a command to drive is over after that
 const SHOWN = 12; // lines
@@ -61,7 +60,7 @@ export function Sessions({ replay }) {
           aria-current=${one === now ? "true" : undefined}
           onClick=${() => replay.seek(one.since)}
         >
-          <span>${clockTime(one.since)} – ${clockTime(one.until)}</span> <small>${long(one.until - one.since)}</small>
+          <span>${clockTime(one.since)} – ${clockTime(one.until)}</span> <small>${span(one.until - one.since)}</small>
         </button>
       </li>`,
     )}
