@@ -13,7 +13,7 @@ let work = Promise.resolve();
 
 self.onmessage = ({ data }) => {
   newest = data.connection;
-  work = work.then(() => take(data.connection, data.message, data.quiet === true));
+  work = work.then(() => take(data.connection, data.message, data.quiet));
 };
 
 /**

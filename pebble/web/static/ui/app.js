@@ -14,12 +14,7 @@ export const PARTS = {
 };
 
 /** Not among them: few people look at recordings. */
-const REPLAY = styled(
-  async () => (await import("./replay/replay.js")).ReplayScreen,
-  "replay.css",
-  "picture.css",
-  "devices.css",
-);
+const REPLAY = styled(async () => (await import("./replay/replay.js")).Replay, "replay.css", "picture.css");
 
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */
 export function useLayout() {
@@ -44,16 +39,15 @@ export function App() {
   const { shown } = useModel(panels);
   const [drawer, setDrawer] = useState(false);
   useEffect(() => {
-    document.title = ref ? `${nameOf(ref)} – Pebble` : replay === null ? "Pebble" : `Recordings – Pebble`;
+    document.title = ref ? `${nameOf(ref)} – Pebble` : replay === null ? "Pebble" : "Recordings – Pebble";
     setDrawer(false);
   }, [ref, replay]);
   const toggle = () => panels.toggle("settings");
-  return html`<div class=${`app ${layout} ${ref ? "at-robot" : replay === null ? "at-fleet" : "at-replay"}`}>
+  return html`<div class=${`app ${layout} ${ref ? "at-robot" : "at-fleet"}`}>
     <a class="skip" href="#main">Skip to content</a>
     <${Boundary} what="The header">
       <${Header}
         at=${ref}
-        replay=${replay}
         layout=${layout}
         panel=${shown === "settings"}
         onPanel=${toggle}
@@ -80,7 +74,7 @@ export function App() {
             />`
           : replay === null
             ? html`<${Part} part=${PARTS.fleet} now />`
-            : html`<${Part} part=${REPLAY} now key=${replay} at=${replay} layout=${layout} />`}
+            : html`<${Part} part=${REPLAY} now key=${replay} at=${replay} />`}
       <//>
     </main>
   </div>`;

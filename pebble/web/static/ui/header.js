@@ -1,22 +1,22 @@
 // The header of every screen: which robot, whether it is there, and STOP.
 
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./hooks.js";
-import { Route, WATCHES } from "./models.js";
+import { Route } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
 import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
 
-export function Header({ at, replay, layout, panel, onPanel, drawer, onDrawer }) {
-  const { commands, driver } = usePage();
+export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
+  const { commands, driver, route } = usePage();
   const wide = layout === "desktop";
   return html`<header class="top">
     <div class="where">
-      ${at || replay !== null ? html`<${BackLink} />` : html`<${Brand} />`}
+      ${at || route.replay !== null ? html`<${BackLink} />` : html`<${Brand} />`}
       ${at && html`<${Picker} at=${at} />`}
     </div>
     ${at && wide && html`<${Vital} at=${at} />`}
     <div class="top-space"></div>
-    ${at && wide && html`<${RecordingsLink} at=${at} />`} ${wide && html`<${ConnectionState} />`}
-    <${Boundary} what="Notices"><${Notices} wide=${wide} /><//>
+    ${wide && html`<${ConnectionState} />`}
+    <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide} /><//>
     ${layout === "immersive" &&
     html`<button
         type="button"
@@ -61,13 +61,14 @@ export function Header({ at, replay, layout, panel, onPanel, drawer, onDrawer })
 
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
 
-/** Follow a link to a component, or the fleet, without loading the page again. */
-export function RouteLink({ to = "", path = Route.path(to), className = "", label = undefined, children }) {
+/** Follow a link to a component, or the fleet, without loading the page again. @param {any} props */
+export function RouteLink({ to = "", path = Route.path(to), className, label, onGo, children }) {
   const { route } = usePage();
   const go = (event) => {
     if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
     event.preventDefault();
     route.open(path);
+    onGo?.();
   };
   return html`<a class=${className} href=${path} aria-label=${label} onClick=${go}>${children}</a>`;
 }
@@ -75,16 +76,6 @@ export function RouteLink({ to = "", path = Route.path(to), className = "", labe
 const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: all robots"
   ><${Icon} name="back" /><span>Fleet</span><//
 >`;
-
-/** To what was recorded, if this server has recordings. */
-export function RecordingsLink({ at = "", className = "button quiet" }) {
-  const { connection } = usePage();
-  useModel(connection, (one) => one.you);
-  if (!connection.you?.recordings || WATCHES) return null;
-  return html`<${RouteLink} path=${Route.recordings(at)} className=${`${className} to-recordings`}
-    ><${Icon} name="recordings" />Recordings<//
-  >`;
-}
 
 function Picker({ at }) {
   const { route } = usePage();

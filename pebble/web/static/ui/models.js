@@ -87,29 +87,12 @@ export class Route extends Model {
   }
 
   get ref() {
-    const path = location.pathname;
-    if (!path.startsWith("/r/")) return "";
-    try {
-      return decodeURIComponent(path.slice(3));
-    } catch {
-      return "";
-    }
+    return below("/r/") ?? "";
   }
 
   /** Of which component the recordings are shown; "" one is to be chosen; null: no recordings are. @returns {string | null} */
   get replay() {
-    const path = location.pathname;
-    if (path !== "/replay" && !path.startsWith("/replay/")) return null;
-    try {
-      return decodeURIComponent(path.slice(8));
-    } catch {
-      return "";
-    }
-  }
-
-  /** @param {string} ref @returns {string} the address of its recordings */
-  static recordings(ref) {
-    return `/replay${ref && Route.path(ref, false).slice(2)}`;
+    return below("/replay")?.slice(1) ?? null;
   }
 
   /** @param {string} ref @returns {string} the address of its screen, which only watches if this one does */
@@ -127,6 +110,17 @@ export class Route extends Model {
     history.pushState(null, "", path);
     scrollTo(0, 0);
     this.changed();
+  }
+}
+
+/** @param {string} folder @returns {string | null} the rest of the page's path; null: it is elsewhere */
+function below(folder) {
+  const path = location.pathname;
+  if (!path.startsWith(folder)) return null;
+  try {
+    return decodeURIComponent(path.slice(folder.length));
+  } catch {
+    return "";
   }
 }
 

@@ -3,7 +3,6 @@
 import { CARDS, TABS, VOICE } from "./cards.js";
 import { DriveCard, DrivePad, DriveSettings, Speed, WhyLine } from "./drive.js";
 import { Boundary, fetchRest, html, useEffect, useMetric, useMetrics, useModel, usePage, useState, useValue } from "./hooks.js";
-import { RecordingsLink } from "./header.js";
 import { CardView, Offers, WATCHES } from "./models.js";
 import { Card, Icon, Part } from "./parts.js";
 import { NoCamera, PictureSettings, Stage, useStream, useVideo } from "./video.js";
@@ -115,7 +114,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
           ><${PictureSettings} at=${at} source=${source} offers=${offers}
         /><//>`}
         <${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
-        <${MoreSettings} at=${at} onPanel=${onPanel} />`}
+        <${MoreSettings} onPanel=${onPanel} />`}
     </div>
     <nav class="tabs" aria-label="Parts of this page">
       ${tabs.map(
@@ -157,13 +156,12 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
         ><${PictureSettings} at=${at} source=${source} offers=${offers} video=${video}
       /><//>`}
       ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} at=${at} offers=${offers} view=${view} />`)}
-      <${MoreSettings} at=${at} onPanel=${onPanel} />
+      <${MoreSettings} onPanel=${onPanel} />
     </aside>`}
   </div>`;
 }
 
-const MoreSettings = ({ at, onPanel }) => html`<${RecordingsLink} at=${at} className="button wide" />
-  <button type="button" class="wide" data-test="settings" onClick=${onPanel}>
+const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
     <${Icon} name="settings" /><${SettingsWords} />
   </button>
   ${document.fullscreenElement &&

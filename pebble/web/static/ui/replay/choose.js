@@ -3,8 +3,8 @@
 import { Archive } from "../../core/replay/archive.js";
 import { html, useEffect, useModel, usePage, useState } from "../hooks.js";
 import { RouteLink } from "../header.js";
-import { Route } from "../models.js";
 import { Icon } from "../parts.js";
+import { recordingsOf } from "../recordings-link.js";
 import { iconOf } from "../fleet.js";
 import { clockTime, nameOf, shortTime } from "../words.js";
 
@@ -47,7 +47,7 @@ function useDays() {
   return { days, problem, again: () => setAttempt(attempt + 1) };
 }
 
-const addressOf = (ref, day) => `${Route.recordings(ref)}?day=${day}`;
+const addressOf = (ref, day) => `${recordingsOf(ref)}?day=${day}`;
 
 /** All days with recordings, newest first. */
 export function Choose() {
@@ -106,7 +106,7 @@ export function Elsewhere({ at, replay }) {
       ><select
         data-test="replay-robot"
         value=${at}
-        onChange=${(event) => route.open(`${Route.recordings(event.currentTarget.value)}?at=${Math.round(replay.player.position)}`)}
+        onChange=${(event) => route.open(`${recordingsOf(event.currentTarget.value)}?at=${Math.round(replay.player.position)}`)}
       >
         ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameOf(ref)}</option>`)}
       </select></label

@@ -11,7 +11,8 @@ import { ReplayPictures } from "../../media/replay-pictures.js";
 import { ReplaySound } from "../../media/replay-sound.js";
 import { LogBook } from "../../core/logs.js";
 import { logViewOf } from "../log-view.js";
-import { Model, Route } from "../models.js";
+import { Model } from "../models.js";
+import { recordingsOf } from "../recordings-link.js";
 import { recorderOf } from "../recorder.js";
 import { Video } from "../video-model.js";
 
@@ -209,7 +210,7 @@ export class Replay extends Model {
     this.changed();
     clearTimeout(this.addressTimer);
     this.addressTimer = setTimeout(() => {
-      const path = `${Route.recordings(this.ref)}?at=${Math.round(this.player.position)}`;
+      const path = `${recordingsOf(this.ref)}?at=${Math.round(this.player.position)}`;
       if (location.pathname + location.search !== path) history.replaceState(null, "", path);
     }, ADDRESS_MS);
   }

@@ -20,21 +20,20 @@ import { Card, Icon, Part } from "../parts.js";
 import { nameOf } from "../words.js";
 import { Choose, Elsewhere, timeWords } from "./choose.js";
 import { Download } from "./download.js";
-import { Replay } from "./model.js";
+import { Replay as Model } from "./model.js";
 import { Picture } from "./picture.js";
 import { Sent, Sessions } from "./beside.js";
 import { TimelineCard } from "./timeline.js";
 
 const LEFT_OUT = ["voice"]; // it is for the live robot
 
-export const ReplayScreen = ({ at, layout }) =>
-  at ? html`<${Opened} at=${at} layout=${layout} />` : html`<${Choose} />`;
+export const Replay = ({ at }) => (at ? html`<${Opened} at=${at} />` : html`<${Choose} />`);
 
-function Opened({ at, layout }) {
+function Opened({ at }) {
   const live = usePage();
-  const [replay, setReplay] = useState(/** @type {Replay | null} */ (null));
+  const [replay, setReplay] = useState(/** @type {Model | null} */ (null));
   useEffect(() => {
-    const made = new Replay(live, at);
+    const made = new Model(live, at);
     setReplay(made);
     live.replay = made; // for tests, and for people who look into it
     live.driver.onSpace = () => made.toggle();
@@ -50,10 +49,10 @@ function Opened({ at, layout }) {
       made.close();
     };
   }, []);
-  return replay && html`<${Shown} at=${at} replay=${replay} layout=${layout} />`;
+  return replay && html`<${Shown} at=${at} replay=${replay} />`;
 }
 
-/** Where the address says: ?at=MS, else ?day=2026-11-22, else the newest day. @param {Replay} replay */
+/** Where the address says: ?at=MS, else ?day=2026-11-22, else the newest day. @param {Model} replay */
 async function start(replay) {
   const query = new URLSearchParams(location.search);
   const at = Number(query.get("at") || NaN);
@@ -63,7 +62,7 @@ async function start(replay) {
   if (day) replay.openDay(day, () => replay.player.seeks || replay.seek(firstOf(replay)));
 }
 
-/** @param {Replay} replay */
+/** @param {Model} replay */
 async function newestDay(replay) {
   try {
     const days = await replay.archive.days(replay.dayAbort.signal);
@@ -78,7 +77,7 @@ async function newestDay(replay) {
   }
 }
 
-/** The first session of the day, else the first message. @param {Replay} replay */
+/** The first session of the day, else the first message. @param {Model} replay */
 function firstOf({ timeline, day }) {
   if (!timeline) return startOf(day);
   if (timeline.sessions.length) return timeline.sessions[0].since;
@@ -90,10 +89,10 @@ const STEP_MS = 10_000;
 const FAR_MS = 60_000;
 const TYPING = "input, select, textarea, [contenteditable], [data-arrows]";
 
-/** @type {WeakMap<Replay, (event: KeyboardEvent) => void>} */
+/** @type {WeakMap<Model, (event: KeyboardEvent) => void>} */
 const handlers = new WeakMap();
 
-/** Keys that move through the recording; the space bar comes by the driver's. @param {Replay} replay */
+/** Keys that move through the recording; the space bar comes by the driver's. @param {Model} replay */
 function keysOf(replay) {
   let handler = handlers.get(replay);
   if (handler) return handler;
@@ -108,7 +107,7 @@ function keysOf(replay) {
   return handler;
 }
 
-/** @param {Replay} replay @param {string} key @param {number} step @returns {boolean} whether the key means something */
+/** @param {Model} replay @param {string} key @param {number} step @returns {boolean} whether the key means something */
 function act(replay, key, step) {
   if (key === "ArrowLeft") replay.step(-step);
   else if (key === "ArrowRight") replay.step(step);
@@ -120,7 +119,7 @@ function act(replay, key, step) {
   return true;
 }
 
-function Shown({ at, replay, layout }) {
+function Shown({ at, replay }) {
   return html`<div class="replay">
     <h1 class="sr">Recording of ${nameOf(at)}</h1>
     <${Boundary} what="The time"><${Badge} at=${at} replay=${replay} /><//>
@@ -129,7 +128,7 @@ function Shown({ at, replay, layout }) {
         <div class="replay-bench">
           <div class="replay-main">
             <${Boundary} what="The picture"><${Picture} at=${at} replay=${replay} /><//>
-            <${Boundary} what="The timeline"><${TimelineCard} replay=${replay} layout=${layout} /><//>
+            <${Boundary} what="The timeline"><${TimelineCard} replay=${replay} /><//>
           </div>
           <div class="replay-side">
             <${Elsewhere} at=${at} replay=${replay} />

@@ -22,7 +22,7 @@ const STRIP_PX = 116; // of one picture, at least
 const MOST_STRIP = 24;
 const ZOOM = 1.6;
 
-export function TimelineCard({ replay, layout }) {
+export function TimelineCard({ replay }) {
   useModel(replay);
   useTick(500);
   const { timeline, indexing, dayProblem, player, view } = replay;
@@ -76,7 +76,7 @@ export function TimelineCard({ replay, layout }) {
       </div>
       <${Strip} replay=${replay} shown=${shown} />
     </div>
-    <${Legend} timeline=${timeline} phone=${layout === "portrait"} />
+    <${Legend} timeline=${timeline} />
   </section>`;
 }
 
@@ -87,15 +87,15 @@ function coverWords(indexing, problem) {
   return indexing < 0 ? "Loading the day…" : `This day is being indexed: ${Math.round(100 * indexing)} %`;
 }
 
-function Legend({ timeline, phone }) {
+function Legend({ timeline }) {
   const gaps = timeline?.gaps.length ?? 0;
   const outages = timeline?.outages.length ?? 0;
   return html`<ul class="legend">
-    <li><i class="swatch gap"></i>not recorded${gaps > 0 && ` (${gaps})`}</li>
-    <li><i class="swatch outage"></i>robot silent${outages > 0 && ` (${outages})`}</li>
-    <li><i class="swatch used"></i>used</li>
-    <li><i class="swatch marked"></i>marked</li>
-    ${!phone && html`<li class="dim">Click: go there · drag: move · wheel: zoom · Space: play</li>`}
+    <li><i class="legend-mark gap"></i>not recorded${gaps > 0 && ` (${gaps})`}</li>
+    <li><i class="legend-mark outage"></i>robot silent${outages > 0 && ` (${outages})`}</li>
+    <li><i class="legend-mark used"></i>used</li>
+    <li><i class="legend-mark marked"></i>marked</li>
+    <li class="dim legend-help">Click: go there · drag: move · wheel: zoom · Space: play</li>
   </ul>`;
 }
 
