@@ -62,13 +62,12 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
 
 /** Follow a link to a component, or the fleet, without loading the page again. @param {any} props */
-export function RouteLink({ to = "", path = Route.path(to), className, label, onGo, children }) {
+export function RouteLink({ to = "", path = Route.path(to), className, label, children }) {
   const { route } = usePage();
   const go = (event) => {
     if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
     event.preventDefault();
     route.open(path);
-    onGo?.();
   };
   return html`<a class=${className} href=${path} aria-label=${label} onClick=${go}>${children}</a>`;
 }

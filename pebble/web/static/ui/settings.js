@@ -48,7 +48,7 @@ export function SettingsPanel({ onClose }) {
       <//>`}
     </fieldset>
     <div class="panel-links">
-      <${RecordingsLink} at=${driver.ref} className="button wide" onGo=${onClose} />
+      <div onClick=${onClose}><${RecordingsLink} at=${driver.ref} className="button wide" /></div>
       ${MORE.map(
         ({ name, icon, text }) => html`<button
           key=${name}
