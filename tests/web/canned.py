@@ -15,8 +15,8 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any
@@ -31,11 +31,16 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
+from pebble.fleet.audit import Audit
 from pebble.media.speech import Speech
+from pebble.transports import MqttSettings
+from pebble.web import recordings
 from pebble.web.guard import CONTENT_SECURITY_POLICY
 from pebble.web.messages import FromPage
+from pebble.web.settings import WebSettings
 from pebble.web.static_files import StaticFiles
 from tests.support import ROOT, free_port, until
+from tests.web import recorded
 
 PING_S = 0.5
 PICTURE_S = 0.1
@@ -59,6 +64,7 @@ class State:
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
     series: Callable[[], dict[tuple[str, str], list[Any]]] = dict  # points of messages.Series, by component and metric
     refused: str = ""  # why nothing that is asked of a robot is done
+    recordings: bool = False  # those of tests.web.recorded are offered
     frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
@@ -78,6 +84,9 @@ class CannedServer:
                 Route("/", self._page),
                 Route("/login", self._page),
                 Route("/r/{ref:path}", self._page),
+                Route("/replay", self._page),
+                Route("/replay/{ref:path}", self._page),
+                *recordings.routes(),
                 Route("/static/{version}/{name:path}", self._static),
                 Route("/stream", self._stream),
                 Route("/api/snapshot.jpg", self._snapshot),
@@ -85,8 +94,13 @@ class CannedServer:
                 WebSocketRoute("/ws/control", self._control),
                 WebSocketRoute("/ws/media", self._media),
                 WebSocketRoute("/ws/sound", self._sound),
-            ]
+            ],
+            lifespan=self._life,
         )
+        app.state.settings = WebSettings(broker=MqttSettings(host="127.0.0.1"))
+        app.state.audit = Audit(None)
+        app.state.recordings = None
+        self._app = app
         config = uvicorn.Config(app, "127.0.0.1", self.port, log_level="critical", ws_per_message_deflate=False)
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
@@ -106,6 +120,8 @@ class CannedServer:
     def show(self, state: State) -> None:
         """What pages that connect from now on are shown."""
         self.state = state
+        if state.recordings and self._app.state.recordings is None:
+            self._app.state.recordings = recordings.Recordings(recorded.folder())
         self.received.clear()
         self.posted.clear()
 
@@ -113,6 +129,13 @@ class CannedServer:
         """What pages sent of one kind, without the numbers of commands."""
         messages = [message for message in list(self.received) if message["op"] == op]
         return [{name: value for name, value in message.items() if name != "n"} for message in messages]
+
+    @asynccontextmanager
+    async def _life(self, app: Starlette) -> AsyncIterator[None]:
+        yield
+        app.state.audit.close()
+        if app.state.recordings is not None:
+            await app.state.recordings.close()
 
     # -- http
 

@@ -13,6 +13,7 @@ import msgspec
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.web.canned import State, Value
+from tests.web.recorded import GAP, START
 
 GOOB, FRED, LAMP, BENJR = (f"pebble/robots/{name}" for name in ("goob", "fred", "minilamp", "benjr"))
 TOWER, EVE, SAT = "pebble/towers/tower-1", "pebble/people/eve", "pebble/satellites/cube-3"
@@ -356,6 +357,9 @@ def with_stream(address: str) -> Callable[[int], Value]:
     return lambda now: (GOOB, "status", {"t": now, "value": {"webrtc_url": address}}, 100)
 
 
+#: The server has recordings.
+REPLAYING = State("/replay", fleet, LIVE, {"recordings": True}, recordings=True)
+
 STATES: dict[str, State] = {
     "fleet": State("/", changed(fleet, at(GOOB, "web/driver", driver("bob", "phone"))), LIVE),
     "fleet-stopped": State(
@@ -366,6 +370,10 @@ STATES: dict[str, State] = {
     "fleet-watching": State("/?watch", fleet, LIVE),
     "driving": DRIVING,
     "operating": OPERATING,
+    "recordings": REPLAYING,
+    "replay": replace(REPLAYING, path=f"/replay/{GOOB}?at={START + 30_000}"),
+    "replay-gap": replace(REPLAYING, path=f"/replay/{GOOB}?at={GAP[0] + 60_000}"),
+    "driving-recorded": replace(DRIVING, welcome={"recordings": True}),
     "system-offline": replace(
         OPERATING, values=changed(fleet, at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2)))
     ),

@@ -31,6 +31,8 @@ export class Driver {
     this.onInterrupt = () => {};
     /** @type {(id: string, phase: "down" | "up") => void} what else keys and buttons do; "up" is of those that are held */
     this.onAction = () => {};
+    /** @type {(() => void) | null} what the space bar does where nothing can be driven: a replay plays and pauses */
+    this.onSpace = null;
     /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
     this.actions = null;
     /** @type {(id: string) => import("./inputs.js").Mapping | null} of a gamepad; null: unknown yet, it only stops */
@@ -240,7 +242,9 @@ export class Driver {
     if (event.code === "Space") {
       const button = event.target.matches?.(PRESSED);
       if (!button) event.preventDefault();
-      if (!button || !event.repeat) this.space(); // a button that is held by it stays held
+      if (this.onSpace && !this.ref) {
+        if (!button && !event.repeat) this.onSpace();
+      } else if (!button || !event.repeat) this.space(); // a button that is held by it stays held
     } else if (event.ctrlKey || event.altKey || event.metaKey) {
       // a shortcut of the browser
     } else if (DRIVE_KEYS.has(event.code) && this.ref && !isOwn(event)) {

@@ -34,6 +34,14 @@ export class Series {
     this.newestAt = -Infinity;
   }
 
+  /** Forget everything: time has jumped, perhaps back. */
+  restart() {
+    this.clear(-Infinity);
+    this.since = Infinity;
+    this.newest = null;
+    this.newestAt = -Infinity;
+  }
+
   /** A new connection: what was sent between the two is missing. */
   begin() {
     this.until = Math.max(this.until, this.newestAt);

@@ -28,13 +28,14 @@ export class H264Decoder {
    * is damaged, UnsupportedError where this browser has no decoder.
    * @param {Uint8Array} sealed
    * @param {boolean} keyframe
-   * @param {any} label returned with the picture of this unit
+   * @param {any} label returned with the picture of this unit; null: that one is not waited for, nor given out
    */
   async decode(sealed, keyframe, label) {
     const unit = unseal(sealed);
     const codec = checkUnit(unit, keyframe);
     try {
       await this.submit(unit, codec, label);
+      if (label === null) return null;
       const made = await this.newest();
       this.failures = 0;
       return made;
@@ -89,26 +90,32 @@ export class H264Decoder {
       frame.close();
       return;
     }
-    this.made.push({ frame, label: this.labels.get(frame.timestamp) });
+    const label = this.labels.get(frame.timestamp);
     this.labels.delete(frame.timestamp);
+    if (label === null) frame.close();
+    else this.made.push({ frame, label });
     this.wake();
   }
 
   async newest() {
-    if (!this.made.length && !this.error) await this.ready(HELD_MS);
+    let works = true;
+    while (works && !this.made.length && !this.error) works = await this.ready(HELD_MS);
     if (this.error) throw this.error;
     const made = this.made.splice(0);
     for (const { frame } of made.slice(0, -1)) frame.close();
     return made.length ? made[made.length - 1] : null;
   }
 
-  /** Wait for a picture, an error or the timeout. */
-  ready(/** @type {number} */ timeout) {
+  /**
+   * Wait for a picture, an error or the timeout.
+   * @param {number} timeout @returns {Promise<boolean>} false: it was the timeout
+   */
+  ready(timeout) {
     return new Promise((resolve) => {
-      const timer = setTimeout(resolve, timeout);
+      const timer = setTimeout(resolve, timeout, false);
       this.wake = () => {
         clearTimeout(timer);
-        resolve(undefined);
+        resolve(true);
       };
     });
   }

@@ -87,7 +87,7 @@ export class NewestOverlays {
   }
 
   forget(now) {
-    for (const [source, { at }] of this.sources) if (now - at > STALE_MS) this.sources.delete(source);
+    for (const [source, { at }] of this.sources) if (Math.abs(now - at) > STALE_MS) this.sources.delete(source);
   }
 }
 

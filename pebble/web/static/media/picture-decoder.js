@@ -34,9 +34,10 @@ export class PictureDecoder {
    * The picture of this payload; null if it is refused, or waits for a key frame or for its decoder. Never throws for a
    * payload. One call at a time.
    * @param {Uint8Array} bytes
+   * @param {boolean} [quiet] no picture is made of it: only the following ones build on it
    * @returns {Promise<Decoded|null>}
    */
-  async feed(bytes) {
+  async feed(bytes, quiet = false) {
     this.unsupported = false;
     try {
       const payload = readPayload(bytes);
@@ -45,7 +46,7 @@ export class PictureDecoder {
         this.h264.close();
         return null;
       }
-      const decoded = payload.encoding === "h264" ? await this.unit(payload) : await this.jpeg(payload);
+      const decoded = payload.encoding === "h264" ? await this.unit(payload, quiet) : await this.jpeg(payload, quiet);
       this.sequence.shown(payload);
       return decoded;
     } catch (error) {
@@ -62,10 +63,10 @@ export class PictureDecoder {
     this.sequence.reset();
   }
 
-  /** @param {import("./decode.js").Payload} payload */
-  async unit(payload) {
+  /** @param {import("./decode.js").Payload} payload @param {boolean} quiet */
+  async unit(payload, quiet) {
     if (this.sequence.last === null) this.h264.close();
-    const made = await this.h264.decode(payload.body, payload.keyframe, labelOf(payload));
+    const made = await this.h264.decode(payload.body, payload.keyframe, quiet ? null : labelOf(payload));
     if (made === null) return null;
     try {
       return { bitmap: await createImageBitmap(made.frame), ...made.label };
@@ -74,15 +75,19 @@ export class PictureDecoder {
     }
   }
 
-  /** @param {import("./decode.js").Payload} payload */
-  async jpeg(payload) {
+  /** @param {import("./decode.js").Payload} payload @param {boolean} quiet */
+  async jpeg(payload, quiet) {
+    if (quiet && payload.encoding === "jpeg") return null;
     const picture = await decodeJpeg(payload.body);
     if (payload.encoding === "jpeg") return { bitmap: picture, ...labelOf(payload) };
     if (payload.keyframe) {
       this.begin(picture);
-      return { bitmap: picture, ...labelOf(payload) };
+      if (!quiet) return { bitmap: picture, ...labelOf(payload) };
+      picture.close();
+      return null;
     }
-    return { bitmap: await this.add(picture), ...labelOf(payload) };
+    const whole = this.add(picture);
+    return quiet ? null : { bitmap: await createImageBitmap(whole), ...labelOf(payload) };
   }
 
   /** Let differences build on this picture. */
@@ -97,8 +102,8 @@ export class PictureDecoder {
     this.reference = null;
   }
 
-  /** @param {ImageBitmap} difference */
-  async add(difference) {
+  /** @param {ImageBitmap} difference @returns {ImageData} the picture that it makes of the last one */
+  add(difference) {
     const { context } = this;
     const { width, height } = difference;
     if (!context || context.canvas.width !== width || context.canvas.height !== height) {
@@ -109,7 +114,7 @@ export class PictureDecoder {
     difference.close();
     addDifference(reference.data, context.getImageData(0, 0, width, height).data);
     this.reference = reference;
-    return createImageBitmap(reference);
+    return reference;
   }
 }
 

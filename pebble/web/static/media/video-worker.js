@@ -8,17 +8,21 @@ const RESCUE_BYTES = HEAD_BYTES + 8; // and the time of capture
 
 let decoder = new PictureDecoder();
 let connection = -1;
+let newest = -1; // connection that messages come by
 let work = Promise.resolve();
 
 self.onmessage = ({ data }) => {
-  work = work.then(() => take(data.connection, data.message));
+  newest = data.connection;
+  work = work.then(() => take(data.connection, data.message, data.quiet));
 };
 
 /**
  * @param {number} from the connection that the message came by; another one begins anew
  * @param {ArrayBuffer} message
+ * @param {boolean} quiet it is not shown: only the following ones build on it
  */
-async function take(from, message) {
+async function take(from, message, quiet) {
+  if (from !== newest) return; // what it belongs to is over
   if (from !== connection) {
     decoder.close();
     decoder = new PictureDecoder();
@@ -28,16 +32,16 @@ async function take(from, message) {
   const seq = view.getUint32(0);
   let made;
   try {
-    made = view.getUint8(4) === 1 ? await rescued(message, view) : await direct(message);
+    made = view.getUint8(4) === 1 ? await rescued(message, view) : await direct(message, quiet);
   } catch (error) {
     made = { what: KEYFRAME_WANTED, problem: String(error) };
   }
   self.postMessage({ connection: from, seq, ...made }, { transfer: made.bitmap ? [made.bitmap] : [] });
 }
 
-/** @param {ArrayBuffer} message */
-async function direct(message) {
-  const made = await decoder.feed(new Uint8Array(message, HEAD_BYTES));
+/** @param {ArrayBuffer} message @param {boolean} quiet */
+async function direct(message, quiet) {
+  const made = await decoder.feed(new Uint8Array(message, HEAD_BYTES), quiet);
   if (made) return { what: DRAWN, problem: "", rescue: false, ...made };
   const { wantsKeyframe, problem } = decoder.sequence;
   if (decoder.unsupported) return { what: CANNOT_DECODE, problem };

@@ -13,6 +13,9 @@ export const PARTS = {
   panels: styled(async () => (await import("./panels.js")).Panels, "panels.css", "notices.css"),
 };
 
+/** Not among them: few people look at recordings. */
+const REPLAY = styled(async () => (await import("./replay/replay.js")).Replay, "replay.css", "picture.css");
+
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */
 export function useLayout() {
   const { route } = usePage();
@@ -30,15 +33,15 @@ export function useLayout() {
 
 export function App() {
   const { route, settings, panels } = usePage();
-  const { ref } = useModel(route);
+  const { ref, replay } = useModel(route);
   useModel(settings);
   const layout = useLayout();
   const { shown } = useModel(panels);
   const [drawer, setDrawer] = useState(false);
   useEffect(() => {
-    document.title = ref ? `${nameOf(ref)} – Pebble` : "Pebble";
+    document.title = ref ? `${nameOf(ref)} – Pebble` : replay === null ? "Pebble" : "Recordings – Pebble";
     setDrawer(false);
-  }, [ref]);
+  }, [ref, replay]);
   const toggle = () => panels.toggle("settings");
   return html`<div class=${`app ${layout} ${ref ? "at-robot" : "at-fleet"}`}>
     <a class="skip" href="#main">Skip to content</a>
@@ -58,7 +61,7 @@ export function App() {
       ><${Part} part=${PARTS.panels} now shown=${shown} onClose=${() => panels.show("")}
     /><//>`}
     <main id="main" tabindex="-1">
-      <${Boundary} key=${ref || "fleet"} what="This screen">
+      <${Boundary} key=${ref || `replay ${replay}`} what="This screen">
         ${ref
           ? html`<${Part}
               part=${PARTS.robot}
@@ -69,7 +72,9 @@ export function App() {
               drawer=${drawer}
               onPanel=${toggle}
             />`
-          : html`<${Part} part=${PARTS.fleet} now />`}
+          : replay === null
+            ? html`<${Part} part=${PARTS.fleet} now />`
+            : html`<${Part} part=${REPLAY} now key=${replay} at=${replay} />`}
       <//>
     </main>
   </div>`;

@@ -16,6 +16,7 @@ import {
 } from "./hooks.js";
 import { Offers, Route, WATCHES } from "./models.js";
 import { Icon, Live, StopButton } from "./parts.js";
+import { RecordingsLink } from "./recordings-link.js";
 import {
   battery,
   charging,
@@ -64,7 +65,7 @@ export function Fleet() {
           : `${robots.length} ${robots.length === 1 ? "robot" : "robots"}${connection.isOpen ? `, ${present.length} online` : ""}`}
         ${others > 0 && html`<span class="dim"> and ${others} ${others === 1 ? "other" : "others"}</span>`}
       </h1>
-      ${total > 0 && html`<${FleetTools} filter=${filter} onFilter=${setFilter} />`}
+      ${total > 0 ? html`<${FleetTools} filter=${filter} onFilter=${setFilter} />` : html`<${RecordingsLink} />`}
     </div>
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
@@ -131,6 +132,7 @@ function FleetTools({ filter, onFilter }) {
       /><span>Thumbnails</span></label
     >`}
     <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}>${WATCHES ? "Show all controls" : "Only watch"}</a>
+    <${RecordingsLink} />
     <button type="button" class="to-phone" data-test="phone" onClick=${() => panels.show("phone")}>
       <${Icon} name="phone" />Open on a phone
     </button>

@@ -6,17 +6,17 @@ import { Icon, Live, StopButton } from "./parts.js";
 import { battery, driverName, kindOf, nameOf, roughly, span, typeOf } from "./words.js";
 
 export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
-  const { commands, driver } = usePage();
+  const { commands, driver, route } = usePage();
   const wide = layout === "desktop";
   return html`<header class="top">
     <div class="where">
-      ${at ? html`<${BackLink} />` : html`<${Brand} />`}
+      ${at || route.replay !== null ? html`<${BackLink} />` : html`<${Brand} />`}
       ${at && html`<${Picker} at=${at} />`}
     </div>
     ${at && wide && html`<${Vital} at=${at} />`}
     <div class="top-space"></div>
     ${wide && html`<${ConnectionState} />`}
-    <${Boundary} what="Notices"><${Notices} wide=${wide} /><//>
+    <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide} /><//>
     ${layout === "immersive" &&
     html`<button
         type="button"
@@ -61,15 +61,15 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
 
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
 
-/** Follow a link to a component, or the fleet, without loading the page again. */
-export function RouteLink({ to, className, label, children }) {
+/** Follow a link to a component, or the fleet, without loading the page again. @param {any} props */
+export function RouteLink({ to = "", path = Route.path(to), className, label, children }) {
   const { route } = usePage();
   const go = (event) => {
     if (event.ctrlKey || event.metaKey || event.shiftKey || event.button) return;
     event.preventDefault();
-    route.go(to);
+    route.open(path);
   };
-  return html`<a class=${className} href=${Route.path(to)} aria-label=${label} onClick=${go}>${children}</a>`;
+  return html`<a class=${className} href=${path} aria-label=${label} onClick=${go}>${children}</a>`;
 }
 
 const BackLink = () => html`<${RouteLink} to="" className="back" label="Fleet: all robots"

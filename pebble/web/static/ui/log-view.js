@@ -41,10 +41,12 @@ export class LogView extends Model {
   }
 }
 
-let view = new LogView("");
+/** @type {WeakMap<object, LogView>} */
+const views = new WeakMap();
 
-/** @param {string} ref @returns {LogView} */
-export function logViewOf(ref) {
-  if (view.ref !== ref) view = new LogView(ref);
+/** @param {object} store of the page, or of a replay @param {string} ref @returns {LogView} the one of this component */
+export function logViewOf(store, ref) {
+  let view = views.get(store);
+  if (view?.ref !== ref) views.set(store, (view = new LogView(ref)));
   return view;
 }

@@ -12,8 +12,8 @@ const SAID_MS = 3000;
 const SERVICES = 64; // to choose from
 
 export function Logs({ at, view: cards }) {
-  const { commands, connection } = usePage();
-  const view = useModel(logViewOf(at));
+  const { commands, connection, store } = usePage();
+  const view = useModel(logViewOf(store, at));
   const { you } = useModel(connection, (one) => one.you);
   const card = useRef(/** @type {HTMLElement | null} */ (null));
   useEffect(() => {

@@ -87,13 +87,12 @@ export class Route extends Model {
   }
 
   get ref() {
-    const path = location.pathname;
-    if (!path.startsWith("/r/")) return "";
-    try {
-      return decodeURIComponent(path.slice(3));
-    } catch {
-      return "";
-    }
+    return below("/r/") ?? "";
+  }
+
+  /** Of which component the recordings are shown; "" one is to be chosen; null: no recordings are. @returns {string | null} */
+  get replay() {
+    return below("/replay")?.slice(1) ?? null;
   }
 
   /** @param {string} ref @returns {string} the address of its screen, which only watches if this one does */
@@ -103,10 +102,25 @@ export class Route extends Model {
   }
 
   go(ref) {
-    if (ref === this.ref) return;
-    history.pushState(null, "", Route.path(ref));
+    if (ref !== this.ref || this.replay !== null) this.open(Route.path(ref));
+  }
+
+  /** @param {string} path */
+  open(path) {
+    history.pushState(null, "", path);
     scrollTo(0, 0);
     this.changed();
+  }
+}
+
+/** @param {string} folder @returns {string | null} the rest of the page's path; null: it is elsewhere */
+function below(folder) {
+  const path = location.pathname;
+  if (!path.startsWith(folder)) return null;
+  try {
+    return decodeURIComponent(path.slice(folder.length));
+  } catch {
+    return "";
   }
 }
 

@@ -6,6 +6,7 @@ import { html, useCalm, useEffect, useModel, usePage, useRefs, useState, useValu
 import { Model, read, write } from "./models.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
+import { RecordingsLink } from "./recordings-link.js";
 import { battery, inner, isObject, nameOf, shortTime } from "./words.js";
 
 const LIMITS = "battery limits"; // by component, in the unit that it reports
@@ -120,7 +121,7 @@ function useNotices() {
 }
 
 /** ``wide``: there is room for a button; else the list is with the settings. */
-export function Bell({ wide }) {
+export function Bell({ at, wide }) {
   const { panels } = usePage();
   const { shown } = useModel(panels);
   const { notices } = useNotices();
@@ -134,6 +135,7 @@ export function Bell({ wide }) {
     show(!open);
   };
   return html`<${Announcement} newest=${notices.list[0]} />
+    ${wide && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
     html`<button
       type="button"

@@ -28,13 +28,12 @@ const switches = new Switches();
 export function Layer({ source }) {
   const { video, driver } = usePage();
   useModel(video);
-  useModel(switches);
   const address = useStream(source);
   const moved = video.stream !== "" && address !== "" && address !== video.stream;
   useEffect(() => {
     if (moved) show(video, driver, "");
   }, [moved]);
-  return html`${switches.isOn(source) && html`<${Overlays} source=${source} />`}
+  return html`<${Drawn} source=${source} />
   ${video.stream &&
   html`<iframe
     class="stream"
@@ -44,6 +43,12 @@ export function Layer({ source }) {
     referrerpolicy="no-referrer"
     src=${video.stream}
   ></iframe>`}`;
+}
+
+/** Overlays, if they are switched on. */
+export function Drawn({ source }) {
+  useModel(switches);
+  return switches.isOn(source) && html`<${Overlays} source=${source} />`;
 }
 
 function Overlays({ source }) {
@@ -90,7 +95,11 @@ function paint(canvas, picture, overlays) {
 }
 
 /** Buttons below the picture of ``source``. ``wanted``: whether pictures are. */
-export function Tools({ source, wanted }) {
+export const Tools = ({ source, wanted }) => html`<${StillTools} source=${source} />
+  <${Stream} source=${source} wanted=${wanted} />`;
+
+/** Snapshots, and whether overlays are drawn. */
+export function StillTools({ source }) {
   const { connection, store, video } = usePage();
   useModel(video);
   useModel(switches);
@@ -111,8 +120,7 @@ export function Tools({ source, wanted }) {
       checked=${switches.isOn(source)}
       onChange=${(event) => switches.set(source, event.currentTarget.checked)}
     /><span>Overlays</span></label
-  >`}
-  <${Stream} source=${source} wanted=${wanted} />`;
+  >`}`;
 }
 
 /** Save what is on the canvas, under the time at which it was taken; returns the file's name. */

@@ -49,7 +49,7 @@ export function Lines({ series, fields, shownMs, least, paused }) {
       const now = store.clock();
       const pixelMs = shownMs / Math.max(1, view.width);
       const step = calm.matches ? CALM_MS : Math.min(CALM_MS, pixelMs);
-      if (!seen || view.recoloured() || stopped.current || now - drawnAt < step) return;
+      if (!seen || view.recoloured() || stopped.current || Math.abs(now - drawnAt) < step) return;
       drawnAt = now;
       view.draw(series.columns(fields, now - shownMs, now), now - shownMs, now, store.offset);
     };

@@ -51,6 +51,11 @@ class Recorder {
     return series;
   }
 
+  /** Time has jumped: what is remembered does not go on. */
+  restart() {
+    for (const series of this.all.values()) series.restart();
+  }
+
   ask() {
     if (this.driver.ref !== this.ref) return; // another one is open meanwhile
     if (this.commands.askSeries(this.ref)) this.askedAt = this.store.clock();

@@ -43,7 +43,7 @@ function Service({ at, view, name, online, one, times }) {
   const entry = isObject(one) ? one : {};
   const words = [restartWords(entry, times, store.now()), droppedWords(entry.dropped)].filter(Boolean).join("; ");
   const logs = () => {
-    logViewOf(at).choose({ service: name, rank: 0, search: "" });
+    logViewOf(store, at).choose({ service: name, rank: 0, search: "" });
     view?.reveal("logs");
   };
   return html`<li class=${online ? (bad ? "bad" : often ? "often" : "") : "dim"} data-test=${`service-${name}`}>

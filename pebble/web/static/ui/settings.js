@@ -4,6 +4,7 @@ import { html, useModel, usePage } from "./hooks.js";
 import { NoticeList } from "./notices.js";
 import { Panel } from "./panel.js";
 import { Icon } from "./parts.js";
+import { RecordingsLink } from "./recordings-link.js";
 import { nameOf } from "./words.js";
 
 const THEMES = { auto: "as the system", light: "light", dark: "dark" };
@@ -47,6 +48,7 @@ export function SettingsPanel({ onClose }) {
       <//>`}
     </fieldset>
     <div class="panel-links">
+      <div onClick=${onClose}><${RecordingsLink} at=${driver.ref} className="button wide" /></div>
       ${MORE.map(
         ({ name, icon, text }) => html`<button
           key=${name}

@@ -172,7 +172,7 @@ function LastOutcome({ at, view }) {
   useTick(watch ? 1000 : 0);
   const { seen, waits } = watch ? outcomeWords(watch.outcome, store.now()) : { seen: "", waits: "" };
   const logs = () => {
-    logViewOf(at).choose({ service: "", rank: 0, search: watch?.outcome.action ?? "" });
+    logViewOf(store, at).choose({ service: "", rank: 0, search: watch?.outcome.action ?? "" });
     view?.reveal("logs");
   };
   return html`<div class=${watch ? "system-outcome" : ""} data-test="outcome">

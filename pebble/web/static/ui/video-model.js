@@ -55,7 +55,7 @@ export class Video extends Model {
     const height = bitmap.displayHeight ?? bitmap.height;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     this.context.drawImage(bitmap, 0, 0);
-    const now = performance.now();
+    const now = this.store.clock();
     const since = now - this.drawnAt;
     if (since < 10_000) this.interval = this.interval ? 0.8 * this.interval + 0.2 * since : since;
     const first = this.info === null;
@@ -72,7 +72,7 @@ export class Video extends Model {
 
   /** ms since the last picture arrived; Infinity: there was none. */
   get sinceDrawn() {
-    return performance.now() - this.drawnAt;
+    return this.store.clock() - this.drawnAt;
   }
 
   get hasStopped() {

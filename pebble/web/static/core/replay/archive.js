@@ -1,0 +1,133 @@
+/** The recordings of the server, as its /archive/ offers them. No framework, no DOM. */
+
+import { readFrames } from "./frames.js";
+
+const MOST_BYTES = 24_000_000; // of one segment: the server ends one at 8 MB of pictures
+const INDEXING_MS = 500; // between two questions for a day that is being indexed
+
+/** The server has answered, and asking the same again changes nothing: ``message`` is what it says. */
+export class RefusedError extends Error {}
+
+/**
+ * @typedef {import("./frames.js").Frame} Frame
+ * @typedef {{frames: Frame[], problem: string, until: number, next: number | null, complete: boolean, bytes: number}} Segment
+ * ``next``: where the next message is; null: nothing follows
+ * @typedef {{since: number, until: number, why?: string}} Stretch
+ * @typedef {{from: number, step: number, activity: number[], video: number[], audio: number[], rest: number[],
+ *   gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
+ * @typedef {{day: string, robots: string[], bytes: number, first: number, last: number, gaps: number}} Day
+ * @typedef {{state: "running" | "ready" | "failed", done: number, why: string, name: string, bytes: number}} ExportState
+ */
+
+export class Archive {
+  /** @param {(url: string, options?: any) => Promise<Response>} [ask] fetch */
+  constructor(ask = (url, options) => fetch(url, options)) {
+    this.ask = ask;
+  }
+
+  /** @param {AbortSignal} [signal] @returns {Promise<Day[]>} newest first */
+  async days(signal) {
+    return (await this.get("/archive/days", signal)).json();
+  }
+
+  /**
+   * Waits while the day is being indexed.
+   * @param {string} day @param {string} robot @param {(share: number) => void} onIndexing @param {AbortSignal} signal
+   * @returns {Promise<Timeline>}
+   */
+  async timeline(day, robot, onIndexing, signal) {
+    for (;;) {
+      const answer = await this.get(`/archive/timeline?${query({ day, robot })}`, signal);
+      const value = await answer.json();
+      if (answer.status !== 202) return value;
+      onIndexing(value.indexing ?? 0);
+      await delay(INDEXING_MS, signal);
+    }
+  }
+
+  /**
+   * @param {string} robot @param {number} at epoch ms @param {number} lasts ms @param {boolean} seek @param {AbortSignal} signal
+   * @returns {Promise<Segment>}
+   */
+  async segment(robot, at, lasts, seek, signal) {
+    const asked = query({ robot, at: Math.floor(at), for: Math.ceil(lasts), ...(seek ? { seek: 1 } : {}) });
+    const answer = await this.get(`/archive/segment?${asked}`, signal);
+    const bytes = await answer.arrayBuffer();
+    if (bytes.byteLength > MOST_BYTES) throw new RefusedError(`${bytes.byteLength} bytes in one segment are too many`);
+    const until = Math.floor(at) + Math.ceil(lasts);
+    const next = answer.headers.get("x-next") ?? "";
+    return {
+      ...readFrames(bytes),
+      until,
+      next: next === "" || !Number.isFinite(Number(next)) ? null : Math.max(until, Number(next)),
+      complete: answer.headers.get("x-complete") !== "0",
+      bytes: bytes.byteLength,
+    };
+  }
+
+  /** @param {string} robot @param {number} at @param {number} w @returns {string} the address of a picture */
+  static frame(robot, at, w) {
+    return `/archive/frame?${query({ robot, at: Math.round(at), w })}`;
+  }
+
+  /** @param {string} robot @param {number} since @param {number} step @param {number} count @returns {string} */
+  static strip(robot, since, step, count) {
+    return `/archive/strip?${query({ robot, since: Math.round(since), step: Math.round(step), count, w: 160 })}`;
+  }
+
+  /** @param {string} robot @param {Stretch} stretch @param {"mkv" | "mp4" | "mcap"} as @returns {Promise<string>} its id */
+  async begin(robot, { since, until }, as) {
+    const body = { robot, since: Math.floor(since), until: Math.ceil(until), as };
+    return (await (await this.post("/archive/exports", body)).json()).id;
+  }
+
+  /** @param {string} id @param {AbortSignal} signal @returns {Promise<ExportState>} */
+  async progress(id, signal) {
+    return (await this.get(`/archive/exports/${encodeURIComponent(id)}`, signal)).json();
+  }
+
+  /** Ends an export, or removes what it has made. @param {string} id */
+  async end(id) {
+    await this.post(`/archive/exports/${encodeURIComponent(id)}/end`, {});
+  }
+
+  /** @param {string} id @returns {string} the address of its file */
+  static file(id) {
+    return `/archive/exports/${encodeURIComponent(id)}/file`;
+  }
+
+  /** @param {string} url @param {AbortSignal} [signal] */
+  async get(url, signal) {
+    return checked(await this.ask(url, { signal }));
+  }
+
+  /** @param {string} url @param {any} body */
+  async post(url, body) {
+    const headers = { "content-type": "application/json" };
+    return checked(await this.ask(url, { method: "POST", headers, body: JSON.stringify(body) }));
+  }
+}
+
+/** @param {Record<string, any>} values @returns {string} */
+const query = (values) => new URLSearchParams(values).toString();
+
+/** @param {Response} answer */
+async function checked(answer) {
+  if (answer.ok) return answer;
+  if (answer.status === 401) throw new RefusedError("log in again: the session has ended");
+  const line = (await answer.text()).split("\n")[0].slice(0, 300);
+  if (answer.status < 500 && answer.status !== 429) throw new RefusedError(line || `refused (${answer.status})`);
+  throw new Error(line || `the server failed (${answer.status})`);
+}
+
+/** @param {number} ms @param {AbortSignal} signal */
+export function delay(ms, signal) {
+  signal.throwIfAborted();
+  return new Promise((resolve, reject) => {
+    const timer = setTimeout(() => resolve(undefined), ms);
+    signal.addEventListener("abort", () => {
+      clearTimeout(timer);
+      reject(signal.reason);
+    });
+  });
+}

@@ -1,0 +1,59 @@
+/** Whether a component was online, by its recorded heartbeats: the rules of pebble.client.discovery. Pure. */
+
+import { isObject } from "../json.js";
+
+const HISTORY = 10;
+const STAMPS = 5;
+const LEAST_MS = 50; // between two heartbeats
+const LONGEST_MS = 10_000;
+
+export class Heartbeats {
+  constructor() {
+    this.receivedAt = -Infinity;
+    this.offline = false;
+    /** @type {number[]} */
+    this.intervals = [];
+    /** @type {number[]} */
+    this.latencies = [];
+    /** @type {number[]} */
+    this.stamps = [];
+  }
+
+  /** @param {number} at when it was received @param {unknown} payload of the metric "online" */
+  receive(at, payload) {
+    const interval = at - this.receivedAt;
+    if (interval >= LEAST_MS && interval <= LONGEST_MS) push(this.intervals, interval, HISTORY);
+    const t = isObject(payload) && Number.isFinite(payload.t) ? payload.t : NaN;
+    const late = at - t;
+    if (late >= -1000 && late <= LONGEST_MS) push(this.latencies, Math.max(0, late), HISTORY);
+    if (t > 0) push(this.stamps, t, STAMPS);
+    this.receivedAt = at;
+    this.offline = isObject(payload) && payload.online === false;
+  }
+
+  /** @param {number} now @returns {import("../../messages.js").Liveness} as the server shows it of a live one */
+  view(now) {
+    return {
+      online: this.online(now),
+      silent_s: this.receivedAt === -Infinity ? null : Math.max(0, now - this.receivedAt) / 1000,
+      latency_ms: this.latencies.at(-1) ?? null,
+      average_latency_ms: mean(this.latencies),
+      interval_ms: mean(this.intervals),
+      whole_seconds: this.stamps.length === STAMPS && this.stamps.every((stamp) => stamp % 1000 === 0),
+    };
+  }
+
+  /** @param {number} now @returns {boolean | null} null: too few heartbeats to decide */
+  online(now) {
+    if (this.offline) return false;
+    const interval = mean(this.intervals);
+    const latency = mean(this.latencies);
+    if (this.intervals.length < 2 || interval === null || latency === null) return null;
+    return now - this.receivedAt <= Math.max(2 * interval, 4 * latency);
+  }
+}
+
+const push = (list, value, most) => list.push(value) > most && list.shift();
+
+/** @param {number[]} values @returns {number | null} */
+const mean = (values) => (values.length ? values.reduce((sum, one) => sum + one, 0) / values.length : null);

@@ -1,0 +1,114 @@
+// A stretch of the recording as a film, or as it was recorded.
+
+import { Archive, delay } from "../../core/replay/archive.js";
+import { stretchOf } from "../../core/replay/timeline.js";
+import { html, useEffect, useModel, useRef, useState, useTick } from "../hooks.js";
+import { Icon, Why } from "../parts.js";
+import { clockTime } from "../words.js";
+import { sizeWords } from "./choose.js";
+import { long } from "./picture.js";
+
+const POLL_MS = 500;
+const LONGEST_MS = 3_600_000;
+const FORMS = { mkv: "Film (MKV)", mp4: "Film (MP4)", mcap: "Raw (MCAP)" };
+
+/** One export at a time, from the request to its file. */
+function useExport(replay) {
+  const [job, setJob] = useState(/** @type {any} */ (null)); // {id, state, done, why, name, bytes}
+  const current = useRef(/** @type {{id: string, abort: AbortController} | null} */ (null));
+  const { archive } = replay;
+  const end = () => {
+    const job = current.current;
+    current.current = null;
+    job?.abort.abort();
+    if (job?.id) archive.end(job.id).catch(() => {}); // it has ended by itself
+    setJob(null);
+  };
+  const begin = async (stretch, as) => {
+    end();
+    const mine = { id: "", abort: new AbortController() };
+    current.current = mine;
+    setJob({ state: "running", done: 0 });
+    try {
+      mine.id = await archive.begin(replay.ref, stretch, as);
+      if (current.current !== mine) return await archive.end(mine.id); // cancelled meanwhile
+      for (let state = "running"; state === "running"; ) {
+        await delay(POLL_MS, mine.abort.signal);
+        const job = await archive.progress(mine.id, mine.abort.signal);
+        state = job.state;
+        setJob({ ...job, id: mine.id });
+      }
+    } catch (error) {
+      if (current.current === mine) setJob({ state: "failed", why: /** @type {Error} */ (error).message });
+    }
+  };
+  useEffect(() => end, []);
+  return { job, begin, end };
+}
+
+export function Download({ replay }) {
+  useModel(replay);
+  useTick(500);
+  const [as, choose] = useState("mkv");
+  const { job, begin, end } = useExport(replay);
+  const { player, timeline, markIn, markOut } = replay;
+  const stretch = stretchOf(markIn, markOut, timeline?.sessions ?? [], player.position);
+  const lasts = stretch.until - stretch.since;
+  const running = job?.state === "running";
+  const why = player.seeks ? (lasts > LONGEST_MS ? "At most one hour: mark a shorter stretch" : "") : "Nothing is open yet";
+  return html`<div class="download">
+    <p>
+      <b data-test="stretch">${player.seeks ? `${clockTime(stretch.since)} – ${clockTime(stretch.until)}` : "–"}</b>
+      <span class="dim"> ${player.seeks && long(lasts)}</span>
+    </p>
+    <div class="download-marks">
+      <button type="button" data-test="mark-in" onClick=${() => replay.mark("markIn", player.position)}>Begin here</button>
+      <button type="button" data-test="mark-out" onClick=${() => replay.mark("markOut", player.position)}>End here</button>
+      ${(markIn ?? markOut) !== null &&
+      html`<button
+        type="button"
+        class="quiet"
+        data-test="mark-clear"
+        onClick=${() => {
+          replay.mark("markIn", null);
+          replay.mark("markOut", null);
+        }}
+      >
+        Clear
+      </button>`}
+    </div>
+    <div class="download-marks">
+      <select data-test="download-as" aria-label="Form of the download" value=${as} onChange=${(event) => choose(event.currentTarget.value)}>
+        ${Object.entries(FORMS).map(([value, words]) => html`<option key=${value} value=${value}>${words}</option>`)}
+      </select>
+      <button
+        type="button"
+        data-test="download"
+        disabled=${running || why !== ""}
+        aria-describedby=${running || why ? "why-download" : undefined}
+        onClick=${() => begin(stretch, as)}
+      >
+        <${Icon} name="save" />Make it
+      </button>
+    </div>
+    ${(running || why) && html`<${Why} id="why-download">${why || "One download is being made"}<//>`}
+    ${job && html`<${Job} job=${job} onEnd=${end} />`}
+  </div>`;
+}
+
+function Job({ job, onEnd }) {
+  if (job.state === "failed") return html`<p class="bad" role="alert" data-test="download-failed">✖ Not made: ${job.why}</p>`;
+  if (job.state === "ready") {
+    return html`<p class="download-job" role="status">
+      <a class="button primary" data-test="download-file" href=${Archive.file(job.id)} download=${job.name}>Save ${job.name}</a>
+      <span class="dim">${sizeWords(job.bytes)}</span>
+      <button type="button" class="quiet" data-test="download-end" onClick=${onEnd}>Remove</button>
+    </p>`;
+  }
+  const share = Math.round(100 * (job.done ?? 0));
+  return html`<p class="download-job">
+    <progress max="100" value=${share} aria-label="Progress of the download"></progress>
+    <span data-test="download-share">${share} %</span>
+    <button type="button" data-test="download-end" onClick=${onEnd}>Cancel</button>
+  </p>`;
+}
