@@ -21,9 +21,9 @@ SCENES = 60  # after which pictures repeat: drawing takes longer than all else
 CAMERA = f"{GOOB}/outgoing/front-camera"
 
 
-def pictures(encoding: str, seconds: float, size: tuple[int, int] = SIZE) -> Iterator[Line]:
-    """A key frame every two seconds; the number in a picture is its own modulo SCENES."""
-    encoder = make_encoder(encoding, fps=FPS, quality=60, keyframe_interval=2 * FPS)
+def pictures(encoding: str, seconds: float, size: tuple[int, int], interval: int | None) -> Iterator[Line]:
+    """The number in a picture is its own modulo SCENES; ``interval``: of key frames, None as robots have it."""
+    encoder = make_encoder(encoding, fps=FPS, quality=60, keyframe_interval=interval)
     scene, made = Scene(*size), list[np.ndarray]()
     for number in range(SCENES):
         made.append(np.empty((size[1], size[0], 3), np.uint8))
@@ -60,14 +60,16 @@ def film(
     *,
     finished: bool = True,
     times: int = 1,
+    interval: int | None = 2 * FPS,
 ) -> Path:
     """A folder as a recorder leaves it: one file of state, one of media, a chunk each second.
 
-    ``times``: so often the pictures are repeated, because encoding an hour takes long.
+    ``times``: so often the pictures are repeated, because encoding an hour takes long. ``interval``: of key frames, in
+    pictures; None: as robots have it.
     """
     day = root / "2023/11/14"
     day.mkdir(parents=True)
-    once = list(pictures(encoding, seconds / times, size))
+    once = list(pictures(encoding, seconds / times, size, interval))
     shown = [line._replace(at=line.at + seconds / times * turn) for turn in range(times) for line in once]
     lines = sorted([*rest(seconds), *shown], key=lambda line: line.at)
     media = [line for line in lines if line.topic in (CAMERA, f"{GOOB}/outgoing/audio")]

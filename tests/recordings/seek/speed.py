@@ -36,7 +36,7 @@ def main() -> None:
     chance = random.Random(1)
     for encoding in ("json", "pbvd", "pbvz", "h264"):
         with tempfile.TemporaryDirectory() as folder:
-            root = film(Path(folder), encoding, SECONDS, SIZE, times=60)
+            root = film(Path(folder), encoding, SECONDS, SIZE, times=60, interval=None)
             size = sum(path.stat().st_size for path in root.rglob("*.mcap")) / 1e6
             archive, began = Archive(root), time.perf_counter()
             segment(archive, GOOB, ms(1), 2000, seek=True, media=True)
