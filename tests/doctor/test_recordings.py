@@ -114,8 +114,8 @@ def test_how_long_there_is_room(tmp_path: Path) -> None:
     assert "is not known yet" in findings(tmp_path)[-1].text
     path = recorded(tmp_path, seconds=3600.0)
     assert "days at this rate" in findings(tmp_path, keep_bytes=0)[-1].text
-    kept = findings(tmp_path, keep_bytes=10 * path.stat().st_size)[-1]
-    assert (kept.level, kept.text) == (Level.OK, "the last 10.0 hours are kept")
+    limited = findings(tmp_path, keep_bytes=10 * path.stat().st_size)[-1]
+    assert (limited.level, limited.text) == (Level.OK, "the last 10.0 hours are kept")
 
 
 def test_little_room_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,8 @@ from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run, program
 from tests.commands.conftest import run as run
 from tests.commands.test_drive import Console
-from tests.recordings.lateness import lateness
 from tests.recordings import messages
+from tests.recordings.lateness import lateness
 from tests.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
 from tests.support import Broker, until
 
