@@ -99,8 +99,8 @@ def main() -> int:
             heaps, all_of = ([one[place] for one in memories] for place in (0, 1))
             sys.stdout.write(
                 f"{encoding}: to the drawn picture p50 {percentile(took, 50):.0f} p95 {percentile(took, 95):.0f} "
-                f"max {max(took):.0f} ms of {len(took)}, {found['wrong']} wrong; heap {heaps[1]:.1f} -> {heaps[-1]:.1f} "
-                f"MB, renderers {all_of[1]:.0f} -> {all_of[-1]:.0f} MB; sent: {', '.join(sorted(found['sent']))}\n"
+                f"max {max(took):.0f} ms of {len(took)}, {found['wrong']} wrong; heap {heaps[1]:.1f} to {heaps[-1]:.1f}"
+                f" MB, renderers {all_of[1]:.0f} to {all_of[-1]:.0f} MB; sent: {', '.join(sorted(found['sent']))}\n"
             )
             sys.stdout.writelines(f"  {line}\n" for line in found["bad"])
             sys.stdout.flush()
