@@ -16,6 +16,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
@@ -33,6 +35,8 @@ STRETCHES: Final = [(START, GAP[0]), (GAP[1], END)]
 BEFORE: Final = (START - 86_400_000, START - 86_390_000)
 DRIVEN: Final = range(START + 20_000, START + 50_000)
 PICTURE_MS, SOUND_MS = 100, 20
+PICTURE_LATE_MS, SOUND_LATE_MS = 40, 30  # from its capture to its reception
+SPEECH: Final = 160_000  # samples
 CAMERA, MICROPHONE = f"{ROBOT}/outgoing/front-camera", f"{ROBOT}/outgoing/audio"
 
 SQUARE = [[0.25, 0.25], [0.6, 0.25], [0.6, 0.7], [0.25, 0.7]]
@@ -111,18 +115,19 @@ def _seen(number: int) -> bytes:
 
 def _picture(at: int) -> bytes:
     number = (at - START) // PICTURE_MS
-    return Picture(PictureKind.ZLIB_JPEG, number + 1, at - 40, _seen(number % 50)).pack()
+    return Picture(PictureKind.ZLIB_JPEG, number + 1, at - PICTURE_LATE_MS, _seen(number % 50)).pack()
 
 
 def _sound(at: int) -> bytes:
     number = (at - START) // SOUND_MS
-    piece = _speech()[320 * number % 160_000 :][:320].tobytes()
-    return Sound(Codec.PCM16LE, 1, 16_000, 320, number + 1, at - 30, piece).pack()
+    first = 320 * number % SPEECH
+    return Sound(Codec.PCM16LE, 1, 16_000, 320, number + 1, at - SOUND_LATE_MS, speech()[first : first + 320].tobytes()).pack()
 
 
 @cache
-def _speech() -> Any:
-    return Speech(16_000).samples(0, 160_320)
+def speech() -> npt.NDArray[np.int16]:
+    """Ten seconds that are said again and again."""
+    return Speech(16_000).samples(0, SPEECH).ravel()
 
 
 def _times(every: int, since: int, until: int) -> Iterator[int]:

@@ -91,6 +91,16 @@ def _do(script: str, *selectors: str) -> Callable[[Page], None]:
     return act
 
 
+def _timeline(page: Page) -> None:
+    """The day is here, and its pictures."""
+    page.locator(".timeline-strip img").wait_for(timeout=30_000)
+    page.locator("[data-card=values] dl").wait_for()
+
+
+def _recordings_link(page: Page) -> None:
+    page.get_by_role("link", name="Recordings").wait_for()
+
+
 def _scroll_to(selector: str) -> Callable[[Page], None]:
     return lambda page: page.locator(selector).first.scroll_into_view_if_needed()
 
@@ -251,6 +261,11 @@ SCREENS = [
     Screen("limits", "driving", _trouble_and_press("[data-test=bell]", "[data-test=limits]"), ("desktop",)),
     Screen("bell", "driving", _trouble, ("desktop", "phone")),
     Screen("own-name", "operating", _press(".me"), ("desktop",)),
+    Screen("replay-timeline", "replay", _timeline, ("desktop", "phone", "landscape", "small")),
+    Screen("replay-day", "replay", _timeline, ("phone",), _at(".timeline")),
+    Screen("replay-marked", "replay-gap", _timeline, ("desktop",), _at(".replay-bench", "[data-test=mark-in]")),
+    Screen("replay-cards", "replay", _timeline, ("desktop",), _at(".replay-body > .cards")),
+    Screen("recordings-link", "driving-recorded", _recordings_link, ("desktop",)),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 

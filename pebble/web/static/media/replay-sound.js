@@ -2,7 +2,7 @@
 
 import { makeSpeaker } from "./speaker.js";
 
-const BUFFERED_MS = 45; // in the jitter buffer, and at the loudspeaker: see playout.js
+const BUFFERED_MS = 65; // in the jitter buffer, and at the loudspeaker: see playout.js
 const LATEST_MS = 500; // sound is not shifted further
 const HEAD_BYTES = 24; // of a packet; its last eight are when it was captured
 const SMOOTH = 0.1;

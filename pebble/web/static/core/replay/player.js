@@ -141,6 +141,7 @@ export class Player {
     this.sounds = [];
     this.bytes = 0;
     this.largest = 0; // bytes of a segment
+    this.lastAt = at; // of what is loaded
     /** @type {{at: number, to: number, since: number}[]} */
     this.jumps = [];
     this.retryAt = -Infinity;
@@ -228,8 +229,8 @@ export class Player {
       (frame.flags & SOUND ? this.sounds : this.frames).push(frame);
       this.bytes += sizeOf(frame);
     }
-    const last = after.at(-1)?.at ?? from;
-    this.follow(segment, after.length ? segment.until : from, last);
+    this.lastAt = after.at(-1)?.at ?? this.lastAt;
+    this.follow(segment, after.length ? segment.until : from);
     if (seek) {
       this.seekPending = false;
       this.seeks++;
@@ -241,13 +242,13 @@ export class Player {
     this.changed();
   }
 
-  /** @param {Segment} segment @param {number} end of what it has @param {number} last message of it */
-  follow({ next, until }, end, last) {
+  /** @param {Segment} segment @param {number} end of what it has */
+  follow({ next, until }, end) {
     if (next === null) {
       this.complete = true;
-      this.loadedTo = Math.max(last, this.position);
+      this.loadedTo = Math.max(this.lastAt, this.position);
     } else {
-      if (next - until >= SKIP_MS) this.jumps.push({ at: end, to: next, since: last });
+      if (next - until >= SKIP_MS) this.jumps.push({ at: end, to: next, since: this.lastAt });
       this.loadedTo = next;
     }
   }

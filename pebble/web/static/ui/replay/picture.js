@@ -76,11 +76,11 @@ function Bar({ at, replay, player }) {
   const words = player.seeking || player.waiting ? "loading…" : player.ended ? "end of the recording" : "";
   return html`<div class="picture-bar replay-bar">
     <div class="replay-keys" role="group" aria-label="Play">
-      <button type="button" data-test="back-10" aria-label="10 seconds back" onClick=${() => replay.step(-10_000)}>−10 s</button>
+      <button type="button" data-test="back-10" aria-label="Back: −10 s" onClick=${() => replay.step(-10_000)}>−10 s</button>
       <button type="button" class="primary" data-test="play" onClick=${() => replay.toggle()}>
         <${Icon} name=${player.playing ? "pause" : "play"} />${player.playing ? "Pause" : "Play"}
       </button>
-      <button type="button" data-test="on-10" aria-label="10 seconds forward" onClick=${() => replay.step(10_000)}>+10 s</button>
+      <button type="button" data-test="on-10" aria-label="Forward: +10 s" onClick=${() => replay.step(10_000)}>+10 s</button>
     </div>
     <label class="field"
       ><span>Speed</span
