@@ -20,7 +20,7 @@ _ABOVE: Final = 22.0  # points for the legend between a panel and its title
 
 
 def traffic_figures(results: Results) -> list[Picture]:
-    """None if the analysis names none of the paper's robots."""
+    """Of those of the paper's robots that were analysed; no picture without one."""
     robots = robots_of(results)
     shown = [(number, *one) for number, one in _FIGURES.items() if one[0] in robots]
     caption = "Figures 4.1 to 4.6 of the paper, with simulated robots on this machine"
