@@ -10,6 +10,14 @@ PAPER_BEST_PERCENT: Final = 80.0
 PAPER_WORDS: Final = {"512k": "degraded", "256k": "broken"}
 
 
+#: Table 4.1 of the paper, kbit/s: median and 95th percentile of video, and of audio.
+TABLE_4_1: Final = {
+    "fred": (172.46, 283.99, 265.60, 270.91),
+    "goob": (181.18, 588.79, 521.60, 532.03),
+}
+MONO_PCM_KBPS: Final = 265.6  # one channel at 16 kHz: 50 packets of 664 bytes a second
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Original:
     """Results of the original program in one trial; None: not recorded."""

@@ -9,6 +9,7 @@ from pebble.bench.plots_impair import over_trials
 from pebble.bench.plots_latency import distributions, null_ratios, ratios
 from pebble.bench.plots_style import Picture, save
 from pebble.bench.plots_time import over_time
+from pebble.bench.plots_traffic import traffic_figures
 from pebble.bench.results import Results
 from pebble.errors import PebbleError
 
@@ -44,6 +45,8 @@ def pictures(results: Results) -> list[Picture]:
             return amounts(results, "Video at equal quality")
         case "sound":
             return amounts(results, "Sound")
+        case "traffic":
+            return traffic_figures(results)
         case "impair":
             return [*over_trials(results), *over_time(results)]
         case _:

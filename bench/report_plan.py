@@ -167,6 +167,19 @@ COMPARISONS = (
         quick_s=12,
     ),
     Comparison(
+        name="traffic",
+        title="Traffic of robots, as in the paper",
+        what="Section 4.1 of the paper with simulated robots: Goob and Fred, MiniLAMP and BenJr stand idle, then are "
+        "driven, and Goob and Fred send pictures as JSON and sound as PCM. `pebble record` records them at a real "
+        "broker, `pebble analyse` computes, with the same definitions as the paper: bandwidth of payloads in active "
+        "seconds, outages of heartbeats, and their latency from stamp to reception.",
+        full=_bench("traffic"),
+        quick=_bench("traffic", "--quick"),
+        full_s=140,
+        quick_s=35,
+        summary_lines=4,
+    ),
+    Comparison(
         name="impair",
         title="On an impaired network",
         what="Whole robots whose uplink is limited and loses packets, trial after trial, as in section 4.2 of the "

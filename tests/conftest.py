@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 
 from pebble.transports import segments
+from tests.recordings.replayed import recording as recording  # a fixture for all tests
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -105,6 +105,17 @@ def fleet(
     return run(plan(quick=quick, rate_hz=rate, output=output, **given))
 
 
+def traffic(quick: Quick = False, output: Output = FOLDER) -> int:
+    """Traffic of the demo's robots as in the paper's section 4.1: bandwidth, outages and latency.
+
+    Records four simulated robots at a real broker, idle, then driven and watched, and analyses the recording as
+    pebble analyse does. Needs mosquitto and the packages of the extra "archive".
+    """
+    from pebble.bench.traffic import plan, run
+
+    return run(plan(quick=quick, output=output))
+
+
 def compare(
     a: Annotated[Path, typer.Argument(help="Results of the older run.", metavar="A.json", show_default=False)],
     b: Annotated[Path, typer.Argument(help="Results of the newer run.", metavar="B.json", show_default=False)],
@@ -138,8 +149,8 @@ def report(
 ) -> int:
     """Run all comparisons and pebble impair, one after the other, and write a report.
 
-    Takes an hour, with --quick less than five minutes. If a comparison fails, the others still run, and the exit code
-    is 1. Without root, comparisons that need it are left out.
+    Takes a little over an hour, with --quick less than five minutes. If a comparison fails, the others still run, and
+    the exit code is 1. Without root, comparisons that need it are left out.
 
     \b
         pebble bench report docs/results
@@ -159,7 +170,7 @@ def report(
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    commands = (frames, fleet, video, sound, *bench_control.COMMANDS, *bench_robot.COMMANDS, compare, report)
+    commands = (frames, fleet, video, sound, traffic, *bench_control.COMMANDS, *bench_robot.COMMANDS, compare, report)
     for command in commands:
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")

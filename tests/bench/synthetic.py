@@ -8,6 +8,16 @@ from collections.abc import Callable
 import numpy as np
 
 from pebble.bench.results import Cell, Results
+from pebble.bench.traffic_report import cells_of
+from pebble.recordings.traffic.results import (
+    Bandwidth,
+    Histogram,
+    Intervals,
+    Latency,
+    Outage,
+    RobotTraffic,
+    Traffic,
+)
 
 TRIALS = (
     "base-start", "1024k", "512k", "256k", "128k", "64k", "1%", "2%", "5%", "10%",
@@ -203,10 +213,37 @@ def broken() -> Results:
     return _results("control", [*cells, nowhere], [], quick=True)
 
 
+def traffic() -> Results:
+    """All of the paper's robots, with outages of each cause."""
+    names = ("goob", "fred", "minilamp", "benjr")
+    analysed = Traffic(
+        since_ns=0, until_ns=60 * 10**9, recordings=1, missing=0, dropped=0, gaps=[],
+        robots=[_robot_traffic(name) for name in names], overhead=False,
+    )  # fmt: skip
+    return _results("traffic", cells_of(analysed), ["aim: PCM: met (fred 265.6 kbit/s)"])
+
+
+def _robot_traffic(name: str) -> RobotTraffic:
+    outages = [Outage(since_ns=0, length_ms=length, shared=length > 500) for length in (120.0, 180.0, 900.0)]
+    outages.append(Outage(since_ns=0, length_ms=250.0, recorder_late=True))
+    families = (("drive", 3.2), ("heartbeat", 1.2), ("video", 170.0), ("audio", 265.6))
+    return RobotTraffic(
+        robot=f"pebble/robots/{name}", machine="MCU" if name in ("minilamp", "benjr") else "Linux", messages=1000,
+        bytes=100_000, session_s=30, idle_s=30, offline=0, offline_s=0.0, sessions=[], outages=outages, streams=[],
+        bandwidth=[
+            Bandwidth(family, time, 30, kbps, 1.3 * kbps, 300, 10_000)
+            for family, kbps in families
+            for time in ("all", "session", "idle")
+        ],
+        intervals=Intervals(count=240, median_ms=250.0, p95_ms=260.0, p99_ms=400.0, longest_ms=1150.0),
+        latency=Latency(240, 1.0, 2.5, 30.0, 60.0, 0.0, Histogram(0.0, 2.0, [90, 80, 40, 20, 5, 0, 5])),
+    )  # fmt: skip
+
+
 def one_of_each(small: bool = False) -> dict[str, Results]:
     """By the name of the comparison; ``small``: fewer cells of the largest ones."""
     trials = ("base-start", "512k", "256k", "64k+5%", "wifi-power-save") if small else TRIALS
-    made: list[Callable[[], Results]] = [bridge, startup, video, sound, fleet]
+    made: list[Callable[[], Results]] = [bridge, startup, video, sound, fleet, traffic]
     every = [control(small), frames(small), cost(small), *(make() for make in made), impair(trials)]
     every += [null_test("control", "zenoh-p2p"), null_test("bridge", "zenoh"), null_test("frames", "zenoh-shm")]
     return {results.bench: results for results in every}

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from pebble.client.discovery import DiscoveredRobot, Discovery, Liveness
 from pebble.transports import Message
+from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
 
 BASE = "pebble/robots/goob"
 WALL = 1_760_000_000.0
@@ -20,6 +23,15 @@ def publish_heartbeats(discovery: Discovery, *times: float) -> DiscoveredRobot:
     for now in times:
         publish(discovery, "online", {"t": int((WALL + now - 0.01) * 1000)}, now=now)
     return discovery.robots[BASE]
+
+
+def discovered(until_s: float = 60.0) -> Discovery:
+    """After the first seconds of the recording of four robots, as it was received."""
+    discovery, wall = Discovery(), messages(DRIVE)[0].log_ns / 1e9
+    for at, message in received(DRIVE):
+        if at <= until_s:
+            discovery.receive(message, at, wall + at)
+    return discovery
 
 
 def test_heartbeats_make_a_robot_online_and_silence_offline() -> None:
@@ -59,16 +71,27 @@ def test_a_slow_link_widens_the_window() -> None:
     assert liveness.online(2.6) is False
 
 
-def test_a_robot_is_ready_once_it_publishes_how_to_drive_it() -> None:
-    discovery = Discovery()
-    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5)
-    assert not seen.ready(0.6)
-    value = {"transport": {"kind": "zenoh"}, "drive": {"available": True, "topic": "somewhere/else"}}
-    publish(
-        discovery, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, now=0.6, retain=True
-    )
-    assert seen.ready(0.6)
-    assert (seen.transport, seen.drive_topic) == ("zenoh", "somewhere/else")
+def test_recorded_robots_are_ready_once_they_published_how_to_drive_them() -> None:
+    end = received(DRIVE)[-1][0]
+    ready = {base: seen.ready(end) for base, seen in discovered(end).robots.items()}
+    assert ready == dict.fromkeys(ROBOTS, True)
+    first, at = messages(DRIVE)[0].log_ns, {}
+    for message in reversed(messages(DRIVE)):
+        at[message.channel.topic] = (message.log_ns - first) / 1e9
+    for base in ROBOTS:
+        before = discovered(at[f"{base}/outgoing/capabilities"] - 0.01)
+        assert not any(seen.drive_topic for name, seen in before.robots.items() if name == base)
+    seen = discovered().robots[GOOB]
+    assert (seen.transport, seen.drive_topic) == ("zenoh", f"{GOOB}/incoming/drive-values")
+
+
+def test_recorded_robots_are_online_until_their_recording_ends() -> None:
+    for base, seen in discovered().robots.items():
+        stamps = [one["t"] for one in values(DRIVE, f"{base}/outgoing/online")]
+        last_s = max(stamps) / 1000 - messages(DRIVE)[0].log_ns / 1e9
+        assert seen.liveness.online(last_s + 0.3), base
+        assert seen.liveness.online(last_s + 1.5) is False, base
+        assert seen.liveness.interval_s == pytest.approx(0.25, abs=0.05)
 
 
 def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
@@ -84,11 +107,12 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
 
 
 def test_battery_and_message_count() -> None:
-    discovery = Discovery()
-    publish(discovery, "charging-level", {"value": 7.9, "unit": "v"})
-    publish(discovery, "charging-status", {"value": None})
-    seen = discovery.robots[BASE]
-    assert (seen.volts, seen.charging, seen.messages.count) == (7.9, None, 2)
+    robots = discovered().robots
+    for base, seen in robots.items():
+        assert seen.messages.count == sum(one.channel.topic.startswith(f"{base}/") for one in messages(DRIVE))
+    assert robots[GOOB].volts == values(DRIVE, f"{GOOB}/outgoing/charging-level")[-1]["value"]
+    assert robots[MINILAMP].volts == values(DRIVE, f"{MINILAMP}/outgoing/charging-level")[-1]["value"]
+    assert robots[GOOB].volts != robots[MINILAMP].volts
 
 
 def test_nonsense_is_passed_over() -> None:
@@ -100,15 +124,16 @@ def test_nonsense_is_passed_over() -> None:
     assert discovery.robots[BASE].liveness.received_at is None
 
 
-def test_a_stopped_robot_is_known_as_such() -> None:
-    discovery = Discovery()
-    publish(discovery, "online", {"t": 1})
-    assert not discovery.robots[BASE].latched
-    state = {"latched": True, "boot": "0", "count": 1, "recent": [], "by": "ann", "why": "dog", "since": 1}
-    publish(discovery, "estop/serial", state, retain=True)
-    seen = discovery.robots[BASE]
-    assert seen.latched
-    assert seen.stopped_by is not None
-    assert seen.stopped_by.by == "ann"
-    publish(discovery, "estop/serial", state | {"latched": False}, retain=True)
-    assert (seen.latched, seen.stopped_by) == (False, None)
+@pytest.mark.parametrize(("base", "device"), [*((one, "serial") for one in ROBOTS[:2]), (MINILAMP, "mcu")])
+def test_a_robot_is_stopped_whenever_it_published_so(base: str, device: str) -> None:
+    discovery, known = Discovery(), []
+    topic = f"{base}/outgoing/estop/{device}"
+    for at, message in received(DRIVE):
+        discovery.receive(message, at, WALL)
+        if message.topic == topic:
+            seen = discovery.robots[base]
+            known.append((seen.latched, seen.stopped_by.by if seen.stopped_by else ""))
+    published = [(one["latched"], one["by"] if one["latched"] else "") for one in values(DRIVE, topic)]
+    assert known == published
+    assert (True, "the demo's operator") in known
+    assert not discovery.robots[base].latched

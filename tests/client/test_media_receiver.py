@@ -11,6 +11,8 @@ from pebble.client.media_receiver import MediaReceiver
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.client.estop_robot import capabilities
+from tests.recordings.demo_robots import DRIVE, FRED, MEDIA, recorded
+from tests.recordings.replayed import Plays
 from tests.support import until
 
 BASE = "pebble/robots/goob"
@@ -40,3 +42,23 @@ def test_overlays_come_from_the_topic_in_the_capabilities(topic: str) -> None:
         robot.publish(topic, b"7")
         assert until(lambda: len(retained) == 3)
         assert receiver.overlays.refused == 0
+
+
+def test_every_recorded_picture_and_sound_is_received(recording: Plays) -> None:
+    """Four encodings of pictures and two of sound, one after another, as the robot sent them."""
+    hub, pictures, sounds = MemoryHub(), [], []
+    capabilities_topic = f"{FRED}/outgoing/capabilities"
+    with MemoryTransport("robot", hub) as robot, MemoryTransport("viewer", hub) as viewer:
+        robot.publish(capabilities_topic, recorded(DRIVE, capabilities_topic)[0], qos=QoS.DELIVERED, retain=True)
+        receiver = MediaReceiver(viewer, FRED)
+        receiver.on_picture = pictures.append  # type: ignore[method-assign]
+        receiver.on_sound = sounds.append  # type: ignore[method-assign]
+        receiver.wait_for_capabilities(5)
+        receiver.request(None, sound=True)
+        recording([MEDIA], hub)
+        sent = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), recorded(MEDIA, f"{FRED}/outgoing/audio")
+        assert until(lambda: (len(pictures), len(sounds)) == (len(sent[0]), len(sent[1])))
+        receiver.close()
+    assert list(dict.fromkeys(one.encoding for one in pictures)) == ["json", "pbvd", "pbvz", "h264"]
+    assert [one.sequence for one in sounds] == [int.from_bytes(payload[12:16]) for payload in sent[1]]
+    assert [one.encoding for one in sounds] == [{1: "pcm", 2: "opus"}[payload[5]] for payload in sent[1]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import struct
 import zlib
 
@@ -14,7 +16,9 @@ from pebble.errors import PayloadError
 from pebble.media.decode import MAX_PAYLOAD, Decoded, VideoDecoder
 from pebble.media.jpeg import decode_jpeg, jpeg_size
 from pebble.media.json_video import JsonPicture, inflate
+from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
+from tests.recordings.demo_robots import FRED, MEDIA, recorded
 
 T0 = 1_710_969_600_000
 FORMS = ("json", "pbvd", "pbvz", "h264")
@@ -113,12 +117,40 @@ def same(shown: Decoded | None, expected: Decoded | None) -> bool:
     return shown is None or (expected is not None and np.array_equal(shown.picture, expected.picture))
 
 
-def test_all_forms_on_one_topic() -> None:
+def test_a_change_of_form_is_seen_at_once() -> None:
     decoder = VideoDecoder()
     for name in (*FORMS, *FORMS):
         assert frames(decoder, stream(name, count=3)) == [0, 1, 2]
         other = next(form for form in FORMS if form != name)
         assert frames(decoder, [stream(other)[3]]) == [None]
+
+
+def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
+    """The number that the simulated camera draws into its pictures grows by one with each, whatever the form."""
+    packets, decoder = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), VideoDecoder()
+    shown = [decoder.feed(packet) for packet in packets]
+    seen = [one for one in shown if one is not None]
+    assert len(seen) == len(packets) > 80
+    assert list(dict.fromkeys(one.encoding for one in seen)) == list(FORMS)
+    for name in FORMS:
+        counts = [read_counter(one.picture) for one in seen if one.encoding == name]
+        assert None not in counts
+        assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
+
+
+def test_a_recorded_camera_is_decoded_to_the_same_pictures_every_time() -> None:
+    packets = recorded(MEDIA, f"{FRED}/outgoing/front-camera")
+    assert len({digest(packets) for _ in range(3)}) == 1
+    assert digest(packets) != digest(packets[:-1])
+
+
+def digest(packets: list[bytes]) -> str:
+    decoder, found = VideoDecoder(), hashlib.sha256()
+    for packet in packets:
+        shown = decoder.feed(packet)
+        assert shown is not None, decoder.problem
+        found.update(shown.picture.tobytes())
+    return found.hexdigest()
 
 
 def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import random
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from pebble.media.jitter import Chunk, JitterBuffer, ahead
 from pebble.media.pcm import to_bytes
 from pebble.media.sound import make_sound_encoder, sequence_numbers
 from pebble.media.speech import Speech
+from tests.recordings.demo_robots import FRED, MEDIA, messages
 
 RATE = 16000
 CHUNK = 320  # 20 ms
@@ -105,6 +108,33 @@ def test_jitter_below_the_target_is_inaudible(seed: int) -> None:
     played = play(JitterBuffer(concealment_ms=0), arrivals)
     assert played.real == list(range(500))
     assert played.stutters == 0
+
+
+def recorded_sound() -> list[tuple[float, bytes]]:
+    """A robot's packets in PCM, with the times at which they really arrived."""
+    packets = [one for one in messages(MEDIA) if one.channel.topic == f"{FRED}/outgoing/audio"]
+    return [((one.log_ns - packets[0].log_ns) / 1e9, one.payload) for one in packets if one.payload[5] == Codec.PCM16LE]
+
+
+def test_recorded_sound_is_played_evenly_at_its_recorded_jitter() -> None:
+    arrivals = recorded_sound()
+    longest_s = max(later - earlier for (earlier, _), (later, _) in itertools.pairwise(arrivals))
+    assert longest_s > 0.08, "more than the buffer waits at first"
+    played = play(JitterBuffer(), arrivals)
+    sent = b"".join(payload[24:] for _, payload in arrivals)
+    first = b"".join(chunk.pcm for _, chunk in played.chunks[:10])
+    assert first == sent[: len(first)]
+    assert sum(not chunk.concealed for _, chunk in played.chunks) >= len(arrivals) - 2, "what waited too long"
+    assert played.stutters == 0
+    assert played.concealed_s < longest_s + 0.1, "the end of the sound is concealed for 0.1 s"
+
+
+def test_recorded_sound_is_the_same_every_time() -> None:
+    digests = set()
+    for _ in range(3):
+        played = play(JitterBuffer(), recorded_sound())
+        digests.add(hashlib.sha256(b"".join(chunk.pcm for _, chunk in played.chunks)).hexdigest())
+    assert len(digests) == 1
 
 
 def test_jitter_above_the_target_is_learnt() -> None:

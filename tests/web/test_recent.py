@@ -7,12 +7,15 @@ import json
 from typing import Any
 
 import msgspec
+import pytest
 
 from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web import recent as module
 from pebble.web.recent import LIMITS, MESSAGE_BYTES, Recent
 from pebble.web.server import encode
+from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, received
+from tests.recordings.demo_robots import values as values_of
 
 REF = "pebble/robots/goob"
 IMU, TOUCH, BATTERY, ODOMETRY = "sensors/imu", "touch-sensors", "charging-level", "wheel-odometry"
@@ -50,11 +53,22 @@ def test_fast_ones_are_thinned_to_their_rate() -> None:
     assert 98 <= len(shown) <= 102
 
 
-def test_only_the_battery_of_components_that_are_not_open() -> None:
-    recent = Recent()
-    for metric in (IMU, BATTERY, "status"):
-        recent.receive(REF, metric, message(1), 0)
-    assert recent.metrics(REF) == [BATTERY]
+@pytest.mark.parametrize("opened", [(), (GOOB,)], ids=["closed", "open"])
+def test_of_recorded_robots_what_is_plotted_is_remembered(opened: tuple[str, ...]) -> None:
+    """Of robots that no page has open the battery alone."""
+    recent, sent = Recent(), received(DRIVE)
+    for ref in opened:
+        recent.open(ref)
+    for at, one in sent:
+        ref, _, metric = one.topic.partition("/outgoing/")
+        recent.receive(ref, metric, one, at)
+    assert recent.metrics(MINILAMP) == [BATTERY]
+    assert recent.metrics(GOOB) == [BATTERY, *([IMU] * len(opened))]
+    for metric in recent.metrics(GOOB):
+        remembered = [msgspec.json.decode(value) for _, value in recent.points(GOOB, metric, sent[-1][0])]
+        published = values_of(DRIVE, f"{GOOB}/outgoing/{metric}")
+        assert remembered == published
+        assert len(published) >= 3
 
 
 def test_a_component_that_is_closed_or_removed_takes_no_room() -> None:

@@ -64,10 +64,11 @@ def _outages(robot: RobotTraffic) -> Figure | None:
         f"A heartbeat comes every {usual.median_ms:.0f} ms. When one is missing, this counts by how much longer than "
         "usual the robot was silent. Outages that several robots had at the same moment are not this robot's fault."
     )
-    return Figure(number, "Heartbeat outages", caption, _svg(lambda axes: _draw_outages(axes, robot), robot, "outages"))
+    return Figure(number, "Heartbeat outages", caption, _svg(lambda axes: draw_outages(axes, robot), robot, "outages"))
 
 
-def _draw_outages(axes: Axes, robot: RobotTraffic) -> None:
+def draw_outages(axes: Axes, robot: RobotTraffic) -> None:
+    """How many outages of each length, by their cause."""
     edges = [start * _BIN_MS for start in range(_LONGEST_MS // _BIN_MS + 1)]
     lengths = {
         cause: [min(one.length_ms, _LONGEST_MS - 1) for one in robot.outages if one.cause == cause]
@@ -101,11 +102,12 @@ def _latency(robot: RobotTraffic) -> Figure | None:
         caption += " This robot cuts its stamps to whole seconds: 0 to 1000 ms of each value is the stamp's."
     if latency.ahead_ms:
         caption += f" Values below 0 show that its clock is at least {latency.ahead_ms:.0f} ms ahead."
-    svg = _svg(lambda axes: _draw_latency(axes, latency), robot, "latency")
+    svg = _svg(lambda axes: draw_latency(axes, latency), robot, "latency")
     return Figure(number, "Latency of heartbeats", caption, svg)
 
 
-def _draw_latency(axes: Axes, latency: Latency) -> None:
+def draw_latency(axes: Axes, latency: Latency) -> None:
+    """The histogram, with its median and 95th percentile."""
     bars = latency.histogram
     lefts = [bars.low + number * bars.width for number in range(len(bars.counts))]
     axes.bar(lefts, bars.counts, width=bars.width, align="edge", color=_BLUE)
@@ -128,11 +130,12 @@ def _bandwidth(robot: RobotTraffic) -> Figure | None:
         "What each kind of message takes: the mark and the number are the median of the seconds with such messages, "
         "the line ends where 95 % of them stay below. The scale is logarithmic: each step is ten times as much."
     )
-    svg = _svg(lambda axes: _draw_bandwidth(axes, shown), robot, "bandwidth")
+    svg = _svg(lambda axes: draw_bandwidth(axes, shown), robot, "bandwidth")
     return Figure("Figure 4.3", "Bandwidth in sessions and while idle", caption, svg)
 
 
-def _draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
+def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
+    """Median and 95th percentile of each family, in sessions and while idle."""
     names = [family for family in reversed(FAMILIES) if any(one.family == family for one in shown)]
     for time, label, colour, offset, marker in _TIMES:
         mine = [one for one in shown if one.time == time]

@@ -19,8 +19,8 @@ from pebble.runtime.addresses import Addresses
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat as BridgeHeartbeat
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.recordings.conftest import Plays
 from tests.recordings.playing import GOOB, Line, js, ms, write
+from tests.recordings.replayed import Plays
 from tests.support import until
 
 BASE = "replay/robots/goob"

@@ -122,11 +122,11 @@ class Uplink:
 class MemoryRig:
     """Two hubs (or twice the same one), a client on each, and any number of bridges one after another."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, one: bool = False) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, one: bool = False, base: str = BASE) -> None:
         self.local_hub = MemoryHub()
         self.remote_hub = self.local_hub if one else MemoryHub()
-        self.local = Client(MemoryTransport("someone-local", self.local_hub))
-        self.remote = Client(MemoryTransport("operator", self.remote_hub))
+        self.local = Client(MemoryTransport("someone-local", self.local_hub), base)
+        self.remote = Client(MemoryTransport("operator", self.remote_hub), base)
         self.uplink = Uplink(self.remote_hub)
         self.robot_side: MemoryTransport
         self.operator_side: MemoryTransport

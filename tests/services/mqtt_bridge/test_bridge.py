@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from pebble.forwarding.event_buffer import LIMIT
 from pebble.forwarding.forwarder import Gate
 from pebble.transports import State
 from pebble.transports.memory import MemoryTransport
+from tests.recordings.demo_robots import DRIVE as RECORDED_DRIVE
+from tests.recordings.demo_robots import GOOB, messages, recorded
+from tests.recordings.replayed import AS_RECORDED, Plays
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, Quiet, gate_of
 from tests.support import until
 
@@ -22,6 +26,11 @@ MIRROR_FLAG = "incoming/flags/remote-mirror"
 VIDEO_FLAG = "incoming/flags/mqtt-video"
 DRIVE = "incoming/drive-values"
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
+#: Of the recording, without what is a device's own: that waits for the device's description, which no replay publishes.
+RECORDED = (
+    "logs", "status", "charging-level", "charging-status", "media-status", "autonomy-files", "autonomy-status",
+    "soundboard-files", "soundboard-status", "sensors/imu",
+)  # fmt: skip
 RETAINED_COMMANDS = [
     DRIVE,
     "incoming/flags/reboot",
@@ -36,6 +45,14 @@ RETAINED_COMMANDS = [
 @pytest.fixture
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
     rig = MemoryRig(monkeypatch)
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def goob(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryRig]:
+    """For the robot of the recordings."""
+    rig = MemoryRig(monkeypatch, base=GOOB)
     yield rig
     rig.close()
 
@@ -66,15 +83,18 @@ def after_all(speaker: Client, listener: Client, suffix: str = "outgoing/after")
 
 
 class TestTable:
-    def test_local_outgoing_reaches_the_remote_side_unchanged(self, rig: MemoryRig) -> None:
-        rig.bridge()
-        raw = bytes(range(256))
-        rig.local.publish("outgoing/apriltag-data", raw, qos=0)
-        rig.local.publish("outgoing/strange/metric", b"", qos=1)
-        assert until(lambda: rig.remote.on("outgoing/strange/metric"))
-        assert [(m.payload, m.qos, m.retain_requested) for m in rig.remote.on("outgoing/apriltag-data")] == [
-            (raw, 0, False)
-        ]
+    def test_what_a_robot_published_reaches_the_remote_side_unchanged(self, goob: MemoryRig, recording: Plays) -> None:
+        """Payloads, quality and order of each topic."""
+        goob.bridge(robot="goob")
+        recording([RECORDED_DRIVE], goob.local_hub, replace(AS_RECORDED, only=(f"{GOOB}/outgoing/#",)))
+        after_all(goob.local, goob.remote)
+        Quiet(goob.remote).wait()
+        arrived = [(one.topic, one.payload, int(one.qos)) for one in goob.remote.seen]
+        for topic in (f"{GOOB}/outgoing/{metric}" for metric in RECORDED):
+            published = [one for one in messages(RECORDED_DRIVE) if one.channel.topic == topic]
+            expected = [(topic, one.payload, int(one.channel.metadata["qos"])) for one in published]
+            assert expected
+            assert [one for one in arrived if one[0] == topic] == expected
 
     def test_state_is_retained_there(self, rig: MemoryRig) -> None:
         rig.local.publish("outgoing/soundboard-files", b"before", retain=True)
@@ -91,14 +111,16 @@ class TestTable:
         rig.local.publish("outgoing/autonomy-files", b"", retain=True)
         assert until(lambda: f"{BASE}/outgoing/autonomy-files" not in rig.remote_hub.retained)
 
-    def test_remote_commands_reach_the_robot_once(self, rig: MemoryRig) -> None:
-        rig.bridge()
-        for number in range(50):
-            rig.remote.publish(DRIVE, b"%d" % number)
-        assert until(lambda: len(rig.local.on(DRIVE)) >= 50)
-        Quiet(rig.local, rig.remote).wait()
-        assert rig.local.payloads(DRIVE) == [b"%d" % number for number in range(50)]
-        assert not rig.remote.on(DRIVE)
+    def test_recorded_commands_reach_the_robot_once_and_in_order(self, goob: MemoryRig, recording: Plays) -> None:
+        goob.bridge(robot="goob")
+        topic = f"{GOOB}/{DRIVE}"
+        recording([RECORDED_DRIVE], goob.remote_hub, replace(AS_RECORDED, only=(topic,)))
+        published = recorded(RECORDED_DRIVE, topic)
+        assert len(published) > 100
+        assert until(lambda: len(goob.local.on(DRIVE)) >= len(published))
+        Quiet(goob.local, goob.remote).wait()
+        assert goob.local.payloads(DRIVE) == published
+        assert goob.remote.payloads(DRIVE) == published, "those of the recording alone"
 
     def test_remote_outgoing_never_comes_in(self, rig: MemoryRig) -> None:
         rig.bridge()

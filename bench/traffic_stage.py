@@ -1,0 +1,100 @@
+"""The demo's robots on a real mosquitto: idle, then driven and watched, recorded by ``pebble record``."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+from pebble.client.media_receiver import MediaReceiver
+from pebble.demo.broker import BrokerKind
+from pebble.demo.operator import Operator
+from pebble.demo.programs import Program, end_all
+from pebble.demo.testbed import ROBOTS, Testbed
+from pebble.errors import PebbleError
+from pebble.transports import MqttSettings, create
+
+VIDEO, AUDIO = "json", "pcm"  # the encodings of the paper's robots
+_READY_S = 30.0
+_POLL_S = 0.1
+_LAST_S = 0.5  # until what was published last is recorded
+_END_S = 10.0  # for the recorder to finish its files
+
+
+def record(folder: Path, idle_s: float, session_s: float) -> None:
+    """Record all robots into ``folder``: idle for ``idle_s``, then used for ``session_s``. Raises PebbleError."""
+    with Testbed(threading.Event()) as testbed:
+        testbed.start_brokers(BrokerKind.MOSQUITTO)
+        with _recorder(folder, testbed.remote_port), closing(_Session(testbed.remote_port)) as session:
+            testbed.start_robots()
+            session.wait_until_ready(testbed.unexpected_exits)
+            time.sleep(idle_s)
+            session.run(session_s)
+            if problems := testbed.unexpected_exits():
+                raise PebbleError("; ".join(problems))
+            time.sleep(_LAST_S)
+        testbed.keep = False
+
+
+@contextmanager
+def _recorder(folder: Path, port: int) -> Iterator[None]:
+    folder.mkdir()
+    command = [sys.executable, "-m", "pebble.cli", "record", "--url", f"mqtt://127.0.0.1:{port}", "--into"]
+    recorder = Program("pebble record", [*command, str(folder / "recordings")], folder / "record.log")
+    try:
+        recorder.wait_until(
+            lambda: b"Recording" in recorder.log.read_bytes(), _READY_S, threading.Event()
+        )  # it is connected
+        yield
+        if recorder.ended:
+            raise PebbleError(f"pebble record ended: {recorder.log.read_text()[-500:]}")
+    finally:
+        end_all([recorder], _END_S)
+
+
+class _Session:
+    """The demo's operator, and a viewer of all pictures and sound."""
+
+    def __init__(self, port: int) -> None:
+        self._operator = Operator(port, "pebble-bench-operator")
+        self._operator.connect()
+        self._viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
+        self._watching = ExitStack()
+
+    def wait_until_ready(self, problems: Callable[[], list[str]]) -> None:
+        """Until every robot can be driven."""
+        end = time.monotonic() + _READY_S
+        while not self._operator.ready(len(ROBOTS)):
+            if problems() or time.monotonic() > end:
+                raise PebbleError("; ".join(problems()) or "the robots did not become ready to drive")
+            time.sleep(_POLL_S)
+
+    def run(self, seconds: float) -> None:
+        """Drive all robots, and receive pictures and sound of those that have them."""
+        end = time.monotonic() + seconds
+        self._viewer.open()
+        receivers = [
+            self._watch(robot.base) for robot in self._operator.discovery.all_robots() if robot.offers("video")
+        ]
+        self._operator.begin()
+        while time.monotonic() < end:
+            time.sleep(_POLL_S)
+            for receiver in receivers:
+                receiver.poll()
+            self._operator.completed.clear()  # nothing is assessed here
+        self._watching.close()
+
+    def close(self) -> None:
+        self._watching.close()
+        self._operator.end()
+        self._viewer.close()
+
+    def _watch(self, base: str) -> MediaReceiver:
+        receiver = self._watching.enter_context(closing(MediaReceiver(self._viewer, base)))
+        receiver.wait_for_capabilities(_READY_S)
+        receiver.viewer.request("video", VIDEO)
+        receiver.viewer.request("audio", AUDIO)
+        return receiver

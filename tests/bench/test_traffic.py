@@ -1,0 +1,110 @@
+"""The paper's section 4.1 with simulated robots: what the report shows of an analysis, and a real recording."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pebble.bench import traffic as comparison
+from pebble.bench.paper import TABLE_4_1
+from pebble.bench.plots import pictures
+from pebble.bench.report_plan import chosen
+from pebble.bench.results import load
+from pebble.bench.traffic_report import assess, cells_of, robots_of, tables
+from pebble.errors import PebbleError
+from pebble.recordings.library import FOREVER_NS
+from pebble.recordings.traffic.analysis import analyse
+from pebble.recordings.traffic.results import AUDIO, VIDEO, Traffic
+from pebble.recordings.traffic.sources import sources
+from tests.bench import synthetic
+from tests.recordings.demo_robots import DRIVE, FRED, MEDIA, messages
+
+
+def printed(traffic: Traffic) -> str:
+    console = Console(record=True, width=120, file=io.StringIO())
+    for table in tables(traffic):
+        console.print(table)
+    return console.export_text()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Traffic:
+    """The analysis of the demo's robots in tests/data."""
+    pytest.importorskip("duckdb")
+    scratch = tmp_path_factory.mktemp("scratch")
+    found = sources([DRIVE, MEDIA], scratch, since_ns=0, until_ns=FOREVER_NS)
+    return analyse(found, scratch)
+
+
+def test_table_4_1_stands_beside_the_paper_s(recorded: Traffic) -> None:
+    """Of bytes that are summed here, second by second."""
+    lines = [line.split() for line in printed(recorded).splitlines()]
+    assert ["fred", "paper", *(f"{value:.2f}" for value in TABLE_4_1["fred"])] in lines
+    seconds: dict[int, int] = {}
+    for message in messages(MEDIA):
+        if message.channel.topic == f"{FRED}/outgoing/audio":
+            second = message.log_ns // 10**9
+            seconds[second] = seconds.get(second, 0) + len(message.payload)
+    middle = sorted(seconds.values())
+    median = (middle[(len(middle) - 1) // 2] + middle[len(middle) // 2]) / 2 * 8 / 1000
+    here = lines[lines.index(["fred", "paper", *(f"{value:.2f}" for value in TABLE_4_1["fred"])]) + 1]
+    assert here[0] == "here"
+    assert float(here[3]) == pytest.approx(median, abs=0.006)
+
+
+def test_sentences_name_what_differs(recorded: Traffic) -> None:
+    sentences = assess(recorded)
+    assert sentences[0].startswith("aim: PCM, one channel at 16 kHz, takes the paper's 265.6 kbit/s within 1 %: missed")
+    assert any("goob's heartbeats take" in one and "20 to 40 ms" in one for one in sentences)
+    assert any(one.startswith("fred's video as JSON takes") for one in sentences)
+
+
+def test_the_whole_analysis_is_in_the_results(recorded: Traffic, tmp_path: Path) -> None:
+    results = synthetic.traffic()
+    results.cells = cells_of(recorded)
+    results.save(tmp_path / "traffic.json")
+    robots = robots_of(load(tmp_path / "traffic.json"))
+    assert robots == {robot.robot.rpartition("/")[2]: robot for robot in recorded.robots}
+
+
+def test_only_figures_of_robots_that_were_analysed_are_drawn() -> None:
+    results = synthetic.traffic()
+    (picture,) = pictures(results)
+    titles = [axes.get_title(loc="left") for axes in picture.make().axes]
+    assert [title.split(":")[0] for title in titles] == [f"Figure 4.{number}" for number in range(1, 7)]
+    results.cells = [cell for cell in results.cells if cell.variant == "goob"]
+    (picture,) = pictures(results)
+    assert [axes.get_title(loc="left").split(",")[0] for axes in picture.make().axes] == [
+        "Figure 4.1: goob",
+        "Figure 4.2: goob",
+    ]
+
+
+def test_without_duckdb_it_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(comparison, "find_spec", lambda name: None if name == "duckdb" else found(name))
+    with pytest.raises(PebbleError, match=r'left out: .* needs DuckDB: pip install "pebble-robot\[archive\]"'):
+        comparison.run(comparison.plan(quick=True, output=tmp_path))
+
+
+@pytest.mark.alone
+def test_the_robots_are_recorded_at_a_broker(tmp_path: Path) -> None:
+    pytest.importorskip("duckdb")
+    plan = comparison.Plan(idle_s=8, session_s=6, quick=True, output=tmp_path)
+    assert comparison.run(plan, Console(quiet=True)) == 0
+    results = load(tmp_path / "traffic.json")
+    robots = robots_of(results)
+    assert set(robots) == {"goob", "fred", "minilamp", "benjr"}
+    for name in ("goob", "fred"):
+        assert robots[name].of(VIDEO) is not None
+        found = robots[name].of(AUDIO)
+        assert found is not None
+        assert found.messages > 100
+        assert found.bytes == 664 * found.messages, "PCM of one channel"
+    assert all(robot.sessions and robot.idle_s for robot in robots.values())
+    assert (tmp_path / "traffic-figures.png").exists()
+    assert chosen(["traffic"])[0].name == results.bench
