@@ -166,12 +166,17 @@ class MediaFeed:
             if reason := refusal(self.ref, self._capabilities, self.medium):
                 raise PebbleError(reason)
             await self._source.follow(self._capabilities, self._encoding())
-            if self._arriving and (self._wants_keyframe or self._lacks_keyframe()):
-                await self._source.request_keyframe(self._arriving)
+            if self._wants_keyframe or self._lacks_keyframe():
+                await self._request_keyframe()
             self._report(self._undecodable)
         except PebbleError as error:
             await self._source.withdraw()
             self._report(str(error))
+
+    async def _request_keyframe(self) -> None:
+        """Not while another encoding still arrives: the one that was requested begins with a key frame."""
+        if self._arriving and self._source.encoding in (_AS_CONFIGURED, self._arriving):
+            await self._source.request_keyframe(self._arriving)
 
     def _encoding(self) -> str | None:
         """The encoding to request: H.264 where a client wants it as it is, else what any viewer already gets."""

@@ -47,17 +47,15 @@ async def _serve(settings: Settings, on_ready: Callable[[str], None]) -> Summary
     loop, broker, schemas = asyncio.get_running_loop(), Broker(settings.broker, "pebble-foxglove"), Schemas()
     server = Server("Pebble", lambda topic, on: _call(loop, robots, topic, on))
     robots = Robots(broker, server, schemas)
-    _cancel_on_signals()
     address = server.start(settings.host, settings.port)
+    signalled = _signalled()
+    work = asyncio.create_task(_show(settings, broker, robots, lambda: on_ready(address)))
     try:
-        await _connect(broker, settings)
-        for filter_ in filters(settings.base):
-            await broker.subscribe(filter_, robots.receive)
-        on_ready(address)
-        await asyncio.Event().wait()
-    except asyncio.CancelledError:  # a signal
-        pass
+        await asyncio.wait({work, asyncio.create_task(signalled.wait())}, return_when=asyncio.FIRST_COMPLETED)
+        if work.done():
+            work.result()
     finally:
+        work.cancel()
         server.stop()
         await robots.close(_WITHDRAW_S)
         with contextlib.suppress(TimeoutError):
@@ -67,23 +65,24 @@ async def _serve(settings: Settings, on_ready: Callable[[str], None]) -> Summary
     return Summary(len(robots.bases), server.published, dropped, robots.refused)
 
 
-def _cancel_on_signals() -> None:
-    """The first signal cancels this task; further ones do not disturb its end."""
-    loop, task = asyncio.get_running_loop(), asyncio.current_task()
-
-    def cancel() -> None:
-        if task is not None and not task.cancelling():
-            task.cancel()
-
-    for name in _SIGNALS:
-        if hasattr(signal, name):
-            loop.add_signal_handler(getattr(signal, name), cancel)
-
-
-async def _connect(broker: Broker, settings: Settings) -> None:
+async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Callable[[], None]) -> None:
+    """Until it is cancelled. Raises TransportError without a broker."""
     await broker.open()
     if not broker.connected:
         raise TransportError(f"cannot connect to {settings.where}: {broker.problem}")
+    for filter_ in filters(settings.base):
+        await broker.subscribe(filter_, robots.receive)
+    on_ready()
+    await asyncio.Event().wait()
+
+
+def _signalled() -> asyncio.Event:
+    """Is set by the signals that end a program."""
+    loop, event = asyncio.get_running_loop(), asyncio.Event()
+    for name in _SIGNALS:
+        if hasattr(signal, name):
+            loop.add_signal_handler(getattr(signal, name), event.set)
+    return event
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:

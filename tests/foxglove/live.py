@@ -28,8 +28,9 @@ def client(broker: Broker, name: str = "robot") -> Transport:
 class Live:
     """The process, once it is ready."""
 
-    def __init__(self, broker: Broker, *options: str) -> None:
-        where = ("--url", f"mqtt://127.0.0.1:{broker.port}")
+    def __init__(self, robots: Broker | str, *options: str) -> None:
+        """``robots``: all of a broker, or a config file."""
+        where = (robots,) if isinstance(robots, str) else ("--url", f"mqtt://127.0.0.1:{robots.port}")
         self.process = program("foxglove", *where, "--port", "0", *options)
         assert self.process.stdout is not None
         assert select.select([self.process.stdout], [], [], 30)[0], "nothing was printed"

@@ -52,6 +52,9 @@ class Watcher:
     def send(self, message: dict[str, Any] | bytes) -> None:
         self._socket.send(message if isinstance(message, bytes) else json.dumps(message))
 
+    def count(self, topic: str) -> int:
+        return sum(message.topic == topic for message in list(self.messages))
+
     def of(self, topic: str) -> list[Any]:
         """The messages of a channel as its schema has them."""
         channel = self.channels.get(topic)
