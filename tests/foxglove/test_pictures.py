@@ -59,7 +59,7 @@ def not_reading(address: str) -> ClientConnection:
 
 
 def pictures_of(connection: ClientConnection, kind: Any) -> list[Any]:
-    """What was kept for it: until half a second passes without a message."""
+    """What waited for it: until half a second passes without a message."""
     found = []
     with contextlib.suppress(TimeoutError):
         while True:
@@ -221,9 +221,9 @@ def test_a_client_that_does_not_read_delays_no_other_and_loses_the_oldest(broker
         images = watcher.of(JPEG)
         assert follow_each_other(counters(list(map(decoded, images))))
         robot.mute = True
-        kept = counters(list(map(decoded, pictures_of(stopped, parser(watcher.channels[JPEG])))))
-        assert kept[-1] == robot.frames - 1
-        assert BACKLOG <= len(kept) < len(images) - 50
+        waited = counters(list(map(decoded, pictures_of(stopped, parser(watcher.channels[JPEG])))))
+        assert waited[-1] == robot.frames - 1
+        assert BACKLOG <= len(waited) < len(images) - 50
         stopped.close()
 
 

@@ -50,14 +50,15 @@ def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, r
     with live(broker) as server:
         watcher = Watcher(server.address)
 
-        def publish_all() -> None:
+        def publish_all() -> bool:
             for channel, value in sent.items():
                 publish(robot, GOOB, channel, value)
+            return all(watcher.of(topic) for topic in topics)
 
         publish_all()
         for topic in topics:
             watcher.subscribe(topic)
-        assert until(lambda: publish_all() or all(watcher.of(topic) for topic in topics), 20, step=0.05)
+        assert until(publish_all, 20, step=0.05)
     log, pose, drawn, scene, data = (watcher.of(topic)[0] for topic in topics)
     assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", t)
     assert (pose.frame_id, pose.pose.position.x) == ("goob/odom", 1.5)
@@ -76,9 +77,10 @@ def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscrib
     robot.publish(f"{GOOB}/outgoing/diagnostics", b"[1, 2]", retain=True)
     with live(broker) as server:
         first, second = Watcher(server.address), Watcher(server.address)
-        for watcher in (first, second):
-            watcher.subscribe(LEVEL)
-            assert until(lambda watcher=watcher: watcher.of(LEVEL)), "although it was published long before"
+        first.subscribe(LEVEL)
+        assert until(lambda: first.of(LEVEL)), "although it was published before"
+        second.subscribe(LEVEL)
+        assert until(lambda: second.of(LEVEL))
         first.subscribe(f"{GOOB}/outgoing/diagnostics")
         assert until(lambda: first.of(f"{GOOB}/outgoing/diagnostics") == [{"value": [1, 2]}])
     channel = first.channels[LEVEL]

@@ -82,14 +82,14 @@ class Watcher:
             assert opcode == 1
             self.messages.append(Received(self._subscribed[number], at_ns, message[_MESSAGE.size :]))
             return
-        said = json.loads(message)
-        match said["op"]:
+        content = json.loads(message)
+        match content["op"]:
             case "serverInfo":
-                self.info = said
+                self.info = content
             case "advertise":
-                self.channels |= {channel["topic"]: channel for channel in said["channels"]}
+                self.channels |= {channel["topic"]: channel for channel in content["channels"]}
             case "status":
-                self.statuses.append(said)
+                self.statuses.append(content)
 
 
 def parser(channel: dict[str, Any]) -> Any:
