@@ -80,5 +80,8 @@ def _print_ready(address: str) -> None:
 
 
 def _print_end(summary: Summary) -> None:
-    lost = f", {summary.dropped:,} dropped" if summary.dropped else ""
-    typer.echo(f"Showed {summary.robots} robots in {summary.published:,} messages{lost}", err=True)
+    lost = [f", {summary.dropped:,} dropped"] * bool(summary.dropped)
+    refused = [f", {summary.refused:,} that cannot be shown"] * bool(summary.refused)
+    typer.echo(
+        "".join([f"Showed {summary.robots} robots in {summary.published:,} messages", *lost, *refused]), err=True
+    )

@@ -14,7 +14,7 @@ from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
 from pebble.contract.packets import PBAT
 from pebble.errors import PebbleError
-from pebble.foxglove.server import ChannelSpec, Server
+from pebble.foxglove.server import Server, protobuf_spec
 from pebble.media import pyav
 from pebble.recordings.exports.foxglove_messages import (
     IMAGE,
@@ -131,9 +131,7 @@ class MediaFeed:
     def _declare(self, schema: str, ending: str) -> str:
         topic = f"{self._topic}/{ending}"
         if not self._server.declared(topic):
-            message = self._schemas.make(schema)
-            descriptors = self._schemas.descriptors(message)
-            self._server.declare(ChannelSpec(topic, "protobuf", message.DESCRIPTOR.full_name, "protobuf", descriptors))
+            self._server.declare(protobuf_spec(topic, self._schemas.make(schema), self._schemas))
         return topic
 
     def _subscribed(self, ending: str) -> bool:

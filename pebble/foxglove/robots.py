@@ -14,9 +14,9 @@ from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import PayloadError
 from pebble.foxglove.json_channels import json_spec
 from pebble.foxglove.media_feed import MediaFeed
-from pebble.foxglove.server import ChannelSpec, Server
+from pebble.foxglove.server import Server, protobuf_spec
 from pebble.recordings.exports.foxglove_messages import (
-    MOST_CHANNELS,
+    Converted,
     Schemas,
     Telemetry,
     as_object,
@@ -45,7 +45,7 @@ class Robots:
 
     def __init__(self, broker: Broker, server: Server, schemas: Schemas) -> None:
         self.bases: set[str] = set()
-        self.refused = 0  # messages that are no JSON, and those of a robot or channel too many
+        self._refused = 0  # messages that are no JSON, and those of a robot too many
         self._broker, self._server, self._schemas = broker, server, schemas
         self._telemetry = Telemetry(schemas)
         self._feeds: dict[tuple[str, Medium], MediaFeed] = {}
@@ -57,13 +57,18 @@ class Robots:
         """Pictures and packets of sound that were too many at once."""
         return sum(feed.dropped for feed in self._feeds.values())
 
+    @property
+    def refused(self) -> int:
+        """What is none of these: no JSON, damaged, or a picture without those that it builds on."""
+        return self._refused + sum(feed.refused for feed in self._feeds.values())
+
     def receive(self, message: Message, at: float) -> None:
         """A message that arrived at ``at`` (monotonic)."""
         address = parse_topic(message.topic)
         if address is None or address.identity.is_server or not message.payload:
             return
         if not self._knows(address.identity):
-            self.refused += 1
+            self._refused += 1
             return
         channel = channel_of(f"{address.direction}/{address.metric}")
         if channel is CAPABILITIES:
@@ -96,28 +101,26 @@ class Robots:
         remember = channel is not None and channel.default_retain
         converted = self._telemetry.convert(topic, payload)
         if converted is not None:
-            made = converted.message
-            name = f"{topic}/{converted.ending}"
-            if self._has_room(name):
-                spec = ChannelSpec(name, "protobuf", made.DESCRIPTOR.full_name, "protobuf", b"")
-                if not self._server.declared(name):
-                    self._server.declare(spec._replace(schema=self._schemas.descriptors(made)))
-                self._server.publish(name, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
+            self._publish_converted(converted, topic, payload, at_ns, remember=remember)
         if converted is None or converted.beside:
             self._publish_json(channel, topic, payload, at_ns, remember=remember)
+
+    def _publish_converted(
+        self, converted: Converted, topic: str, payload: bytes, at_ns: int, *, remember: bool
+    ) -> None:
+        made, topic = converted.message, f"{topic}/{converted.ending}"
+        if not self._server.declared(topic):
+            self._server.declare(protobuf_spec(topic, made, self._schemas))
+        self._server.publish(topic, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
 
     def _publish_json(self, channel: Channel | None, topic: str, payload: bytes, at_ns: int, *, remember: bool) -> None:
         data = as_object(payload)
         if data is None:
-            self.refused += 1
-        elif self._has_room(topic):
+            self._refused += 1
+            return
+        if not self._server.declared(topic):
             self._server.declare(json_spec(topic, channel))
-            self._server.publish(topic, data, at_ns, remember=remember)
-
-    def _has_room(self, topic: str) -> bool:
-        room = self._server.declared(topic) or len(self._server) < MOST_CHANNELS
-        self.refused += not room
-        return room
+        self._server.publish(topic, data, at_ns, remember=remember)
 
     # -- pictures and sound
 
@@ -128,8 +131,7 @@ class Robots:
             return
         for medium in _MEDIA:
             feed = self._feeds.get((base, medium)) or self._start(base, medium)
-            if len(self._server) < MOST_CHANNELS:
-                self._by_channel.update(dict.fromkeys(feed.update(capabilities), feed))
+            self._by_channel.update(dict.fromkeys(feed.update(capabilities), feed))
 
     def _start(self, base: str, medium: Medium) -> MediaFeed:
         feed = self._feeds[base, medium] = MediaFeed(self._broker, self._server, self._schemas, base, medium)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
 from pebble.errors import TransportError
@@ -48,10 +48,11 @@ async def _serve(settings: Settings, on_ready: Callable[[str], None]) -> Summary
     server = Server("Pebble", lambda topic, on: _call(loop, robots, topic, on))
     robots = Robots(broker, server, schemas)
     address = server.start(settings.host, settings.port)
-    signalled = _signalled()
+    broker.on_state(lambda: None if broker.connected else server.report(f"{settings.where}: {broker.problem}"))
     work = asyncio.create_task(_show(settings, broker, robots, lambda: on_ready(address)))
     try:
-        await asyncio.wait({work, asyncio.create_task(signalled.wait())}, return_when=asyncio.FIRST_COMPLETED)
+        with _signalled() as signalled:
+            await asyncio.wait({work, asyncio.create_task(signalled.wait())}, return_when=asyncio.FIRST_COMPLETED)
         if work.done():
             work.result()
     finally:
@@ -76,13 +77,17 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
     await asyncio.Event().wait()
 
 
-def _signalled() -> asyncio.Event:
-    """Is set by the signals that end a program."""
+@contextlib.contextmanager
+def _signalled() -> Iterator[asyncio.Event]:
+    """Is set by the signals that end a program. Not all platforms let a loop handle signals."""
     loop, event = asyncio.get_running_loop(), asyncio.Event()
-    for name in _SIGNALS:
-        if hasattr(signal, name):
-            loop.add_signal_handler(getattr(signal, name), event.set)
-    return event
+    numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
+    before = {number: signal.signal(number, lambda *_: loop.call_soon_threadsafe(event.set)) for number in numbers}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from pebble.errors import PebbleError
+from pebble.recordings.exports.foxglove_messages import MOST_CHANNELS, Schemas
 
 if TYPE_CHECKING:
     import foxglove
@@ -32,6 +33,11 @@ class ChannelSpec(NamedTuple):
     schema_name: str
     schema_encoding: str  # jsonschema or protobuf
     schema: bytes  # empty: any JSON
+
+
+def protobuf_spec(topic: str, message: Any, schemas: Schemas) -> ChannelSpec:
+    """The channel for messages of this kind."""
+    return ChannelSpec(topic, "protobuf", message.DESCRIPTOR.full_name, "protobuf", schemas.descriptors(message))
 
 
 class _Remembered(NamedTuple):
@@ -85,8 +91,8 @@ class Server:
         return topic in self._channels
 
     def declare(self, spec: ChannelSpec) -> None:
-        """Advertise a channel, once; it stays."""
-        if spec.topic in self._channels:
+        """Advertise a channel, once; it stays. Not beyond the limit: then what is published on it is dropped."""
+        if spec.topic in self._channels or len(self._channels) >= MOST_CHANNELS:
             return
         schema = self._sdk.Schema(name=spec.schema_name, encoding=spec.schema_encoding, data=spec.schema)
         self._channels[spec.topic] = self._sdk.Channel(
@@ -95,17 +101,13 @@ class Server:
         if len(self._channels) % _PAUSE_EVERY == 0:
             time.sleep(_PAUSE_S)
 
-    def __len__(self) -> int:
-        """How many channels there are."""
-        return len(self._channels)
-
     def subscribed(self, topic: str) -> bool:
         """Whether any client has subscribed to this channel."""
         with self._lock:
             return bool(self._subscribers.get(topic))
 
     def publish(self, topic: str, data: bytes, log_ns: int, *, remember: bool = False) -> None:
-        """Publish on a declared channel; what is remembered, clients that subscribe later receive then."""
+        """Publish on a channel that is declared; what is remembered, clients that subscribe later receive then."""
         channel = self._channels.get(topic)
         if channel is None or len(data) > MAX_BYTES:
             self.dropped += 1

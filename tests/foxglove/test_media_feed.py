@@ -6,6 +6,7 @@ import asyncio
 from typing import cast
 
 import numpy as np
+import pytest
 
 from pebble.contract.packets import PBAT
 from pebble.foxglove.media_feed import MAX_PAYLOAD, MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
@@ -76,3 +77,12 @@ def test_a_message_that_is_too_large_is_dropped_and_counted() -> None:
     server.publish("a", bytes(MAX_BYTES + 1), 1)
     server.publish("b", b"{}", 1)
     assert (server.published, server.dropped) == (1, 2)
+
+
+def test_the_channels_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pebble.foxglove.server.MOST_CHANNELS", 2)
+    server = Server("test", lambda _topic, _on: None)
+    for topic in "abc":
+        server.declare(ChannelSpec(topic, "json", "pebble.Any", "jsonschema", b""))
+        server.publish(topic, b"{}", 1)
+    assert (server.declared("b"), server.declared("c"), server.dropped) == (True, False, 1)

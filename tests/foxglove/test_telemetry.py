@@ -157,3 +157,23 @@ def test_what_is_no_json_and_no_robot_is_left_out(broker: Broker, robot: Transpo
         online(robot, GOOB)
         watcher.subscribe(ONLINE)
         assert list(watcher.channels) == [ONLINE]
+
+
+def test_a_broker_that_goes_is_a_problem_in_foxglove_and_one_that_is_back_goes_on(
+    broker: Broker, robot: Transport
+) -> None:
+    with live(broker) as server:
+        watcher = Watcher(server.address)
+        online(robot, GOOB)
+        watcher.subscribe(ONLINE)
+        assert until(lambda: watcher.of(ONLINE))
+        broker.stop()
+        assert until(lambda: watcher.statuses, 20)
+        assert f"mqtt://127.0.0.1:{broker.port}" in watcher.statuses[0]["message"]
+        broker.start()
+
+        def published() -> bool:
+            online(robot, GOOB, 2)
+            return {"t": 2} in watcher.of(ONLINE)
+
+        assert until(published, 30, step=0.1)
