@@ -23,6 +23,7 @@ ELSEWHERE = [sys.executable, str(ROOT / "tests" / "fakes" / "other_platform.py")
 MODULES = (
     *(f"pebble.commands.{name}" for name in ("topic", "estop", "watch", "web", "cert", "drive", "topics", "check")),
     *("pebble.web.app", "pebble.web.serve", "pebble.transports.mqtt.transport", "pebble.client.media_receiver"),
+    *("pebble.commands.foxglove", "pebble.foxglove.run"),
 )
 
 

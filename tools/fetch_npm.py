@@ -42,6 +42,34 @@ PACKAGES = {
         ("lib/tsc.js", "lib/_tsc.js", "lib/lib.*", "package.json"),
         "TypeScript, which checks the types of the operator page",
     ),
+    "node_modules/@foxglove/ws-protocol": Package(
+        "@foxglove/ws-protocol",
+        "0.8.0",
+        "Wh3dlmgoCr3D9D8c3Wk2GXvyMiftScItFT6LKK1apJZagElod2PQBPdyVN/GXATOvavKhw97eMGrcDTU7vekVw==",
+        ("dist/cjs/*", "package.json"),
+        "Foxglove's own client, which tests the live connection",
+    ),
+    "node_modules/eventemitter3": Package(
+        "eventemitter3",
+        "5.0.4",
+        "mlsTRyGaPBjPedk6Bvw+aqbsXDtoAyAzm5MO7JgU+yVRyMQ5O8bD4Kcci7BS85f93veegeCPkL8R4GLClnjLFw==",
+        ("index.js", "package.json"),
+        "what Foxglove's client is built on",
+    ),
+    "node_modules/tslib": Package(
+        "tslib",
+        "2.9.1",
+        "a4Ux9VKuIMHsOS7ENbEq6hK2ZGYIT27Rtl0E4eD9KqwxhKiQeMZE/9xb3IdYwWaSOyIBQLExhQgXDTYoiCxnWA==",
+        ("tslib.js", "package.json"),
+        "what Foxglove's client is built on",
+    ),
+    "node_modules/ws": Package(
+        "ws",
+        "8.23.0",
+        "wCkmX8QMOrKjgO8HW2WyDbTSGeqkocxgDzS9iR79rEAexty6/2qzilx3Ag8Tqf9ykop3irLKle0MtVn5qjVnoQ==",
+        ("index.js", "lib/*", "package.json"),
+        "WebSockets for Node.js",
+    ),
 }
 
 

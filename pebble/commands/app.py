@@ -28,6 +28,7 @@ COMMANDS = {
     "watch": "watch",
     "snapshot": "watch",
     "web": "web",
+    "foxglove": "foxglove",
     "record": "record",
     "recordings": "recordings",
     "replay": "replay",
@@ -62,6 +63,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble script new follow   write a first program that moves a robot
     pebble watch goob.json     show its camera and play its microphone
     pebble web goob.json       drive, stop and watch robots in a browser
+    pebble foxglove goob.json  show robots live in the Foxglove app
     pebble record --url URL    record robots; for recordings, replay, analyse
     pebble cert init NAME      make certificates, so that phones can, too
     pebble flash lamp.json     install a robot's firmware on its board

@@ -22,8 +22,9 @@ _DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wa
 class Broker:
     """Handlers and watchers run on the event loop; subscribing waits for the broker, so it does not happen there."""
 
-    def __init__(self, settings: MqttSettings) -> None:
-        self.transport: Transport = create("mqtt", f"pebble-web-{secrets.token_hex(4)}", settings)
+    def __init__(self, settings: MqttSettings, name: str = "pebble-web") -> None:
+        """``name``: what the broker's log calls it."""
+        self.transport: Transport = create("mqtt", f"{name}-{secrets.token_hex(4)}", settings)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()
@@ -37,6 +38,11 @@ class Broker:
     @property
     def connected(self) -> bool:
         return self.transport.state is State.CONNECTED
+
+    @property
+    def dropped(self) -> int:
+        """Messages for which there was no room, because too many came at once."""
+        return self._arrived.dropped
 
     @property
     def problem(self) -> str:

@@ -1,0 +1,1 @@
+"""Robots live in the Foxglove app."""

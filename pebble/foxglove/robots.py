@@ -1,0 +1,146 @@
+"""Robots of a broker for Foxglove: their channels as they appear, and their telemetry."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import Any, Final
+
+from pebble.client.viewer import Medium
+from pebble.contract import CAPABILITIES, Channel, codec
+from pebble.contract.channels import channel_of
+from pebble.contract.identity import Identity, parse_topic
+from pebble.errors import PayloadError
+from pebble.foxglove.json_channels import json_spec
+from pebble.foxglove.media_feed import MediaFeed
+from pebble.foxglove.server import Server, protobuf_spec
+from pebble.recordings.exports.foxglove_messages import (
+    Converted,
+    Schemas,
+    Telemetry,
+    as_object,
+    stamped,
+    time_of,
+)
+from pebble.transports import Message
+from pebble.transports.topics import matches
+from pebble.web.broker import Broker
+from pebble.web.robots import FLEET, SYNONYMS, WATCHED
+
+log = logging.getLogger(__name__)
+
+MOST_ROBOTS: Final = 500
+_MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
+
+
+def filters(base: str) -> list[str]:
+    """What to subscribe to: the telemetry of these robots, without pictures and sound."""
+    every = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
+    return [one for one in every if not any(other != one and matches(other, one) for other in every)]
+
+
+class Robots:
+    """Only the event loop calls it."""
+
+    def __init__(self, broker: Broker, server: Server, schemas: Schemas) -> None:
+        self.bases: set[str] = set()
+        self._refused = 0  # messages that are no JSON, and those of a robot too many
+        self._broker, self._server, self._schemas = broker, server, schemas
+        self._telemetry = Telemetry(schemas)
+        self._feeds: dict[tuple[str, Medium], MediaFeed] = {}
+        self._by_channel: dict[str, MediaFeed] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    @property
+    def dropped(self) -> int:
+        """Pictures and packets of sound that were too many at once."""
+        return sum(feed.dropped for feed in self._feeds.values())
+
+    @property
+    def refused(self) -> int:
+        """What is none of these: no JSON, damaged, or a picture without those that it builds on."""
+        return self._refused + sum(feed.refused for feed in self._feeds.values())
+
+    def receive(self, message: Message, at: float) -> None:
+        """A message that arrived at ``at`` (monotonic)."""
+        address = parse_topic(message.topic)
+        if address is None or address.identity.is_server or not message.payload:
+            return
+        if not self._knows(address.identity):
+            self._refused += 1
+            return
+        channel = channel_of(f"{address.direction}/{address.metric}")
+        if channel is CAPABILITIES:
+            self._update(address.identity.base, message.payload)
+        self._publish(channel, message, time.time_ns() - round((time.monotonic() - at) * 1e9))
+
+    def wake(self, topic: str, *, subscribed: bool) -> None:
+        """A client has subscribed to this channel, or unsubscribed."""
+        feed = self._by_channel.get(topic)
+        if feed is not None:
+            feed.wake(topic.rpartition("/")[2], subscribed=subscribed)
+
+    async def close(self, timeout: float) -> None:
+        """Withdraw all requests."""
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=timeout)
+
+    def _knows(self, identity: Identity) -> bool:
+        if identity.base not in self.bases and len(self.bases) < MOST_ROBOTS:
+            self.bases.add(identity.base)
+        return identity.base in self.bases
+
+    # -- telemetry
+
+    def _publish(self, channel: Channel | None, message: Message, at_ns: int) -> None:
+        """What Foxglove has a schema for, by that; other JSON as it is. The last value of a state is remembered."""
+        topic, payload = message.topic, message.payload
+        remember = channel is not None and channel.default_retain
+        converted = self._telemetry.convert(topic, payload)
+        if converted is not None:
+            self._publish_converted(converted, topic, payload, at_ns, remember=remember)
+        if converted is None or converted.beside:
+            self._publish_json(channel, topic, payload, at_ns, remember=remember)
+
+    def _publish_converted(
+        self, converted: Converted, topic: str, payload: bytes, at_ns: int, *, remember: bool
+    ) -> None:
+        made, topic = converted.message, f"{topic}/{converted.ending}"
+        if not self._server.declared(topic):
+            self._server.declare(protobuf_spec(topic, made, self._schemas))
+        self._server.publish(topic, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
+
+    def _publish_json(self, channel: Channel | None, topic: str, payload: bytes, at_ns: int, *, remember: bool) -> None:
+        data = as_object(payload)
+        if data is None:
+            self._refused += 1
+            return
+        if not self._server.declared(topic):
+            self._server.declare(json_spec(topic, channel))
+        self._server.publish(topic, data, at_ns, remember=remember)
+
+    # -- pictures and sound
+
+    def _update(self, base: str, payload: bytes) -> None:
+        try:
+            capabilities: dict[str, Any] = codec.decode(CAPABILITIES, payload).value
+        except PayloadError:  # the last valid ones stay
+            return
+        for medium in _MEDIA:
+            feed = self._feeds.get((base, medium)) or self._start(base, medium)
+            self._by_channel.update(dict.fromkeys(feed.update(capabilities), feed))
+
+    def _start(self, base: str, medium: Medium) -> MediaFeed:
+        feed = self._feeds[base, medium] = MediaFeed(self._broker, self._server, self._schemas, base, medium)
+        task = asyncio.create_task(feed.run(), name=f"the {medium} of {base}")
+        self._tasks.add(task)
+        task.add_done_callback(_log_error)
+        return feed
+
+
+def _log_error(task: asyncio.Task[None]) -> None:
+    if not task.cancelled() and task.exception() is not None:
+        log.error("%s has ended", task.get_name(), exc_info=task.exception())

@@ -1,0 +1,96 @@
+"""Serves robots to Foxglove until a signal ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple
+
+from pebble.errors import TransportError
+from pebble.foxglove.robots import Robots, filters
+from pebble.foxglove.server import Server
+from pebble.recordings.exports.foxglove_messages import Schemas
+from pebble.transports import MqttSettings
+from pebble.web.broker import Broker
+
+_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
+_WITHDRAW_S, _CLOSE_S = 1.0, 0.5
+
+
+class Settings(NamedTuple):
+    """``base``: the robot to show, or ``+/+/+``. ``where`` is the broker in words."""
+
+    broker: MqttSettings
+    where: str
+    base: str
+    host: str
+    port: int
+
+
+class Summary(NamedTuple):
+    """What was done, for the last line."""
+
+    robots: int
+    published: int
+    dropped: int
+    refused: int
+
+
+def run(settings: Settings, on_ready: Callable[[str], None]) -> Summary:
+    """Serve until SIGINT, SIGTERM or SIGHUP; ``on_ready`` gets the address. Raises PebbleError."""
+    return asyncio.run(_serve(settings, on_ready))
+
+
+async def _serve(settings: Settings, on_ready: Callable[[str], None]) -> Summary:
+    loop, broker, schemas = asyncio.get_running_loop(), Broker(settings.broker, "pebble-foxglove"), Schemas()
+    server = Server("Pebble", lambda topic, on: _call(loop, robots, topic, on))
+    robots = Robots(broker, server, schemas)
+    address = server.start(settings.host, settings.port)
+    broker.on_state(lambda: None if broker.connected else server.report(f"{settings.where}: {broker.problem}"))
+    work = asyncio.create_task(_show(settings, broker, robots, lambda: on_ready(address)))
+    try:
+        with _signalled() as signalled:
+            await asyncio.wait({work, asyncio.create_task(signalled.wait())}, return_when=asyncio.FIRST_COMPLETED)
+        if work.done():
+            work.result()
+    finally:
+        work.cancel()
+        server.stop()
+        await robots.close(_WITHDRAW_S)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_CLOSE_S):
+                await broker.close()
+    dropped = server.dropped + robots.dropped + broker.dropped
+    return Summary(len(robots.bases), server.published, dropped, robots.refused)
+
+
+async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Callable[[], None]) -> None:
+    """Until it is cancelled. Raises TransportError without a broker."""
+    await broker.open()
+    if not broker.connected:
+        raise TransportError(f"cannot connect to {settings.where}: {broker.problem}")
+    for filter_ in filters(settings.base):
+        await broker.subscribe(filter_, robots.receive)
+    on_ready()
+    await asyncio.Event().wait()
+
+
+@contextlib.contextmanager
+def _signalled() -> Iterator[asyncio.Event]:
+    """Is set by the signals that end a program. Not all platforms let a loop handle signals."""
+    loop, event = asyncio.get_running_loop(), asyncio.Event()
+    numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
+    before = {number: signal.signal(number, lambda *_: loop.call_soon_threadsafe(event.set)) for number in numbers}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:
+    """On a thread of the SDK. The loop may have ended meanwhile."""
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(lambda: robots.wake(topic, subscribed=on))
