@@ -176,7 +176,7 @@ COMPARISONS = (
         full=_bench("traffic"),
         quick=_bench("traffic", "--quick"),
         full_s=140,
-        quick_s=35,
+        quick_s=19,
         summary_lines=4,
     ),
     Comparison(

@@ -29,7 +29,7 @@ class Plan:
 
 
 def plan(*, quick: bool = False, output: Path = output.FOLDER) -> Plan:
-    return Plan(quick=True, idle_s=9.0, session_s=9.0, output=output) if quick else Plan(output=output)
+    return Plan(quick=True, idle_s=7.0, session_s=6.0, output=output) if quick else Plan(output=output)
 
 
 def run(plan: Plan, console: Console | None = None) -> int:

@@ -214,13 +214,15 @@ def broken() -> Results:
 
 
 def traffic() -> Results:
+    return _results("traffic", cells_of(analysed()), ["aim: PCM: met (fred 265.6 kbit/s)"])
+
+
+def analysed() -> Traffic:
     """All of the paper's robots, with outages of each cause."""
-    names = ("goob", "fred", "minilamp", "benjr")
-    analysed = Traffic(
+    return Traffic(
         since_ns=0, until_ns=60 * 10**9, recordings=1, missing=0, dropped=0, gaps=[],
-        robots=[_robot_traffic(name) for name in names], overhead=False,
+        robots=[_robot_traffic(name) for name in ("goob", "fred", "minilamp", "benjr")], overhead=False,
     )  # fmt: skip
-    return _results("traffic", cells_of(analysed), ["aim: PCM: met (fred 265.6 kbit/s)"])
 
 
 def _robot_traffic(name: str) -> RobotTraffic:
