@@ -5,7 +5,7 @@ import { CHAIN, INCOMING, PICTURE, SOUND, STATE } from "../../core/replay/frames
 import { Incoming } from "../../core/replay/incoming.js";
 import { Heartbeats } from "../../core/replay/liveness.js";
 import { Player, SPEEDS } from "../../core/replay/player.js";
-import { View, dayOf, extentOf } from "../../core/replay/timeline.js";
+import { View, dayOf, extentOf, stretchOf } from "../../core/replay/timeline.js";
 import { Store } from "../../core/store.js";
 import { ReplayPictures } from "../../media/replay-pictures.js";
 import { ReplaySound } from "../../media/replay-sound.js";
@@ -161,6 +161,16 @@ export class Replay extends Model {
       else this.markIn = null;
     }
     this.changed();
+  }
+
+  /** What is downloaded. */
+  get stretch() {
+    return stretchOf(this.markIn, this.markOut, this.timeline?.sessions ?? [], this.player.position);
+  }
+
+  /** The same, once a person has marked it. */
+  get marked() {
+    return this.markIn === null && this.markOut === null ? null : this.stretch;
   }
 
   /** @param {string} day @param {() => void} [then] once its timeline is here */
