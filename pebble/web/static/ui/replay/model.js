@@ -106,10 +106,12 @@ export class Replay extends Model {
     };
     this.timers = [setInterval(() => this.tick(), TICK_MS), setInterval(() => this.shareLiveness(), LIVENESS_MS)];
     this.addressTimer = 0;
+    this.closed = false;
     this.speed = 1;
   }
 
   close() {
+    this.closed = true;
     this.timers.forEach(clearInterval);
     clearTimeout(this.addressTimer);
     this.dayAbort.abort();
@@ -125,7 +127,7 @@ export class Replay extends Model {
 
   /** @param {number} ms */
   seek(ms) {
-    if (!Number.isFinite(ms)) return;
+    if (!Number.isFinite(ms) || this.closed) return;
     this.openDay(dayOf(ms));
     this.player.seek(ms);
   }
@@ -175,7 +177,7 @@ export class Replay extends Model {
 
   /** @param {string} day @param {() => void} [then] once its timeline is here */
   async openDay(day, then = () => {}) {
-    if (day === this.day && !this.dayProblem) return;
+    if (this.closed || (day === this.day && !this.dayProblem)) return;
     this.dayAbort.abort();
     const { signal } = (this.dayAbort = new AbortController());
     if (day !== this.day) this.view = new View(day);
