@@ -121,7 +121,9 @@ def _picture(at: int) -> bytes:
 def _sound(at: int) -> bytes:
     number = (at - START) // SOUND_MS
     first = 320 * number % SPEECH
-    return Sound(Codec.PCM16LE, 1, 16_000, 320, number + 1, at - SOUND_LATE_MS, speech()[first : first + 320].tobytes()).pack()
+    return Sound(
+        Codec.PCM16LE, 1, 16_000, 320, number + 1, at - SOUND_LATE_MS, speech()[first : first + 320].tobytes()
+    ).pack()
 
 
 @cache

@@ -174,6 +174,7 @@ class Screen(NamedTuple):
 ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
 #: Text that shows that a state has been reached, where it takes a while.
 WHEN = {
+    "recordings": "Sunday, 22 November 2026",
     "fleet": "4 robots",
     "fleet-stopped": "is stopped",
     "fleet-empty": "No robot has been seen",

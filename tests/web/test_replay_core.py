@@ -12,7 +12,8 @@ from tests.web.in_node import evaluate
 
 AT = 1_795_341_600_000.0
 
-#: A player over made-up messages every 100 ms, with a clock that only ``pass`` moves, and a server that only ``answer`` is.
+#: A player over made-up messages every 100 ms, with a clock that only ``pass`` moves, and a server that only
+#: ``answer`` is.
 PLAYER = """
 const { Player } = player;
 const bytes = (n) => new Uint8Array(n);
@@ -20,7 +21,8 @@ function make({ frames = every(0, 60_000), gaps = [], size = 10, extra = [] } = 
   const it = { now: 0, asked: [], delivered: [], resets: [], fail: null, busy: false, lead: 0, hold: false, held: [] };
   it.answer = (at, lasts, seek) => {
     const until = at + lasts;
-    const mine = frames.filter((t) => t >= at && t < until).map((t) => ({ at: t, flags: 0, metric: "m", payload: bytes(size) }));
+    const mine = frames.filter((t) => t >= at && t < until).map((t) => ({ at: t, flags: 0, metric: "m", payload:
+    bytes(size) }));
     const before = seek ? extra.map((flags) => ({ at: at - 10, flags, metric: "b", payload: bytes(1) })) : [];
     const next = frames.find((t) => t >= until);
     const total = size * mine.length;
@@ -126,7 +128,8 @@ def test_little_is_loaded_ahead_and_less_of_what_is_large():
     assert run("""const it = make(); it.player.seek(1000); await it.pass(60); it.player.play(); let most = 0;
         for (let i = 0; i < 200; i++) { await it.pass(20); most = Math.max(most, it.player.ahead); }
         return [most <= 6000, most > 3000, it.asked.length < 8];""") == [True, True, True]
-    assert run("""const it = make({ size: 400_000 }); it.player.seek(1000); await it.pass(60); it.player.play(); let most = 0;
+    assert run("""const it = make({ size: 400_000 }); it.player.seek(1000); await it.pass(60); it.player.play();
+    let most = 0;
         for (let i = 0; i < 200; i++) { await it.pass(20); most = Math.max(most, it.player.bytes); }
         return [most <= 16_000_000, it.player.position > 4500];""") == [True, True]
 
@@ -134,7 +137,8 @@ def test_little_is_loaded_ahead_and_less_of_what_is_large():
 def test_a_seek_forgets_what_was_and_begins_with_the_state_and_the_pictures_before():
     assert run("""const it = make({ extra: [1, 2 | 8] }); it.player.seek(1000); await it.pass(60); it.player.play();
         await it.pass(500); it.player.seek(30_000); const first = it.asked.at(-1)[3].aborted; await it.pass(40);
-        return [it.resets, it.delivered.slice(0, 4), it.asked.filter((one) => one[2]).map((one) => one[0]), it.player.playing, first];
+        return [it.resets, it.delivered.slice(0, 4), it.asked.filter((one) => one[2]).map((one) => one[0]),
+        it.player.playing, first];
         """) == [[1000, 30_000], [29_990, 29_990, 30_000], [1000, 30_000], True, False]
 
 
@@ -148,7 +152,8 @@ def test_only_the_last_of_many_seeks_arrives():
 def test_a_gap_is_left_out_and_shown():
     assert run("""const it = make({ frames: [...every(0, 3000), ...every(203_000, 220_000)] });
         it.player.seek(1000); await it.pass(60); it.player.play(); await it.pass(2700);
-        const { since, until } = it.player.skipped; const at = it.player.position; await it.pass(1000); const on = it.delivered.at(-1);
+        const { since, until } = it.player.skipped; const at = it.player.position; await it.pass(1000);
+        const on = it.delivered.at(-1);
         await it.pass(6000); return [since, until, at >= 203_000 && at < 204_000, on > 203_400, it.player.skipped];
         """) == [2900, 203_000, True, True, None]
 
@@ -156,14 +161,16 @@ def test_a_gap_is_left_out_and_shown():
 def test_a_gap_is_known_by_what_came_before_it_even_if_the_server_first_answers_with_nothing():
     """A segment that has messages says where it ends, not where the next one is."""
     assert run("""const it = make({ frames: [...every(0, 3000), ...every(203_000, 220_000)] }); const plain = it.answer;
-        it.answer = (...all) => { const made = plain(...all); return made.frames.length ? { ...made, next: made.until } : made; };
+        it.answer = (...all) => { const made = plain(...all);
+        return made.frames.length ? { ...made, next: made.until } : made; };
         it.player.seek(1000); await it.pass(60); it.player.play(); await it.pass(4500);
         const { since, until } = it.player.skipped; return [since, until];""") == [2900, 203_000]
 
 
 def test_a_seek_into_a_gap_plays_from_its_end():
     assert run("""const it = make({ frames: [...every(0, 3000), ...every(203_000, 220_000)] });
-        it.player.seek(50_000); await it.pass(60); const before = it.player.position; it.player.play(); await it.pass(60);
+        it.player.seek(50_000); await it.pass(60); const before = it.player.position; it.player.play();
+        await it.pass(60);
         return [before, it.player.position >= 203_000];""") == [50_000, True]
 
 
@@ -183,20 +190,23 @@ def test_it_ends_and_goes_on_when_more_was_recorded():
 def test_a_failure_is_shown_and_tried_again_while_the_time_stands_still():
     assert run("""const it = make(); it.player.seek(1000); await it.pass(60); it.player.play(); await it.pass(200);
         it.fail = new Error("network"); await it.pass(20_000);
-        const during = [it.player.problem, it.player.waiting, it.player.playing, it.asked.length < 20]; const at = it.player.position;
+        const during = [it.player.problem, it.player.waiting, it.player.playing, it.asked.length < 20];
+        const at = it.player.position;
         await it.pass(2000); const still = it.player.position === at; it.fail = null; await it.pass(6000);
         return [...during, still, it.player.problem, it.player.position > at];
         """) == ["network", True, True, True, True, "", True]
 
 
 def test_what_the_server_refuses_is_not_asked_again():
-    assert run("""const it = make(); it.fail = new RefusedError("log in"); it.player.seek(1000); it.player.play(); await it.pass(9000);
+    assert run("""const it = make(); it.fail = new RefusedError("log in"); it.player.seek(1000); it.player.play();
+    await it.pass(9000);
         const asked = it.asked.length; it.fail = null; it.player.play(); await it.pass(500);
         return [asked, it.player.problem, it.player.position > 1000];""") == [1, "", True]
 
 
 def test_the_time_stands_still_while_pictures_are_behind():
-    assert run("""const it = make(); it.player.seek(1000); await it.pass(60); it.player.play(); await it.pass(100); it.busy = true;
+    assert run("""const it = make(); it.player.seek(1000); await it.pass(60); it.player.play(); await it.pass(100);
+    it.busy = true;
         const at = it.player.position; await it.pass(1000); const still = it.player.position === at; it.busy = false;
         await it.pass(1000); return [still, it.player.position - at];""") == [True, 1000]
 
@@ -205,14 +215,16 @@ def test_sound_is_delivered_earlier_by_its_lead():
     assert run("""const it = make(); const plain = it.answer;
         it.answer = (...all) => { const made = plain(...all);
           return { ...made, frames: made.frames.map((one) => ({ ...one, flags: 16 })) }; };
-        it.lead = 100; it.player.seek(1000); await it.pass(60); const paused = it.delivered.at(-1); it.player.play(); await it.pass(200);
+        it.lead = 100; it.player.seek(1000); await it.pass(60); const paused = it.delivered.at(-1); it.player.play();
+        await it.pass(200);
         return [paused, it.delivered.at(-1)];""") == [1000, 1300]
 
 
 def test_a_recording_of_heartbeats_shows_when_the_robot_was_silent():
     steps = """const beats = new Heartbeats(); const views = [beats.view(1000)];
     for (let t = 1000; t <= 3000; t += 250) beats.receive(t, { t: t - 42 });
-    views.push(beats.view(3100), beats.view(9000)); beats.receive(9100, { t: 9090, online: false }); views.push(beats.view(9100));
+    views.push(beats.view(3100), beats.view(9000)); beats.receive(9100, { t: 9090, online: false });
+    views.push(beats.view(9100));
     result = views.map(({ online, latency_ms, interval_ms }) => [online, latency_ms, interval_ms]);"""
     found = evaluate({"core/replay/liveness.js": "Heartbeats"}, steps)
     assert found[:3] == [[None, None, None], [True, 42, 250], [False, 42, 250]]
@@ -240,7 +252,8 @@ def test_a_day_is_zoomed_and_moved_within_its_bounds():
     steps = f"""{VIEW} const start = view.start;
     const state = () => [(view.from - start) / 3.6e6, (view.to - start) / 3.6e6];
     result = [state()]; view.zoom(2, start + 6 * 3.6e6); result.push(state()); view.move(-99e9); result.push(state());
-    view.move(99e9); result.push(state()); view.zoom(1e9, view.to); result.push(view.span); view.zoom(1e-9, view.to); result.push(state());
+    view.move(99e9); result.push(state()); view.zoom(1e9, view.to); result.push(view.span); view.zoom(1e-9, view.to);
+    result.push(state());
     view.zoom(24, start); result.push(view.follow(start + 5 * 3.6e6), view.follow(start + 5 * 3.6e6));"""
     found = evaluate({"core/replay/timeline.js": "View"}, steps)
     assert found == [[0, 24], [3, 15], [0, 12], [12, 24], 60_000, [0, 24], True, False]
@@ -283,7 +296,8 @@ def test_answers_of_the_server():
     steps = """const answers = [
       new Response(new Uint8Array(0), { headers: { "x-next": "2500.5", "x-complete": "0" } }),
       new Response(new Uint8Array(0), { headers: { "x-next": "" } }),
-      new Response("robot: none\\nmore", { status: 400 }), new Response("", { status: 503 }), new Response("", { status: 401 }),
+      new Response("robot: none\\nmore", { status: 400 }), new Response("", { status: 503 }), new Response("", {
+      status: 401 }),
     ];
     const asked = []; const archive = new Archive(async (url) => { asked.push(url); return answers.shift(); });
     const never = new AbortController().signal; result = [];

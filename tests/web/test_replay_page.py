@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Route
 
-from tests.web.browser import PIXELS, Tab, tab
 from tests.web import recorded
+from tests.web.browser import PIXELS, Tab, tab
 from tests.web.canned import CannedServer, serving
 from tests.web.recorded import DAY, END, GAP, ROBOT, START
 from tests.web.states import STATES
@@ -178,7 +178,9 @@ def test_what_was_sent_is_shown_and_not_sent_again(replay: Tab):
 
 
 def test_overlays_are_those_of_that_time(replay: Tab):
-    inked = f"""(canvas) => {{ {PIXELS} return pixelsOf(canvas).filter((value, i) => i % 4 === 3 && value > 0).length; }}"""
+    inked = (
+        f"""(canvas) => {{ {PIXELS} return pixelsOf(canvas).filter((value, i) => i % 4 === 3 && value > 0).length; }}"""
+    )
     overlays = replay.test("overlays-canvas")
     assert replay.until(lambda: overlays.evaluate(inked) > 500)
     replay.test("overlays").uncheck()
@@ -201,7 +203,7 @@ def test_the_end_of_the_recording_is_shown(replay: Tab):
     assert replay.test("play").inner_text() == "Play"
 
 
-def test_where_nothing_was_recorded_the_page_says_so(server: CannedServer, browser: Browser):
+def test_a_time_at_which_nothing_was_recorded(server: CannedServer, browser: Browser):
     server.show(STATES["replay-gap"])
     with tab(browser, server.url + STATES["replay-gap"].path) as opened:
         assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
@@ -341,9 +343,11 @@ def test_two_hundred_seeks_leave_nothing_behind(server: CannedServer, browser: B
       ImageBitmap.prototype.close = function () { if (known.delete(this)) made.open--; return close.call(this); };
       const { Worker: Old } = window;
       window.Worker = class extends Old { constructor(...all) { super(...all); made.workers++; } };"""
-    seeks = """async (times) => { const { replay } = pebble; const later = (ms) => new Promise((go) => setTimeout(go, ms));
+    seeks = """async (times) => { const { replay } = pebble;
+    const later = (ms) => new Promise((go) => setTimeout(go, ms));
       for (const at of times) { const { seeks } = replay.player; replay.seek(at); const end = performance.now() + 4000;
-        while (performance.now() < end && !(replay.player.seeks > seeks && replay.drawnAt.seeks === replay.player.seeks)) await later(2); }
+        while (performance.now() < end && !(replay.player.seeks > seeks && replay.drawnAt.seeks ===
+        replay.player.seeks)) await later(2); }
       return [replay.player.seeks, replay.drawnAt.seeks]; }"""
     with tab(browser, server.url + STATES["replay"].path, script=counting) as opened:
         assert shown(opened, AT)
@@ -362,7 +366,7 @@ def test_two_hundred_seeks_leave_nothing_behind(server: CannedServer, browser: B
         assert opened.complaints() == []
 
 
-def test_sound_is_heard_at_its_own_speed_only_and_after_a_click(replay: Tab):
+def test_sound_is_played_at_its_own_speed_only_and_after_a_click(replay: Tab):
     assert replay.page.evaluate("pebble.replay.sound.context") is None
     replay.test("play").click()
     replay.test("replay-sound").click()
@@ -378,7 +382,8 @@ def test_sound_is_heard_at_its_own_speed_only_and_after_a_click(replay: Tab):
     assert replay.until("pebble.replay.sound.context.state === 'suspended'")
 
 
-#: Records what is played, and when pictures are drawn: of each block its time, and of each picture when it was received.
+#: Records what is played, and when pictures are drawn: of each block its time, and of each picture when it was
+#: received.
 _LISTEN = """() => { const { sound } = pebble.replay; const { context } = sound;
   Object.assign(window, { blocks: [], drawn: [] });
   sound.speaker.node.port.onmessage = ({ data }) => {

@@ -134,7 +134,7 @@ export const holding = (list, ms) => list.find(({ since, until }) => ms >= since
  * @param {{since: number, until: number}[]} sessions @param {number} ms
  */
 export function stretchOf(marked, end, sessions, ms) {
-  const session = holding(sessions, ms);
+  const session = holding(sessions, marked ?? end ?? ms);
   const since = marked ?? (session && (end === null || session.since < end) ? session.since : (end ?? ms + 60_000) - 60_000);
   const until = end ?? (session && session.until > since ? session.until : since + 60_000);
   return { since, until };

@@ -48,7 +48,7 @@ export function Sessions({ replay }) {
   useTick(1000);
   const { timeline, player } = replay;
   const sessions = timeline?.sessions ?? [];
-  if (!sessions.length) return html`<p class="dim">${timeline ? "Nobody used it that day." : "…"}</p>`;
+  if (!sessions.length) return html`<p class="dim">${timeline ? "It was not used that day." : "…"}</p>`;
   const now = holding(sessions, player.position);
   return html`<ol class="sessions">
     ${sessions.map(

@@ -3,7 +3,7 @@
 import { Archive } from "../../core/replay/archive.js";
 import { html, useEffect, useModel, usePage, useState } from "../hooks.js";
 import { RouteLink } from "../header.js";
-import { Icon } from "../parts.js";
+import { Icon, Why } from "../parts.js";
 import { recordingsOf } from "../recordings-link.js";
 import { iconOf } from "../fleet.js";
 import { clockTime, nameOf, shortTime } from "../words.js";
@@ -85,6 +85,13 @@ function Day({ one: { day, robots, bytes, first, last, gaps } }) {
   </li>`;
 }
 
+/** @param {number} count of days @param {number} index of the one that is open @returns {string} */
+function whyNoDay(count, index) {
+  if (count < 2) return "No other day of it is recorded";
+  if (index < 1) return "No earlier day of it is recorded";
+  return index === count - 1 ? "No later day of it is recorded" : "";
+}
+
 /** Another robot, or another day. */
 export function Elsewhere({ at, replay }) {
   const { route } = usePage();
@@ -95,9 +102,10 @@ export function Elsewhere({ at, replay }) {
   const robots = [...new Set([at, ...(known.find((one) => one.day === day)?.robots ?? [])])].sort();
   const own = [...new Set([day, ...known.filter((one) => one.robots.includes(at)).map((one) => one.day)])].filter(Boolean);
   const index = own.sort().indexOf(day);
+  const why = whyNoDay(own.length, index);
   const open = (other) => {
     history.replaceState(null, "", addressOf(at, other));
-    replay.player.seeks = 0;
+    replay.player.pause(); // else its own day would be opened again
     replay.openDay(other, () => replay.seek(replay.timeline.sessions[0]?.since ?? known.find((one) => one.day === other)?.first ?? NaN));
   };
   return html`<div class="replay-elsewhere">
@@ -118,19 +126,21 @@ export function Elsewhere({ at, replay }) {
           ${own.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
         </select></label
       >
-      <button type="button" aria-label="Day before" disabled=${index < 1} onClick=${() => open(own[index - 1])}>
-        <${Icon} name="back" />
-      </button>
-      <button
-        type="button"
-        class="turned"
-        aria-label="Day after"
-        disabled=${index < 0 || index >= own.length - 1}
-        onClick=${() => open(own[index + 1])}
-      >
-        <${Icon} name="back" />
-      </button>
+      ${[-1, 1].map((step) => {
+        const off = index < 0 || !own[index + step];
+        return html`<button
+          key=${step}
+          type="button"
+          class=${step > 0 ? "turned" : ""}
+          aria-label=${step > 0 ? "Day after" : "Day before"}
+          disabled=${off}
+          aria-describedby=${off ? "why-day" : undefined}
+          onClick=${() => open(own[index + step])}
+        >
+          <${Icon} name="back" />
+        </button>`;
+      })}
     </div>
-    ${own.length < 2 && html`<span class="why">No other day of ${nameOf(at)} is recorded</span>`}
+    ${why && html`<${Why} id="why-day">${why}<//>`}
   </div>`;
 }

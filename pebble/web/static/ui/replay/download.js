@@ -1,7 +1,6 @@
 // A stretch of the recording as a film, or as it was recorded.
 
 import { Archive, delay } from "../../core/replay/archive.js";
-import { stretchOf } from "../../core/replay/timeline.js";
 import { html, useEffect, useModel, useRef, useState, useTick } from "../hooks.js";
 import { Icon, Why } from "../parts.js";
 import { clockTime } from "../words.js";
@@ -51,8 +50,7 @@ export function Download({ replay }) {
   useTick(500);
   const [as, choose] = useState("mkv");
   const { job, begin, end } = useExport(replay);
-  const { player, timeline, markIn, markOut } = replay;
-  const stretch = stretchOf(markIn, markOut, timeline?.sessions ?? [], player.position);
+  const { player, stretch } = replay;
   const lasts = stretch.until - stretch.since;
   const running = job?.state === "running";
   const why = player.seeks ? (lasts > LONGEST_MS ? "At most one hour: mark a shorter stretch" : "") : "Nothing is open yet";
@@ -64,7 +62,7 @@ export function Download({ replay }) {
     <div class="download-marks">
       <button type="button" data-test="mark-in" onClick=${() => replay.mark("markIn", player.position)}>Begin here</button>
       <button type="button" data-test="mark-out" onClick=${() => replay.mark("markOut", player.position)}>End here</button>
-      ${(markIn ?? markOut) !== null &&
+      ${replay.marked &&
       html`<button
         type="button"
         class="quiet"

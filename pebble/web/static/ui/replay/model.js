@@ -5,7 +5,7 @@ import { CHAIN, INCOMING, PICTURE, SOUND, STATE } from "../../core/replay/frames
 import { Incoming } from "../../core/replay/incoming.js";
 import { Heartbeats } from "../../core/replay/liveness.js";
 import { Player, SPEEDS } from "../../core/replay/player.js";
-import { View, dayOf, extentOf } from "../../core/replay/timeline.js";
+import { View, dayOf, extentOf, stretchOf } from "../../core/replay/timeline.js";
 import { Store } from "../../core/store.js";
 import { ReplayPictures } from "../../media/replay-pictures.js";
 import { ReplaySound } from "../../media/replay-sound.js";
@@ -106,10 +106,12 @@ export class Replay extends Model {
     };
     this.timers = [setInterval(() => this.tick(), TICK_MS), setInterval(() => this.shareLiveness(), LIVENESS_MS)];
     this.addressTimer = 0;
+    this.closed = false;
     this.speed = 1;
   }
 
   close() {
+    this.closed = true;
     this.timers.forEach(clearInterval);
     clearTimeout(this.addressTimer);
     this.dayAbort.abort();
@@ -125,7 +127,7 @@ export class Replay extends Model {
 
   /** @param {number} ms */
   seek(ms) {
-    if (!Number.isFinite(ms)) return;
+    if (!Number.isFinite(ms) || this.closed) return;
     this.openDay(dayOf(ms));
     this.player.seek(ms);
   }
@@ -163,9 +165,19 @@ export class Replay extends Model {
     this.changed();
   }
 
+  /** What is downloaded. */
+  get stretch() {
+    return stretchOf(this.markIn, this.markOut, this.timeline?.sessions ?? [], this.player.position);
+  }
+
+  /** The same, once a person has marked it. */
+  get marked() {
+    return this.markIn === null && this.markOut === null ? null : this.stretch;
+  }
+
   /** @param {string} day @param {() => void} [then] once its timeline is here */
   async openDay(day, then = () => {}) {
-    if (day === this.day && !this.dayProblem) return;
+    if (this.closed || (day === this.day && !this.dayProblem)) return;
     this.dayAbort.abort();
     const { signal } = (this.dayAbort = new AbortController());
     if (day !== this.day) this.view = new View(day);

@@ -37,7 +37,7 @@ function Opened({ at }) {
     setReplay(made);
     live.replay = made; // for tests, and for people who look into it
     live.driver.onSpace = () => made.toggle();
-    const go = () => start(made);
+    const go = () => live.route.replay === at && start(made);
     addEventListener("popstate", go);
     document.addEventListener("keydown", keysOf(made));
     start(made);

@@ -234,7 +234,7 @@ class Drawing {
 
   draw() {
     const { replay, canvas, width } = this;
-    const { view, player, timeline, markIn, markOut } = replay;
+    const { view, player, timeline, marked } = replay;
     if (player.playing && this.follows && player.seeks) view.follow(player.position);
     const inside = player.position >= view.from && player.position < view.to;
     if (inside) this.follows = true;
@@ -244,7 +244,7 @@ class Drawing {
     const style = getComputedStyle(canvas);
     const names = ["--fg", "--dim", "--line", "--sunk", "--accent", "--accent-soft", "--bad", "--warn-soft", ...ROWS.map(({ id }) => `--row-${id}`)];
     const colours = Object.fromEntries(names.map((name) => [name.slice(2), style.getPropertyValue(name).trim()]));
-    const key = JSON.stringify([view.from, view.to, width, pixels, colours, markIn, markOut, timeline?.activity.length, replay.day]);
+    const key = JSON.stringify([view.from, view.to, width, pixels, colours, marked, timeline?.activity.length, replay.day]);
     if (key === this.drawn) return;
     this.drawn = key;
     this.onShown(rangeWords(view));
@@ -253,7 +253,7 @@ class Drawing {
     Object.assign(canvas, { width: Math.round(width * pixels), height: Math.round(HEIGHT * pixels) });
     const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
     context.scale(pixels, pixels);
-    new Painter(context, view, width, colours).paint(timeline, markIn, markOut);
+    new Painter(context, view, width, colours).paint(timeline, marked);
   }
 }
 
@@ -269,9 +269,9 @@ class Painter {
     this.colours = colours;
   }
 
-  paint(timeline, markIn, markOut) {
+  paint(timeline, marked) {
     const { colours } = this;
-    if (markIn !== null || markOut !== null) this.area(markIn ?? this.view.from, markOut ?? this.view.to, colours["warn-soft"], AXIS, HEIGHT);
+    if (marked) this.area(marked.since, marked.until, colours["warn-soft"], AXIS, HEIGHT);
     this.axis();
     if (!timeline) return;
     for (const { since, until } of timeline.sessions) this.area(since, until, colours.accent, AXIS, AXIS + SESSIONS - 2);
