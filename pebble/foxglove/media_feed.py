@@ -14,7 +14,7 @@ from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
 from pebble.contract.packets import PBAT
 from pebble.errors import PebbleError
-from pebble.foxglove.server import Server, protobuf_spec
+from pebble.foxglove.server import MAX_BYTES, Server, protobuf_spec
 from pebble.media import pyav
 from pebble.recordings.exports.foxglove_messages import (
     IMAGE,
@@ -68,7 +68,7 @@ class MediaFeed:
         self._last: PictureHeader | None = None  # of the newest picture, unless one is missing before it
         self._arriving = ""  # the encoding of the newest picture
         self._problem = ""  # as shown
-        self._undecodable = ""
+        self._unpublished = ""  # why the newest payload was not
 
     def update(self, capabilities: dict[str, Any]) -> list[str]:
         """Take new capabilities; returns the channels that it has by them, which stay."""
@@ -102,9 +102,16 @@ class MediaFeed:
         self._waiting.append(_Waiting(payload, time.time_ns(), self._last is not None))
         self._waiting_bytes += len(payload)
         while len(self._waiting) > MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
-            self._waiting_bytes -= len(self._waiting.popleft().payload)
-            self.dropped += 1
+            self._drop()
         self._work.set()
+
+    def _drop(self) -> None:
+        """The oldest; of pictures all, because each builds on those before it."""
+        count = len(self._waiting) if self.medium == "video" else 1
+        for _ in range(count):
+            self._waiting_bytes -= len(self._waiting.popleft().payload)
+        self.dropped += count
+        self._last, self._wants_keyframe = None, self.medium == "video"
 
     def _take_picture(self, payload: bytes) -> bool:
         """Whether it is a picture. One that is missing before it is noticed, and a key frame wanted."""
@@ -166,7 +173,7 @@ class MediaFeed:
             await self._source.follow(self._capabilities, self._encoding())
             if self._wants_keyframe or self._lacks_keyframe():
                 await self._request_keyframe()
-            self._report(self._undecodable)
+            self._report(self._why_nothing_is_shown())
         except PebbleError as error:
             await self._source.withdraw()
             self._report(str(error))
@@ -187,6 +194,11 @@ class MediaFeed:
 
     def _lacks_keyframe(self) -> bool:
         return self._subscribed(IMAGE[1]) and self._media.decoder(self._topic).wants_keyframe
+
+    def _why_nothing_is_shown(self) -> str:
+        if self._arriving == "h264" and self._subscribed(IMAGE[1]) and not pyav.installed():
+            return f"h264 {pyav.INSTALL}"
+        return self._unpublished
 
     def _report(self, problem: str) -> None:
         """Show a new problem in Foxglove, once."""
@@ -216,16 +228,18 @@ class MediaFeed:
     def _converters(self, one: _Waiting) -> list[tuple[Callable[[str, bytes], Converted | None], str]]:
         if self.medium == "audio":
             return [(self._media.sound, SOUND[1])]
-        passed_on = one.complete and is_h264(one.payload)
-        return [(self._media.video, VIDEO[1])] * passed_on + [(self._media.image, IMAGE[1])]
+        image = (self._media.image, IMAGE[1])
+        return [(self._media.video, VIDEO[1]), image] if one.complete and is_h264(one.payload) else [image]
 
     def _publish(self, convert: Callable[[str, bytes], Converted | None], one: _Waiting) -> None:
         try:
-            converted = convert(self._topic, one.payload)
+            converted, self._unpublished = convert(self._topic, one.payload), ""
         except PebbleError as error:  # Opus without PyAV
-            converted, self._undecodable = None, str(error)
+            converted, self._unpublished = None, str(error)
         if converted is None:
             self.refused += 1
             return
         data = stamped(converted.message, time_of(one.payload, one.at_ns))
+        if len(data) > MAX_BYTES:
+            self._unpublished = f"{len(data)} bytes at once, more than {MAX_BYTES}: reduce size or quality"
         self._server.publish(f"{self._topic}/{converted.ending}", data, one.at_ns)

@@ -98,7 +98,7 @@ class Robots:
     def _publish(self, channel: Channel | None, message: Message, at_ns: int) -> None:
         """What Foxglove has a schema for, by that; other JSON as it is. The last value of a state is remembered."""
         topic, payload = message.topic, message.payload
-        remember = channel is not None and channel.default_retain
+        remember = message.retain or (channel is not None and channel.default_retain)
         converted = self._telemetry.convert(topic, payload)
         if converted is not None:
             self._publish_converted(converted, topic, payload, at_ns, remember=remember)

@@ -109,13 +109,14 @@ class Server:
     def publish(self, topic: str, data: bytes, log_ns: int, *, remember: bool = False) -> None:
         """Publish on a channel that is declared; what is remembered, clients that subscribe later receive then."""
         channel = self._channels.get(topic)
-        if channel is None or len(data) > MAX_BYTES:
-            self.dropped += 1
-            return
-        if remember:
-            self._remember(topic, _Remembered(data, log_ns))
-        self.published += 1
-        channel.log(data, log_time=log_ns)
+        fits = channel is not None and len(data) <= MAX_BYTES
+        with self._lock:
+            self.published += fits
+            self.dropped += not fits
+            if fits and (remember or topic in self._remembered):
+                self._remember(topic, _Remembered(data, log_ns))
+        if channel is not None and fits:
+            channel.log(data, log_time=log_ns)
 
     def report(self, text: str) -> None:
         """Show a problem in Foxglove."""
@@ -123,13 +124,12 @@ class Server:
             self._server.publish_status(text, self._sdk.StatusLevel.Warning)
 
     def _remember(self, topic: str, message: _Remembered) -> None:
-        with self._lock:
-            old = self._remembered.pop(topic, None)
-            self._remembered_bytes -= 0 if old is None else len(old.data)
-            size = len(message.data)
-            if size <= MAX_REMEMBERED and self._remembered_bytes + size <= MAX_REMEMBERED_BYTES:
-                self._remembered[topic] = message
-                self._remembered_bytes += size
+        old = self._remembered.pop(topic, None)
+        self._remembered_bytes -= 0 if old is None else len(old.data)
+        size = len(message.data)
+        if size <= MAX_REMEMBERED and self._remembered_bytes + size <= MAX_REMEMBERED_BYTES:
+            self._remembered[topic] = message
+            self._remembered_bytes += size
 
     # -- threads of the SDK
 
@@ -149,7 +149,7 @@ class Server:
 
 
 class _Listener:
-    """What the SDK calls. It catches nothing of the rest: without capabilities it refuses the rest itself."""
+    """What the SDK calls. The rest of a listener belongs to capabilities that the server does not have."""
 
     def __init__(self, subscribe: Callable[[str, int], None], unsubscribe: Callable[[str, int], None]) -> None:
         self._subscribe, self._unsubscribe = subscribe, unsubscribe

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from typing import cast
 
 import numpy as np
@@ -16,15 +17,13 @@ from pebble.media.video import make_encoder
 from pebble.recordings.exports.foxglove_messages import Schemas
 from pebble.transports.memory import MemoryHub
 from pebble.web.broker import Broker
-from tests.web.picture_robot import REF, FakeBroker
+from tests.web.picture_robot import REF, VIDEO, FakeBroker
+from tests.web.sound_robot import AUDIO
 
 
-def pictures(count: int) -> list[bytes]:
-    encoder, scene, made = (
-        make_encoder("h264", fps=15, quality=40, keyframe_interval=10),
-        Scene(160, 120),
-        np.empty((120, 160, 3), np.uint8),
-    )
+def pictures(count: int, keyframe_interval: int = 10) -> list[bytes]:
+    encoder = make_encoder("h264", fps=15, quality=40, keyframe_interval=keyframe_interval)
+    scene, made = Scene(160, 120), np.empty((120, 160, 3), np.uint8)
     payloads = []
     for number in range(count):
         scene.render(number, made)
@@ -54,6 +53,24 @@ def test_the_oldest_is_dropped_for_the_newest() -> None:
     found = feed("audio", [large] * 5)
     assert found.dropped == 3
     assert sum(len(one.payload) for one in found._waiting) <= MAX_WAITING_BYTES
+
+
+def test_pictures_that_build_on_a_dropped_one_go_with_it() -> None:
+    (first, *differences) = pictures(MAX_WAITING + 5, keyframe_interval=1000)
+    found = feed("video", [first, *differences])
+    assert found.dropped == MAX_WAITING + 1
+    assert [one.complete for one in found._waiting] == [False] * 4
+    assert found._wants_keyframe
+
+
+def test_without_pyav_nothing_is_requested_that_needs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = {"video": VIDEO, "audio": AUDIO}
+    video, audio = feed("video", []), feed("audio", [])
+    video.update(everything)
+    audio.update(everything)
+    assert (video._encoding(), audio._encoding()) == (None, None)
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert (video._encoding(), audio._encoding()) == ("pbvz", "pcm")
 
 
 def test_what_is_nothing_of_this_medium_or_too_large_is_refused() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from tests.foxglove.live import GOOB, client, live, online
 from tests.foxglove.test_pictures import H264, JPEG, WITHDRAWN, filming, nal_types
-from tests.foxglove.watcher import parser
+from tests.foxglove.watcher import Watcher, parser
 from tests.support import ROOT, Broker, until
 
 PACKAGES = ROOT / ".venv" / "node_modules" / "@foxglove" / "ws-protocol"
@@ -25,6 +25,9 @@ def watch(address: str, topic: str, count: int) -> dict[str, Any]:
     if shutil.which("node") is None or not PACKAGES.exists():
         missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
         missing("needs Node.js (apt install nodejs) and Foxglove's client (python tools/fetch_npm.py .venv)")
+    watcher = Watcher(address)
+    assert until(lambda: topic in watcher.channels)
+    watcher.close()
     command = ["node", str(Path(__file__).with_name("client.cjs")), address, topic, str(count)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

@@ -89,6 +89,20 @@ def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscrib
     assert second.of(LEVEL)[0]["value"] == 7.4
 
 
+def test_a_value_that_the_broker_retains_is_remembered_whatever_its_channel(broker: Broker, robot: Transport) -> None:
+    outlet = f"{GOOB}/outgoing/mcu/strip/o1"
+    robot.publish(outlet, b'{"t": 1}', qos=QoS.DELIVERED, retain=True)
+    with live(broker) as server:
+        first, second = Watcher(server.address), Watcher(server.address)
+        first.subscribe(outlet)
+        assert until(lambda: first.of(outlet) == [{"t": 1}])
+        robot.publish(outlet, b'{"t": 2}', qos=QoS.DELIVERED, retain=True)
+        assert until(lambda: first.of(outlet) == [{"t": 1}, {"t": 2}])
+        second.subscribe(outlet)
+        assert until(lambda: second.of(outlet))
+        assert second.of(outlet) == [{"t": 2}]
+
+
 def test_a_robot_that_comes_later_gets_its_channels_then_and_one_that_goes_keeps_them(
     broker: Broker, robot: Transport
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
 import threading
 from typing import Any, NamedTuple
@@ -15,6 +16,9 @@ from websockets.sync.client import connect
 from tests.support import until
 
 SUBPROTOCOL = "foxglove.sdk.v1"
+_FIRST = 100  # number of a subscription, less that of its channel
+#: The SDK advertises a channel a moment before it accepts subscriptions to it.
+_UNKNOWN = re.compile(r"Unknown channel ID: (\d+)")
 _MESSAGE = struct.Struct("<BIQ")  # opcode, subscription, time of receipt in nanoseconds
 
 
@@ -42,8 +46,11 @@ class Watcher:
         """Subscribe as soon as the channel is there."""
         assert until(lambda: topic in self.channels, 20), f"{topic} is not among {sorted(self.channels)}"
         channel = self.channels[topic]["id"]
-        self._subscribed[channel + 100] = topic
-        self.send({"op": "subscribe", "subscriptions": [{"id": channel + 100, "channelId": channel}]})
+        self._subscribed[channel + _FIRST] = topic
+        self._subscribe(channel)
+
+    def _subscribe(self, channel: int) -> None:
+        self.send({"op": "subscribe", "subscriptions": [{"id": channel + _FIRST, "channelId": channel}]})
 
     def unsubscribe(self, topic: str) -> None:
         number = next(one for one, name in self._subscribed.items() if name == topic)
@@ -88,6 +95,8 @@ class Watcher:
                 self.info = content
             case "advertise":
                 self.channels |= {channel["topic"]: channel for channel in content["channels"]}
+            case "status" if found := _UNKNOWN.fullmatch(content["message"]):
+                self._subscribe(int(found[1]))
             case "status":
                 self.statuses.append(content)
 
