@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
@@ -73,19 +73,28 @@ class _Session:
             time.sleep(_POLL_S)
 
     def run(self, seconds: float) -> None:
-        """Drive all robots, and receive pictures and sound of those that have them."""
-        end = time.monotonic() + seconds
+        """Drive all robots while their pictures and sound arrive, of those that have them. Raises PebbleError."""
         self._viewer.open()
-        receivers = [
-            self._watch(robot.base) for robot in self._operator.discovery.all_robots() if robot.offers("video")
-        ]
+        robots = self._operator.discovery.all_robots()
+        receivers = [self._watch(robot.base) for robot in robots if robot.offers("video")]
+        self._wait_for_media(receivers)
         self._operator.begin()
+        end = time.monotonic() + seconds
         while time.monotonic() < end:
             time.sleep(_POLL_S)
             for receiver in receivers:
                 receiver.poll()
             self._operator.completed.clear()  # nothing is assessed here
         self._watching.close()
+
+    def _wait_for_media(self, receivers: Sequence[MediaReceiver]) -> None:
+        end = time.monotonic() + _READY_S
+        while missing := [one.name for one in receivers if not one.encoding.keys() >= {"video", "audio"}]:
+            if time.monotonic() > end:
+                raise PebbleError(f"no pictures or no sound came from {', '.join(missing)}")
+            time.sleep(_POLL_S)
+            for receiver in receivers:
+                receiver.poll()
 
     def close(self) -> None:
         self._watching.close()
