@@ -266,7 +266,7 @@ def test_the_fixture_feeds_a_recording_to_the_clients_of_a_hub(tmp_path: Path, r
         service.subscribe(f"{GOOB}/incoming/#", received.append, direct=True)
         began = time.perf_counter()
         player = recording([path], hub)
-        assert time.perf_counter() - began < 5
+        assert time.perf_counter() - began < 30, "a second on a machine that is not busy; the recording takes 60"
         assert until(lambda: len(received) == 3001)
     assert player.sent == 3001
     assert [message.payload for message in received] == [*(line.payload for line in lines[1:]), zero("").payload]
