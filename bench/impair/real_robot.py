@@ -28,7 +28,7 @@ from pebble.transports import Message, QoS, Transport
 
 NAME: Final = "impair.json"
 _LABEL: Final = re.compile(r"(?!\d+$)[A-Za-z0-9][A-Za-z0-9._+%-]{0,63}")  # a recorder's own folders are digits
-_HEARD_S: Final = 5.0
+_HEARTBEAT_S: Final = 5.0
 _CAPABILITIES_S: Final = 5.0
 _FIRST_S: Final = 15.0  # a camera that is off takes a moment to open
 _TURN_S: Final = 0.1
@@ -106,23 +106,23 @@ def _make_folder(plan: Plan) -> None:
 
 
 def _require_heartbeat(transport: Transport, base: str) -> None:
-    """Wait for a heartbeat of the robot. Raises PebbleError that names the robots that were heard instead."""
-    heard: set[str] = set()
+    """Wait for a heartbeat of the robot. Raises PebbleError that names the robots that were received instead."""
+    received: set[str] = set()
 
     def on_heartbeat(message: Message) -> None:
         address = parse_topic(message.topic)
         if address is not None and not message.retain:  # a retained heartbeat may be old
-            heard.add(address.identity.base)
+            received.add(address.identity.base)
 
     with closing(transport.subscribe(ONLINE.filter("+/+/+"), on_heartbeat, qos=QoS.LATEST, direct=True)):
-        end = time.monotonic() + _HEARD_S
-        while base not in heard and time.monotonic() < end:
+        end = time.monotonic() + _HEARTBEAT_S
+        while base not in received and time.monotonic() < end:
             time.sleep(_TURN_S)
-    if base not in heard:
-        names = sorted(map(id_of, heard))
+    if base not in received:
+        names = sorted(map(id_of, received))
         more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-        others = f"heard instead: {', '.join(names[:_MOST_NAMES])}{more}" if names else "nor of any other robot"
-        raise PebbleError(f"no heartbeat of {id_of(base)} came within {_HEARD_S:g} s; {others}")
+        others = f"received instead: {', '.join(names[:_MOST_NAMES])}{more}" if names else "nor of any other robot"
+        raise PebbleError(f"no heartbeat of {id_of(base)} came within {_HEARTBEAT_S:g} s; {others}")
 
 
 class _Recorder(Recorder):
