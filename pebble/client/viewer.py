@@ -32,10 +32,11 @@ class Viewer:
 
     ``on_payload(medium, payload)`` runs on a thread of the transport. :meth:`close` withdraws the requests made by
     :meth:`request` and lowers the flags it raised; what was running before stays. A flag that another operator lowers
-    stays lowered.
+    stays lowered. ``on_payload`` None: another connection of the caller receives the media, which calls
+    :meth:`note_received`, so that they are transmitted once.
     """
 
-    def __init__(self, transport: Transport, base: str, on_payload: Callable[[Medium, bytes], None]) -> None:
+    def __init__(self, transport: Transport, base: str, on_payload: Callable[[Medium, bytes], None] | None) -> None:
         self.base = base
         self.capabilities: dict[str, Any] = {}
         self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is from others
@@ -75,6 +76,10 @@ class Viewer:
             self._raised.add(medium)
             self._set_flag(medium, up=True)
         self._send_request(medium)
+
+    def note_received(self, medium: Medium) -> None:
+        """A payload of ``medium`` has arrived now."""
+        self._received_at[medium] = time.monotonic()
 
     def repeat_requests(self) -> None:
         """Call this now and then: sends each request again while no payload arrives."""
@@ -162,11 +167,12 @@ class Viewer:
             if not self._flags[flag]:
                 self._raised.discard(medium)  # another operator has lowered it, so raising it again is theirs, too
 
-        def on_media(message: Message) -> None:
-            self._received_at[medium] = time.monotonic()
-            self._on_payload(medium, message.payload)
-
         self._subscriptions.append(self._transport.subscribe(flag, on_flag, echo=False, direct=True))
-        media = self.capabilities[medium].get("topic")
-        if isinstance(media, str):
+        media, on_payload = self.capabilities[medium].get("topic"), self._on_payload
+        if isinstance(media, str) and on_payload is not None:
+
+            def on_media(message: Message) -> None:
+                self.note_received(medium)
+                on_payload(medium, message.payload)
+
             self._subscriptions.append(self._transport.subscribe(media, on_media, qos=QoS.LATEST))

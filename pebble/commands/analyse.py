@@ -7,14 +7,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from pebble.commands.options import Output
-from pebble.errors import PebbleError
 from pebble.recordings.period import SINCE_HELP, UNTIL_HELP
 
 if TYPE_CHECKING:
@@ -59,7 +57,9 @@ def analyse(
         pebble analyse recordings/ --since 10:00 --until +30m --robot goob
         pebble analyse recordings/2026/11/20 --csv --output monday/
     """
-    _require_packages()
+    from pebble.recordings.traffic.duck import require_packages
+
+    require_packages("duckdb", "matplotlib")
     from pebble.bench.output import check_folder
     from pebble.client.names import base_of
     from pebble.recordings.period import parse_period
@@ -79,12 +79,6 @@ def analyse(
         written = write_report(traffic, output, csv=csv, advance=progress)
     _print(traffic, written)
     return 0
-
-
-def _require_packages() -> None:
-    missing = [name for name in ("duckdb", "matplotlib") if find_spec(name) is None]
-    if missing:
-        raise PebbleError(f'{" and ".join(missing)} missing: pip install "pebble-robot[archive]"')
 
 
 @contextmanager

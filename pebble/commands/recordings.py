@@ -206,9 +206,9 @@ def compact(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.",
 
 def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> None:
     """Index recordings for `pebble analyse`, as Parquet files."""
-    from pebble.commands.analyse import _require_packages as require_packages
+    from pebble.recordings.traffic.duck import require_packages
 
-    require_packages()
+    require_packages("duckdb", "matplotlib")
     due = not_indexed(folder)
     with _progress("indexing", len(due)) as advance:
         for number, path in enumerate(due, 1):

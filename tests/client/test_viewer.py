@@ -139,3 +139,15 @@ def test_requests_go_to_no_other_robot() -> None:
         viewer = Viewer(transport, BASE, lambda _medium, _payload: None)
         viewer.wait_for_capabilities(5)
         assert viewer.topic("video", "command_topic", VIDEO_CONTROL) == REQUEST
+
+
+def test_without_a_receiver_it_receives_no_media_but_learns_of_them(robot: Robot) -> None:
+    transport = MemoryTransport("viewer", robot.hub).open()
+    viewer = Viewer(transport, BASE, None)
+    viewer.wait_for_capabilities(5)
+    viewer.note_received("video")
+    viewer.request("video")  # another viewer's pictures arrive already
+    assert CAMERA not in {subscription.filter for subscription in viewer._subscriptions}
+    viewer.close()
+    assert robot.requests == []
+    transport.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -15,6 +16,13 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
 _GLOB: Final = re.compile(r"([*?\[])")
+
+
+def require_packages(*names: str) -> None:
+    """Raises PebbleError that names those of the extra "archive" that are not installed."""
+    missing = [name for name in names if find_spec(name) is None]
+    if missing:
+        raise PebbleError(f'{" and ".join(missing)} missing: pip install "pebble-robot[archive]"')
 
 
 @contextmanager

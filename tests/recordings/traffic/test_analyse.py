@@ -81,7 +81,7 @@ def test_what_is_wrong_is_one_line(run, folder, arguments, message):
 
 
 def test_packages_that_are_missing_are_named(run, folder, monkeypatch):
-    monkeypatch.setattr("pebble.commands.analyse.find_spec", lambda _name: None)
+    monkeypatch.setattr("pebble.recordings.traffic.duck.find_spec", lambda _name: None)
     assert run("analyse", folder) == 1
     assert run.err == 'pebble: duckdb and matplotlib missing: pip install "pebble-robot[archive]"\n'
 

@@ -1,0 +1,214 @@
+"""Measures a real robot behind the user's own network: requests its media, records it, and never drives it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from pebble.bench.output import check_folder
+from pebble.client.connection import Target, connected, resolve
+from pebble.client.names import id_of
+from pebble.client.viewer import Medium, Viewer
+from pebble.contract import ONLINE
+from pebble.contract.identity import parse_topic
+from pebble.errors import PebbleError
+from pebble.recordings.library import FOREVER_NS
+from pebble.recordings.recorder.recorder import Options, Recorder
+from pebble.recordings.recorder.source import Source
+from pebble.recordings.traffic.duck import require_packages
+from pebble.transports import Message, QoS, Transport
+
+NAME: Final = "impair.json"
+_LABEL: Final = re.compile(r"(?!\d+$)[A-Za-z0-9][A-Za-z0-9._+%-]{0,63}")  # a recorder's own folders are digits
+_HEARTBEAT_S: Final = 5.0
+_CAPABILITIES_S: Final = 5.0
+_FIRST_S: Final = 15.0  # a camera that is off takes a moment to open
+_TURN_S: Final = 0.1
+_MOST_NAMES: Final = 8
+_MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
+
+Progress = Callable[[str], None]
+
+
+class Plan(msgspec.Struct, frozen=True, kw_only=True):
+    """One measurement."""
+
+    target: Target
+    label: str
+    into: Path
+    seconds: float = 120.0
+    media: bool = True
+    replace: bool = False
+
+    @property
+    def folder(self) -> Path:
+        return self.into / self.label
+
+
+class Measurement(msgspec.Struct, kw_only=True):
+    """What was measured, beside its recordings; times in nanoseconds since 1970."""
+
+    label: str
+    robot: str  # its base topic
+    since_ns: int
+    until_ns: int = FOREVER_NS
+    format: int = 1
+
+    def save(self, folder: Path) -> None:
+        (folder / NAME).write_bytes(msgspec.json.format(msgspec.json.encode(self)) + b"\n")
+
+
+def measure(plan: Plan, progress: Progress) -> Measurement:
+    """Record the robot for the plan's time, or until KeyboardInterrupt. Raises PebbleError.
+
+    Nothing is measured before all requested media have arrived, for at most 15 s. At the end the requests are
+    withdrawn.
+    """
+    _check(plan)
+    with connected(plan.target) as (transport, names):
+        progress(f"waiting for a heartbeat of {id_of(names.base)}")
+        _require_heartbeat(transport, names.base)
+        with closing(Viewer(transport, names.base, None)) as viewer:
+            if plan.media:
+                viewer.wait_for_capabilities(_CAPABILITIES_S)
+            _make_folder(plan)
+            with _recording(plan, viewer) as (recorder, source):
+                return _Course(plan, recorder, source, viewer, progress).run()
+
+
+def _check(plan: Plan) -> None:
+    if not _LABEL.fullmatch(plan.label):
+        raise PebbleError(
+            f'--label "{plan.label}" cannot name a folder: use letters, digits and . _ + % -, such as 512k'
+        )
+    require_packages("duckdb", "zstandard")
+    if plan.folder.exists() and not plan.replace:
+        raise PebbleError(f"{plan.folder} exists: add --replace to measure it again, or use another --label")
+    if plan.folder.exists() and not (plan.folder / NAME).is_file():
+        raise PebbleError(f"{plan.folder} is no measurement, so it is not replaced: use another --label or --into")
+
+
+def _make_folder(plan: Plan) -> None:
+    if plan.folder.exists():
+        try:
+            shutil.rmtree(plan.folder)
+        except OSError as error:
+            raise PebbleError(f"{error.filename}: {error.strerror}") from None
+    check_folder(plan.folder)
+
+
+def _require_heartbeat(transport: Transport, base: str) -> None:
+    """Wait for a heartbeat of the robot. Raises PebbleError that names the robots that were received instead."""
+    received: set[str] = set()
+
+    def on_heartbeat(message: Message) -> None:
+        address = parse_topic(message.topic)
+        if address is not None and not message.retain:  # a retained heartbeat may be old
+            received.add(address.identity.base)
+
+    with closing(transport.subscribe(ONLINE.filter("+/+/+"), on_heartbeat, qos=QoS.LATEST, direct=True)):
+        end = time.monotonic() + _HEARTBEAT_S
+        while base not in received and time.monotonic() < end:
+            time.sleep(_TURN_S)
+    if base not in received:
+        names = sorted(map(id_of, received))
+        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+        others = f"received instead: {', '.join(names[:_MOST_NAMES])}{more}" if names else "nor of any other robot"
+        raise PebbleError(f"no heartbeat of {id_of(base)} came within {_HEARTBEAT_S:g} s; {others}")
+
+
+class _Recorder(Recorder):
+    """A recorder that notes for a viewer which media have arrived."""
+
+    def __init__(self, plan: Plan, viewer: Viewer) -> None:
+        super().__init__(plan.folder, Options(), {"impair": plan.label, "filters": f"{viewer.base}/#"})
+        self.arrived: set[Medium] = set()
+        self._viewer = viewer
+        topics = {medium: viewer.capabilities.get(medium, {}).get("topic") for medium in _MEDIA}
+        self._media = {topic: medium for medium, topic in topics.items() if isinstance(topic, str)}
+
+    def receive(
+        self,
+        topic: str,
+        payload: bytes,
+        qos: int | None,
+        retain: bool | None,
+        *,
+        retained: bool = False,
+        source: str = "",
+    ) -> None:
+        medium = self._media.get(topic)
+        if medium is not None and not retained:
+            self.arrived.add(medium)
+            self._viewer.note_received(medium)
+        super().receive(topic, payload, qos, retain, retained=retained, source=source)
+
+
+@contextmanager
+def _recording(plan: Plan, viewer: Viewer) -> Iterator[tuple[_Recorder, Source]]:
+    kind, settings, _, _ = resolve(plan.target)
+    if kind == "mqtt":
+        settings = replace(settings, protocol="5")
+    recorder = _Recorder(plan, viewer)
+    recorder.start()
+    try:
+        with closing(Source(recorder, kind, settings, [f"{viewer.base}/#"])) as source:
+            source.start()
+            yield recorder, source
+    finally:
+        recorder.stop()
+
+
+class _Course:
+    """The course of one measurement."""
+
+    def __init__(self, plan: Plan, recorder: _Recorder, source: Source, viewer: Viewer, progress: Progress) -> None:
+        self._plan, self._recorder, self._source = plan, recorder, source
+        self._viewer, self._progress = viewer, progress
+
+    def run(self) -> Measurement:
+        measurement = Measurement(label=self._plan.label, robot=self._viewer.base, since_ns=self._recorder.clock.now())
+        measurement.save(self._plan.folder)
+        try:
+            requested = self._request()
+            self._watch(_FIRST_S, "waiting for pictures and sound", lambda: requested <= self._recorder.arrived)
+            measurement.since_ns = self._recorder.clock.now()
+            self._watch(self._plan.seconds, "measuring", lambda: False)
+        except KeyboardInterrupt:
+            pass  # what was measured until now is the measurement
+        finally:
+            measurement.until_ns = self._recorder.clock.now()
+            measurement.save(self._plan.folder)
+        return measurement
+
+    def _request(self) -> set[Medium]:
+        sections = self._viewer.capabilities if self._plan.media else {}
+        offered = [one for one in _MEDIA if sections.get(one, {}).get("available") and sections[one].get("controls")]
+        for medium in offered:
+            self._viewer.request(medium)
+        return set(offered)
+
+    def _watch(self, seconds: float, what: str, is_over: Callable[[], bool]) -> None:
+        began = checked = time.monotonic()
+        while not is_over() and (now := time.monotonic()) - began < seconds:
+            time.sleep(_TURN_S)
+            if now - checked >= 1.0:
+                checked = now
+                self._source.check()
+                self._viewer.repeat_requests()
+            self._progress(f"{what}: {now - began:.0f} of {seconds:g} s{self._state()}")
+            if self._recorder.blocked:
+                raise PebbleError(f"{self._plan.folder}: {self._recorder.blocked}")
+
+    def _state(self) -> str:
+        counters = self._recorder.counters
+        problem = "" if self._source.connected else f", not connected: {self._source.problem or 'no answer'}"
+        return f", {counters['messages']:,} messages, {counters['bytes'] / 1e6:.1f} MB{problem}"
