@@ -110,7 +110,8 @@ def _outages(traffic: Traffic) -> Iterator[str]:
         f"{len(outages)} outages of heartbeats, {brief} of them shorter than 300 ms (the paper: most), {shared} of "
         "several robots at once or of the recorder, so of this machine"
     )
-    yield f"{found if outages else 'no outage of heartbeats'}; the paper's are of archived operation across the internet"
+    paper = "the paper's are of archived operation, over the internet"
+    yield f"{found if outages else 'no outage of heartbeats'}; {paper}"
 
 
 def _latencies(traffic: Traffic) -> Iterator[str]:
