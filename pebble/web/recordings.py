@@ -280,8 +280,9 @@ async def _file(request: Request, recordings: Recordings) -> Response:
 
 
 async def _end_export(request: Request, recordings: Recordings) -> Response:
-    if recordings.export_of(request.path_params["id"]) is not None:
-        await recordings.end_export()
+    if recordings.export_of(request.path_params["id"]) is None:
+        return PlainTextResponse("there is no such export", 404)
+    await recordings.end_export()
     return JSONResponse({})
 
 

@@ -29,7 +29,8 @@ class Hall:
         self.people = People(folder / "people.sqlite")
         for role in Role:
             self.people.add(role.value, PASSWORDS[role.value], role)
-        self.served = Served(broker_port, login=True, people=folder / "people.sqlite", **settings)
+        more = {"people": folder / "people.sqlite", "recordings": folder, **settings}
+        self.served = Served(broker_port, login=True, **more)
 
     def __enter__(self) -> Self:
         self.served.__enter__()

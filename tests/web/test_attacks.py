@@ -499,7 +499,8 @@ def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes
     with hall.client("admin") as client:
         for path in hall.routes(Route, "POST"):
             if path != "/api/logout":
-                assert client.post(path, content=body, headers=headers).status_code in (400, 413, 429), path
+                expected = (400, 413, 429, *(404,) * ("{" in path))
+                assert client.post(path, content=body, headers=headers).status_code in expected, path
     assert len(everything.incoming()) == before
 
 
