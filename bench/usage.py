@@ -44,6 +44,19 @@ def pss_mb(pid: int) -> float:
 
     Raises PebbleError if the kernel does not provide it.
     """
+    return _memory_mb(pid, "Pss:")
+
+
+def own_mb(pid: int) -> float:
+    """What a process has allocated, without the pages of programs and libraries: only it can make this grow.
+
+    The proportional set size grows too when another process ends with which pages were shared. Shared memory is divided
+    among its users. 0 for a process that has ended. Raises PebbleError if the kernel does not provide it.
+    """
+    return _memory_mb(pid, "Anonymous:", "Pss_Shmem:")
+
+
+def _memory_mb(pid: int, *fields: str) -> float:
     try:
         lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()
     except (FileNotFoundError, PermissionError) as error:
@@ -52,7 +65,7 @@ def pss_mb(pid: int) -> float:
         return 0.0
     except ProcessLookupError:
         return 0.0
-    return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0) / 1024
+    return sum(int(line.split()[1]) for line in lines if line.startswith(fields)) / 1024
 
 
 def children(pid: int) -> list[int]:

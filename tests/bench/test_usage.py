@@ -1,5 +1,6 @@
 """Resource usage of running and ended processes, from the kernel."""
 
+import mmap
 import os
 import sys
 import time
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.bench import usage
-from pebble.bench.usage import children, cpu_s, pss_mb, wake_ups
+from pebble.bench.usage import children, cpu_s, own_mb, pss_mb, wake_ups
 from pebble.bench.wake_up import wake_up_us
 from pebble.bench.worker import Worker
 from pebble.errors import PebbleError
@@ -65,6 +66,20 @@ def test_memory_of_an_ended_process_is_zero_and_unknown_memory_is_an_error(
     with pytest.raises(PebbleError, match="smaps_rollup"):
         pss_mb(7)
     assert pss_mb(8) == 0
+
+
+def test_a_process_owns_what_it_allocates_but_not_the_files_that_it_reads(tmp_path: Path) -> None:
+    size = 32 << 20
+    (tmp_path / "program").write_bytes(bytes(size))
+    with (tmp_path / "program").open("rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as program:
+        own, proportional = own_mb(os.getpid()), pss_mb(os.getpid())
+        assert not any(program[at] for at in range(0, size, mmap.PAGESIZE))
+        assert own_mb(os.getpid()) < own + 16
+        assert pss_mb(os.getpid()) > proportional + 16
+    allocated = bytearray(os.urandom(size))
+    assert own_mb(os.getpid()) > own + 16
+    assert len(allocated) == size
+    assert own_mb(GONE) == 0
 
 
 def test_a_worker_that_has_ended_is_reported_when_asked(tmp_path: Path) -> None:

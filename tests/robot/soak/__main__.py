@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench.usage import pss_mb
+from pebble.bench.usage import own_mb
 from tests.robot.operator import Driver, number_of
 from tests.robot.rig import STOP
 from tests.robot.soak.attacks import Attack, attacks, shuffled
@@ -174,7 +174,7 @@ def main() -> int:
             outcome = perform(world, name, attack, chance.uniform(*attack.seconds), first)
             outcomes.append(outcome)
             for program, pid in world.robot.items():
-                memory[program].append(pss_mb(pid))
+                memory[program].append(own_mb(pid))
             _report(terminal, options, outcome, time.monotonic() - began, end)
     finally:
         world.close()
