@@ -24,10 +24,11 @@ from pebble.errors import PebbleError
 from pebble.recordings import catalogue
 from pebble.recordings.catalogue import FileInfo, Query
 from pebble.recordings.exports.copy import write_copy
-from pebble.recordings.exports.film import unfinished, write_film, write_wav
+from pebble.recordings.exports.film import write_film, write_wav
 from pebble.recordings.exports.foxglove import write_foxglove
 from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
 from pebble.recordings.exports.mongo import read_mongo, write_mongo
+from pebble.recordings.exports.unfinished import unfinished
 from pebble.recordings.files.finish import finish as finish_file
 from pebble.recordings.files.mcap import Recorded
 from pebble.recordings.files.reader import RecordingError

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 from pebble.contract.packets import PBAT
-from pebble.recordings.exports.film import unfinished
 from pebble.recordings.exports.foxglove_messages import (
     MOST_CHANNELS,
     QUALITY,
@@ -24,6 +23,7 @@ from pebble.recordings.exports.foxglove_messages import (
     time_of,
 )
 from pebble.recordings.exports.lines import Progress
+from pebble.recordings.exports.unfinished import unfinished
 from pebble.recordings.files.mcap import Recorded
 from pebble.recordings.files.writer import McapWriter
 from pebble.recordings.stamps import is_picture

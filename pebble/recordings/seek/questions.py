@@ -18,7 +18,8 @@ import msgspec
 
 from pebble.errors import PebbleError
 from pebble.recordings.exports.copy import write_copy
-from pebble.recordings.exports.film import unfinished, write_film
+from pebble.recordings.exports.film import write_film
+from pebble.recordings.exports.unfinished import unfinished
 from pebble.recordings.library import ACTIVE, merged, robot_of
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days

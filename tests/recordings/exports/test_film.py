@@ -20,7 +20,9 @@ from pebble.media.scene import Scene, read_counter
 from pebble.media.sound import make_sound_encoder
 from pebble.media.sound_file import SoundFile
 from pebble.media.video import make_encoder
-from pebble.recordings.exports.film import RATE, parameter_sets, write_film, write_wav
+from pebble.recordings.exports.film import write_film, write_wav
+from pebble.recordings.exports.film_pictures import parameter_sets
+from pebble.recordings.exports.film_sound import RATE
 from pebble.recordings.files.mcap import Channel, Recorded
 from pebble.recordings.files.reader import RecordingError
 

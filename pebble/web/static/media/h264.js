@@ -47,12 +47,17 @@ export class H264Decoder {
     }
   }
 
+  /** The next unit builds on nothing before it. The decoder stays: a page that opens one for each seek grows. */
+  forget() {
+    this.labels.clear();
+    for (const { frame } of this.made.splice(0)) frame.close();
+  }
+
   close() {
     if (this.decoder && this.decoder.state !== "closed") this.decoder.close();
     this.decoder = null;
     this.error = null;
-    this.labels.clear();
-    for (const { frame } of this.made.splice(0)) frame.close();
+    this.forget();
   }
 
   /** @param {Uint8Array} unit @param {string|null} codec of a key frame @param {any} label */
@@ -86,14 +91,10 @@ export class H264Decoder {
 
   /** @param {VideoDecoder} decoder @param {VideoFrame} frame */
   take(decoder, frame) {
-    if (this.decoder !== decoder) {
-      frame.close();
-      return;
-    }
-    const label = this.labels.get(frame.timestamp);
+    const label = this.decoder === decoder ? this.labels.get(frame.timestamp) : null;
     this.labels.delete(frame.timestamp);
-    if (label === null) frame.close();
-    else this.made.push({ frame, label });
+    if (label) this.made.push({ frame, label });
+    else frame.close(); // it is not shown, or forgotten
     this.wake();
   }
 

@@ -43,7 +43,7 @@ export class PictureDecoder {
       const payload = readPayload(bytes);
       if (payload.packed) payload.body = await inflate(payload.body);
       if (!this.sequence.admit(payload)) {
-        this.h264.close();
+        this.h264.forget();
         return null;
       }
       const decoded = payload.encoding === "h264" ? await this.unit(payload, quiet) : await this.jpeg(payload, quiet);
@@ -58,6 +58,12 @@ export class PictureDecoder {
     }
   }
 
+  /** What comes next builds on nothing before it: another connection, or a seek. */
+  restart() {
+    this.h264.forget();
+    this.sequence = new Sequence();
+  }
+
   close() {
     this.h264.close();
     this.sequence.reset();
@@ -65,7 +71,7 @@ export class PictureDecoder {
 
   /** @param {import("./decode.js").Payload} payload @param {boolean} quiet */
   async unit(payload, quiet) {
-    if (this.sequence.last === null) this.h264.close();
+    if (this.sequence.last === null) this.h264.forget();
     const made = await this.h264.decode(payload.body, payload.keyframe, quiet ? null : labelOf(payload));
     if (made === null) return null;
     try {

@@ -6,7 +6,7 @@ export const [DRAWN, KEYFRAME_WANTED, CANNOT_DECODE] = [0, 1, 2];
 const HEAD_BYTES = 5; // u32 number, u8 kind
 const RESCUE_BYTES = HEAD_BYTES + 8; // and the time of capture
 
-let decoder = new PictureDecoder();
+const decoder = new PictureDecoder();
 let connection = -1;
 let newest = -1; // connection that messages come by
 let work = Promise.resolve();
@@ -24,8 +24,7 @@ self.onmessage = ({ data }) => {
 async function take(from, message, quiet) {
   if (from !== newest) return; // what it belongs to is over
   if (from !== connection) {
-    decoder.close();
-    decoder = new PictureDecoder();
+    decoder.restart();
     connection = from;
   }
   const view = new DataView(message);
