@@ -19,7 +19,9 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
 from pebble.transports.mqtt import transport as transport_module
-from pebble.transports.mqtt.connection import MAX_PACKET, UNACKED_LIMIT, Connection
+from pebble.transports.mqtt.client import Client
+from pebble.transports.mqtt.connection import UNACKED_LIMIT, Connection
+from pebble.transports.mqtt.packets import MAX_PACKET
 from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
 from tests.tcp_proxy import BridgelessProxy, TcpProxy
@@ -368,14 +370,14 @@ def test_what_came_while_the_machine_was_suspended_never_arrives(
 def test_a_stop_of_the_process_while_it_reads_counts(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stops, now, read = [0.0], clock.since_boot, Connection._on_publication
+    stops, now, read = [0.0], clock.since_boot, Connection.on_publication
     monkeypatch.setattr(clock, "since_boot", lambda: now() + stops[0])
 
     def read_late(*arguments: Any) -> None:
         stops[0] += 0.6
         read(*arguments)
 
-    monkeypatch.setattr(Connection, "_on_publication", read_late)
+    monkeypatch.setattr(Connection, "on_publication", read_late)
     waited: list[float] = []
     robot, operator = clients(broker.port), connect_as(broker, "operator")
     robot.subscribe(topic, lambda message: waited.append(message.waited_s))
@@ -549,14 +551,14 @@ def test_a_burst_is_taken_out_of_the_socket_at_once_and_grows_old_all_the_same(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What waits in the process is as old as what waits in the kernel."""
-    read, sizes = paho.Client._sock_recv, list[int]()
+    receive_some, sizes = Client._receive, list[int]()
 
-    def note(client: paho.Client, size: int) -> bytes:
-        data = read(client, size)
+    def note(client: Client) -> bytes:
+        data = receive_some(client)
         sizes.append(len(data))
         return data
 
-    monkeypatch.setattr(paho.Client, "_sock_recv", note)
+    monkeypatch.setattr(Client, "_receive", note)
     robot, received = clients(broker.port), list[tuple[bytes, float]]()
     numbers = [b"%d" % number for number in range(500)]
     with socket.create_connection(("127.0.0.1", broker.port)) as operator:
@@ -649,14 +651,14 @@ def test_a_message_that_is_too_large_is_discarded_and_costs_no_connection(
 def test_a_message_that_is_too_large_is_never_collected(broker: Broker, clients: Clients, topic: str) -> None:
     robot, most = clients(broker.port, "robot"), [0]
     client = robot._connection._client  # type: ignore[attr-defined]
-    read = client._packet_read
+    read = client.read
 
-    def note() -> Any:
-        result = read()
-        most[0] = max(most[0], len(client._in_packet["packet"]))
-        return result
+    def note(count: int) -> bool:
+        more: bool = read(count)
+        most[0] = max(most[0], client._reader.kept)
+        return more
 
-    client._packet_read = note
+    client.read = note
     robot.subscribe(topic, Received())
     stranger = connect_as(broker, "stranger")
     stranger.publish(topic, bytes(20 * MAX_PACKET)).wait_for_publish(30)

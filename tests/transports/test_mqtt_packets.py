@@ -1,0 +1,306 @@
+"""What a client writes and reads is what paho writes and reads."""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from pebble.transports.base import Message, QoS
+from pebble.transports.mqtt import packets, reasons
+from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted, Filter, MalformedError, Reader
+
+V3, V5 = MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5
+Seen = tuple[Any, ...]
+both_versions = pytest.mark.parametrize("modern", [False, True])
+
+
+def paho(*, modern: bool, **options: Any) -> Client:
+    client = Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)
+    client.written = []  # type: ignore[attr-defined]
+
+    def queue(_command: int, packet: bytes, *_: Any, **__: Any) -> int:
+        client.written.append(bytes(packet))  # type: ignore[attr-defined]
+        return 0
+
+    client._sock = object()  # type: ignore[assignment]
+    client._packet_queue = queue  # type: ignore[method-assign,assignment]
+    return client
+
+
+def last(client: Client) -> bytes:
+    return bytes(client.written[-1])  # type: ignore[attr-defined]
+
+
+class Noted:
+    """Notes what a reader says."""
+
+    def __init__(self, skipped: bytes = b"\0") -> None:
+        self.seen: list[Seen] = []
+        self._skipped = skipped
+
+    def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        self.seen.append((topic, payload, (first & ANY_QOS) >> 1, bool(first & RETAIN)))
+
+    def skips(self, topic: bytes) -> bool:
+        return topic == self._skipped
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *arguments: self.seen.append((name.removeprefix("on_"), *arguments))
+
+
+def read(data: bytes, *, modern: bool, pieces: int = 1, most: int = 64, skipped: bytes = b"\0") -> tuple[Noted, Reader]:
+    """``data`` in so many pieces of random sizes."""
+    noted = Noted(skipped)
+    reader = Reader(noted, modern=modern)
+    rng = random.Random(pieces)
+    cuts = sorted(rng.randrange(len(data) + 1) for _ in range(pieces - 1))
+    for begin, end in zip([0, *cuts], [*cuts, len(data)], strict=True):
+        reader.feed(data[begin:end])
+        while reader.read(most) or reader.unread:
+            pass
+    return noted, reader
+
+
+class TestWritten:
+    """The same bytes as paho writes."""
+
+    @both_versions
+    @pytest.mark.parametrize("login", [(None, None), ("user", None), ("user", "pässword")])
+    @pytest.mark.parametrize("will", [None, Message("a/ü", b"\xffgone", QoS.DELIVERED, True), Message("b", b"")])
+    def test_connect(self, modern: bool, login: tuple[str | None, str | None], will: Message | None) -> None:
+        client = paho(modern=modern, client_id="goob-1")
+        client.username_pw_set(*login)
+        if will is not None:
+            client.will_set(will.topic, will.payload, int(will.qos), will.retain)
+        client._send_connect(15)
+        username, password = login
+        ours = packets.connect(
+            "goob-1",
+            modern=modern,
+            bridge=False,
+            keepalive_s=15,
+            will=will,
+            username=username,
+            password=password,
+        )
+        assert ours == last(client)
+
+    def test_bridge_mode(self) -> None:
+        client = paho(modern=False, client_id="b")
+        client.enable_bridge_mode()
+        client._send_connect(60)
+        options: Any = {"will": None, "username": None, "password": None}
+        assert packets.connect("b", modern=False, bridge=True, keepalive_s=60, **options) == last(client)
+
+    @both_versions
+    @pytest.mark.parametrize("qos", [0, 1])
+    @pytest.mark.parametrize("retain", [False, True])
+    @pytest.mark.parametrize("size", [0, 100, 127, 128, 20_000, 3_000_000])
+    def test_publish(self, modern: bool, qos: int, retain: bool, size: int) -> None:
+        client, payload = paho(modern=modern), bytes(size)
+        client._send_publish(7, b"a/\xc3\xbc", payload, qos, retain)
+        ours = packets.publish("a/ü", payload, qos, 7, retain=retain, modern=modern, expires_s=None)
+        assert ours == last(client)
+
+    def test_publish_with_an_expiry(self) -> None:
+        client, properties = paho(modern=True), Properties(PacketTypes.PUBLISH)
+        properties.MessageExpiryInterval = 70_000
+        client._send_publish(7, b"a", b"x", 0, False, properties=properties)
+        assert packets.publish("a", b"x", 0, 0, retain=False, modern=True, expires_s=70_000) == last(client)
+
+    @pytest.mark.parametrize("no_local", [False, True])
+    @pytest.mark.parametrize("as_published", [False, True])
+    @pytest.mark.parametrize("sends_retained", [False, True])
+    def test_subscribe(self, no_local: bool, as_published: bool, sends_retained: bool) -> None:
+        client = paho(modern=True)
+        handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if sends_retained else SubscribeOptions.RETAIN_DO_NOT_SEND
+        options = SubscribeOptions(1, no_local, as_published, handling)
+        client._send_subscribe(False, [(b"a/#", options), (b"b", options)])
+        wanted = [Filter(text, 1, no_local, as_published, sends_retained) for text in ("a/#", "b")]
+        assert packets.subscribe(1, wanted, modern=True) == last(client)
+
+    def test_subscribe_on_3_1_1(self) -> None:
+        client = paho(modern=False)
+        client._send_subscribe(False, [(b"a/#", 1), (b"b", 0)])
+        assert packets.subscribe(1, [Filter("a/#", 1, True), Filter("b", 0)], modern=False) == last(client)
+
+    @both_versions
+    def test_unsubscribe(self, modern: bool) -> None:
+        client = paho(modern=modern)
+        client._send_unsubscribe(False, [b"a/#", b"b"])
+        assert packets.unsubscribe(1, ["a/#", "b"], modern=modern) == last(client)
+
+    def test_ping_and_disconnect(self) -> None:
+        client = paho(modern=False)
+        client._send_pingreq()
+        assert last(client) == packets.PINGREQ
+        client._send_disconnect()
+        assert last(client) == packets.DISCONNECT
+
+    def test_a_text_that_is_too_long_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="65536 bytes where MQTT has room for 65535"):
+            packets.unsubscribe(1, ["a" * 65_536], modern=False)
+
+
+def publication(rng: random.Random, *, modern: bool) -> bytes:
+    """A PUBLISH of QoS 0 or 1, perhaps with properties, an odd topic, or of any length."""
+    first = 0x30 | rng.choice((0, 2)) | rng.choice((0, 1)) | rng.choice((0, 8))
+    topic = rng.choice((b"a/b", b"\xff\xfe", "ü/ß".encode(), b"pebble/robots/goob/outgoing/online"))
+    body = struct.pack("!H", len(topic)) + topic + (rng.randbytes(2) if first & 2 else b"")
+    if modern:
+        properties = Properties(PacketTypes.PUBLISH)
+        if rng.random() < 0.3:
+            properties.MessageExpiryInterval = rng.randrange(1, 9)
+        if rng.random() < 0.3:
+            properties.UserProperty = ("key", "v" * rng.choice((1, 200)))
+        body += properties.pack()
+    body += rng.randbytes(rng.choice((0, 1, 40, 120, 3000)))
+    return packet(first, body)
+
+
+def packet(first: int, body: bytes) -> bytes:
+    return packets._packet(first, body)
+
+
+def as_paho_reads(data: bytes, *, modern: bool) -> list[Seen]:
+    """The publications in ``data``, of packets that are whole."""
+    client, seen, at = paho(modern=modern), list[Seen](), 0
+    client.on_message = lambda _client, _data, raw: seen.append((raw._topic, bytes(raw.payload), raw.qos, raw.retain))
+    while at < len(data):
+        size, start = packets._read_variable(data, at + 1)
+        client._in_packet.update(
+            {"command": data[at], "packet": bytearray(data[start : start + size]), "remaining_length": size}  # type: ignore[typeddict-item]
+        )
+        client._handle_publish()
+        at = start + size
+    return seen
+
+
+class TestRead:
+    @both_versions
+    @pytest.mark.parametrize("pieces", [1, 2, 50, 4000])
+    def test_publications_are_read_as_paho_reads_them_in_any_pieces(self, modern: bool, pieces: int) -> None:
+        rng = random.Random(pieces)
+        data = b"".join(publication(rng, modern=modern) for _ in range(500))
+        noted, reader = read(data, modern=modern, pieces=pieces)
+        assert noted.seen == as_paho_reads(data, modern=modern)
+        assert len(noted.seen) == 500
+        asked = sum(qos for _, _, qos, _ in noted.seen)
+        assert len(reader.acks) == 4 * asked > 400
+        assert reader.unread == reader.kept == 0
+
+    def test_no_more_than_asked_for(self) -> None:
+        reader = Reader(noted := Noted(), modern=False)
+        reader.feed(5 * packet(0x30, b"\0\1ax"))
+        assert [reader.read(2) for _ in range(4)] == [2, 2, 1, 0]
+        assert len(noted.seen) == 5
+
+    @both_versions
+    def test_each_other_packet(self, modern: bool) -> None:
+        none = b"\0" if modern else b""
+        data = b"".join(
+            (
+                packet(0x20, b"\0\0" + none),
+                packet(0x90, b"\1\2" + none + b"\1\x80"),
+                packet(0xB0, b"\1\3" + none),
+                packet(0x40, b"\1\4"),
+                packet(0xD0, b""),
+                packet(0x62, b"\1\5"),
+                packet(0xE0, b"\x8e"),
+            )
+        )
+        noted, reader = read(data, modern=modern, pieces=20)
+        assert noted.seen == [
+            ("accepted", Accepted()),
+            ("answer", 0x102, b"\1\x80"),
+            ("answer", 0x103, b""),
+            ("puback", 0x104),
+            ("pong",),
+            ("disconnect", 0x8E),
+        ]
+        assert bytes(reader.acks) == b"\x70\2\1\5"  # PUBCOMP
+
+    def test_what_a_broker_allows(self) -> None:
+        properties = Properties(PacketTypes.CONNACK)
+        properties.ReceiveMaximum, properties.MaximumPacketSize, properties.AssignedClientIdentifier = 20, 4096, "me"
+        properties.UserProperty = [("a", "b"), ("c", "d")]
+        properties.ServerKeepAlive, properties.RetainAvailable = 30, 1
+        noted, _ = read(packet(0x20, b"\0\0" + properties.pack()), modern=True)
+        assert noted.seen == [("accepted", Accepted(max_packet=4096, receive_maximum=20))]
+
+    @both_versions
+    def test_a_refusal_has_its_code(self, modern: bool) -> None:
+        noted, _ = read(packet(0x20, b"\0\5"), modern=modern)
+        assert noted.seen == [("refused", 5)]
+
+    @both_versions
+    def test_retained_messages_that_are_not_wanted_are_acknowledged_and_removals_delivered(self, modern: bool) -> None:
+        properties = b"\0" if modern else b""
+        data = packet(0x33, b"\0\1a\0\1" + properties + b"x") + packet(0x33, b"\0\1a\0\2" + properties)
+        noted, reader = read(data, modern=modern, skipped=b"a")
+        assert noted.seen == [(b"a", b"", 1, True)]
+        assert bytes(reader.acks) == b"\x40\2\0\1\x40\2\0\2"
+
+    @both_versions
+    @pytest.mark.parametrize("pieces", [1, 300])
+    @pytest.mark.parametrize("qos", [0, 1])
+    def test_a_packet_that_is_too_long_is_discarded_but_acknowledged(self, modern: bool, pieces: int, qos: int) -> None:
+        long = packet(0x30 | qos << 1, b"\0\3a/b\0\7" + bytes(MAX_PACKET))
+        after = packet(0x30, b"\0\1a" + (b"\0" if modern else b"") + b"x")
+        noted, reader = read(long + after, modern=modern, pieces=pieces)
+        assert noted.seen == [("too_long", b"a/b", MAX_PACKET + 7), (b"a", b"x", 0, False)]
+        assert bytes(reader.acks) == qos * b"\x40\2\0\7"
+        assert reader.kept == 0
+
+    @both_versions
+    @pytest.mark.parametrize(
+        ("data", "said"),
+        [
+            (packet(0x30, b"\0\0x"), "without a topic"),
+            (packet(0x30, b"\0\x09ax"), "ends in its head"),
+            (packet(0x32, b"\0\1a\0"), "ends in its head"),
+            (packet(0x36, b"\0\1a\0\1\0"), "QoS 3"),
+            (packet(0x10, b"MQTT"), "begins with 10"),
+            (packet(0x40, b"\0"), "begins with 40 and has 1 bytes"),
+            (b"\x30\xff\xff\xff\xff\1", "a length of more than four bytes"),
+            (b"\x90" + packets._variable(MAX_PACKET + 1) + bytes(9), "begins with 90"),
+            (b"HTTP/1.1 400 Bad Request\r\n", "begins with 48"),
+        ],
+    )
+    def test_what_is_no_mqtt_is_said(self, modern: bool, data: bytes, said: str) -> None:
+        with pytest.raises(MalformedError, match=said):
+            read(data + bytes(200), modern=modern)
+
+    @both_versions
+    def test_random_bytes_are_read_or_refused(self, modern: bool) -> None:
+        rng, refused = random.Random(3), 0
+        for _ in range(2000):
+            reader = Reader(Noted(), modern=modern)
+            try:
+                for _ in range(3):
+                    reader.feed(bytes((rng.choice((0x30, 0x32, 0x20, 0x40, 0x90, 0xE0, rng.randrange(256))),)))
+                    reader.read(64)
+                    reader.feed(rng.randbytes(rng.randrange(40)))
+                    while reader.read(64) or reader.unread:
+                        pass
+            except MalformedError:
+                refused += 1
+            assert reader.kept <= MAX_PACKET
+        assert 500 < refused < 2000
+
+
+def test_reasons_are_called_as_paho_calls_them() -> None:
+    for code in range(0x80, 0xA3):
+        name = ReasonCode(PacketTypes.DISCONNECT, identifier=0x80).names.get(code)
+        if name is not None:
+            assert reasons.words(code).lower() == next(iter(name)).lower()
