@@ -551,14 +551,13 @@ def test_a_burst_is_taken_out_of_the_socket_at_once_and_grows_old_all_the_same(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What waits in the process is as old as what waits in the kernel."""
-    receive_some, sizes = Client._receive, list[int]()
+    receive_some, sizes = Client.receive, list[int]()
 
-    def note(client: Client) -> bytes:
-        data = receive_some(client)
-        sizes.append(len(data))
-        return data
+    def note(client: Client) -> int:
+        sizes.append(receive_some(client))
+        return sizes[-1]
 
-    monkeypatch.setattr(Client, "_receive", note)
+    monkeypatch.setattr(Client, "receive", note)
     robot, received = clients(broker.port), list[tuple[bytes, float]]()
     numbers = [b"%d" % number for number in range(500)]
     with socket.create_connection(("127.0.0.1", broker.port)) as operator:
@@ -653,10 +652,9 @@ def test_a_message_that_is_too_large_is_never_collected(broker: Broker, clients:
     client = robot._connection._client  # type: ignore[attr-defined]
     read = client.read
 
-    def note(count: int) -> bool:
-        more: bool = read(count)
+    def note(count: int) -> None:
+        read(count)
         most[0] = max(most[0], client._reader.kept)
-        return more
 
     client.read = note
     robot.subscribe(topic, Received())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import struct
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,7 +33,7 @@ def paho(*, modern: bool, **options: Any) -> Client:
         client.written.append(bytes(packet))  # type: ignore[attr-defined]
         return 0
 
-    client._sock = object()  # type: ignore[assignment]
+    client._sock = SimpleNamespace(close=lambda: None)  # type: ignore[assignment]
     client._packet_queue = queue  # type: ignore[method-assign,assignment]
     return client
 
