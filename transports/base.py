@@ -32,6 +32,7 @@ _OWN_BYTES = 16 << 20  # the same, with their payloads
 _DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
 _DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
+_MATCHED = 512  # topics whose subscriptions are remembered
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
 
@@ -211,6 +212,7 @@ class Transport(ABC):
         self._connected = threading.Event()
         self._watchers: list[Watcher] = []
         self._subscriptions: list[Subscription] = []
+        self._matched: dict[str, tuple[Subscription, ...]] = {}  # of these, by topic; empty after each change
         self._lock = threading.RLock()  # guards the list of subscriptions
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
         # Our newest retained message, by topic; empty payloads included.
@@ -260,6 +262,7 @@ class Transport(ABC):
             self._set_state(State.CLOSED)
         with self._lock:
             subscriptions, self._subscriptions = self._subscriptions, []
+            self._matched.clear()
         for subscription in subscriptions:
             subscription._stop()
         self._close(self.will if connected else None)
@@ -328,6 +331,7 @@ class Transport(ABC):
                 subscription._stop()
                 raise TransportError(f"transport {self.client_id} is closed")
             self._subscriptions.append(subscription)
+            self._matched.clear()
         self._declare(subscription)
         return subscription
 
@@ -339,9 +343,16 @@ class Transport(ABC):
 
     # -- for backends
 
-    def _matching(self, topic: str) -> list[Subscription]:
+    def _matching(self, topic: str) -> tuple[Subscription, ...]:
+        """Remembered by topic: matching takes longer than everything else that happens to a message here."""
         with self._lock:
-            return [subscription for subscription in self._subscriptions if matches(subscription.filter, topic)]
+            found = self._matched.get(topic)
+            if found is None:
+                found = tuple(one for one in self._subscriptions if matches(one.filter, topic))
+                if len(self._matched) >= _MATCHED:
+                    self._matched.clear()
+                self._matched[topic] = found
+            return found
 
     def _set_state(self, state: State) -> None:
         """Notify the watchers, once per change. A closed transport stays closed unless it is opened again."""
@@ -417,6 +428,7 @@ class Transport(ABC):
             if subscription not in self._subscriptions:
                 return
             self._subscriptions.remove(subscription)
+            self._matched.clear()
         self._undeclare(subscription)
 
     @abstractmethod

@@ -654,7 +654,7 @@ def test_a_message_that_is_too_large_is_never_collected(broker: Broker, clients:
 
     def note(count: int) -> None:
         read(count)
-        most[0] = max(most[0], client._reader.kept)
+        most[0] = max(most[0], client._reader.partial)
 
     client.read = note
     robot.subscribe(topic, Received())

@@ -198,7 +198,7 @@ class TestRead:
         assert len(noted.seen) == 500
         asked = sum(qos for _, _, qos, _ in noted.seen)
         assert len(reader.acks) == 4 * asked > 400
-        assert reader.unread == reader.kept == 0
+        assert reader.unread == reader.partial == 0
 
     def test_no_more_than_asked_for(self) -> None:
         reader = Reader(noted := Noted(), modern=False)
@@ -261,11 +261,11 @@ class TestRead:
         noted, reader = read(long + after, modern=modern, pieces=pieces)
         assert noted.seen == [("too_long", b"a/b", MAX_PACKET + 7), (b"a", b"x", 0, False)]
         assert bytes(reader.acks) == qos * b"\x40\2\0\7"
-        assert reader.kept == 0
+        assert reader.partial == 0
 
     @both_versions
     @pytest.mark.parametrize(
-        ("data", "said"),
+        ("data", "problem"),
         [
             (packet(0x30, b"\0\0x"), "without a topic"),
             (packet(0x30, b"\0\x09ax"), "ends in its head"),
@@ -278,8 +278,8 @@ class TestRead:
             (b"HTTP/1.1 400 Bad Request\r\n", "begins with 48"),
         ],
     )
-    def test_what_is_no_mqtt_is_said(self, modern: bool, data: bytes, said: str) -> None:
-        with pytest.raises(MalformedError, match=said):
+    def test_what_is_no_mqtt_is_refused(self, modern: bool, data: bytes, problem: str) -> None:
+        with pytest.raises(MalformedError, match=problem):
             read(data + bytes(200), modern=modern)
 
     @both_versions
@@ -296,7 +296,7 @@ class TestRead:
                         pass
             except MalformedError:
                 refused += 1
-            assert reader.kept <= MAX_PACKET
+            assert reader.partial <= MAX_PACKET
         assert 500 < refused < 2000
 
 
