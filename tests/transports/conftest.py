@@ -42,13 +42,22 @@ NETS: dict[str, Callable[[Path], Net]] = {"memory": _memory, "mqtt311": _mqtt311
 _numbers = itertools.count(1)
 
 
-@pytest.fixture(scope="module", params=list(NETS))
+#: A kind, and the client library below it.
+KINDS = [(kind, "") for kind in NETS] + [
+    pytest.param((kind, "paho"), marks=pytest.mark.thorough) for kind in ("mqtt311", "mqtt5")
+]
+
+
+@pytest.fixture(scope="module", params=KINDS, ids=lambda one: "-".join(filter(None, one)))
 def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
     """One per module and kind; its broker or hub is started."""
-    net = NETS[request.param](tmp_path_factory.mktemp("net"))
-    net.start_network()
-    yield net
-    net.stop()
+    kind, library = request.param
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PEBBLE_MQTT_CLIENT", library)
+        net = NETS[kind](tmp_path_factory.mktemp("net"))
+        net.start_network()
+        yield net
+        net.stop()
 
 
 @pytest.fixture
