@@ -367,6 +367,19 @@ def test_what_came_while_the_machine_was_suspended_never_arrives(
     operator.loop_stop()
 
 
+def test_a_server_that_speaks_no_mqtt_is_a_problem_in_words(clients: Clients) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        client = clients(port, opened=False)
+        client.open(0.0)
+        web, _ = server.accept()
+        web.sendall(b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\nContent-Length: 0\r\n\r\n" * 9)
+        expected = f"broker 127.0.0.1:{port} does not speak MQTT: a packet that begins with 48"
+        assert until(lambda: expected in client.problem), client.problem
+        client.close()
+        web.close()
+
+
 def test_a_stop_of_the_process_while_it_reads_counts(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,142 @@
+"""A client against the other end of its socket, which does what no broker does on demand."""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from pebble.transports import MqttSettings
+from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.client import Client
+from pebble.transports.mqtt.packets import Filter
+from tests.support import until
+from tests.transports.test_mqtt_packets import Noted, packet
+
+RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
+
+
+class Pair:
+    """A client, and the other end of its connection."""
+
+    def __init__(self, protocol: str) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol=protocol)
+            self.noted = Noted()
+            self.client = Client("client", settings, None, None, self.noted, bridge=False)
+            self.client.open()
+            self.other, _ = server.accept()
+        self.other.settimeout(5)
+        self.hello = self.written()
+
+    def written(self) -> bytes:
+        """What has arrived at the other end."""
+        select.select([self.other], [], [], 1)
+        self.other.setblocking(False)
+        parts = []
+        try:
+            while part := self.other.recv(1 << 20):
+                parts.append(part)
+        except BlockingIOError:
+            pass
+        return b"".join(parts)
+
+    def sends(self, data: bytes) -> None:
+        """The other end does, and the client reads it."""
+        self.other.setblocking(True)
+        self.other.sendall(data)
+        assert until(lambda: self.client.receive() == len(data))
+        self.client.read(64)
+
+    def close(self) -> None:
+        self.client.close()
+        self.other.close()
+
+
+@pytest.fixture
+def pairs() -> Iterator[Any]:
+    with ExitStack() as made:
+
+        def make(protocol: str) -> Pair:
+            pair = Pair(protocol)
+            made.callback(pair.close)
+            return pair
+
+        yield make
+
+
+def publish(client: Client, number: int) -> None:
+    client.publish("a", b"%d" % number, 1, retain=False, expires_s=None)
+
+
+def test_no_more_is_in_flight_than_the_broker_takes(pairs: Any) -> None:
+    pair = pairs("5")
+    pair.sends(RECEIVE_MAXIMUM_2)
+    for number in range(5):
+        publish(pair.client, number)
+    client_sent = [
+        packets.publish("a", b"%d" % n, 1, n + 1, retain=False, modern=True, expires_s=None) for n in range(5)
+    ]
+    assert pair.written() == b"".join(client_sent[:2])
+    pair.sends(packet(0x40, b"\0\1"))
+    assert pair.written() == client_sent[2]
+    pair.sends(packet(0x40, b"\0\2") + packet(0x40, b"\0\3"))
+    assert pair.written() == b"".join(client_sent[3:])
+    pair.sends(packet(0x40, b"\0\4") + packet(0x40, b"\0\5"))
+    for number in range(3):
+        publish(pair.client, number)
+    assert len(pair.written()) == 2 * len(client_sent[0])
+
+
+@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
+def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any, protocol: str) -> None:
+    pair, numbers = pairs(protocol), range(40)
+    for number in numbers:
+        pair.client.publish("a", bytes([number]) * 200_000, 0, retain=False, expires_s=None)
+    pair.client.ping()
+    assert pair.client.want_write
+    assert 0 < pair.client.unwritten < 40 * 200_100
+    arrived = bytearray()
+
+    def done() -> bool:
+        arrived.extend(pair.written())
+        pair.client.write()
+        return arrived.endswith(packets.PINGREQ)
+
+    assert until(done, 20)
+    expected = [
+        packets.publish("a", bytes([n]) * 200_000, 0, 0, retain=False, modern=protocol == "5", expires_s=None)
+        for n in numbers
+    ]
+    assert bytes(arrived) == b"".join(expected) + packets.PINGREQ
+    assert not pair.client.want_write
+    assert pair.client.unwritten == 0
+
+
+def test_acknowledgements_of_what_was_read_together_are_written_together(pairs: Any) -> None:
+    pair = pairs("3.1.1")
+    pair.sends(b"".join(packet(0x32, b"\0\1a" + bytes((0, number)) + b"x") for number in (1, 2, 3)))
+    assert pair.written() == b"\x40\2\0\1\x40\2\0\2\x40\2\0\3"
+    assert [seen[0] for seen in pair.noted.seen] == [b"a"] * 3
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_a_connection_that_the_other_side_ends_has_no_socket(pairs: Any, reset: bool) -> None:
+    pair = pairs("3.1.1")
+    pair.other.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0" if reset else bytes(8))
+    pair.other.close()
+
+    def ended() -> bool:
+        pair.client.receive()
+        return pair.client.socket is None
+
+    assert until(ended)
+    publish(pair.client, 1)
+    pair.client.subscribe([Filter("a", 1)])
+    pair.client.ping()
+    assert not pair.client.want_write
+    assert pair.client.receive() == 0
