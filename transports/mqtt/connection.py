@@ -8,6 +8,7 @@ OpenSSL does not support reading and writing at once. It is not held while a han
 from __future__ import annotations
 
 import logging
+import os
 import random
 import select
 import socket
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from math import ceil, inf
+from typing import TYPE_CHECKING
 
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS
@@ -36,6 +38,9 @@ from pebble.transports.mqtt.outgoing import (
 )
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, Filter, MalformedError
 from pebble.transports.settings import MqttSettings
+
+if TYPE_CHECKING:
+    from pebble.transports.mqtt.paho_client import PahoClient
 
 log = logging.getLogger(__name__)
 
@@ -100,6 +105,14 @@ class _Poll:
         return self._sock in ready[0] + ready[2], bool(ready[1]), self._wake in ready[0]
 
 
+def _client_class() -> type[Client] | type[PahoClient]:
+    if os.environ.get("PEBBLE_MQTT_CLIENT") != "paho":
+        return Client
+    from pebble.transports.mqtt.paho_client import PahoClient
+
+    return PahoClient
+
+
 def ignore(_messages: list[Message]) -> None:
     """Discard messages: for :meth:`Connection.pump` before a connection is accepted, and at its end."""
 
@@ -145,8 +158,7 @@ class Connection:
         self._since = self._answered_at  # of the batch that is read
         keepalive_s = settings.keepalive_s or inf  # 0: none
         self._ping_interval_s = max(_LEAST_PING_S, min(settings.silence_s, keepalive_s) / 4)
-        #: Pings are sent regularly: other answers come only to what we publish.
-        self._ping_due_at = self._answered_at + self._ping_interval_s
+        self._ping_due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
         self._packets = 0  # received so far
         self._received_at = self._answered_at  # before the socket was emptied, or a piece of what is in it taken out
         self._more = False  # a batch ended before the socket was empty
@@ -159,7 +171,7 @@ class Connection:
         self._wake_write.setblocking(False)
         self._poll: _Poll | None = None
         bridge = as_published and not self._modern
-        self._client = Client(client_id, settings, context, will, self, bridge=bridge)
+        self._client = _client_class()(client_id, settings, context, will, self, bridge=bridge)
 
     # -- opening and closing
 
@@ -224,7 +236,7 @@ class Connection:
             if readable or self._more:
                 self._read()
             self._write()
-            if self._accepted and clock.since_boot() >= self._ping_due_at:
+            if clock.since_boot() >= self._ping_due_at:
                 self._ping()
             self._quick_ack()
             messages, self._inbox = self._inbox, []
@@ -462,6 +474,7 @@ class Connection:
     def on_accepted(self, accepted: Accepted) -> None:
         self.max_packet = accepted.max_packet
         self._note_connack()
+        self._ping_due_at = self._answered_at + self._ping_interval_s
         self._accepted = True
 
     def on_refused(self, code: int) -> None:

@@ -1,0 +1,205 @@
+"""A client of an MQTT broker for one connection: its socket, what waits to be written, and message ids.
+
+Not locked, and without a thread: both are its connection's. One `recv` takes everything that has come, and one `send`
+writes a message or all acknowledgements of what was read: a general client library takes several of each, and makes
+objects that nobody here looks at.
+"""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import ssl
+from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
+
+from pebble.transports.base import Message
+from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.packets import Accepted, Filter, Listener, Reader
+from pebble.transports.settings import MqttSettings
+
+CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
+SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
+_PIECE = 64 * 1024  # bytes that are read at once
+_MOST_IDS = 65_535
+_NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
+
+
+class Client:
+    """`open` waits for TCP and TLS, everything else returns at once. ``listener`` is called by `read`."""
+
+    def __init__(
+        self,
+        client_id: str,
+        settings: MqttSettings,
+        context: ssl.SSLContext | None,
+        will: Message | None,
+        listener: Listener,
+        *,
+        bridge: bool,
+    ) -> None:
+        self.socket: socket.socket | None = None  # None: not open yet, or lost
+        self.unwritten = 0  # bytes that the kernel has not accepted yet
+        self.drained = True  # `receive` has taken out everything that had come
+        self._modern = settings.protocol == "5"
+        self._settings, self._context = settings, context
+        self._hello = packets.connect(
+            client_id,
+            modern=self._modern,
+            bridge=bridge,
+            keepalive_s=settings.keepalive_s,
+            will=will,
+            username=settings.username,
+            password=settings.password,
+        )
+        self._reader = Reader(self, modern=self._modern)
+        self._waiting: deque[bytes] = deque()  # to be written
+        self._ids = itertools.cycle(range(1, _MOST_IDS + 1))
+        self._quota = _MOST_IDS  # messages of QoS 1 that the broker takes before it acknowledges one
+        self._held: deque[bytes] = deque()  # such messages beyond that
+        self._listener = listener
+        self.on_publication, self.skips, self.on_too_long = (
+            listener.on_publication,
+            listener.skips,
+            listener.on_too_long,
+        )
+        self.on_answer, self.on_pong = listener.on_answer, listener.on_pong
+        self.on_refused, self.on_disconnect = listener.on_refused, listener.on_disconnect
+
+    def open(self) -> None:
+        """Connect, and send CONNECT. Raises OSError; ValueError for a host that cannot be a name."""
+        sock = socket.create_connection((self._settings.host, self._settings.port), CONNECT_TIMEOUT_S)
+        try:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if self._context is not None:
+                sock = self._context.wrap_socket(sock, server_hostname=self._settings.host)
+            sock.setblocking(False)
+        except BaseException:
+            sock.close()
+            raise
+        self.socket = sock
+        self._send(self._hello)
+
+    def close(self) -> None:
+        """Without DISCONNECT."""
+        if self.socket is not None:
+            with suppress(OSError):
+                self.socket.close()
+        self.socket = None
+
+    # -- reading
+
+    @property
+    def unread(self) -> int:
+        """Bytes that were taken out of the socket, and not read yet."""
+        return self._reader.unread
+
+    def receive(self) -> int:
+        """Take what has come out of the socket, if all that came before is read; returns how many bytes.
+
+        A connection that the other side has closed has no `socket` afterwards.
+        """
+        sock, self.drained = self.socket, True
+        if sock is None:
+            return 0
+        try:
+            data = sock.recv(_PIECE)
+        except _NOT_NOW:
+            return 0
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+        # What TLS has unpacked is no measure of what the socket has.
+        self.drained = not data or (len(data) < _PIECE and self._context is None)
+        self._reader.feed(data)
+        return len(data)
+
+    def read(self, most: int) -> None:
+        """Hand up to ``most`` packets to the listener. Raises MalformedError."""
+        reader = self._reader
+        reader.read(most)
+        if reader.acks:
+            acks, reader.acks = bytes(reader.acks), bytearray()
+            self._send(acks)
+
+    def on_accepted(self, accepted: Accepted) -> None:
+        if accepted.receive_maximum is not None:
+            self._quota = accepted.receive_maximum
+        self._listener.on_accepted(accepted)
+
+    def on_puback(self, mid: int) -> None:
+        if self._held:
+            self._send(self._held.popleft())
+        else:
+            self._quota += 1
+        self._listener.on_puback(mid)
+
+    # -- writing
+
+    @property
+    def want_write(self) -> bool:
+        return bool(self._waiting)
+
+    def write(self) -> None:
+        """Write what waits, as far as the socket accepts it."""
+        while self._waiting:
+            data = self._waiting[0]
+            written = self._write(data)
+            self.unwritten -= written
+            if written < len(data):
+                self._waiting[0] = data[written:]
+                return
+            self._waiting.popleft()
+
+    def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, expires_s: int | None) -> int:
+        """Returns the message id, 0 with QoS 0."""
+        mid = next(self._ids) if qos else 0
+        packet = packets.publish(topic, payload, qos, mid, retain=retain, modern=self._modern, expires_s=expires_s)
+        if qos and self._quota <= 0:
+            self._held.append(packet)
+        else:
+            self._quota -= qos
+            self._send(packet)
+        return mid
+
+    def subscribe(self, filters: Iterable[Filter]) -> int:
+        """Returns the message id."""
+        mid = next(self._ids)
+        self._send(packets.subscribe(mid, filters, modern=self._modern))
+        return mid
+
+    def unsubscribe(self, filters: Iterable[str]) -> int:
+        mid = next(self._ids)
+        self._send(packets.unsubscribe(mid, filters, modern=self._modern))
+        return mid
+
+    def ping(self) -> None:
+        self._send(packets.PINGREQ)
+
+    def disconnect(self) -> None:
+        self._send(packets.DISCONNECT)
+
+    def _send(self, data: bytes) -> None:
+        """Hot."""
+        if not self._waiting:
+            written = self._write(data)
+            if written == len(data):
+                return
+            data = data[written:]
+        self._waiting.append(data)
+        self.unwritten += len(data)
+
+    def _write(self, data: bytes) -> int:
+        """How many bytes the kernel accepts; all for a connection that is lost."""
+        if self.socket is None:
+            return len(data)
+        try:
+            return self.socket.send(data)
+        except _NOT_NOW:
+            return 0
+        except OSError:
+            self.close()
+            return len(data)

@@ -1,0 +1,359 @@
+"""MQTT's packets as bytes, 3.1.1 and 5: what a client writes, and what it reads. Knows neither sockets nor clocks.
+
+Sources are MQTT 3.1.1 and MQTT 5.0 (OASIS), chapters 2 and 3 of each. ``modern`` is version 5.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from pebble.transports.base import Message
+
+MAX_PACKET: Final = 1024 * 1024  # bytes; a longer one is read and discarded
+HEAD: Final = 2 + 65_535 + 2  # bytes of a PUBLISH up to its message id, at most
+RETAIN: Final = 0b1  # in the first byte of a PUBLISH
+ANY_QOS: Final = 0b110
+
+PINGREQ: Final = b"\xc0\x00"
+DISCONNECT: Final = b"\xe0\x00"
+
+_CONNECT, _PUBLISH, _SUBSCRIBE, _UNSUBSCRIBE = 0x10, 0x30, 0x82, 0xA2
+_QOS_1, _QOS_2 = 0b010, 0b100
+_BRIDGE = 0x80  # added to the protocol level of 3.1.1: what mosquitto calls bridge mode
+_CLEAN, _WILL, _WILL_RETAIN, _PASSWORD, _USERNAME = 0x02, 0x04, 0x20, 0x40, 0x80  # flags of CONNECT
+_EXPIRY = 0x02  # property: seconds after which the broker discards a message
+_RECEIVE_MAXIMUM, _MAXIMUM_PACKET = 0x21, 0x27
+_NO_LOCAL, _AS_PUBLISHED, _NO_RETAINED = 0x04, 0x08, 0x20  # options of a subscription
+
+#: Bytes of each property's value by its number; text and bytes begin with their length (MQTT 5.0, 2.2.2.2).
+_SIZES = {
+    **dict.fromkeys((0x01, 0x17, 0x19, 0x24, 0x25, 0x28, 0x29, 0x2A), 1),
+    **dict.fromkeys((0x13, 0x21, 0x22, 0x23), 2),
+    **dict.fromkeys((0x02, 0x11, 0x18, 0x27), 4),
+}
+_TEXTS = {0x03: 1, 0x08: 1, 0x09: 1, 0x12: 1, 0x15: 1, 0x16: 1, 0x1A: 1, 0x1C: 1, 0x1F: 1, 0x26: 2}  # how many texts
+
+
+class MalformedError(Exception):
+    """What the other side sends is no MQTT. Its text says what is wrong."""
+
+
+# -- what a client writes
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """One filter of a SUBSCRIBE; the options but ``qos`` are of MQTT 5."""
+
+    text: str
+    qos: int
+    no_local: bool = False
+    as_published: bool = False
+    sends_retained: bool = True
+
+
+def connect(
+    client_id: str,
+    *,
+    modern: bool,
+    bridge: bool,
+    keepalive_s: int,
+    will: Message | None,
+    username: str | None,
+    password: str | None,
+) -> bytes:
+    """CONNECT with a clean session. ``bridge``: in bridge mode, which is 3.1.1's only."""
+    flags, payload = _CLEAN, _text(client_id)
+    properties = b"\0" if modern else b""
+    if will is not None:
+        flags |= _WILL | int(will.qos) << 3 | (_WILL_RETAIN if will.retain else 0)
+        payload += properties + _text(will.topic) + _bytes(will.payload)
+    if username is not None:
+        flags |= _USERNAME
+        payload += _text(username)
+    if password is not None:
+        flags |= _PASSWORD
+        payload += _text(password)
+    level = 5 if modern else 4 | (_BRIDGE if bridge else 0)
+    return _packet(_CONNECT, b"\0\4MQTT", struct.pack("!BBH", level, flags, keepalive_s), properties, payload)
+
+
+def publish(
+    topic: str, payload: bytes, qos: int, mid: int, *, retain: bool, modern: bool, expires_s: int | None
+) -> bytes:
+    """PUBLISH; ``mid`` counts with QoS 1 only, ``expires_s`` with MQTT 5 only. Hot."""
+    name = topic.encode()
+    head = len(name).to_bytes(2, "big") + name
+    if qos:
+        head += mid.to_bytes(2, "big")
+    if modern:
+        head += b"\0" if expires_s is None else struct.pack("!BBI", 5, _EXPIRY, expires_s)
+    first, size = _PUBLISH | qos << 1 | retain, len(head) + len(payload)
+    if size < 128:
+        return bytes((first, size)) + head + payload
+    return b"".join((bytes((first,)), _variable(size), head, payload))
+
+
+def subscribe(mid: int, filters: Iterable[Filter], *, modern: bool) -> bytes:
+    wanted = b"".join(_text(one.text) + bytes((_options(one) if modern else one.qos,)) for one in filters)
+    return _packet(_SUBSCRIBE, mid.to_bytes(2, "big"), b"\0" if modern else b"", wanted)
+
+
+def _options(one: Filter) -> int:
+    options = one.qos | (_NO_LOCAL if one.no_local else 0) | (_AS_PUBLISHED if one.as_published else 0)
+    return options | (0 if one.sends_retained else _NO_RETAINED)
+
+
+def unsubscribe(mid: int, filters: Iterable[str], *, modern: bool) -> bytes:
+    return _packet(_UNSUBSCRIBE, mid.to_bytes(2, "big"), b"\0" if modern else b"", *map(_text, filters))
+
+
+def _packet(first: int, *parts: bytes) -> bytes:
+    body = b"".join(parts)
+    return bytes((first,)) + _variable(len(body)) + body
+
+
+def _text(text: str) -> bytes:
+    return _bytes(text.encode())
+
+
+def _bytes(data: bytes) -> bytes:
+    if len(data) > 0xFFFF:
+        raise ValueError(f"{len(data)} bytes where MQTT has room for 65535")
+    return len(data).to_bytes(2, "big") + data
+
+
+def _variable(size: int) -> bytes:
+    """A length of one to four bytes, seven bits in each."""
+    parts = bytearray()
+    while size > 127:
+        parts.append(size & 127 | 128)
+        size >>= 7
+    parts.append(size)
+    return bytes(parts)
+
+
+# -- what it reads
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """What a CONNACK without an error says; None: nothing."""
+
+    max_packet: int | None = None  # bytes that the broker takes
+    receive_maximum: int | None = None  # messages of QoS 1 that may be unacknowledged
+
+
+class Listener(Protocol):
+    """Is called with what was read, in the order of the packets."""
+
+    def on_accepted(self, accepted: Accepted) -> None: ...
+
+    def on_refused(self, code: int) -> None:
+        """A CONNACK with an error; ``code`` is 3.1.1's or MQTT 5's, each as the broker sent it."""
+
+    def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        """``first`` is the first byte of the packet, with QoS and retain."""
+
+    def on_puback(self, mid: int) -> None: ...
+
+    def on_answer(self, mid: int, codes: bytes) -> None:
+        """A SUBACK, with a code for each filter, or an UNSUBACK; from 128 on a code is a refusal."""
+
+    def on_pong(self) -> None: ...
+
+    def on_disconnect(self, code: int) -> None: ...
+
+    def on_too_long(self, topic: bytes, length: int) -> None:
+        """A PUBLISH of ``length`` bytes was discarded."""
+
+    def skips(self, topic: bytes) -> bool:
+        """Whether a retained message of this topic is not wanted."""
+
+
+class Reader:
+    """Makes packets out of bytes as they come; ``acks`` collects the answers that are to be written."""
+
+    def __init__(self, listener: Listener, *, modern: bool) -> None:
+        self.acks = bytearray()
+        self._listener, self._modern = listener, modern
+        self._data, self._at = b"", 0  # what was not read yet begins there
+        self._partial = bytearray()  # a packet that is not whole
+        self._needed = 0  # bytes of it until more can be read
+        self._discarded = 0  # bytes of a long packet that still come
+        self._too_long = (b"", 0, b"")  # its topic, its length, and the answer to it
+
+    @property
+    def unread(self) -> int:
+        """Bytes of whole packets that wait for the next `read`, and of what follows these."""
+        return len(self._data) - self._at
+
+    @property
+    def partial(self) -> int:
+        """Bytes of a packet that is not whole."""
+        return len(self._partial)
+
+    def feed(self, data: bytes) -> None:
+        """Take what was received; to be called when nothing is `unread`."""
+        if self._discarded:
+            data = self._discard(data)
+        if self._partial:
+            self._partial += data
+            if len(self._partial) < self._needed:
+                return
+            data = bytes(self._partial)
+            self._partial.clear()
+        self._data, self._at = data, 0
+
+    def read(self, most: int) -> int:
+        """Hand up to ``most`` whole packets to the listener; returns how many. Raises MalformedError. Hot."""
+        data, end, count = self._data, len(self._data), 0
+        while count < most:
+            at = self._at
+            if end - at < 2:
+                self._keep(2)
+                break
+            size, start = data[at + 1], at + 2
+            if size > 127:
+                size, start = _read_variable(data, at + 1)
+                if size < 0:
+                    self._keep(end - at + 1)
+                    break
+            stop = start + size
+            if size > MAX_PACKET:
+                self._begin_discarding(start, stop)
+                break
+            if stop > end:
+                self._keep(stop - at)
+                break
+            self._at = stop
+            count += 1
+            if data[at] & 0xF0 == _PUBLISH:
+                self._publish(data, data[at], start, stop)
+            else:
+                self._other(data[at], data[start:stop])
+        return count
+
+    def _keep(self, size: int) -> None:
+        """Wait for the rest of a packet, of which ``size`` bytes are needed."""
+        self._partial += self._data[self._at :]
+        self._needed = size
+        self._data, self._at = b"", 0
+
+    def _publish(self, data: bytes, first: int, start: int, stop: int) -> None:
+        """Hot."""
+        end = start + 2 + int.from_bytes(data[start : start + 2], "big")
+        body, topic = end, data[start + 2 : end]
+        qos = first & ANY_QOS
+        if qos:
+            body += 2
+            if qos == _QOS_1:
+                self.acks += b"\x40\x02" + data[end:body]
+            elif qos == _QOS_2:  # nothing is subscribed to with it: PUBREC, so that the broker goes on
+                self.acks += b"\x50\x02" + data[end:body]
+            else:
+                raise MalformedError("a message of QoS 3")
+        if self._modern and body <= stop:
+            size, body = _read_variable(data[:stop], body)
+            body = stop + 1 if size < 0 else body + size
+        if body > stop or not topic:
+            raise MalformedError("a message that ends in its head" if topic else "a message without a topic")
+        if not (first & RETAIN and body < stop and self._listener.skips(topic)):
+            self._listener.on_publication(topic, data[body:stop], first)
+
+    def _other(self, first: int, body: bytes) -> None:
+        if first not in _SHORTEST or len(body) < _SHORTEST[first]:
+            raise MalformedError(f"a packet that begins with {first:02x} and has {len(body)} bytes")
+        if first == _PUBACK:
+            self._listener.on_puback(body[0] << 8 | body[1])
+        elif first in (_SUBACK, _UNSUBACK):
+            codes = 2 + self._properties_size(body, 2)
+            self._listener.on_answer(body[0] << 8 | body[1], body[codes:])
+        elif first == _PINGRESP:
+            self._listener.on_pong()
+        elif first == _PUBREL:
+            self.acks += b"\x70\x02" + body[:2]
+        elif first == _CONNACK:
+            self._connack(body)
+        else:
+            self._listener.on_disconnect(body[0] if body else 0)
+
+    def _properties_size(self, body: bytes, at: int) -> int:
+        """Bytes of the properties at ``at``, with their length; 0 on 3.1.1."""
+        if not self._modern:
+            return 0
+        size, start = _read_variable(body, at)
+        return start - at + size if size >= 0 else len(body)
+
+    def _connack(self, body: bytes) -> None:
+        if body[1]:
+            self._listener.on_refused(body[1])
+            return
+        found = properties(body[2 : 2 + self._properties_size(body, 2)])
+        self._listener.on_accepted(Accepted(found.get(_MAXIMUM_PACKET), found.get(_RECEIVE_MAXIMUM)))
+
+    # -- packets that are too long
+
+    def _begin_discarding(self, start: int, stop: int) -> None:
+        data, at = self._data, self._at
+        if data[at] & 0xF0 != _PUBLISH:
+            raise MalformedError(f"a packet that begins with {data[at]:02x} and has {stop - start} bytes")
+        if len(data) < start + HEAD:
+            self._keep(start + HEAD - at)
+            return
+        end = start + 2 + int.from_bytes(data[start : start + 2], "big")
+        ack = b"\x40\x02" + data[end : end + 2] if data[at] & ANY_QOS == _QOS_1 else b""
+        self._too_long = data[start + 2 : end], stop - start, ack
+        self._discarded, self._data, self._at = stop - at, b"", 0
+        self.feed(data[at:])
+
+    def _discard(self, data: bytes) -> bytes:
+        """Returns what comes after the long packet."""
+        rest = data[self._discarded :]
+        self._discarded -= len(data) - len(rest)
+        if not self._discarded:
+            topic, size, ack = self._too_long
+            self.acks += ack
+            self._listener.on_too_long(topic, size)
+        return rest
+
+
+_CONNACK, _PUBACK, _PUBREL, _SUBACK, _UNSUBACK, _PINGRESP, _DISCONNECT = 0x20, 0x40, 0x62, 0x90, 0xB0, 0xD0, 0xE0
+_SHORTEST = {_CONNACK: 2, _PUBACK: 2, _PUBREL: 2, _SUBACK: 3, _UNSUBACK: 2, _PINGRESP: 0, _DISCONNECT: 0}  # bytes
+
+
+def _read_variable(data: bytes, at: int) -> tuple[int, int]:
+    """A length, and where what it counts begins; -1: its end is missing. Raises MalformedError."""
+    value = shift = 0
+    for byte in data[at : at + 4]:
+        at += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, at
+        shift += 7
+    if shift == 28:
+        raise MalformedError("a length of more than four bytes")
+    return -1, at
+
+
+def properties(data: bytes) -> dict[int, int]:
+    """The properties of MQTT 5 whose values are numbers, by their own numbers. ``data`` begins with their length."""
+    found = dict[int, int]()
+    if not data:
+        return found
+    _, at = _read_variable(data, 0)
+    while at < len(data):
+        number, at = data[at], at + 1
+        size = _SIZES.get(number)
+        if size is not None:
+            found[number] = int.from_bytes(data[at : at + size], "big")
+            at += size
+        elif number in _TEXTS:
+            for _ in range(_TEXTS[number]):
+                at += 2 + int.from_bytes(data[at : at + 2], "big")
+        else:
+            _, at = _read_variable(data, at)  # a subscription identifier, or one that no version has yet
+    return found

@@ -1,0 +1,234 @@
+"""The same as `client.Client`, by paho: chosen with ``PEBBLE_MQTT_CLIENT=paho``, should the other one fail somewhere.
+
+Needs paho-mqtt. Costs about half as much again in processor time, and 5 MB.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from collections.abc import Iterable
+from typing import Any, cast
+
+import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from pebble.transports.base import Message
+from pebble.transports.mqtt.client import CONNECT_TIMEOUT_S, SEND_BUFFER
+from pebble.transports.mqtt.packets import ANY_QOS, HEAD, MAX_PACKET, RETAIN, Accepted, Filter, Listener
+from pebble.transports.settings import MqttSettings
+
+_PIECE = 64 * 1024  # bytes that are read at once
+_IN_FLIGHT = 65_535  # messages of QoS 1; their number is bounded by the connection
+
+
+class _Paho(paho.Client):
+    """paho, with pings of our own (its keepalive is too slow for T19), and a limit to what it collects."""
+
+    listener: Listener
+    ahead = b""  # was taken out of the socket; `begin` of it was read
+    begin = 0
+
+    def send_ping(self) -> None:
+        self._send_pingreq()
+
+    @property
+    def unwritten(self) -> int:
+        return sum(packet["to_process"] for packet in self._out_packet)
+
+    def _sock_recv(self, bufsize: int) -> bytes:
+        if self.begin == len(self.ahead):
+            raise BlockingIOError
+        if self._too_long:
+            del self._in_packet["packet"][HEAD:]
+        data = self.ahead[self.begin : self.begin + bufsize]
+        self.begin += len(data)
+        return data
+
+    @property
+    def _too_long(self) -> bool:
+        """Whether the packet that arrives is discarded, but for its head."""
+        return bool(self._in_packet["have_remaining"]) and self._in_packet["remaining_length"] > MAX_PACKET
+
+    def _handle_publish(self) -> MQTTErrorCode:
+        packet, first = self._in_packet["packet"], self._in_packet["command"]
+        end = 2 + int.from_bytes(packet[:2])
+        if self._too_long:
+            self.listener.on_too_long(bytes(packet[2:end]), self._in_packet["remaining_length"])
+        elif not (first & RETAIN and self._skips_retained(packet, end, end + 2 if first & ANY_QOS else end)):
+            return super()._handle_publish()
+        return self._send_puback(int.from_bytes(packet[end : end + 2])) if first & ANY_QOS else MQTTErrorCode(0)
+
+    def _skips_retained(self, packet: bytearray, end: int, start: int) -> bool:
+        """Whether the retained PUBLISH that arrived, whose topic ends at ``end``, is not wanted. Removals are."""
+        if self._protocol == MQTTProtocolVersion.MQTTv5 and start < len(packet):
+            start += 1 + packet[start]  # of properties, of which nobody needs 128 bytes
+        return len(packet) > start and self.listener.skips(bytes(packet[2:end]))
+
+    def _handle_on_message(self, message: paho.MQTTMessage) -> None:
+        first = (ANY_QOS if message.qos else 0) | (RETAIN if message.retain else 0)
+        self.listener.on_publication(message._topic, bytes(message.payload), first)
+
+    def _handle_connack(self) -> MQTTErrorCode:
+        if self._protocol != MQTTProtocolVersion.MQTTv5 and self._in_packet["packet"][1:2] == b"\1":
+            self.listener.on_refused(1)  # paho would try an older version
+            return MQTTErrorCode.MQTT_ERR_CONN_REFUSED
+        return super()._handle_connack()
+
+    def _handle_pingresp(self) -> MQTTErrorCode:
+        self.listener.on_pong()
+        return super()._handle_pingresp()
+
+
+class PahoClient:
+    """See `client.Client`."""
+
+    def __init__(
+        self,
+        client_id: str,
+        settings: MqttSettings,
+        context: ssl.SSLContext | None,
+        will: Message | None,
+        listener: Listener,
+        *,
+        bridge: bool,
+    ) -> None:
+        self.drained = True
+        self._settings, self._context, self._listener = settings, context, listener
+        self._modern = settings.protocol == "5"
+        protocol = MQTTProtocolVersion.MQTTv5 if self._modern else MQTTProtocolVersion.MQTTv311
+        self._paho = client = _Paho(
+            CallbackAPIVersion.VERSION2, client_id=client_id, protocol=protocol, reconnect_on_failure=False
+        )
+        client.listener = listener
+        client.connect_timeout = CONNECT_TIMEOUT_S
+        if not self._modern:
+            client.max_inflight_messages_set(_IN_FLIGHT)  # on 5 the broker's Receive Maximum may be paho's 20
+            if bridge:
+                client.enable_bridge_mode()
+        if settings.username is not None:
+            client.username_pw_set(settings.username, settings.password)
+        if context is not None:
+            client.tls_set_context(context)
+        if will is not None:
+            client.will_set(will.topic, will.payload, int(will.qos), will.retain)
+        client.on_socket_open = self._on_socket_open
+        client.on_socket_register_write = lambda *_: None  # else paho writes by itself
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
+        client.on_subscribe = self._on_subscribe
+        client.on_unsubscribe = lambda _client, _data, mid, _reasons, _properties: listener.on_answer(mid, b"")
+        client.on_publish = lambda _client, _data, mid, _reason, _properties: listener.on_puback(mid)
+
+    def open(self) -> None:
+        self._paho.connect(self._settings.host, self._settings.port, self._settings.keepalive_s)
+        self.write()
+
+    def close(self) -> None:
+        if (sock := self.socket) is not None:
+            sock.close()
+
+    @property
+    def socket(self) -> socket.socket | None:
+        sock = cast("socket.socket | None", self._paho.socket())
+        return None if sock is None or sock.fileno() < 0 else sock
+
+    # -- reading
+
+    @property
+    def unread(self) -> int:
+        return len(self._paho.ahead) - self._paho.begin
+
+    def receive(self) -> int:
+        sock, self.drained = self.socket, True
+        if sock is None:
+            return 0
+        try:
+            data = sock.recv(_PIECE)
+        except (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError):
+            return 0
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+        self.drained = not data or (len(data) < _PIECE and self._context is None)
+        self._paho.ahead, self._paho.begin = data, 0
+        return len(data)
+
+    def read(self, most: int) -> None:
+        for _ in range(most):
+            if not self.unread or self._paho.loop_read(1) is not MQTTErrorCode.MQTT_ERR_SUCCESS:
+                break
+        self.write()
+
+    # -- writing
+
+    @property
+    def unwritten(self) -> int:
+        return self._paho.unwritten
+
+    @property
+    def want_write(self) -> bool:
+        return self._paho.want_write()
+
+    def write(self) -> None:
+        if self._paho.want_write():
+            self._paho.loop_write()
+
+    def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, expires_s: int | None) -> int:
+        properties = None
+        if self._modern and expires_s is not None:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties.MessageExpiryInterval = expires_s
+        sent = self._paho.publish(topic, payload, qos, retain, properties)
+        self.write()
+        return sent.mid if qos else 0
+
+    def subscribe(self, filters: Iterable[Filter]) -> int:
+        return self._request(self._paho.subscribe([self._topic(one) for one in filters]))
+
+    def unsubscribe(self, filters: Iterable[str]) -> int:
+        return self._request(self._paho.unsubscribe(list(filters)))
+
+    def _topic(self, one: Filter) -> Any:
+        if not self._modern:
+            return one.text, one.qos
+        handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+        if not one.sends_retained:
+            handling = SubscribeOptions.RETAIN_DO_NOT_SEND
+        return one.text, SubscribeOptions(one.qos, one.no_local, one.as_published, handling)
+
+    def _request(self, sent: tuple[MQTTErrorCode, int | None]) -> int:
+        self.write()
+        return sent[1] or 0  # 0: lost; no answer will have it
+
+    def ping(self) -> None:
+        self._paho.send_ping()
+        self.write()
+
+    def disconnect(self) -> None:
+        self._paho.disconnect()
+        self.write()
+
+    # -- paho's callbacks
+
+    def _on_socket_open(self, _client: Any, _data: Any, sock: Any) -> None:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+
+    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: ReasonCode, properties: Any) -> None:
+        if reason.is_failure:
+            self._listener.on_refused(reason.value)
+        else:
+            self._listener.on_accepted(Accepted(getattr(properties, "MaximumPacketSize", None)))
+
+    def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: ReasonCode, _properties: Any) -> None:
+        if flags.is_disconnect_packet_from_server:
+            self._listener.on_disconnect(reason.value)
+
+    def _on_subscribe(self, _client: Any, _data: Any, mid: int, answers: list[ReasonCode], _properties: Any) -> None:
+        self._listener.on_answer(mid, bytes(answer.value for answer in answers))
