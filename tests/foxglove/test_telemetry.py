@@ -157,7 +157,8 @@ def test_many_robots_at_once_do_not_lose_a_client(broker: Broker, robot: Transpo
         assert until(lambda: watcher.info)
         for base in bases:
             for metric in ("online", "status", "charging-level", "charging-status"):
-                robot.publish(f"{base}/outgoing/{metric}", b'{"t": 1}', qos=QoS.DELIVERED)
+                topic = f"{base}/outgoing/{metric}"
+                assert until(lambda topic=topic: robot.publish(topic, b'{"t": 1}', qos=QoS.DELIVERED))  # type: ignore[misc]
         assert until(lambda: len(watcher.channels) == 4 * len(bases), 30)
         assert not watcher.closed
 

@@ -35,6 +35,9 @@ class _Time:
     def monotonic(self) -> float:
         return self.clock()
 
+    def clock_gettime(self, _clock: int) -> float:
+        return self.clock()
+
     def time(self) -> float:
         return EPOCH + self.clock()
 

@@ -56,7 +56,7 @@ window.compare = async (payloadsPath, expectedPath) => {
     shown.push({ encoding, key, frame, capturedMs, width: bitmap.width, height: bitmap.height, difference });
     bitmap.close();
   }
-  decoder.close();
+  decoder.h264.close();
   return { shown, wants, counters: decoder.sequence.counters };
 };
 
@@ -70,7 +70,7 @@ window.post = async (payloadsPath, target) => {
     parts.push(new Uint32Array([made.bitmap.width, made.bitmap.height]), pixelsOf(made.bitmap));
     made.bitmap.close();
   }
-  decoder.close();
+  decoder.h264.close();
   await fetch(target, { method: "POST", body: new Blob(parts) });
   return decoder.sequence.problem;
 };
@@ -85,7 +85,7 @@ window.timed = async (payloadsPath) => {
     took.push(performance.now() - start);
     made?.bitmap.close();
   }
-  decoder.close();
+  decoder.h264.close();
   return took;
 };
 

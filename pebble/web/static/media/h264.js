@@ -47,7 +47,7 @@ export class H264Decoder {
     }
   }
 
-  /** The next unit builds on nothing before it. The decoder stays: a page that opens one for each seek grows. */
+  /** The next unit builds on nothing before. The decoder stays: a new one for each seek takes memory. */
   forget() {
     this.labels.clear();
     for (const { frame } of this.made.splice(0)) frame.close();
@@ -91,10 +91,10 @@ export class H264Decoder {
 
   /** @param {VideoDecoder} decoder @param {VideoFrame} frame */
   take(decoder, frame) {
-    const label = this.decoder === decoder ? this.labels.get(frame.timestamp) : null;
+    const label = this.decoder === decoder && this.labels.get(frame.timestamp);
     this.labels.delete(frame.timestamp);
     if (label) this.made.push({ frame, label });
-    else frame.close(); // it is not shown, or forgotten
+    else frame.close(); // not shown, or forgotten
     this.wake();
   }
 

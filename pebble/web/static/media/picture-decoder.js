@@ -64,11 +64,6 @@ export class PictureDecoder {
     this.sequence = new Sequence();
   }
 
-  close() {
-    this.h264.close();
-    this.sequence.reset();
-  }
-
   /** @param {import("./decode.js").Payload} payload @param {boolean} quiet */
   async unit(payload, quiet) {
     if (this.sequence.last === null) this.h264.forget();
