@@ -58,7 +58,7 @@ export class PictureDecoder {
     }
   }
 
-  /** What comes next builds on nothing before it: another connection, or a seek. */
+  /** After a seek, or on another connection. */
   restart() {
     this.h264.forget();
     this.sequence = new Sequence();
