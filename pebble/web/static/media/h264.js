@@ -54,7 +54,7 @@ export class H264Decoder {
   }
 
   close() {
-    if (this.decoder && this.decoder.state !== "closed") this.decoder.close();
+    if (this.decoder?.state === "configured") this.decoder.close();
     this.decoder = null;
     this.error = null;
     this.forget();
@@ -92,9 +92,9 @@ export class H264Decoder {
   /** @param {VideoDecoder} decoder @param {VideoFrame} frame */
   take(decoder, frame) {
     const label = this.decoder === decoder && this.labels.get(frame.timestamp);
-    this.labels.delete(frame.timestamp);
     if (label) this.made.push({ frame, label });
     else frame.close(); // not shown, or forgotten
+    this.labels.delete(frame.timestamp);
     this.wake();
   }
 
@@ -102,9 +102,9 @@ export class H264Decoder {
     let works = true;
     while (works && !this.made.length && !this.error) works = await this.ready(HELD_MS);
     if (this.error) throw this.error;
-    const made = this.made.splice(0);
-    for (const { frame } of made.slice(0, -1)) frame.close();
-    return made.length ? made[made.length - 1] : null;
+    const newest = this.made.pop() ?? null;
+    for (const { frame } of this.made.splice(0)) frame.close();
+    return newest;
   }
 
   /**

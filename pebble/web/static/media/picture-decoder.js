@@ -61,7 +61,7 @@ export class PictureDecoder {
   /** After a seek, or on another connection. */
   restart() {
     this.h264.forget();
-    this.sequence = new Sequence();
+    this.sequence.last = null;
   }
 
   /** @param {import("./decode.js").Payload} payload @param {boolean} quiet */
