@@ -39,7 +39,7 @@ def run(plan: BridgePlan, console: Console | None = None) -> int:
     console = console or Console()
     plan.check()
     watch = Stopwatch("bridge", plan.command(), plan.options())
-    tallies = [Tally(kind, load) for load in _loads(plan) for kind in plan.kinds]
+    tallies = [Tally(kind, UNLOADED) for kind in plan.kinds] + [Tally(kind, LOADED) for kind in plan.media_kinds]
     tallies.append(Tally(HOP, reports=False))
     rounds = Rounds(plan.rounds, console)
     with interrupted_by_signals():
@@ -52,10 +52,6 @@ def run(plan: BridgePlan, console: Console | None = None) -> int:
     lines = [*rounds.notes(), *bridge_report.assessment(cells)]
     output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
     return rounds.code(cells)
-
-
-def _loads(plan: BridgePlan) -> tuple[str, ...]:
-    return (UNLOADED, LOADED) if plan.with_media else (UNLOADED,)
 
 
 def _measure(plan: BridgePlan, tallies: Sequence[Tally], rounds: Rounds, console: Console) -> None:
@@ -79,7 +75,7 @@ def _round(
     parts: list[RoundPart] = []
     with ExitStack() as stack:
         show_step("starting the robots")
-        driven_robots = [stack.enter_context(DrivenRobot(kind, media=plan.with_media)) for kind in plan.kinds]
+        driven_robots = [stack.enter_context(DrivenRobot(kind, media=kind in plan.media_kinds)) for kind in plan.kinds]
         hop = stack.enter_context(OneHop())
         for driven_robot in driven_robots:
             driven_robot.wait()
@@ -88,7 +84,8 @@ def _round(
         participants: list[DrivenRobot | OneHop] = [*driven_robots, hop]
         for participant, segments in _in_turns(participants, plan.seconds, backwards=bool(number % 2)):
             parts.append((by_name[participant.kind, UNLOADED], segments, participant.match_arrivals(segments), {}))
-        for driven_robot in (driven_robots[::-1] if number % 2 else driven_robots) if plan.with_media else ():
+        with_media = [one for one in driven_robots if one.kind in plan.media_kinds]
+        for driven_robot in with_media[::-1] if number % 2 else with_media:
             show_step(f"{driven_robot.kind} with media")
             parts.append(_drive_with_media(driven_robot, plan.seconds, by_name[driven_robot.kind, LOADED]))
     return parts

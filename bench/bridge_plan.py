@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.bench.bridge_drive import RATE_HZ
-from pebble.bench.bridge_robot import KINDS
+from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.measured_robot import check_kinds
 from pebble.bench.output import FOLDER, check_folder
 from pebble.bench.percentiles import LONGEST_S
@@ -42,7 +42,7 @@ class BridgePlan:
     mode: Mode = Mode.COMPARE
     seconds: float = 4.0
     rounds: int = 10
-    kinds: Sequence[str] = KINDS
+    kinds: Sequence[str] = (STAND_IN, *KINDS)
     quick: bool = False
     output: Path = FOLDER
 
@@ -50,9 +50,14 @@ class BridgePlan:
     def with_media(self) -> bool:
         return self.mode is Mode.MEDIA
 
+    @property
+    def media_kinds(self) -> Sequence[str]:
+        """The robots that are also driven while media flow; the stand-in has none."""
+        return [kind for kind in self.kinds if kind != STAND_IN] if self.with_media else []
+
     def check(self) -> None:
         """Raises PebbleError naming an invalid option."""
-        check_kinds(self.kinds)
+        check_kinds(self.kinds, also=(STAND_IN,) if self.mode in (Mode.COMPARE, Mode.MEDIA) else ())
         if self.mode is Mode.NULL and len(self.kinds) != 1:
             raise PebbleError("--null takes one transport: --variants mqtt, or zenoh")
         if not 0 < self.seconds <= LONGEST_S or self.rounds < 1:
@@ -79,5 +84,5 @@ class BridgePlan:
 def plan(mode: Mode, *, quick: bool = False, **given: Any) -> BridgePlan:
     """The default or quick plan, with the ``given`` options replaced."""
     seconds, rounds = _USUAL[mode][quick]
-    kinds = KINDS[1:] if mode is Mode.NULL else KINDS
+    kinds = {Mode.NULL: KINDS[1:], Mode.PROFILE: KINDS}.get(mode, (STAND_IN, *KINDS))
     return BridgePlan(mode=mode, quick=quick, **{"seconds": seconds, "rounds": rounds, "kinds": kinds, **given})

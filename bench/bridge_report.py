@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from pebble.bench.bridge_one_hop import HOP
-from pebble.bench.bridge_robot import KINDS
+from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP
 from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import LEAST_ROUNDS, paired
@@ -28,7 +28,8 @@ def show(cells: Sequence[Cell], console: Console) -> None:
     """Prints the latencies, then CPU and media rates of the same time."""
     ordered = sorted(cells, key=lambda cell: (list(WAYS).index(cell.measure), cell.params["load"] == LOADED))
     title = "Commands down, reports up; and the load on the robot"
-    console.print(latency_table(title, ordered, KINDS[0]))
+    baseline = STAND_IN if any(cell.variant == STAND_IN for cell in cells) else KINDS[0]
+    console.print(latency_table(title, ordered, baseline))
     cost = plain_table("Meanwhile", ["robot", "load", "CPU %", *_FLOWS.values()], left=2)
     for cell in ordered:
         if cell.measure == DOWN and cell.variant != HOP:
@@ -45,13 +46,18 @@ def assessment(cells: Sequence[Cell]) -> list[str]:
 
 
 def _transports(cells: Sequence[Cell]) -> list[str]:
-    """Compares the robots' medians."""
+    """Compares the robots' medians, then each with the stand-in."""
     lines = []
     for load in (UNLOADED, LOADED):
         for way, words in WAYS.items():
+            what = f"Median, {words}{_media_suffix(load)}"
             if robots := _robots(cells, way, load):
-                what = f"Median, {words}{_media_suffix(load)}"
                 lines.append(sentence(what, robots, quantity="time"))
+            lines += [
+                sentence(what, [plain, one], quantity="time")
+                for plain in _stand_ins(cells, way, load)
+                for one in robots
+            ]
     return lines
 
 
@@ -123,6 +129,12 @@ def _outcome(beyond_ms: float) -> str:
 def _robots(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
     found = [cell for cell in cells if (cell.measure, cell.params["load"]) == (measure, load) and cell.variant in KINDS]
     return sorted(found, key=lambda cell: KINDS.index(cell.variant))
+
+
+def _stand_ins(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
+    """The stand-in's cell, if it was measured."""
+    found = (cell for cell in cells if cell.variant == STAND_IN and cell.samples)
+    return [cell for cell in found if (cell.measure, cell.params["load"]) == (measure, load)]
 
 
 def _number(cell: Cell, name: str) -> str:

@@ -17,6 +17,7 @@ from pebble.demo.programs import Program, end_all
 from pebble.simulation.trace import Entry, read_trace
 
 KINDS = ("mqtt", "zenoh")
+STAND_IN = "paho"  # two plain paho programs in place of a robot of ours: see stand_in
 _NAME = "rover"
 BASE = Identity("pebble", "robots", _NAME).base
 _START_S = 15.0
@@ -24,7 +25,7 @@ _ROBOT_ENDS_S, _REST_ENDS_S = 6.0, 2.0
 
 
 class RobotProcesses:
-    """``kind`` is the local transport: ``mqtt`` or ``zenoh``. Operators connect to ``remote_port`` of loopback.
+    """``kind`` is the local transport, or STAND_IN. Operators connect to ``remote_port`` of loopback.
 
     With ``media`` the robot has a camera and a microphone; with ``reports`` it forwards every report of its MCU, 50 a
     second. It starts its own remote broker, unless it is given the port of one.
@@ -49,6 +50,7 @@ class RobotProcesses:
         self._brokers: dict[str, Broker] = {}
         self._programs: list[Program] = []
         self._launcher: Program | None = None
+        self._stand_in: list[Program] = []
         self._never = threading.Event()
         self.run_dir = self._root / "run"
 
@@ -65,7 +67,7 @@ class RobotProcesses:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         """Ends the robot first, while the brokers can still receive its last messages."""
-        end_all([self._launcher] if self._launcher is not None else [], _ROBOT_ENDS_S)
+        end_all([*self._stand_in, *([self._launcher] if self._launcher is not None else [])], _ROBOT_ENDS_S)
         end_all([*self._programs, *(broker.program for broker in self._brokers.values())], _REST_ENDS_S)
         self._folder.cleanup()
 
@@ -84,10 +86,10 @@ class RobotProcesses:
 
     def pids(self) -> list[int]:
         """The launcher, its children (including a hub), and the local broker, if there is one."""
-        if self._launcher is None:
-            return []
         local = [self._brokers["local"].program.pid] if "local" in self._brokers else []
-        return [self._launcher.pid, *children(self._launcher.pid), *local]
+        if self._stand_in:
+            return [*(one.pid for one in self._stand_in), *local]
+        return [] if self._launcher is None else [self._launcher.pid, *children(self._launcher.pid), *local]
 
     def log(self) -> str:
         """The end of the robot's log."""
@@ -96,11 +98,18 @@ class RobotProcesses:
 
     def launch(self) -> None:
         """Starts the robot."""
+        if self._kind == STAND_IN:
+            ports = ["--local", str(self._brokers["local"].port), "--remote", str(self.remote_port)]
+            rest = ["--base", self.base, "--device", str(self._root / "mcu")]
+            for part in ("bridge", "serial"):
+                command = [sys.executable, "-m", "pebble.bench.stand_in", part, *ports, *rest]
+                self._stand_in.append(Program(f"the stand-in's {part}", command, self._root / "robot.log"))
+            return
         command = [sys.executable, "-m", "pebble.cli", "up", str(self._root / "robot.json")]
         self._launcher = Program(f"the {self._kind} robot", command, self._root / "robot.log")
 
     def _start(self) -> None:
-        wanted = {"remote": self._given_port is None, "local": self._kind == "mqtt"}
+        wanted = {"remote": self._given_port is None, "local": self._kind in ("mqtt", STAND_IN)}
         for name in (name for name, needed in wanted.items() if needed):
             self._brokers[name] = Broker(name, BrokerKind.MOSQUITTO, self._root)
         for broker in self._brokers.values():
@@ -135,6 +144,6 @@ class RobotProcesses:
             }
         transport: dict[str, Any] = {"kind": self._kind, "run_dir": str(self.run_dir), "state_dir": str(self.run_dir)}
         config: dict[str, Any] = {"robot": {"id": self._name}, "transport": transport, "services": services}
-        if self._kind == "mqtt":
+        if "local" in self._brokers:
             config["local_mqtt"] = {"host": "localhost", "port": self._brokers["local"].port}
         return config

@@ -80,10 +80,11 @@ def _comm(pid: int) -> str:
         return ""
 
 
-def check_kinds(kinds: Sequence[str]) -> None:
-    """Raises PebbleError naming an unknown or repeated transport."""
-    unknown = [kind for kind in kinds if kind not in KINDS]
+def check_kinds(kinds: Sequence[str], *, also: Sequence[str] = ()) -> None:
+    """Raises PebbleError naming an unknown or repeated transport. ``also`` may be named besides ours."""
+    known = (*KINDS, *also)
+    unknown = [kind for kind in kinds if kind not in known]
     if unknown or not kinds:
-        raise PebbleError(f"unknown transport {', '.join(unknown)}: there are {', '.join(KINDS)}")
+        raise PebbleError(f"unknown transport {', '.join(unknown)}: there are {', '.join(known)}")
     if len(set(kinds)) < len(kinds):
         raise PebbleError(f"{', '.join(kinds)}: name each transport once")

@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import cost, cost_robot, startup
-from pebble.bench.bridge_robot import KINDS
+from pebble.bench import bridge, cost, cost_robot, startup
+from pebble.bench.bridge_plan import Mode, plan
+from pebble.bench.bridge_robot import KINDS, STAND_IN
+from pebble.bench.bridge_tally import DOWN, UNLOADED, UP
 from pebble.bench.results import load
 from pebble.bench.usage import children
 from tests.robot.rig import Rig, descendants
@@ -79,6 +81,18 @@ def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             pictures = results.find(kind, "pictures", phase=phase)
             assert pictures is not None
             assert pictures.samples[0] > 0
+    assert children(os.getpid()) == []
+
+
+def test_the_stand_in_carries_commands_and_reports(tmp_path: Path) -> None:
+    short = plan(Mode.COMPARE, quick=True, rounds=1, seconds=1.0, kinds=[STAND_IN, "mqtt"], output=tmp_path)
+    assert bridge.run(short, Console(file=io.StringIO())) == 0
+    results = load(tmp_path / "bridge.json")
+    for measure in (DOWN, UP):
+        for kind in (STAND_IN, "mqtt"):
+            cell = results.find(kind, measure, load=UNLOADED)
+            assert cell is not None
+            assert len(cell.samples) >= 10
     assert children(os.getpid()) == []
 
 

@@ -1,0 +1,90 @@
+"""A robot as somebody would build it with paho alone: ``python -m pebble.bench.stand_in bridge|serial …``.
+
+What a user would have without us, after the description of the original in the paper; not the original's code, which is
+not here. One process forwards between two brokers: a client on each side, whose ``on_message`` publishes on the other.
+Another owns the serial line: drive commands become lines at once, reports become messages. Neither watches how old a
+command is, bounds a queue, or stops the motors when commands end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from typing import Any
+
+import serial
+from paho.mqtt.client import Client, MQTTMessage
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pebble.contract import DRIVE, ONLINE, STATUS, TOUCH_SENSORS
+
+_HEARTBEAT_S = 1.0
+_TOUCH = ("a0", "a1", "a2")
+
+
+def client(port: int, *filters: str) -> Client:
+    """Connected, on a thread of its own, and subscribed to ``filters`` with QoS 1."""
+    made = Client(CallbackAPIVersion.VERSION2)
+
+    def subscribe(*_: Any) -> None:
+        made.subscribe([(filter_, 1) for filter_ in filters])
+
+    made.on_connect = subscribe
+    made.connect("127.0.0.1", port)
+    return made
+
+
+def bridge(remote_port: int, local_port: int, base: str) -> None:
+    """Forwards commands to the local broker, everything else to the remote one; publishes heartbeats."""
+    remote, local = client(remote_port, f"{base}/incoming/#"), client(local_port, f"{base}/outgoing/#")
+
+    def forward(to: Client) -> Any:
+        return lambda _client, _data, one: to.publish(one.topic, one.payload, one.qos, one.retain)
+
+    remote.on_message, local.on_message = forward(local), forward(remote)
+    for one in (remote, local):
+        one.loop_start()
+    state = {"value": {"services": {"bridge": {"state": "ready"}}}}
+    while True:
+        remote.publish(STATUS.topic(base), json.dumps(state), 1, True)
+        remote.publish(ONLINE.topic(base), json.dumps({"t": round(1000 * time.time())}), 1)
+        time.sleep(_HEARTBEAT_S)
+
+
+def serial_bridge(local_port: int, base: str, device: str, baud: int) -> None:
+    """Writes a line for each drive command, and publishes each report of the touch sensors."""
+    port = serial.Serial(device, baud)
+
+    def drive(_client: Client, _data: Any, message: MQTTMessage) -> None:
+        wanted = json.loads(message.payload)
+        left, right = (max(-1.0, min(1.0, wanted["z"] + side * wanted["x"])) for side in (1, -1))
+        port.write(b"M %.3f %.3f\n" % (left, right))
+
+    local = client(local_port, DRIVE.topic(base))
+    local.on_message = drive
+    local.loop_start()
+    for line in port:
+        fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
+        if all(name in fields for name in _TOUCH):
+            touch = {name: int(fields[name]) for name in _TOUCH}
+            local.publish(TOUCH_SENSORS.topic(base), json.dumps({"value": touch}))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m pebble.bench.stand_in", description=__doc__)
+    parser.add_argument("part", choices=("bridge", "serial"))
+    parser.add_argument("--remote", type=int, default=0, help="port of the remote broker")
+    parser.add_argument("--local", type=int, required=True, help="port of the local broker")
+    parser.add_argument("--base", required=True, help="of the robot's topics")
+    parser.add_argument("--device", default="", help="of the serial line")
+    parser.add_argument("--baud", type=int, default=460800)
+    options = parser.parse_args()
+    if options.part == "bridge":
+        bridge(options.remote, options.local, options.base)
+    else:
+        serial_bridge(options.local, options.base, options.device, options.baud)
+
+
+if __name__ == "__main__":
+    main()
