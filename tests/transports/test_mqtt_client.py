@@ -117,6 +117,20 @@ def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any,
     assert pair.client.unwritten == 0
 
 
+def test_message_ids_begin_anew(pairs: Any) -> None:
+    pair = pairs("3.1.1")
+    ids = [pair.client.subscribe([]) for _ in range(65_537)]
+    assert ids == [*range(1, 65_536), 1, 2]
+
+
+def test_acknowledgements_that_nobody_waits_for_allow_no_more(pairs: Any) -> None:
+    pair = pairs("5")
+    pair.sends(RECEIVE_MAXIMUM_2 + 5 * packet(0x40, b"\0\1"))
+    for number in range(5):
+        publish(pair.client, number)
+    assert pair.written().count(b"a\0") == 2
+
+
 def test_acknowledgements_of_what_was_read_together_are_written_together(pairs: Any) -> None:
     pair = pairs("3.1.1")
     pair.sends(b"".join(packet(0x32, b"\0\1a" + bytes((0, number)) + b"x") for number in (1, 2, 3)))

@@ -76,7 +76,7 @@ class TestWritten:
     """The same bytes as paho writes."""
 
     @both_versions
-    @pytest.mark.parametrize("login", [(None, None), ("user", None), ("user", "pässword")])
+    @pytest.mark.parametrize("login", [(None, None), ("user", None), ("user", "pässword"), (None, "unused")])
     @pytest.mark.parametrize("will", [None, Message("a/ü", b"\xffgone", QoS.DELIVERED, True), Message("b", b"")])
     def test_connect(self, modern: bool, login: tuple[str | None, str | None], will: Message | None) -> None:
         client = paho(modern=modern, client_id="goob-1")
@@ -205,6 +205,16 @@ class TestRead:
         reader.feed(5 * packet(0x30, b"\0\1ax"))
         assert [reader.read(2) for _ in range(4)] == [2, 2, 1, 0]
         assert len(noted.seen) == 5
+
+    def test_a_long_packet_in_small_pieces_is_copied_once(self) -> None:
+        long = packet(0x30, b"\0\1a" + bytes(MAX_PACKET - 3))
+        reader, copied = Reader(noted := Noted(), modern=False), 0
+        for begin in range(0, len(long), 500):
+            reader.feed(long[begin : begin + 500])
+            copied += reader.unread
+            reader.read(64)
+        assert len(noted.seen) == 1
+        assert copied < 1.1 * len(long)
 
     @both_versions
     def test_each_other_packet(self, modern: bool) -> None:

@@ -7,7 +7,6 @@ objects that nobody here looks at.
 
 from __future__ import annotations
 
-import itertools
 import socket
 import ssl
 from collections import deque
@@ -55,8 +54,8 @@ class Client:
         )
         self._reader = Reader(self, modern=self._modern)
         self._waiting: deque[bytes] = deque()  # to be written
-        self._ids = itertools.cycle(range(1, _MOST_IDS + 1))
-        self._quota = _MOST_IDS  # messages of QoS 1 that the broker takes before it acknowledges one
+        self._mid = 0  # the newest message id
+        self._quota = self._receive_maximum = _MOST_IDS  # messages of QoS 1 that the broker takes without an answer
         self._held: deque[bytes] = deque()  # such messages beyond that
         self._listener = listener
         self.on_publication, self.skips, self.on_too_long = (
@@ -127,14 +126,14 @@ class Client:
 
     def on_accepted(self, accepted: Accepted) -> None:
         if accepted.receive_maximum is not None:
-            self._quota = accepted.receive_maximum
+            self._quota = self._receive_maximum = accepted.receive_maximum
         self._listener.on_accepted(accepted)
 
     def on_puback(self, mid: int) -> None:
         if self._held:
             self._send(self._held.popleft())
         else:
-            self._quota += 1
+            self._quota = min(self._quota + 1, self._receive_maximum)
         self._listener.on_puback(mid)
 
     # -- writing
@@ -156,7 +155,7 @@ class Client:
 
     def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, expires_s: int | None) -> int:
         """Returns the message id, 0 with QoS 0."""
-        mid = next(self._ids) if qos else 0
+        mid = self._next_id() if qos else 0
         packet = packets.publish(topic, payload, qos, mid, retain=retain, modern=self._modern, expires_s=expires_s)
         if qos and self._quota <= 0:
             self._held.append(packet)
@@ -167,12 +166,12 @@ class Client:
 
     def subscribe(self, filters: Iterable[Filter]) -> int:
         """Returns the message id."""
-        mid = next(self._ids)
+        mid = self._next_id()
         self._send(packets.subscribe(mid, filters, modern=self._modern))
         return mid
 
     def unsubscribe(self, filters: Iterable[str]) -> int:
-        mid = next(self._ids)
+        mid = self._next_id()
         self._send(packets.unsubscribe(mid, filters, modern=self._modern))
         return mid
 
@@ -181,6 +180,10 @@ class Client:
 
     def disconnect(self) -> None:
         self._send(packets.DISCONNECT)
+
+    def _next_id(self) -> int:
+        self._mid = self._mid % _MOST_IDS + 1
+        return self._mid
 
     def _send(self, data: bytes) -> None:
         """Hot."""

@@ -161,6 +161,7 @@ class Connection:
         self._ping_due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
         self._packets = 0  # received so far
         self._received_at = self._answered_at  # before the socket was emptied, or a piece of what is in it taken out
+        self._stalled_since = self._answered_at  # when the last time without reading began, for which a ping was sent
         self._more = False  # a batch ended before the socket was empty
         self._copies = False  # there are retained messages in the batch
         self._accepted = False
@@ -300,6 +301,8 @@ class Connection:
             before, unread = self._packets, client.unread
             if not unread:
                 self._received_at = began = clock.since_boot()
+                if began - self._waiting.checked_at > _OVERSLEPT_S and self._accepted:
+                    self._ping_after_stall(began)
                 unread = client.receive()
                 self._waiting.found(unread if client.drained else unread + self._readable, began)
             self._since = self._waiting_since
@@ -368,6 +371,15 @@ class Connection:
         self._in_flight.ping(now, ack)
         self._delay.asked(now, clear=ahead <= _CLEAR)
         self._client.ping()
+
+    def _ping_after_stall(self, now: float) -> None:
+        """Once for each time without reading: its answer comes after what has waited at the broker meanwhile."""
+        since = self._waiting.checked_at
+        if since != self._stalled_since:
+            self._stalled_since = since
+            self._in_flight.ping(now, None)
+            self._delay.stalled(since, now)
+            self._client.ping()
 
     def on_pong(self) -> None:
         self._note_answer()

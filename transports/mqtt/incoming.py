@@ -32,17 +32,17 @@ class WaitingTime:
 
     def __init__(self, now: float) -> None:
         self.since = now
-        self._checked_at = now  # all but the counted bytes have arrived since then
+        self.checked_at = now  # all but the counted bytes have arrived in the socket since then
         self._counted = 0
 
     def empty(self, now: float) -> None:
         """The socket was empty at ``now``."""
-        self._checked_at, self._counted = now, 0
+        self.checked_at, self._counted = now, 0
 
     def found(self, size: int, now: float) -> None:
         """``size`` bytes are in the socket at ``now``."""
         if self._counted <= 0:
-            self.since, self._checked_at, self._counted = self._checked_at, now, size
+            self.since, self.checked_at, self._counted = self.checked_at, now, size
 
     def read(self, size: int) -> None:
         """``size`` bytes were taken out of it."""
@@ -60,7 +60,8 @@ class BrokerDelay:
     """
 
     def __init__(self) -> None:
-        self._asked: deque[tuple[float, bool]] = deque()  # unanswered pings: when, and whether they say something
+        #: Unanswered pings: since when what comes before the answer may have waited, when sent, do they say something.
+        self._asked: deque[tuple[float, float, bool]] = deque()
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds until the newest answer
         self._prompt = 0  # answers in a row that came right after the newest of several pings
@@ -71,16 +72,20 @@ class BrokerDelay:
 
     def asked(self, now: float, *, clear: bool) -> None:
         """A ping was sent; ``clear``: nothing of ours was on its way."""
-        self._asked.append((now, clear))
+        self._asked.append((now, now, clear))
+
+    def stalled(self, since: float, now: float) -> None:
+        """A ping was sent after nothing was read ``since`` then: what fits into no socket has waited at the broker."""
+        self._asked.append((since, now, True))
 
     def answered(self, now: float) -> None:
         """The oldest ping was answered."""
         if self._asked:
-            asked_at, clear = self._asked.popleft()
-            self._newest = now - asked_at if clear else 0.0
-            self.usual(now - asked_at)
+            _, sent_at, clear = self._asked.popleft()
+            self._newest = now - sent_at if clear else 0.0
+            self.usual(now - sent_at)
         near = self._shortest <= _NEAR_S
-        prompt = near and bool(self._asked) and now - self._asked[-1][0] <= self._shortest + _NEAR_S
+        prompt = near and bool(self._asked) and now - self._asked[-1][1] <= self._shortest + _NEAR_S
         self._prompt = self._prompt + 1 if prompt else 0
         if self._prompt >= _LOST:
             self._asked.clear()
@@ -88,13 +93,13 @@ class BrokerDelay:
 
     def acknowledged(self, sent_at: float, now: float) -> None:
         """What was sent at ``sent_at`` was answered: so were all pings before it, or their answers are lost."""
-        while self._asked and self._asked[0][0] < sent_at:
+        while self._asked and self._asked[0][1] < sent_at:
             self._asked.popleft()
         self._newest = min(self._newest, now - sent_at)
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
         """``round_trip_s`` asks for TCP's present one, if that matters."""
-        oldest = next((asked_at for asked_at, clear in self._asked if clear), now)
+        oldest = next((since for since, _, clear in self._asked if clear), now)
         waited = max(self._newest, now - oldest)
         if waited <= self._shortest + _NOTICED_S:
             return 0.0

@@ -74,9 +74,9 @@ def connect(
     if username is not None:
         flags |= _USERNAME
         payload += _text(username)
-    if password is not None:
-        flags |= _PASSWORD
-        payload += _text(password)
+        if password is not None:  # not without a user name: MQTT-3.1.2-22
+            flags |= _PASSWORD
+            payload += _text(password)
     level = 5 if modern else 4 | (_BRIDGE if bridge else 0)
     return _packet(_CONNECT, b"\0\4MQTT", struct.pack("!BBH", level, flags, keepalive_s), properties, payload)
 
@@ -211,6 +211,8 @@ class Reader:
     def read(self, most: int) -> int:
         """Hand up to ``most`` whole packets to the listener; returns how many. Raises MalformedError. Hot."""
         data, end, count = self._data, len(self._data), 0
+        if not data:
+            return 0
         while count < most:
             at = self._at
             if end - at < 2:
@@ -256,9 +258,11 @@ class Reader:
                 self.acks += b"\x50\x02" + data[end:body]
             else:
                 raise MalformedError("a message of QoS 3")
-        if self._modern and body <= stop:
-            size, body = _read_variable(data[:stop], body)
-            body = stop + 1 if size < 0 else body + size
+        if self._modern and body < stop and data[body] < 128:
+            body += 1 + data[body]
+        elif self._modern and body <= stop:
+            size, length = _read_variable(data[body : min(body + 4, stop)], 0)
+            body = stop + 1 if size < 0 else body + length + size
         if body > stop or not topic:
             raise MalformedError("a message that ends in its head" if topic else "a message without a topic")
         if not (first & RETAIN and body < stop and self._listener.skips(topic)):
