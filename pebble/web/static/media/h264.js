@@ -47,7 +47,7 @@ export class H264Decoder {
     }
   }
 
-  /** The next unit builds on nothing before. The decoder stays: a new one for each seek takes memory. */
+  /** The next unit builds on nothing before. The decoder stays: a new one for each seek takes time. */
   forget() {
     this.labels.clear();
     for (const { frame } of this.made.splice(0)) frame.close();

@@ -61,7 +61,7 @@ export class ReplayPictures {
   }
 
   start() {
-    const worker = new Worker(new URL("./video-worker.js", import.meta.url), { type: "module" });
+    const worker = new Worker(new URL("./replay-video-worker.js", import.meta.url), { type: "module" });
     worker.onmessage = ({ data }) => this.made(data);
     worker.onerror = (event) => this.change(`Pictures cannot be decoded here: ${event.message}`);
     return worker;
