@@ -123,7 +123,7 @@ def test_message_ids_begin_anew(pairs: Any) -> None:
     assert ids == [*range(1, 65_536), 1, 2]
 
 
-def test_acknowledgements_that_nobody_waits_for_allow_no_more(pairs: Any) -> None:
+def test_acknowledgements_of_unknown_messages_allow_no_more(pairs: Any) -> None:
     pair = pairs("5")
     pair.sends(RECEIVE_MAXIMUM_2 + 5 * packet(0x40, b"\0\1"))
     for number in range(5):
