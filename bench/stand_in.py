@@ -17,7 +17,7 @@ import serial
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
 
-from pebble.contract import DRIVE, ONLINE, STATUS, TOUCH_SENSORS
+from pebble.contract import DRIVE, INCOMING, ONLINE, OUTGOING, STATUS, TOUCH_SENSORS
 
 _HEARTBEAT_S = 1.0
 _TOUCH = ("a0", "a1", "a2")
@@ -37,7 +37,7 @@ def client(port: int, *filters: str) -> Client:
 
 def bridge(remote_port: int, local_port: int, base: str) -> None:
     """Forwards commands to the local broker, everything else to the remote one; publishes heartbeats."""
-    remote, local = client(remote_port, f"{base}/incoming/#"), client(local_port, f"{base}/outgoing/#")
+    remote, local = client(remote_port, f"{base}/{INCOMING}/#"), client(local_port, f"{base}/{OUTGOING}/#")
 
     def forward(to: Client) -> Any:
         return lambda _client, _data, one: to.publish(one.topic, one.payload, one.qos, one.retain)
