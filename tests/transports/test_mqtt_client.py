@@ -154,3 +154,13 @@ def test_a_connection_that_the_other_side_ends_has_no_socket(pairs: Any, reset: 
     pair.client.ping()
     assert not pair.client.want_write
     assert pair.client.receive() == 0
+
+
+def test_a_client_that_leaves_closes_after_its_last_packet(pairs: Any) -> None:
+    pair = pairs("3.1.1")
+    publish(pair.client, 1)
+    pair.client.disconnect()
+    assert pair.client.socket is None
+    pair.other.setblocking(True)
+    parts = list(iter(lambda: pair.other.recv(4096), b""))  # a reset would raise
+    assert b"".join(parts).endswith(packets.DISCONNECT)

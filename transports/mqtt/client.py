@@ -179,7 +179,10 @@ class Client:
         self._send(packets.PINGREQ)
 
     def disconnect(self) -> None:
+        """Send DISCONNECT, and close so that it arrives: a connection that is reset may lose it."""
         self._send(packets.DISCONNECT)
+        if not self._waiting:
+            self.close()
 
     def _next_id(self) -> int:
         self._mid = self._mid % _MOST_IDS + 1
