@@ -21,7 +21,7 @@ from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.counters import Counters
-from pebble.transports.topics import check_filter, check_topic, matches
+from pebble.transports.topics import REMEMBERED_LENGTH, check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
 
@@ -351,7 +351,8 @@ class Transport(ABC):
                 found = tuple(one for one in self._subscriptions if matches(one.filter, topic))
                 if len(self._matched) >= _MATCHED:
                     self._matched.clear()
-                self._matched[topic] = found
+                if len(topic) <= REMEMBERED_LENGTH:
+                    self._matched[topic] = found
             return found
 
     def _set_state(self, state: State) -> None:

@@ -3,18 +3,34 @@
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, wraps
 
 from pebble.errors import TransportError
 
 MAX_BYTES = 1024  # our own limit; MQTT's is 65,535
 MAX_LEVELS = 200  # mosquitto closes the connection beyond it (TOPIC_HIERARCHY_LIMIT)
 
+REMEMBERED_LENGTH = 128  # characters of topics whose translations are remembered: strangers' may have 64 KB each
+_REMEMBERED = 4096
+
 # Control characters and Unicode non-characters: MQTT lets a receiver close the connection on them, and mosquitto does.
 _NON_CHARACTERS = "\ufdd0-\ufdef" + "".join(
     chr(plane * 0x10000 + last) for plane in range(17) for last in (0xFFFE, 0xFFFF)
 )
 _FORBIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f{_NON_CHARACTERS}]")
+
+
+def remembered(translate: Callable[[str], str]) -> Callable[[str], str]:
+    """``translate``, which remembers what it returned for topics of the usual length; 2 MB at most."""
+    cached = lru_cache(_REMEMBERED)(translate)
+
+    @wraps(translate)
+    def translated(topic: str) -> str:
+        usual = isinstance(topic, str) and len(topic) <= REMEMBERED_LENGTH  # what is no text is refused in words
+        return cached(topic) if usual else translate(topic)
+
+    return translated
 
 
 def _check(what: str, text: str) -> None:
@@ -32,7 +48,7 @@ def _check(what: str, text: str) -> None:
         raise TransportError(f"{what} {text!r} contains the control or non-character {bad.group()!r}")
 
 
-@lru_cache(maxsize=4096)
+@remembered
 def check_topic(topic: str) -> str:
     """Return ``topic`` if it may be published to; raise TransportError naming what is wrong with it."""
     _check("topic", topic)
@@ -43,7 +59,7 @@ def check_topic(topic: str) -> str:
     return topic
 
 
-@lru_cache(maxsize=4096)
+@remembered
 def check_filter(filter_: str) -> str:
     """Return ``filter_`` if it may be subscribed to; raise TransportError naming what is wrong with it."""
     _check("filter", filter_)
@@ -63,7 +79,6 @@ def is_pattern(filter_: str) -> bool:
     return "+" in filter_ or "#" in filter_
 
 
-@lru_cache(maxsize=16384)
 def matches(filter_: str, topic: str) -> bool:
     """MQTT's rules: ``+`` is one level, a final ``#`` is the rest and its parent, wildcards skip ``$…`` topics."""
     if filter_ == topic:

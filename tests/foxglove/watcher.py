@@ -95,7 +95,9 @@ class Watcher:
                 self.info = content
             case "advertise":
                 self.channels |= {channel["topic"]: channel for channel in content["channels"]}
-            case "status" if found := _UNKNOWN.fullmatch(content["message"]):
+            case "status" if (found := _UNKNOWN.fullmatch(content["message"])) and int(
+                found[1]
+            ) + _FIRST in self._subscribed:
                 self._subscribe(int(found[1]))
             case "status":
                 self.statuses.append(content)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+import tracemalloc
 
 import pytest
 
 from pebble.transports import Message, QoS, base
 from pebble.transports.base import _OWN_LIMIT
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from pebble.transports.topics import check_topic
+from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
 from tests.support import until
 
 
@@ -58,6 +61,19 @@ def test_a_slow_handlers_queue_is_bounded_in_bytes(monkeypatch: pytest.MonkeyPat
         assert until(lambda: client.counters["delivered"] == 1)
         for number in range(1, 10):
             client.publish("t", bytes([number]) * 300, qos=QoS.DELIVERED)
+        assert until(lambda: slow.dropped == 6)
         goes_on.set()
         assert until(lambda: received == [0, 7, 8, 9])
         assert slow.dropped == client.counters["dropped"] == 6
+
+
+def test_long_topics_of_strangers_are_not_remembered() -> None:
+    with MemoryTransport("client", MemoryHub()) as client:
+        wanted = client.subscribe("a/#", lambda _: None)
+        tracemalloc.start()
+        for number in range(1000):
+            assert client._matching(f"a/{number:60000}") == (wanted,)
+            assert key_to_topic(topic_to_key(check_topic(f"a/{number:1000}"))) == f"a/{number:1000}"
+        left, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert left < 500_000

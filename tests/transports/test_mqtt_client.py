@@ -12,7 +12,7 @@ import pytest
 
 from pebble.transports import MqttSettings
 from pebble.transports.mqtt import packets
-from pebble.transports.mqtt.client import Client
+from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.packets import Filter
 from tests.support import until
 from tests.transports.test_mqtt_packets import Noted, packet
@@ -27,7 +27,7 @@ class Pair:
         with socket.create_server(("127.0.0.1", 0)) as server:
             settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol=protocol)
             self.noted = Noted()
-            self.client = Client("client", settings, None, None, self.noted, bridge=False)
+            self.client = Client(Opening("client", settings, None, None), self.noted, bridge=False)
             self.client.open()
             self.other, _ = server.accept()
         self.other.settimeout(5)

@@ -12,6 +12,7 @@ import ssl
 from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
+from typing import NamedTuple
 
 from pebble.transports.base import Message
 from pebble.transports.mqtt import packets
@@ -25,30 +26,31 @@ _MOST_IDS = 65_535
 _NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
+class Opening(NamedTuple):
+    """What a connection is opened with."""
+
+    client_id: str
+    settings: MqttSettings
+    context: ssl.SSLContext | None  # None: without TLS
+    will: Message | None
+
+
 class Client:
     """`open` waits for TCP and TLS, everything else returns at once. ``listener`` is called by `read`."""
 
-    def __init__(
-        self,
-        client_id: str,
-        settings: MqttSettings,
-        context: ssl.SSLContext | None,
-        will: Message | None,
-        listener: Listener,
-        *,
-        bridge: bool,
-    ) -> None:
+    def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
+        settings = opening.settings
         self.socket: socket.socket | None = None  # None: not open yet, or lost
         self.unwritten = 0  # bytes that the kernel has not accepted yet
         self.drained = True  # `receive` has taken out everything that had come
         self._modern = settings.protocol == "5"
-        self._settings, self._context = settings, context
+        self._settings, self._context = settings, opening.context
         self._hello = packets.connect(
-            client_id,
+            opening.client_id,
             modern=self._modern,
             bridge=bridge,
             keepalive_s=settings.keepalive_s,
-            will=will,
+            will=opening.will,
             username=settings.username,
             password=settings.password,
         )

@@ -12,7 +12,6 @@ import os
 import random
 import select
 import socket
-import ssl
 import struct
 import threading
 import time
@@ -26,7 +25,7 @@ from pebble.transports.base import Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
-from pebble.transports.mqtt.client import CONNECT_TIMEOUT_S, Client
+from pebble.transports.mqtt.client import CONNECT_TIMEOUT_S, Client, Opening
 from pebble.transports.mqtt.incoming import BrokerDelay, WaitingTime, readable_bytes
 from pebble.transports.mqtt.outgoing import (
     Backlog,
@@ -37,7 +36,6 @@ from pebble.transports.mqtt.outgoing import (
     unconfirmed_bytes,
 )
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, Filter, MalformedError
-from pebble.transports.settings import MqttSettings
 
 if TYPE_CHECKING:
     from pebble.transports.mqtt.paho_client import PahoClient
@@ -126,16 +124,14 @@ class Connection:
 
     def __init__(
         self,
-        client_id: str,
-        settings: MqttSettings,
-        context: ssl.SSLContext | None,
-        will: Message | None,
+        opening: Opening,
         counters: Counters,
         *,
         as_published: bool,
         on_answers: Callable[[Mapping[str, bool]], None],
         skips_retained: Callable[[bytes], bool],
     ) -> None:
+        settings = opening.settings
         self.as_published = as_published
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
         self.hesitated = False  # the broker took so long to accept us that it may have been suspended
@@ -172,7 +168,7 @@ class Connection:
         self._wake_write.setblocking(False)
         self._poll: _Poll | None = None
         bridge = as_published and not self._modern
-        self._client = _client_class()(client_id, settings, context, will, self, bridge=bridge)
+        self._client = _client_class()(opening, self, bridge=bridge)
 
     # -- opening and closing
 

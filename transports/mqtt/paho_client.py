@@ -17,10 +17,8 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from pebble.transports.base import Message
-from pebble.transports.mqtt.client import CONNECT_TIMEOUT_S, SEND_BUFFER
+from pebble.transports.mqtt.client import CONNECT_TIMEOUT_S, SEND_BUFFER, Opening
 from pebble.transports.mqtt.packets import ANY_QOS, HEAD, MAX_PACKET, RETAIN, Accepted, Filter, Listener
-from pebble.transports.settings import MqttSettings
 
 _PIECE = 64 * 1024  # bytes that are read at once
 _IN_FLIGHT = 65_535  # messages of QoS 1; their number is bounded by the connection
@@ -87,16 +85,8 @@ class _Paho(paho.Client):
 class PahoClient:
     """See `client.Client`."""
 
-    def __init__(
-        self,
-        client_id: str,
-        settings: MqttSettings,
-        context: ssl.SSLContext | None,
-        will: Message | None,
-        listener: Listener,
-        *,
-        bridge: bool,
-    ) -> None:
+    def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
+        client_id, settings, context, will = opening
         self.drained = True
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"

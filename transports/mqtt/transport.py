@@ -15,6 +15,7 @@ from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Message, Outgoing, QoS, State, Subscription, Transport
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
+from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection, Lost, Refused, Silent, ignore
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import LOSSES, PendingAck, RefusedMessages
@@ -195,10 +196,7 @@ class MqttTransport(Transport):
 
     def _make_connection(self, will: Message | None, *, as_published: bool) -> Connection:
         return Connection(
-            self._mqtt_client_id,
-            self.settings,
-            self._context,
-            will,
+            Opening(self._mqtt_client_id, self.settings, self._context, will),
             self.counters,
             as_published=as_published,
             on_answers=self._note_answers,

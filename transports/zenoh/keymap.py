@@ -9,27 +9,28 @@ skip it. Ordinary topics map to themselves.
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+
+from pebble.transports.topics import remembered
 
 _FORBIDDEN = re.compile(r"[%*$?#]")  # what Zenoh forbids in a chunk, and the escape character itself
 _ESCAPE = re.compile(r"%([0-9A-F]{2})")
 _EMPTY = "%"  # no escaped level looks like this
 
 
-@lru_cache(maxsize=16384)
+@remembered
 def topic_to_key(topic: str) -> str:
     """The key of a checked topic (see topics.check_topic)."""
     return _join([_level(level) for level in topic.split("/")])
 
 
-@lru_cache(maxsize=4096)
+@remembered
 def filter_to_key(filter_: str) -> str:
     """The key expression of a checked filter (see topics.check_filter)."""
     wildcards = {"+": "*", "#": "**"}
     return _join([wildcards[level] if level in wildcards else _level(level) for level in filter_.split("/")])
 
 
-@lru_cache(maxsize=16384)
+@remembered
 def key_to_topic(key: str) -> str:
     """The topic that ``topic_to_key`` made ``key`` from."""
     return "/".join("" if chunk == _EMPTY else _unescape(chunk) for chunk in key.removeprefix("@").split("/"))

@@ -134,7 +134,7 @@ def test_a_stopped_manager_leaves_none_either_and_publishes_so(rig: ManagerRig) 
     pids = family(folder)
     rig.end()
     assert all(map(gone, pids))
-    assert (rig.status["running"], rig.status["pid"]) == (False, None)
+    assert until(lambda: (rig.status["running"], rig.status["pid"]) == (False, None))
 
 
 def test_a_script_that_will_not_end_is_killed_with_all_it_started(mqtt: ManagerRig) -> None:
