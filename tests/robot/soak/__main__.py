@@ -31,6 +31,7 @@ BACK_S = 5.0  # after the end of an attack commands reach the wheels again
 _PAUSE_S = 1.5  # without commands, after each attack
 _NUMBERS = 2000  # of one attack's commands
 _GROWS = 1.10, 2.0  # a process does, if it takes more than so many times as much, and more than so many MB
+_MOST_MB = 30.0  # more than at first: what one flood may take
 _LOOKS = 640_000 // _NUMBERS
 
 
@@ -112,13 +113,15 @@ def _longest_turn(world: World, began: float) -> float:
 
 
 def grown(memory: dict[str, list[float]], *, killed: bool) -> list[str]:
-    """Which programs took more in the second half than in the first.
+    """Which programs take too much.
 
-    Where their processes are ``killed`` at random times, and floods leave them with different amounts, the highest
-    counts; else the median.
+    A process that is ``killed`` now and then does not grow old, and floods leave it with more or less: what counts is
+    that it never takes much more than at first. What leaks is seen without kills: the median of the second half is
+    compared with that of the first.
     """
-    measure = max if killed else statistics.median
-    return [name for name, values in memory.items() if _grows(*(measure(half) for half in halves(values)))]
+    if killed:
+        return [name for name, values in memory.items() if max(values) > values[0] + _MOST_MB]
+    return [name for name, values in memory.items() if _grows(*map(statistics.median, halves(values)))]
 
 
 def _grows(before: float, after: float) -> bool:
