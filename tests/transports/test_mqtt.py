@@ -22,6 +22,7 @@ from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, Connection
 from pebble.transports.mqtt.packets import MAX_PACKET
+from pebble.transports.topics import MAX_BYTES
 from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, free_port, until
 from tests.tcp_proxy import BridgelessProxy, TcpProxy
@@ -688,6 +689,28 @@ def test_a_message_that_is_too_large_is_discarded_and_costs_no_connection(
     assert until(lambda: received.payloads[-1:] == [bytes(10)], 30)
     assert [len(payload) for payload in received.payloads[:-1]] == [MAX_PACKET - 2 - len(topic) - 2 - 1]
     assert robot.counters["too_long"] == 1
+    assert robot.counters["connected"] == 1
+    stranger.disconnect()
+    stranger.loop_stop()
+
+
+@both_protocols
+def test_a_topic_that_no_transport_carries_is_discarded(
+    broker: Broker, clients: Clients, topic: str, protocol: str
+) -> None:
+    robot, received = clients(broker.port, "robot", protocol=protocol), Received()
+    stranger, longest = connect_as(broker, "stranger"), f"{topic}/".ljust(MAX_BYTES, "x")
+
+    def publish_all(*, retain: bool) -> None:
+        for one in (f"{longest}x", longest.ljust(65_535, "x"), longest):
+            stranger.publish(one, b"x", qos=1, retain=retain).wait_for_publish(30)
+
+    publish_all(retain=True)
+    robot.subscribe(f"{topic}/#", received)
+    assert until(lambda: (robot.counters["too_long"], len(received.messages)) == (2, 1))
+    publish_all(retain=False)
+    assert until(lambda: (robot.counters["too_long"], len(received.messages)) == (4, 2))
+    assert {message.topic for message in received.messages} == {longest}
     assert robot.counters["connected"] == 1
     stranger.disconnect()
     stranger.loop_stop()

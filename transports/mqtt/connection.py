@@ -36,6 +36,7 @@ from pebble.transports.mqtt.outgoing import (
     unconfirmed_bytes,
 )
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, Filter, MalformedError
+from pebble.transports.topics import MAX_BYTES
 
 if TYPE_CHECKING:
     from pebble.transports.mqtt.paho_client import PahoClient
@@ -49,6 +50,7 @@ _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
+_LOGGED = 200  # bytes of a topic
 _BATCH = 64  # messages read in a row before they are delivered
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 _ABORT = struct.pack("ii", 1, 0)  # SO_LINGER that makes close() drop what was not sent
@@ -522,14 +524,17 @@ class Connection:
             self._delay.acknowledged(sent_at, now)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        retain = bool(first & RETAIN)
+        self._copies |= retain
+        if len(topic) > MAX_BYTES:  # no transport carries it, and much would be remembered of many
+            self.on_too_long(topic, len(topic) + len(payload))
+            return
         self._packets += 1
         try:
             text = topic.decode()
         except UnicodeDecodeError:
             self._counters.add("malformed")
             return
-        retain = bool(first & RETAIN)
-        self._copies |= retain
         retain_requested = retain if self.as_published else (True if retain else None)
         qos = QoS.DELIVERED if first & ANY_QOS else QoS.LATEST
         self._inbox.append(Message(text, payload, qos, retain, retain_requested, self._since))
@@ -550,4 +555,4 @@ class Connection:
     def on_too_long(self, topic: bytes, length: int) -> None:
         self._packets += 1
         self._counters.add("too_long")
-        log.debug("%s sent %d bytes on %r: discarded", self.where, length, topic)
+        log.debug("%s sent %d bytes on %r…: discarded", self.where, length, topic[:_LOGGED])
