@@ -61,7 +61,7 @@ PACKAGES = {
         "2.9.1",
         "a4Ux9VKuIMHsOS7ENbEq6hK2ZGYIT27Rtl0E4eD9KqwxhKiQeMZE/9xb3IdYwWaSOyIBQLExhQgXDTYoiCxnWA==",
         ("tslib.js", "package.json"),
-        "what Foxglove's client is built on",
+        "what Foxglove's client and @mcap/core are built on",
     ),
     "node_modules/ws": Package(
         "ws",
@@ -69,6 +69,34 @@ PACKAGES = {
         "wCkmX8QMOrKjgO8HW2WyDbTSGeqkocxgDzS9iR79rEAexty6/2qzilx3Ag8Tqf9ykop3irLKle0MtVn5qjVnoQ==",
         ("index.js", "lib/*", "package.json"),
         "WebSockets for Node.js",
+    ),
+    "node_modules/@mcap/core": Package(
+        "@mcap/core",
+        "2.2.2",
+        "W4NFiyqQlJsNjw8JxAAQ872u0xLWJy0GFC3YFm8bTLbNs+HdDWe8DwBqznr0MGYpWtw+AX8XzHWB5Y9rLEGJJg==",
+        ("dist/cjs/*", "package.json"),
+        "@mcap/core, which reads recordings in a browser",
+    ),
+    "node_modules/@foxglove/crc": Package(
+        "@foxglove/crc",
+        "0.0.3",
+        "DjIZsnL3CyP/yQ/vUYA9cjrD0a/8YXejI5ZmsaOiT16cLfZcTwaCxIN01/ys4jsy+dZCQ/9DnWFn7AEFbiMDaA==",
+        ("dist/cjs/src/*", "package.json"),
+        "what @mcap/core is built on",
+    ),
+    "node_modules/heap-js": Package(
+        "heap-js",
+        "2.7.1",
+        "EQfezRg0NCZGNlhlDR3Evrw1FVL2G3LhU7EgPoxufQKruNBSYA8MiRPHeWbU+36o+Fhel0wMwM+sLEiBAlNLJA==",
+        ("dist/heap-js.umd.js", "package.json"),
+        "what @mcap/core is built on",
+    ),
+    "node_modules/fzstd": Package(
+        "fzstd",
+        "0.1.1",
+        "dkuVSOKKwh3eas5VkJy1AW1vFpet8TA/fGmVA5krThl8YcOVE/8ZIoEA1+U1vEn5ckxxhLirSdY837azmbaNHA==",
+        ("lib/index.js", "package.json"),
+        "Zstandard for @mcap/core",
     ),
 }
 

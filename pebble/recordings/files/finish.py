@@ -1,7 +1,8 @@
 """Finishes in place what a killed recorder has left: no copy is made, so it works on a full disk.
 
 The torn end is cut off and the summary is written. Damaged bytes between records are covered by a record that every
-reader of MCAP skips; of them only the first nine change.
+reader of MCAP skips: of them only the first nine change, unless they held the names of channels. These are written
+there again, because readers from the begin to the end refuse a message whose channel comes later.
 """
 
 from __future__ import annotations
@@ -15,7 +16,18 @@ from typing import Any, BinaryIO, Final
 import msgspec
 
 from pebble.recordings.files import mcap
-from pebble.recordings.files.mcap import HEAD, MESSAGE, Channel, ChunkIndex, DamageError, Metadata, Op, Schema
+from pebble.recordings.files.mcap import (
+    FILE_TOPIC,
+    HEAD,
+    MESSAGE,
+    Channel,
+    ChunkIndex,
+    DamageError,
+    Metadata,
+    Op,
+    Packer,
+    Schema,
+)
 from pebble.recordings.files.reader import DAMAGE, MISSING, RecordingError, Summary, mapped, unnamed
 from pebble.recordings.files.reading_lock import own
 from pebble.recordings.files.scan import Block, Damage, blocks
@@ -82,7 +94,7 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
         return finished
     own(file, path, _READERS_S)
     rest = contents.mend_indexes(file, covers)
-    _cover(file, covers, contents.file)
+    _cover(file, covers, contents)
     file.truncate(contents.end_at)
     file.seek(contents.end_at)
     _write(file, rest)
@@ -97,14 +109,15 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
     return finished
 
 
-def _cover(file: BinaryIO, spans: list[tuple[int, int]], name: str) -> None:
+def _cover(file: BinaryIO, spans: list[tuple[int, int]], contents: _Contents) -> None:
     for begin, end in spans:
-        start = b"" if begin else mcap.header(_LIBRARY, name)
-        length = end - begin - len(start) - HEAD.size
-        if length < 0:
+        start = b"" if begin else mcap.header(_LIBRARY, contents.file)
+        room = end - begin - len(start) - HEAD.size
+        if room < 0:
             raise RecordingError(f"{end - begin} damaged bytes are too few to be covered")
+        names = contents.name_channels(begin + len(start), end, room)
         file.seek(begin)
-        _write(file, start + HEAD.pack(Op.PADDING, length))
+        _write(file, start + names + HEAD.pack(Op.PADDING, room - len(names)))
 
 
 def _write(file: BinaryIO, data: bytes) -> None:
@@ -124,6 +137,7 @@ class _Contents(Contents):
         self.wrong: list[tuple[int, int]] = []  # indexes that say something else than their chunk
         self.covered = self.damaged_before = self.torn = 0  # bytes, when the file was finished before
         self._mends: list[tuple[int, int, bytes]] = []  # number of a chunk, where its indexes belong, and what they are
+        self._early: dict[int, int] = {}  # channels that are used before they are named: where the first chunk is
         self._due = self._missed_before = 0
 
     def add(self, block: Block, data: Any) -> None:
@@ -165,13 +179,36 @@ class _Contents(Contents):
                 covers[place : place + 1] = [(at + len(indexes), covers[place][1])] if room else []
             elif at == self.end_at:
                 return indexes
+            elif place is not None and covers[place][1] == self.end_at:
+                del covers[place]
+                self.end_at = at
+                return indexes
             else:
                 index = ChunkIndex.unpack(self.chunks[number][HEAD.size :])
                 self.chunks[number] = replace(index, start_ns=0, end_ns=0, indexes={}, indexes_length=0).pack()
         return b""
 
+    def name_channels(self, at: int, end: int, room: int) -> bytes:
+        """A chunk for ``at`` with the channels that chunks behind ``end`` use too early; none if it has no ``room``."""
+        early = [self.channels[number] for number, where in self._early.items() if where >= end]
+        if not early:
+            return b""
+        schemas = [self.schemas[number].pack() for number in {one.schema for one in early} & self.schemas.keys()]
+        first = [one for one in self.channels.values() if one.topic == FILE_TOPIC]  # as in each chunk
+        records = b"".join([one.pack() for one in first] + schemas + [one.pack() for one in early])
+        chunk = mcap.chunk(records, 0, 0, Packer())
+        if len(chunk) > room:
+            return b""
+        for one in early:
+            del self._early[one.id]
+        compression, packed = mcap.chunk_compression(chunk[HEAD.size :])
+        index = ChunkIndex(0, 0, at, len(chunk), {}, 0, compression, packed, len(records))
+        self.chunks.append(index.pack())
+        self.chunks.sort(key=lambda packed: ChunkIndex.unpack(packed[HEAD.size :]).at)
+        return chunk
+
     def _add_chunk(self, block: Block, data: Any) -> None:
-        entries = self._entries(block.body)
+        entries = self._entries(block.body, block.at)
         times = [log_ns for each in entries.values() for log_ns, _ in each]
         expected, indexes = b"", {}
         for channel, each in entries.items():
@@ -196,13 +233,15 @@ class _Contents(Contents):
             ).pack()
         )
 
-    def _entries(self, records: bytes) -> dict[int, list[tuple[int, int]]]:
-        """The indexes that belong to the records of a chunk."""
+    def _entries(self, records: bytes, at: int) -> dict[int, list[tuple[int, int]]]:
+        """The indexes that belong to the records of the chunk at ``at``."""
         entries: dict[int, list[tuple[int, int]]] = {}
         for op, begin, stop in mcap.records(records):
             if op == Op.MESSAGE:
                 channel, sequence, log_ns, _ = MESSAGE.unpack_from(records, begin)
                 entries.setdefault(channel, []).append((log_ns, begin - HEAD.size))
+                if channel not in self.channels:
+                    self._early.setdefault(channel, at)
                 self.count(channel, log_ns)
                 self.missing += max(0, sequence - self._due)
                 self._due = sequence + 1

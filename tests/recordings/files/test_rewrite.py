@@ -14,7 +14,8 @@ from pebble.recordings.files.mcap import Packer
 from pebble.recordings.files.reader import RecordingError
 from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.files.writer import McapWriter
-from tests.recordings.files.test_files import counted_by_mcap, zero_a_page
+from tests.recordings.files.other_readers import Counted, by_mcap
+from tests.recordings.files.test_files import zero_a_page
 from tests.recordings.messages import START_NS, contents, write
 
 
@@ -28,7 +29,7 @@ def test_a_compact_copy_holds_the_same_and_keeps_its_age_and_readers(tmp_path: P
     assert (contents(path), made.messages, made.missing) == (written, len(written), 0)
     assert path.stat().st_size < before * 0.8
     assert (path.stat().st_mode & 0o777, path.stat().st_mtime) == (0o640, 1_000_000_000)
-    assert counted_by_mcap(path) == (len(written), len(written))
+    assert by_mcap(path) == Counted(len(written), len(written), len(written))
     assert not list(tmp_path.glob(".*"))
 
 
