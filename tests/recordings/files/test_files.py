@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import random
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
@@ -147,23 +150,28 @@ class TestDamaged:
                 path.write_bytes(raw)
                 assert len(contents(path)) >= len(written) - 100, at
 
-    def test_finishing_may_be_interrupted_at_any_byte(self, tmp_path: Path) -> None:
-        rng, path = random.Random(5), tmp_path / "a.mcap"
+    @pytest.mark.parametrize("damage", DAMAGES)
+    def test_finishing_may_be_killed_at_any_byte(
+        self, tmp_path: Path, damage: Callable[[bytearray, random.Random], None]
+    ) -> None:
+        rng, path, killed = random.Random(damage.__name__), tmp_path / "a.mcap", dict[Path, Counted]()
         write(path, finish=False)
         raw = bytearray(path.read_bytes())
-        zero_a_page(raw, rng)
+        damage(raw, rng)
         path.write_bytes(raw)
-        read = contents(path)
-        begun = finish(path)
-        done = path.read_bytes()
-        for _ in range(100 * TIMES):
-            path.write_bytes(done[: rng.randrange(len(raw) - 20_000, len(done))])
-            if path.stat().st_size < len(raw):
-                path.write_bytes(raw[: path.stat().st_size])
-                continue
-            assert finish(path).messages == begun.messages
+        read, size = contents(path), _finish_until_killed(path, math.inf)
+        made = finish(path)
+        assert size > 1000
+        for number in range(20 * TIMES):
+            path = tmp_path / f"{number}.mcap"
+            path.write_bytes(raw)
+            _finish_until_killed(path, rng.randrange(size))
+            again = finish(path)
+            assert (again.messages, again.missing) == (made.messages, made.missing)
             assert contents(path) == read
-            assert by_mcap(path).statistics == begun.messages
+            killed[path] = Counted(len(read), len(read), len(read))
+            assert by_mcap(path) == killed[path]
+        assert by_mcap_core(list(killed)) == list(killed.values())
 
     @pytest.mark.parametrize("level", [0, 3])
     def test_a_recording_inside_a_payload_is_not_taken_for_one_of_the_file(self, tmp_path: Path, level: int) -> None:
@@ -192,6 +200,27 @@ class TestDamaged:
             with pytest.raises(RecordingError):
                 finish(path)
             assert path.read_bytes() == garbage
+
+
+class _KilledError(BaseException):
+    pass
+
+
+def _finish_until_killed(path: Path, budget: float) -> int:
+    """Finish a file, but no further than after so many bytes, as its file is not buffered; returns how many."""
+    written = 0
+
+    def write(file: BinaryIO, data: bytes) -> None:
+        nonlocal written
+        part = data[: int(min(len(data), budget - written))]
+        written += file.write(part)
+        if written >= budget:
+            raise _KilledError
+
+    with pytest.MonkeyPatch.context() as patch, contextlib.suppress(_KilledError):
+        patch.setattr("pebble.recordings.files.finish._write", write)
+        finish(path)
+    return written
 
 
 def _records(raw: bytes) -> list[int]:
