@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import socket
+import statistics
 import subprocess
 import sys
 import time
@@ -44,6 +45,14 @@ def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float
             return True
         time.sleep(step)
     return bool(condition())
+
+
+def quarters(values: Sequence[float]) -> list[float]:
+    """The medians of the quarters of a run. The first one warms up: caches fill, and the heap finds its size."""
+    size = max(1, len(values) // 4)
+    return [statistics.median(values[at * size : (at + 1) * size] or values) for at in range(3)] + [
+        statistics.median(values[-size:])
+    ]
 
 
 def free_port() -> int:

@@ -9,7 +9,6 @@ been loaded and all buffers of the pages are filling or full.
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from rich.table import Table
 from pebble.bench import chromium as program
 from pebble.bench.usage import pss_mb
 from pebble.demo.testbed import ROBOTS
+from tests.support import quarters
 from tests.web.browser import Tab
 from tests.web.console import Console, console
 from tests.web.stage import Stage
@@ -88,8 +88,7 @@ def _is_memory(what: str) -> bool:
 
 def change(values: list[float]) -> float:
     """Of the median of the last quarter since the second one; 0: none."""
-    quarter = max(1, len(values) // 4)
-    before, after = statistics.median(values[quarter : 2 * quarter] or values), statistics.median(values[-quarter:])
+    _, before, _, after = quarters(values)
     return after / before - 1
 
 
