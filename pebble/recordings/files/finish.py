@@ -105,7 +105,7 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
         contents.metadata.append((about, contents.end_at))
         _write(file, about.pack())
         contents.end_at += len(about.pack())
-    _write(file, contents.end(contents.end_at))
+    _write(file, contents.end(contents.end_at, len(contents.chunks), b"".join(contents.chunks)))
     return finished
 
 
@@ -131,6 +131,7 @@ class _Contents(Contents):
 
     def __init__(self) -> None:
         super().__init__()
+        self.chunks: list[bytes] = []  # their indexes, packed
         self.file = ""  # its name, which its chunks repeat
         self.end_at = 0  # where the data end that can be kept
         self.missing = 0  # messages, by their numbers

@@ -10,12 +10,13 @@ from collections import deque
 from collections.abc import Callable
 
 from pebble.recordings.recorder.lane import OpenFile
+from pebble.runtime.memory import return_free_pages
 
 log = logging.getLogger(__name__)
 
 
 class Background:
-    """Makes files durable every few seconds, and does what may take long, one after the other."""
+    """Makes files durable every few seconds, and returns free memory; does what may take long, one after the other."""
 
     def __init__(self, period_s: float, note: Callable[[float], None]) -> None:
         self._period_s, self._note = period_s, note
@@ -63,6 +64,7 @@ class Background:
                 synced = time.monotonic()
                 for file in files:
                     self._sync(file)
+                return_free_pages()
 
     def _do(self, job: Callable[[], None]) -> None:
         try:
