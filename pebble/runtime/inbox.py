@@ -27,6 +27,7 @@ class Inbox:
         self._jobs: OrderedDict[Hashable, Job] = OrderedDict()
         self._internal: deque[Job] = deque()
         self._numbers = count()
+        self._woken = False
         self.dropped = 0
 
     def post(self, job: Job, *, newest_of: Hashable = None) -> None:
@@ -43,15 +44,29 @@ class Inbox:
         self._internal.append(job)
         self._wakeup.set()
 
-    def take(self, timeout: float | None) -> Job | None:
-        """The next job, waiting up to ``timeout`` seconds for one; None when there was none."""
-        end = None if timeout is None else time.monotonic() + timeout
-        while (job := self._next()) is None:
-            if not self._wakeup.wait(end):
-                return None
-        return job
+    def wake(self) -> None:
+        """Make `wait` return, without a job."""
+        self._woken = True
+        self._wakeup.set()
 
-    def _next(self) -> Job | None:
+    def wait(self, timeout: float | None) -> None:
+        """Wait until there is a job, up to ``timeout`` seconds, or until `wake`."""
+        if self:
+            return
+        end = None if timeout is None else time.monotonic() + timeout
+        while not (self or self._woken):
+            if not self._wakeup.wait(end):
+                return
+        self._woken = False
+
+    def __bool__(self) -> bool:
+        """Whether there is a job."""
+        return bool(self._internal or self._jobs)
+
+    def take(self, timeout: float | None = 0.0) -> Job | None:
+        """The next job, waiting up to ``timeout`` seconds for one; None when there was none, or on `wake`."""
+        if timeout != 0.0:
+            self.wait(timeout)
         if self._internal:
             return self._internal.popleft()
         with self._lock:

@@ -6,6 +6,8 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
+from math import inf
 from typing import Any, ClassVar, TypeVar
 
 from pebble.config import Config
@@ -15,6 +17,7 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.inbox import Inbox
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.timers import Timer, Timers
+from pebble.runtime.work_lock import WorkLock
 from pebble.transports import Message, QoS, State, Subscription, Transport
 from pebble.transports.counters import Counters, bounds_reached
 
@@ -51,6 +54,10 @@ def every(seconds: float) -> Callable[[Method], Method]:
     return mark
 
 
+def _fail(failure: Exception) -> None:
+    raise failure
+
+
 def _marked(cls: type, mark: str) -> list[str]:
     """Names of the methods that carry ``mark``, in the order of their definition, base classes first."""
     names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
@@ -58,7 +65,9 @@ def _marked(cls: type, mark: str) -> list[str]:
 
 
 class Service:
-    """One process of a robot. Handlers and timers all run on the thread that called :meth:`run`: no locks needed.
+    """One process of a robot. Handlers and timers run one at a time, on the thread that called :meth:`run`: no locks.
+
+    Only what is given to :meth:`run_if_idle` may run on another thread, while that one has nothing to do.
 
     A subclass gives ``name`` and ``publishes``, marks methods with ``@on`` and ``@every``, opens its device in
     ``start`` and leaves it safe in ``stop``. A reader thread of a blocking device only ever calls ``post``.
@@ -95,6 +104,8 @@ class Service:
         self.timers = Timers()
         self._quiet_log = RateLimitedLog(self.log)
         self._inbox = Inbox()
+        self._work = WorkLock()
+        self._wakes_at = -inf  # when the service's thread looks at its timers, on `clock`; guarded by `_work`
         self._states: dict[str, tuple[Channel, bytes]] = {}
         self._handled: dict[Channel, Subscription] = {}  # of the methods marked with @on
         self._on_stop = ExitStack()
@@ -166,8 +177,29 @@ class Service:
         """Run ``job`` before everything that waits. It is never dropped, so at most one of a kind may wait."""
         self._inbox.post_internal(job)
 
+    def run_if_idle(self, job: Callable[[], None]) -> bool:
+        """Run ``job`` now, on the calling thread, if the service is idle; False: it was not run, and is to be posted.
+
+        It saves a switch of threads, which costs more than most jobs. Idle is a service that does nothing and for which
+        nothing waits; if its thread hangs, it is not. ``job`` must neither block nor take long. A failure ends the
+        service, as that of a posted job.
+        """
+        if not self._work.try_enter():
+            return False
+        try:
+            if self._inbox:
+                return False
+            job()
+            if self.timers.next_due < self._wakes_at:
+                self._inbox.wake()
+        except Exception as failure:  # noqa: BLE001 - it is raised again where it ends the service
+            self.post_first(partial(_fail, failure))
+        finally:
+            self._work.leave()
+        return True
+
     def call_at(self, due: float, job: Callable[[], None]) -> Timer:
-        """Run ``job`` at ``due`` on ``clock``, on the service's thread (call from there)."""
+        """Run ``job`` at ``due`` on ``clock``, on the service's thread (call from there, or from `run_if_idle`)."""
         return self.timers.add(due, job)
 
     def quit(self) -> None:
@@ -178,10 +210,11 @@ class Service:
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
         """Run until :meth:`quit`. ``ready`` is called once the service has subscribed."""
         try:
-            self._set_up()
+            with self._work:
+                self._set_up()
             ready()
             while self._running:
-                self._turn(self.timers.wait(self.clock()))
+                self._turn(None if self._wakes_at == inf else max(0.0, self._wakes_at - self.clock()))
         finally:
             self._tear_down()
 
@@ -203,13 +236,17 @@ class Service:
 
     def _turn(self, timeout: float | None) -> bool:
         """Do one job, if there is one within ``timeout`` seconds, and what is due; return whether there was one."""
-        job = self._inbox.take(timeout)
-        if job is not None:
-            job()
-        self.timers.run_due(self.clock())
+        self._inbox.wait(timeout)
+        with self._work:
+            job = self._inbox.take()
+            if job is not None:
+                job()
+            self.timers.run_due(self.clock())
+            self._wakes_at = self.timers.next_due
         return job is not None
 
     def _tear_down(self) -> None:
+        self._work.shut()
         try:
             with self._on_stop:
                 self.stop()

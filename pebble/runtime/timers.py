@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable
 from itertools import count
+from math import inf
 
 
 class Timer:
@@ -30,10 +31,16 @@ class Timers:
         self._push(timer)
         return timer
 
+    @property
+    def next_due(self) -> float:
+        """When the next timer is due; infinite without timers."""
+        self._discard_cancelled()
+        return self._heap[0][0] if self._heap else inf
+
     def wait(self, now: float) -> float | None:
         """Seconds until the next timer is due; None without timers."""
-        self._discard_cancelled()
-        return max(0.0, self._heap[0][0] - now) if self._heap else None
+        due = self.next_due
+        return None if due == inf else max(0.0, due - now)
 
     def run_due(self, now: float) -> None:
         """Run what is due. A periodic timer that fell behind skips the missed turns instead of making them up."""

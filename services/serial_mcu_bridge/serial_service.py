@@ -89,14 +89,18 @@ class SerialService(Service, ABC):
         self.on_line_state(state)
 
     def _queue_input(self, chunk: bytes) -> None:
-        """On the reading thread: at most one job waits, however much the MCU sends: commands are not delayed."""
+        """On the reading thread, which also parses it if the service is idle.
+
+        At most one job waits, however much the MCU sends: commands are not delayed.
+        """
         with self._input_lock:
             if len(self._input) + len(chunk) > _INPUT_LIMIT:
                 self.counters.add("input_dropped", len(self._input))
                 self._input.clear()
                 self._input += self.end  # what follows does not continue the text line before the gap
             self._input += chunk
-        self.post(self._read_input, newest_of="serial input")
+        if not self.run_if_idle(self._read_input):
+            self.post(self._read_input, newest_of="serial input")
 
     def _read_input(self) -> None:
         with self._input_lock:

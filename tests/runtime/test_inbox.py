@@ -71,8 +71,12 @@ def test_a_waiting_thread_is_woken() -> None:
     assert ran == ["job", "internal"]
 
 
-def test_take_gives_up_after_its_timeout() -> None:
-    assert Inbox().take(0.01) is None
+def test_take_gives_up_after_its_timeout_or_when_it_is_woken() -> None:
+    inbox = Inbox()
+    assert inbox.take(0.01) is None
+    inbox.wake()
+    assert inbox.take(None) is None
+    assert inbox.take(0.01) is None, "it was woken once"
 
 
 def test_a_timeout_that_ends_while_it_is_looked_at_is_no_wait_for_ever() -> None:

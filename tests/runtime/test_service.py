@@ -293,6 +293,112 @@ def test_timers_go_on_under_a_flood_and_calls_come_when_they_are_due(robot: Robo
     assert called[0] >= due
 
 
+# -- work on the thread that brings it
+
+
+class Idle(Recorder):
+    """Without timers of its own: nothing wakes it."""
+
+    tick = None  # type: ignore[assignment]
+
+
+@pytest.fixture
+def idle() -> Iterator[Robot]:
+    made = Robot(Idle, defaults={"retained_publish_interval_seconds": 10_000})
+    made.start()
+    assert until(lambda: made.service._wakes_at > time.monotonic() + 1000)
+    yield made
+    made.close()
+
+
+def run_when_idle(service: Service, job: Callable[[], None]) -> bool:
+    return until(lambda: service.run_if_idle(job))
+
+
+def test_an_idle_service_works_on_the_thread_that_brings_the_work(idle: Robot) -> None:
+    ran: list[int] = []
+    assert run_when_idle(idle.service, lambda: ran.append(threading.get_ident()))
+    assert ran == [threading.get_ident()]
+
+
+def test_a_service_that_works_or_hangs_takes_no_work_of_other_threads(idle: Robot) -> None:
+    ran: list[str] = []
+    idle.service.go_on.clear()
+    idle.publish(DRIVE_TOPIC, '{"x": 0.5}')
+    assert idle.saw(0.5)
+    assert not idle.service.run_if_idle(lambda: ran.append("visitor"))
+    idle.service.go_on.set()
+    assert run_when_idle(idle.service, lambda: ran.append("visitor"))
+    assert ran == ["visitor"]
+
+
+def test_work_of_another_thread_goes_before_nothing_that_waits(idle: Robot) -> None:
+    order: list[str] = []
+
+    def first() -> None:
+        idle.service.post(lambda: order.append("posted"))
+        order.append("first")
+
+    assert run_when_idle(idle.service, first)
+    assert run_when_idle(idle.service, lambda: order.append("second"))
+    assert order == ["first", "posted", "second"]
+
+
+def test_one_thread_works_at_a_time_and_the_services_own_has_its_turns(idle: Robot) -> None:
+    inside, most, own, ends = [0], [0], [0], threading.Event()
+
+    def work() -> None:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        time.sleep(0.0001)
+        inside[0] -= 1
+
+    def own_work() -> None:
+        own[0] += 1
+        work()
+
+    def visit() -> None:
+        while not ends.is_set():
+            idle.service.run_if_idle(work)
+
+    visitors = [threading.Thread(target=visit) for _ in range(3)]
+    for visitor in visitors:
+        visitor.start()
+    try:
+        for expected in range(1, 51):
+            idle.service.post(own_work)
+            assert until(lambda expected=expected: own[0] == expected, 5)  # type: ignore[misc]
+    finally:
+        ends.set()
+        for visitor in visitors:
+            visitor.join(5)
+    assert most == [1]
+
+
+def test_a_timer_that_another_thread_sets_wakes_the_services_own(idle: Robot) -> None:
+    called: list[int] = []
+    due = time.monotonic() + 0.05
+    assert run_when_idle(
+        idle.service, lambda: idle.service.call_at(due, lambda: called.append(threading.get_ident())) and None
+    )
+    assert until(lambda: bool(called), 5)
+    assert called[0] != threading.get_ident()
+
+
+def test_work_of_another_thread_that_fails_ends_the_service_and_not_that_thread(idle: Robot) -> None:
+    def fail() -> None:
+        raise RuntimeError("it failed")
+
+    assert run_when_idle(idle.service, fail)
+    assert until(lambda: str(idle.error) == "it failed")
+    assert idle.service.transport.state is State.CLOSED
+
+
+def test_a_service_that_has_ended_takes_no_work(idle: Robot) -> None:
+    idle.end()
+    assert not idle.service.run_if_idle(lambda: None)
+
+
 # -- receiving
 
 

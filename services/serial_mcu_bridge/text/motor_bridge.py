@@ -114,7 +114,7 @@ class MotorBridge(SerialService):
         self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def _judge_soon(self, was_empty: bool) -> None:
-        if was_empty:
+        if was_empty and not self.run_if_idle(self._judge):
             self.post_first(self._judge)
 
     # -- commands

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +51,22 @@ class Bench:
             self.service.run()
         except TransportError as error:
             self.failure = error
+
+    @contextmanager
+    def occupied(self) -> Iterator[None]:
+        """Keeps the service's thread busy: what arrives meanwhile waits."""
+        begun, ends = threading.Event(), threading.Event()
+
+        def work() -> None:
+            begun.set()
+            ends.wait(5)
+
+        self.service.post(work)
+        assert begun.wait(5)
+        try:
+            yield
+        finally:
+            ends.set()
 
     def send(self, suffix: str, body: Any) -> None:
         self.operator.publish(f"{BASE}/{suffix}", json.dumps(body).encode(), qos=QoS.DELIVERED)

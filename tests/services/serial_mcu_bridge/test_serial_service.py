@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -174,12 +173,10 @@ def test_a_retained_stop_and_a_retained_reset_do_nothing(bench: Bench) -> None:
 
 def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(bench: Bench) -> None:
     """The service is busy while a drive command, a stop and another drive command arrive."""
-    busy = threading.Event()
-    bench.service.post(lambda: busy.wait(5))
-    bench.send("incoming/drive-values", {"z": 0.25})
-    bench.send("incoming/estop", STOP)
-    bench.send("incoming/drive-values", {"z": 0.5})
-    busy.set()
+    with bench.occupied():
+        bench.send("incoming/drive-values", {"z": 0.25})
+        bench.send("incoming/estop", STOP)
+        bench.send("incoming/drive-values", {"z": 0.5})
     assert stopped(bench)
     bench.send("incoming/lights-solid", {"r": 1})
     assert bench.line("L 0.000 0.000 1.000")
@@ -187,13 +184,11 @@ def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(bench: Bench) 
 
 
 def test_a_stop_does_not_wait_behind_a_full_inbox(bench: Bench) -> None:
-    busy = threading.Event()
-    bench.service.post(lambda: busy.wait(5))
-    for _ in range(2000):
-        bench.service.post(lambda: time.sleep(0.001))
-    bench.send("incoming/estop", STOP)
-    began = time.monotonic()
-    busy.set()
+    with bench.occupied():
+        for _ in range(2000):
+            bench.service.post(lambda: time.sleep(0.001))
+        bench.send("incoming/estop", STOP)
+        began = time.monotonic()
     assert stopped(bench)
     assert time.monotonic() - began < 5
     assert state(bench)["count"] == 1

@@ -1,0 +1,37 @@
+"""The lock under which a service works: its own thread, or a thread that brings work and finds it idle."""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+
+
+class WorkLock:
+    """``with`` is for the service's own thread, and waits. Other threads only try, and never wait for anything here.
+
+    The own thread waits for one visitor at most: while it waits, no other one gets in.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._awaited = False  # by the own thread
+
+    def __enter__(self) -> None:
+        self._awaited = True
+        self._lock.acquire()
+        self._awaited = False
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._lock.release()
+
+    def try_enter(self) -> bool:
+        """Take the lock for another thread, which then calls `leave`; False while the service works."""
+        return not self._awaited and self._lock.acquire(blocking=False)
+
+    def leave(self) -> None:
+        self._lock.release()
+
+    def shut(self) -> None:
+        """Take the lock for good, for the own thread."""
+        self._awaited = True
+        self._lock.acquire()

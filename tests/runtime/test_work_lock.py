@@ -1,0 +1,32 @@
+from __future__ import annotations
+
+import threading
+
+from pebble.runtime.work_lock import WorkLock
+from tests.support import until
+
+
+def test_nobody_else_gets_in_before_the_own_thread_once_that_waits() -> None:
+    lock, ends = WorkLock(), threading.Event()
+
+    def work() -> None:
+        with lock:
+            ends.wait(10)
+
+    assert lock.try_enter()
+    own = threading.Thread(target=work, daemon=True)
+    own.start()
+    assert until(lambda: lock._awaited)
+    lock.leave()
+    try:
+        assert not any(lock.try_enter() for _ in range(1000))
+    finally:
+        ends.set()
+        own.join(10)
+    assert lock.try_enter()
+
+
+def test_a_lock_that_is_shut_lets_nobody_in() -> None:
+    lock = WorkLock()
+    lock.shut()
+    assert not lock.try_enter()
