@@ -101,8 +101,9 @@ class RobotProcesses:
         if self._kind == STAND_IN:
             ports = ["--local", str(self._brokers["local"].port), "--remote", str(self.remote_port)]
             rest = ["--base", self.base, "--device", str(self._root / "mcu")]
+            reports = ["--reports"] if self._reports else []
             for part in ("bridge", "serial"):
-                command = [sys.executable, "-m", "pebble.bench.stand_in", part, *ports, *rest]
+                command = [sys.executable, "-m", "pebble.bench.stand_in", part, *ports, *rest, *reports]
                 self._stand_in.append(Program(f"the stand-in's {part}", command, self._root / "robot.log"))
             return
         command = [sys.executable, "-m", "pebble.cli", "up", str(self._root / "robot.json")]
