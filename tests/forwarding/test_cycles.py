@@ -334,6 +334,6 @@ class TestCycles:
             cycles.receive(REMOTE, TOPIC, b"%d" % number, once=True)
             cycles.receive(LOCAL, TOPIC, bytes(b" \t"[number >> digit & 1] for digit in range(32)), once=True)
             cycles.repeats_stop(REMOTE, ESTOP, b"%d" % number)
-        for memory, most in (("_ways", 1024), ("_closed", 256), ("_ours", 256), ("_others", 256), ("_stops", 256)):
+        for memory, most in (("_ways", 1024), ("closed_ways", 256), ("_ours", 256), ("_others", 256), ("_stops", 256)):
             assert 200 < len(getattr(cycles, memory)) <= most
         assert len(cycles._ways[REMOTE, TOPIC].counts) <= 64

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import select
 import socket
+import threading
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from typing import Any
 
 import pytest
 
 from pebble.transports import MqttSettings
+from pebble.transports.base import Message
+from pebble.transports.counters import Counters
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Client, Opening
+from pebble.transports.mqtt.connection import Connection
 from pebble.transports.mqtt.packets import Filter
 from tests.support import until
 from tests.transports.test_mqtt_packets import Noted, packet
@@ -98,7 +102,7 @@ def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any,
     for number in numbers:
         pair.client.publish("a", bytes([number]) * 200_000, 0, retain=False, expires_s=None)
     pair.client.ping()
-    assert pair.client.want_write
+    assert pair.client.waiting
     assert 0 < pair.client.unwritten < 40 * 200_100
     arrived = bytearray()
 
@@ -113,7 +117,7 @@ def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any,
         for n in numbers
     ]
     assert bytes(arrived) == b"".join(expected) + packets.PINGREQ
-    assert not pair.client.want_write
+    assert not pair.client.waiting
     assert pair.client.unwritten == 0
 
 
@@ -134,6 +138,9 @@ def test_acknowledgements_of_unknown_messages_allow_no_more(pairs: Any) -> None:
 def test_acknowledgements_of_what_was_read_together_are_written_together(pairs: Any) -> None:
     pair = pairs("3.1.1")
     pair.sends(b"".join(packet(0x32, b"\0\1a" + bytes((0, number)) + b"x") for number in (1, 2, 3)))
+    assert pair.client.owes
+    pair.client.acknowledge()
+    assert not pair.client.owes
     assert pair.written() == b"\x40\2\0\1\x40\2\0\2\x40\2\0\3"
     assert [seen[0] for seen in pair.noted.seen] == [b"a"] * 3
 
@@ -152,7 +159,7 @@ def test_a_connection_that_the_other_side_ends_has_no_socket(pairs: Any, reset: 
     publish(pair.client, 1)
     pair.client.subscribe([Filter("a", 1)])
     pair.client.ping()
-    assert not pair.client.want_write
+    assert not pair.client.waiting
     assert pair.client.receive() == 0
 
 
@@ -164,3 +171,38 @@ def test_a_client_that_leaves_closes_after_its_last_packet(pairs: Any) -> None:
     pair.other.setblocking(True)
     parts = list(iter(lambda: pair.other.recv(4096), b""))  # a reset would raise
     assert b"".join(parts).endswith(packets.DISCONNECT)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_message_is_acknowledged_when_it_was_handled_even_if_that_failed(fails: bool) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as stack:
+        settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1])
+        connection = Connection(
+            Opening("client", settings, None, None),
+            Counters(),
+            as_published=False,
+            on_answers=lambda _answers: None,
+            skips_retained=lambda _topic: False,
+        )
+        stack.callback(connection.discard)
+        connecting = threading.Thread(target=connection.connect, args=(threading.Event(),))
+        connecting.start()
+        other = stack.enter_context(server.accept()[0])
+        other.settimeout(5)
+        assert other.recv(4096).startswith(b"\x10")
+        other.sendall(b"\x20\2\0\0")
+        connecting.join(5)
+        handled: list[bytes] = []
+
+        def handle(messages: list[Message]) -> None:
+            handled.extend(message.payload for message in messages)
+            assert not select.select([other], [], [], 0.1)[0], "acknowledged before"
+            if fails:
+                raise RuntimeError("a handler failed")
+
+        other.sendall(b"".join(packet(0x32, b"\0\1a" + bytes((0, number)) + b"x") for number in (1, 2)))
+        with pytest.raises(RuntimeError) if fails else nullcontext():
+            while not handled:
+                connection.pump(1.0, handle)
+        assert handled == [b"x", b"x"]
+        assert other.recv(4096) == b"\x40\2\0\1\x40\2\0\2"

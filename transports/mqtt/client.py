@@ -55,7 +55,7 @@ class Client:
             password=settings.password,
         )
         self._reader = Reader(self, modern=self._modern)
-        self._waiting: deque[bytes] = deque()  # to be written
+        self.waiting: deque[bytes] = deque()  # to be written, once the socket accepts more
         self._mid = 0  # the newest message id
         self._quota = self._receive_maximum = _MOST_IDS  # messages of QoS 1 that the broker takes without an answer
         self._held: deque[bytes] = deque()  # such messages beyond that
@@ -118,13 +118,22 @@ class Client:
         self._reader.feed(data)
         return len(data)
 
-    def read(self, most: int) -> None:
-        """Hand up to ``most`` packets to the listener. Raises MalformedError."""
+    def read(self, most: int) -> int:
+        """Hand up to ``most`` packets to the listener; returns how many bytes are `unread`. Raises MalformedError."""
         reader = self._reader
         reader.read(most)
-        if reader.acks:
-            acks, reader.acks = bytes(reader.acks), bytearray()
-            self._send(acks)
+        return reader.unread
+
+    @property
+    def owes(self) -> bool:
+        """Whether there are messages to `acknowledge`."""
+        return bool(self._reader.acks)
+
+    def acknowledge(self) -> None:
+        """Acknowledge what was read, in one piece: after it was handled, which is more urgent."""
+        reader = self._reader
+        acks, reader.acks = bytes(reader.acks), bytearray()
+        self._send(acks)
 
     def on_accepted(self, accepted: Accepted) -> None:
         if accepted.receive_maximum is not None:
@@ -140,24 +149,17 @@ class Client:
 
     # -- writing
 
-    @property
-    def want_write(self) -> bool:
-        return bool(self._waiting)
-
     def write(self) -> None:
         """Write what waits, as far as the socket accepts it."""
-        while self._waiting:
-            data = self._waiting[0]
-            written = self._write(data)
-            self.unwritten -= written
-            if written < len(data):
-                self._waiting[0] = data[written:]
-                return
-            self._waiting.popleft()
+        waiting, self.waiting, self.unwritten = self.waiting, deque(), 0
+        for data in waiting:
+            self._send(data)  # all the others wait after the first one that is not accepted
 
     def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, expires_s: int | None) -> int:
         """Returns the message id, 0 with QoS 0."""
-        mid = self._next_id() if qos else 0
+        mid = 0
+        if qos:
+            mid = self._mid = self._mid % _MOST_IDS + 1
         packet = packets.publish(topic, payload, qos, mid, retain=retain, modern=self._modern, expires_s=expires_s)
         if qos and self._quota <= 0:
             self._held.append(packet)
@@ -183,7 +185,7 @@ class Client:
     def disconnect(self) -> None:
         """Send DISCONNECT, and close so that it arrives: a connection that is reset may lose it."""
         self._send(packets.DISCONNECT)
-        if not self._waiting:
+        if not self.waiting:
             self.close()
 
     def _next_id(self) -> int:
@@ -192,22 +194,18 @@ class Client:
 
     def _send(self, data: bytes) -> None:
         """Hot."""
-        if not self._waiting:
-            written = self._write(data)
+        if self.socket is None:
+            return
+        if not self.waiting:
+            try:
+                written = self.socket.send(data)
+            except _NOT_NOW:
+                written = 0
+            except OSError:
+                self.close()
+                return
             if written == len(data):
                 return
             data = data[written:]
-        self._waiting.append(data)
+        self.waiting.append(data)
         self.unwritten += len(data)
-
-    def _write(self, data: bytes) -> int:
-        """How many bytes the kernel accepts; all for a connection that is lost."""
-        if self.socket is None:
-            return len(data)
-        try:
-            return self.socket.send(data)
-        except _NOT_NOW:
-            return 0
-        except OSError:
-            self.close()
-            return len(data)

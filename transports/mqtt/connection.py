@@ -49,6 +49,7 @@ _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payloa
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_PING_S = 0.05  # between two pings, however short the allowed silence
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
+_FRESH_S = 0.05  # what is in a socket that was empty so recently counts as having come just now
 _OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _LOGGED = 200  # bytes of a topic
 _BATCH = 64  # messages read in a row before they are delivered
@@ -228,38 +229,52 @@ class Connection:
         message is never delivered later than the confirmation of its subscription. Whether a subscription is refused is
         known before both.
         """
-        readable = self._wait(timeout)
+        readable, client = self._wait(timeout), self._client
         with self._lock:
             # Before reading: messages queued during a silence must not arrive as if they were fresh (T19).
             self._check_silence()
             if readable or self._more:
                 self._read()
-            self._write()
+            if client.waiting or self._backlog.waiting:
+                self._write()
             if clock.since_boot() >= self._ping_due_at:
                 self._ping()
-            self._quick_ack()
+            owes = client.owes
+            if not owes:
+                self._quick_ack()
             messages, self._inbox = self._inbox, []
             answers, self._answers = self._answers, {}
         if answers:
             self._on_answers(answers)
-        receive(messages)
+        try:
+            if messages:
+                receive(messages)
+        finally:
+            if owes:
+                with self._lock:
+                    client.acknowledge()
         if self._copies:
             self._note_copies()  # again: they may take longer to handle than an answer may
             self._copies = False
-        self._in_flight.complete()
+        if self._in_flight.answered:
+            self._in_flight.complete()
 
     def _wait(self, timeout: float) -> bool:
         with self._lock:
             sock = self._client.socket
             if sock is None:
                 raise Lost(self._closed)
-            blocked = self._client.want_write
+            blocked = self._client.waiting
             poll = self._poll = self._poll or _Poll(sock.fileno(), self._wake_read.fileno())
         began = clock.since_boot()
         wait = min(timeout, self._ping_due_at - began)
-        readable, writable, woken = poll.wait(0.0, write=blocked)
+        readable = writable = woken = False
+        is_fresh = not self._more and began - self._waiting.checked_at <= _FRESH_S
+        if not is_fresh:
+            readable, writable, woken = poll.wait(0.0, write=blocked)
         if not (readable or writable or woken or self._more):
-            self._waiting.empty(began)
+            if not is_fresh:
+                self._waiting.empty(began)
             readable, writable, woken = poll.wait(max(wait, 0.0), write=blocked)
             if (now := clock.since_boot()) - began <= wait + _OVERSLEPT_S:
                 self._waiting.empty(now)  # until just now
@@ -294,9 +309,10 @@ class Connection:
     def _read(self) -> None:
         """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks."""
         client, first, size = self._client, self._packets, 0
+        unread = client.unread if self._more else 0
         self._more = True
         while self._more and self._packets - first < _BATCH:
-            before, unread = self._packets, client.unread
+            before = self._packets
             if not unread:
                 self._received_at = began = clock.since_boot()
                 if began - self._waiting.checked_at > _OVERSLEPT_S and self._accepted:
@@ -304,11 +320,10 @@ class Connection:
                 unread = client.receive()
                 self._waiting.found(unread if client.drained else unread + self._readable, began)
             self._since = self._waiting_since
-            self._read_some(_BATCH - (before - first))
-            read = unread - client.unread
-            self._waiting.read(read)
-            size += read
-            self._more = client.unread > 0 or not client.drained
+            left = self._read_some(_BATCH - (before - first))
+            self._waiting.read(unread - left)
+            size, unread = size + unread - left, left
+            self._more = left > 0 or not client.drained
             if self._packets == before:
                 break
         if size and self._packets == first:
@@ -318,13 +333,15 @@ class Connection:
         if not self._more:
             self._waiting.empty(self._received_at)
 
-    def _read_some(self, most: int) -> None:
+    def _read_some(self, most: int) -> int:
+        """Returns how many bytes are still to be read."""
         try:
-            self._client.read(most)
+            left = self._client.read(most)
         except MalformedError as error:
             raise Lost(f"{self.where} does not speak MQTT: {error}") from None
         if self._refusal is not None:
             raise self._refusal
+        return left
 
     @property
     def _readable(self) -> int:
@@ -337,13 +354,14 @@ class Connection:
 
     def _write(self) -> None:
         self._client.write()
-        while self._backlog and self._client.socket is not None and not self._client.want_write:
+        while self._backlog.waiting and self._client.socket is not None and not self._client.waiting:
             self._write_publish(self._backlog.take(), None)
 
     def _quick_ack(self) -> None:
         """Send TCP's ACKs at once: a broker with Nagle's algorithm delays its next message until then (up to 40 ms).
 
-        The kernel falls back to delayed ACKs whenever we send, so this is called after every read and write.
+        The kernel falls back to delayed ACKs whenever we send, so this is called after every read, unless MQTT's own
+        acknowledgements follow and carry TCP's.
         """
         sock = self._client.socket
         if _QUICKACK is not None and sock is not None:
@@ -393,23 +411,24 @@ class Connection:
                 return False
             if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT:
                 return False
-            self._in_flight.accept(message)
-            if message.qos is QoS.LATEST and self._client.want_write:
+            if message.retain:
+                self._in_flight.accept(message)
+            if message.qos is QoS.LATEST and self._client.waiting:
                 self._counters.add("dropped", self._backlog.put(message))
             else:
-                if self._backlog:
+                if self._backlog.waiting:
                     self._counters.add("dropped", self._backlog.supersede(message))
                 self._write_publish(message, expires_s)
-                self._quick_ack()
-            blocked = self._client.socket is None or self._client.want_write
+            blocked = self._client.socket is None or self._client.waiting
         if blocked:
             self.wake()
         return True
 
     def takes(self, message: Message) -> bool:
         """Whether the broker has not said that ``message`` is too large."""
-        size = _OVERHEAD + len(message.topic.encode()) + len(message.payload)
-        return self.max_packet is None or size <= self.max_packet
+        if self.max_packet is None:
+            return True
+        return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
         mid = self._client.publish(
@@ -451,7 +470,7 @@ class Connection:
     def drained(self) -> bool:
         """Whether everything accepted is written, and acknowledged where that is due."""
         with self._lock:
-            return not (self._in_flight.unacked or self._backlog or self._client.want_write)
+            return not (self._in_flight.unacked or self._backlog.waiting or self._client.waiting)
 
     @property
     def unacked(self) -> int:
@@ -520,7 +539,8 @@ class Connection:
         now = clock.since_boot()
         sent_at = self._in_flight.acknowledge(mid, now)
         if sent_at is not None:
-            self._note_answer()
+            self._packets += 1
+            self._answered_at = now
             self._delay.acknowledged(sent_at, now)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:

@@ -99,8 +99,10 @@ class BrokerDelay:
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
         """``round_trip_s`` asks for TCP's present one, if that matters."""
-        oldest = next((since for since, _, clear in self._asked if clear), now)
-        waited = max(self._newest, now - oldest)
+        waited = self._newest
+        if self._asked:
+            oldest = next((since for since, _, clear in self._asked if clear), now)
+            waited = max(waited, now - oldest)
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
         return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))

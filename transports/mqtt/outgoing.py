@@ -47,46 +47,46 @@ class Backlog:
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[str | int, Message] = {}  # retained ones by topic, the others by number
+        self.waiting: dict[str | int, Message] = {}  # retained ones by topic, the others by number
         self._numbers = itertools.count()
         self._live_bytes = 0
         self._live = 0
 
     def __bool__(self) -> bool:
-        return bool(self._waiting)
+        return bool(self.waiting)
 
     @property
     def size(self) -> int:
         """Bytes of all payloads that wait."""
-        return sum(len(message.payload) for message in self._waiting.values())
+        return sum(len(message.payload) for message in self.waiting.values())
 
     def __contains__(self, topic: str) -> bool:
-        return topic in self._waiting
+        return topic in self.waiting
 
     def put(self, message: Message) -> int:
         """Append ``message``; return how many messages were dropped for it."""
         if message.retain:
-            replaced = self._waiting.pop(message.topic, None) is not None
-            self._waiting[message.topic] = message
+            replaced = self.waiting.pop(message.topic, None) is not None
+            self.waiting[message.topic] = message
             return int(replaced)
-        self._waiting[next(self._numbers)] = message
+        self.waiting[next(self._numbers)] = message
         self._live += 1
         self._live_bytes += len(message.payload)
         dropped = 0
         while self._live > 1 and (self._live > BACKLOG_MESSAGES or self._live_bytes > BACKLOG_BYTES):
-            self._remove(next(key for key in self._waiting if isinstance(key, int)))
+            self._remove(next(key for key in self.waiting if isinstance(key, int)))
             dropped += 1
         return dropped
 
     def take(self) -> Message:
         """Remove and return the oldest message."""
-        return self._remove(next(iter(self._waiting)))
+        return self._remove(next(iter(self.waiting)))
 
     def supersede(self, newer: Message) -> int:
         """Drop what waits on the topic of a DELIVERED message that is sent ahead: it is stale (T8). Return how many."""
         stale = [
             key
-            for key, message in self._waiting.items()
+            for key, message in self.waiting.items()
             if message.topic == newer.topic and (newer.retain or not message.retain)
         ]
         for key in stale:
@@ -94,7 +94,7 @@ class Backlog:
         return len(stale)
 
     def _remove(self, key: str | int) -> Message:
-        message = self._waiting.pop(key)
+        message = self.waiting.pop(key)
         if isinstance(key, int):
             self._live -= 1
             self._live_bytes -= len(message.payload)
@@ -171,7 +171,7 @@ class InFlightTable:
         self._acked_at = float("-inf")  # the newest acknowledgement
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
         self._requests: dict[int, PendingAck] = {}
-        self._answered: list[PendingAck] = []  # not completed yet
+        self.answered: list[PendingAck] = []  # and not completed yet
         self._pings: deque[tuple[float, PendingAck | None]] = deque()  # unanswered: when sent, and what waits for it
         self._ping_number = self._pong_number = 0
 
@@ -227,11 +227,11 @@ class InFlightTable:
     def answer(self, mid: int) -> None:
         """Process a SUBACK or UNSUBACK."""
         if mid in self._requests:
-            self._answered.append(self._requests.pop(mid))
+            self.answered.append(self._requests.pop(mid))
 
     def complete(self) -> None:
         """Complete the answered requests, once the messages received before the answers have been delivered."""
-        answered, self._answered = self._answered, []
+        answered, self.answered = self.answered, []
         for ack in answered:
             ack.complete()
 
@@ -250,7 +250,7 @@ class InFlightTable:
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]
         if ack is not None:
-            self._answered.append(ack)
+            self.answered.append(ack)
 
     def measured(self, round_trip_s: float) -> None:
         self._round_trips.append(round_trip_s)

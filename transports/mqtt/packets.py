@@ -216,7 +216,10 @@ class Reader:
         while count < most:
             at = self._at
             if end - at < 2:
-                self._keep(2)
+                if at < end:
+                    self._keep(2)
+                else:
+                    self._data, self._at = b"", 0
                 break
             size, start = data[at + 1], at + 2
             if size > 127:
@@ -235,6 +238,8 @@ class Reader:
             count += 1
             if data[at] & 0xF0 == _PUBLISH:
                 self._publish(data, data[at], start, stop)
+            elif data[at] == _PUBACK and size >= _SHORTEST[_PUBACK]:
+                self._listener.on_puback(data[start] << 8 | data[start + 1])
             else:
                 self._other(data[at], data[start:stop])
         return count
@@ -271,9 +276,7 @@ class Reader:
     def _other(self, first: int, body: bytes) -> None:
         if first not in _SHORTEST or len(body) < _SHORTEST[first]:
             raise MalformedError(f"a packet that begins with {first:02x} and has {len(body)} bytes")
-        if first == _PUBACK:
-            self._listener.on_puback(body[0] << 8 | body[1])
-        elif first in (_SUBACK, _UNSUBACK):
+        if first in (_SUBACK, _UNSUBACK):
             codes = 2 + self._properties_size(body, 2)
             self._listener.on_answer(body[0] << 8 | body[1], body[codes:])
         elif first == _PINGRESP:

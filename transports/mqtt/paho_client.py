@@ -149,11 +149,17 @@ class PahoClient:
         self._paho.ahead, self._paho.begin = data, 0
         return len(data)
 
-    def read(self, most: int) -> None:
+    owes = False  # paho acknowledges as it reads
+
+    def read(self, most: int) -> int:
         for _ in range(most):
             if not self.unread or self._paho.loop_read(1) is not MQTTErrorCode.MQTT_ERR_SUCCESS:
                 break
         self.write()
+        return self.unread
+
+    def acknowledge(self) -> None:
+        """Nothing is owed."""
 
     # -- writing
 
@@ -162,7 +168,7 @@ class PahoClient:
         return self._paho.unwritten
 
     @property
-    def want_write(self) -> bool:
+    def waiting(self) -> bool:
         return self._paho.want_write()
 
     def write(self) -> None:
