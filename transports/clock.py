@@ -10,8 +10,6 @@ _NAMES = ("CLOCK_BOOTTIME", "CLOCK_MONOTONIC")  # of Linux; of macOS, whose time
 _CLOCK: int | None = next((getattr(time, name) for name in _NAMES if hasattr(time, name)), None)
 
 
-#: Seconds on a clock that all processes of a machine share, where the system has one; else ``time.monotonic()``. Without
-#: a function of Python's: it is called some ten times for each message.
-since_boot: Callable[[], float] = (
-    time.monotonic if _CLOCK is None else functools.partial(time.clock_gettime, _CLOCK)
-)
+#: Seconds on a clock that all processes of a machine share, where the system has one; else ``time.monotonic()``.
+#: No function of Python: it is called some ten times for each message.
+since_boot: Callable[[], float] = time.monotonic if _CLOCK is None else functools.partial(time.clock_gettime, _CLOCK)

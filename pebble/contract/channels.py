@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 from msgspec import Struct
@@ -28,6 +29,8 @@ class Kind(Enum):
     STREAM = (OUTGOING, 0, False, "freshness first; drop the oldest")
     FEED = (INCOMING, 0, False, "a stream sent to the robot")
 
+    __hash__ = object.__hash__  # of C's, not of Python's: kinds are looked up several times for each message
+
     def __init__(self, direction: str, qos: int, retain: bool, meaning: str) -> None:
         self.direction, self.qos, self.retain, self.meaning = direction, qos, retain, meaning
 
@@ -40,7 +43,7 @@ class Override(Struct, frozen=True):
     retain: str | None = None
 
 
-class Channel(Struct, frozen=True, kw_only=True):
+class Channel(Struct, frozen=True, kw_only=True, dict=True):
     """One topic, or a family of topics: its name, payload and delivery.
 
     ``metric`` may hold ``{names}``, one level each. With ``remote=False`` it never leaves the robot. With
@@ -77,7 +80,7 @@ class Channel(Struct, frozen=True, kw_only=True):
     def is_pattern(self) -> bool:
         return "{" in self.metric
 
-    @property
+    @cached_property
     def suffix(self) -> str:
         """The topic below the identity: ``incoming/drive-values``."""
         return f"{self.direction}/{self.metric}"

@@ -85,12 +85,9 @@ class Cycles:
         #: Theirs, and when we relayed each; long ago once it comes back, so that its sender is not on the way.
         self._others: dict[tuple[Side, bytes], float] = {}
         self._stops: dict[tuple[Side, bytes], float] = {}
-        self._closed: Final[set[tuple[Side, str]]] = set()
+        #: What comes from this side on this topic and is forwarded comes back there.
+        self.closed_ways: Final[set[tuple[Side, str]]] = set()
         self._unlogged: tuple[Side, str, float] | None = None  # circulates, and since when this is known
-
-    def closed(self, side: Side, topic: str) -> bool:
-        """Whether what comes from ``side`` on ``topic`` and is forwarded comes back there."""
-        return (side, topic) in self._closed
 
     def receive(self, side: Side, topic: str, payload: bytes, *, once: bool, report: bool = False) -> Finding:
         """``side`` has sent a message that may be forwarded.
@@ -108,7 +105,7 @@ class Cycles:
             period = _PERIOD_IN_STORM_S if count > _STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
             often = count > (_STORM if report else _SUSPICIOUS)
-            suspicious = way.closed or often or (never_probed and bool(self._closed))
+            suspicious = way.closed or often or (never_probed and bool(self.closed_ways))
             suspicious = suspicious and (once or len(payload) <= _LONGEST)
             return Finding.SUSPECT if suspicious and now - way.probed_at >= period else Finding.PASS
 
@@ -137,7 +134,9 @@ class Cycles:
         with self._lock:
             self._log_error()
             due = []
-            for key in [key for key in self._closed if self._clock() - self._ways[key].probed_at >= PROBE_PERIOD_S / 2]:
+            for key in [
+                key for key in self.closed_ways if self._clock() - self._ways[key].probed_at >= PROBE_PERIOD_S / 2
+            ]:
                 if self._ways[key].unanswered >= _UNANSWERED:
                     self._open(*key)
                 else:
@@ -161,15 +160,15 @@ class Cycles:
     def _close(self, side: Side, topic: str) -> None:
         way = self._way(side, topic)
         way.unanswered = 0
-        if way.closed or len(self._closed) >= _MOST_CLOSED:
+        if way.closed or len(self.closed_ways) >= _MOST_CLOSED:
             return
         way.closed = True
-        if self._closed:
+        if self.closed_ways:
             log.info("%s circulates, too, from the %s side", topic, side.value)
         else:
             self._unlogged = side, topic, self._clock()
             self._log_error()
-        self._closed.add((side, topic))
+        self.closed_ways.add((side, topic))
 
     def _log_error(self) -> None:
         if self._unlogged is None:
@@ -191,15 +190,15 @@ class Cycles:
 
     def _open(self, side: Side, topic: str) -> None:
         self._ways[side, topic].closed = False
-        self._closed.discard((side, topic))
-        if not self._closed:
+        self.closed_ways.discard((side, topic))
+        if not self.closed_ways:
             log.info("%s and what else circulated does so no more: everything is forwarded again", topic)
 
     def _way(self, side: Side, topic: str) -> _Way:
         way = self._ways.get((side, topic))
         if way is None:
             if len(self._ways) >= _TOPICS:
-                del self._ways[next(key for key in self._ways if key not in self._closed)]
+                del self._ways[next(key for key in self._ways if key not in self.closed_ways)]
             way = self._ways[side, topic] = _Way(self._clock())
         return way
 

@@ -18,7 +18,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from enum import Enum
-from typing import NamedTuple
 
 import msgspec
 
@@ -26,7 +25,6 @@ from pebble.contract import (
     AUDIO_CONTROL,
     AUTONOMY_COMMAND,
     DRIVE,
-    ESTOP,
     GIT_PULL,
     LIGHTS_FLASH,
     LIGHTS_SOLID,
@@ -76,7 +74,7 @@ _RETURN_S = 2.0
 _PROBED = (DRIVE, REBOOT, SERVICE_RESTART, GIT_PULL)
 
 _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES)
-_FINDINGS = {Finding.PROBE: Drop.PROBE, Finding.CIRCULATES: Drop.CIRCULATES}
+_FORWARDED = {side: f"{side.value}: forwarded" for side in Side}  # names of counters
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
@@ -86,7 +84,7 @@ class Gate(Enum):
     SHUT = "shut"  # nothing passes
 
 
-class Routed(NamedTuple):
+class Routed(msgspec.Struct, frozen=True):
     """What became of a received message; ``subject`` is None for a topic that is not this robot's."""
 
     subject: Subject | None
@@ -116,6 +114,7 @@ class Forwarder:
         self.counters = Counters()
         self._subjects, self._rules, self._transports = subjects, rules, transports
         self._winner, self._on_value, self._clock = winner, on_value, clock
+        self._both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
         self._lock = self.retained_lock = threading.RLock()  # while it is held no retained message passes
         self._reconciliation = Reconciliation(winner)
         self._admission = Admission(clock)
@@ -233,7 +232,7 @@ class Forwarder:
     def _examine(self, side: Side, subject: Subject, message: Message) -> Finding:
         if self.gate is not Gate.OPEN:
             return Finding.PASS
-        if _is_stop(subject):
+        if subject.is_stop:
             repeated = self._cycles.repeats_stop(side, message.topic, message.payload)
             return Finding.CIRCULATES if repeated else Finding.PASS
         once, report = subject.kind in ONE_SHOT, subject.kind.direction == OUTGOING
@@ -241,7 +240,7 @@ class Forwarder:
 
     def _note_return(self, side: Side, subject: Subject, message: Message) -> None:
         """``message`` goes to ``side``; if its topic circulates, it comes back from the other one."""
-        if subject.kind not in ONE_SHOT and self._cycles.closed(side.other, message.topic):
+        if subject.kind not in ONE_SHOT and (side.other, message.topic) in self._cycles.closed_ways:
             self._returns[side.other].expect(message.topic, message.payload)
 
     # -- the receiving threads
@@ -252,7 +251,7 @@ class Forwarder:
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
             return False
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
-        self._note_retained_now(side)
+        self._note_retained(side)
         self.counters.add(f"{side.value}: {drop.value}")
         shown = topic[:_LOGGED].decode(errors="replace")
         self._quiet_log.warning(drop.name, "%s is not forwarded: %s", shown, drop.value)
@@ -262,12 +261,13 @@ class Forwarder:
         """Forward ``message`` by the table."""
         subject = self._subjects[message.topic]
         outcome = self._receive(side, subject, message)
-        self.counters.add(f"{side.value}: {outcome.value if isinstance(outcome, Drop) else 'forwarded'}")
+        self.counters.add(f"{side.value}: {outcome.value}" if isinstance(outcome, Drop) else _FORWARDED[side])
         return Routed(subject, outcome)
 
     def _receive(self, side: Side, subject: Subject | None, message: Message) -> Forward | Drop:
-        if not _is_stop(subject):
-            self._note_retained(side, message)
+        if subject is None or not subject.is_stop:
+            if message.retain:  # they still arrive: a stop may be among them, which does not count: it may be repeated
+                self._note_retained(side)
         elif not self._is_old_stop(side, message):
             message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
         forward = route(self._rules, side, subject, message, mirroring=self._may_mirror())
@@ -279,18 +279,20 @@ class Forwarder:
         if refused is not None:
             self._quiet_log.warning(refused.name, "%s is not forwarded: %s", message.topic[:_LOGGED], refused.value)
             return refused
-        if _is_late(subject, message):
+        if subject.kind in ONE_SHOT and _is_late(subject, message):
             return Drop.LATE
         if self._is_echo(side, subject, message):
             return Drop.ECHO
-        finding = self._examine(side, subject, message)
-        if finding in _FINDINGS:
-            return _FINDINGS[finding]
-        if finding is Finding.RELAY:
-            self._publish(side.other, subject, message, Forward(forward.qos, False, forward.urgent))
-            return Drop.PROBE
-        if finding is Finding.SUSPECT:  # the probe goes first: it comes back before the message does
-            self._probe(side, message.topic, message.payload)
+        match self._examine(side, subject, message):
+            case Finding.PROBE:
+                return Drop.PROBE
+            case Finding.CIRCULATES:
+                return Drop.CIRCULATES
+            case Finding.RELAY:
+                self._publish(side.other, subject, message, Forward(forward.qos, False, forward.urgent))
+                return Drop.PROBE
+            case Finding.SUSPECT:  # the probe goes first: it comes back before the message does
+                self._probe(side, message.topic, message.payload)
         return self._pass(side, subject, message, forward)
 
     def _pass(self, side: Side, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
@@ -317,7 +319,7 @@ class Forwarder:
     def _pass_retained(self, side: Side, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
         with self._lock:
             self._begin_restarted()
-            if self._rules.both_ways(subject.kind):
+            if subject.kind in self._both_ways:
                 drop = self._reconcile(side, subject, message)
                 if drop is not None:
                     return drop
@@ -363,12 +365,7 @@ class Forwarder:
             return False
         return not self._transports[side].as_published or self._clock() < self._stops_retained_until[side]
 
-    def _note_retained(self, side: Side, message: Message) -> None:
-        """Retained messages still arrive: a stop may be among them. Stops do not count, so that one can be repeated."""
-        if message.retain:
-            self._note_retained_now(side)
-
-    def _note_retained_now(self, side: Side) -> None:
+    def _note_retained(self, side: Side) -> None:
         now, until = self._clock(), self._stops_retained_until[side]
         if now >= until:
             return
@@ -405,17 +402,18 @@ class Forwarder:
             qos=forward.qos,
             retain=forward.retain,
             urgent=forward.urgent,
-            shared=self._rules.both_ways(subject.kind),
+            shared=subject.kind in self._both_ways,
         )
         if not accepted:
             self.counters.add(f"{side.value}: refused")
         if echoing and (not accepted or transport.state is not State.CONNECTED):
             self._loopback[side].forget(topic)
-        if forward.retain and self._rules.both_ways(subject.kind):
+        if forward.retain and subject.kind in self._both_ways:
             self._reconciliation.note_published(side, topic, payload)
 
     def _is_echo(self, side: Side, subject: Subject, message: Message) -> bool:
-        if self._cycles.closed(side, message.topic) and self._returns[side].is_echo(message.topic, message.payload):
+        circulates = (side, message.topic) in self._cycles.closed_ways
+        if circulates and self._returns[side].is_echo(message.topic, message.payload):
             return True
         if self._transports[side].exact_echo or message.retain or not _echo_matters(subject):
             return False
@@ -462,15 +460,12 @@ def _ignore(_message: Message) -> None:
     """A barrier has to subscribe to something."""
 
 
-def _is_stop(subject: Subject | None) -> bool:
-    return subject is not None and subject.channel is ESTOP
-
-
 def _is_late(subject: Subject, message: Message) -> bool:
+    """Of what happens once."""
     limit = _PATIENT_S if subject.channel in _PATIENT else _LATE_S
-    if subject.kind not in ONE_SHOT or message.waited_s <= limit:
+    if message.waited_s <= limit:
         return False
-    return not (_is_stop(subject) or _ends_something(subject, message))
+    return not (subject.is_stop or _ends_something(subject, message))
 
 
 def _ends_something(subject: Subject, message: Message) -> bool:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
+from msgspec import Struct
+
 from pebble.contract import INCOMING, Kind
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message, QoS
@@ -19,9 +21,11 @@ class Side(Enum):
     LOCAL = "local"  # the robot's own transport
     REMOTE = "remote"  # the other one
 
-    @property
-    def other(self) -> Side:
-        return Side.REMOTE if self is Side.LOCAL else Side.LOCAL
+    other: Side
+    __hash__ = object.__hash__  # of C's, not of Python's: a side is looked up ten times for each message
+
+
+Side.LOCAL.other, Side.REMOTE.other = Side.REMOTE, Side.LOCAL
 
 
 class Drop(Enum):
@@ -47,8 +51,7 @@ class Drop(Enum):
     LATE = "waited too long, here or at the broker"
 
 
-@dataclass(frozen=True, slots=True)
-class Forward:
+class Forward(Struct, frozen=True):
     """How a message is published on the other side: same topic, same bytes."""
 
     qos: QoS
@@ -90,8 +93,8 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
         return Drop.MEDIA
     if subject.stays and rules.leaves_robot:
         return Drop.STAYS
-    if is_stale(subject.kind, message):
-        return Drop.STALE
+    if subject.kind in ONE_SHOT and (message.retain or message.retain_requested):
+        return Drop.STALE  # or was published to be retained: some brokers hide which
     if subject.kind not in rules.passes[side]:
         if subject.kind not in rules.mirrored.get(side, ()):
             return Drop.ONE_WAY
@@ -100,15 +103,10 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
     return Forward(_qos(subject, message), _retain(subject, message), subject.kind in URGENT)
 
 
-def is_stale(kind: Kind, message: Message) -> bool:
-    """Whether something that happens once is retained, or was published to be retained (some brokers hide which)."""
-    return kind in ONE_SHOT and (message.retain or bool(message.retain_requested))
-
-
 def _qos(subject: Subject, message: Message) -> QoS:
     """As received; messages *to* a robot get their channel's QoS at least: one QoS per topic keeps the order."""
     if subject.kind.direction == INCOMING:
-        return QoS(max(message.qos, subject.qos))
+        return message.qos if message.qos >= subject.qos else QoS(subject.qos)
     return message.qos
 
 

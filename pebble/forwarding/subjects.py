@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from pebble.config import Config
-from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind
+from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Channel, Kind
 from pebble.errors import TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
@@ -21,7 +22,7 @@ _FAMILIES = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Subject:
     """One topic below our own identity. ``channel`` is None for metrics that are not in the contract."""
 
@@ -30,15 +31,19 @@ class Subject:
     qos: int = 0
     retain: bool = False  # assumed if the broker hides it
 
-    @property
+    @cached_property
     def stays(self) -> bool:
         """Whether it never leaves the robot."""
         return self.channel is not None and not self.channel.remote
 
-    @property
+    @cached_property
     def bridged(self) -> bool:
         """Whether it is forwarded with other messages; media has connections of its own."""
         return self.channel is None or self.channel.bridged
+
+    @cached_property
+    def is_stop(self) -> bool:
+        return self.channel is ESTOP
 
 
 class _Unknown:

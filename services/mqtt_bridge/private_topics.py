@@ -70,6 +70,8 @@ class PrivateTopics:
         """Whether a manifest makes this topic private. Requests for one always are: they concern serial lines only."""
         if topic.startswith(self._commands) and topic.endswith(_QUESTION):
             return True
+        if not self._devices:
+            return False
         if any(topic in device.private for device in list(self._devices.values())):
             return True
         device = self._device_of(topic)

@@ -297,7 +297,7 @@ class MqttBridge(Service):
             if channel is None or not (local and self._actions.accepts_retained(channel)):
                 self._refuse_stale(channel)
                 return
-        elif routed.outcome in _IGNORED or not (local or isinstance(routed.outcome, Forward)):
+        elif not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
             return
         reaction = self._message_reactions.get(channel.suffix) if channel is not None else None
         if reaction is not None and not codec.is_blank(message.payload):

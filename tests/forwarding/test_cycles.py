@@ -285,10 +285,10 @@ class TestCycles:
     def test_a_probe_that_comes_back_where_it_was_sent_proves_nothing(self, cycles: Cycles) -> None:
         probe = cycles.probe(REMOTE, TOPIC)
         assert cycles.receive(LOCAL, TOPIC, probe, once=True) is Finding.PROBE
-        assert not cycles.closed(REMOTE, TOPIC)
+        assert (REMOTE, TOPIC) not in cycles.closed_ways
         assert cycles.receive(REMOTE, TOPIC, probe, once=True) is Finding.PROBE
-        assert cycles.closed(REMOTE, TOPIC)
-        assert not cycles.closed(LOCAL, TOPIC)
+        assert (REMOTE, TOPIC) in cycles.closed_ways
+        assert (LOCAL, TOPIC) not in cycles.closed_ways
 
     def test_a_late_answer_counts(self, cycles: Cycles, network: Network) -> None:
         probe = cycles.probe(REMOTE, TOPIC)
@@ -303,7 +303,7 @@ class TestCycles:
             assert cycles.poll() == [(REMOTE, TOPIC)]
             cycles.probe(REMOTE, TOPIC)
         network.now += 1
-        assert cycles.closed(REMOTE, TOPIC)
+        assert (REMOTE, TOPIC) in cycles.closed_ways
         assert cycles.poll() == []
         assert cycles.receive(REMOTE, TOPIC, MOVE, once=True) is Finding.PASS
 
@@ -324,7 +324,7 @@ class TestCycles:
                 cycles.receive(side, FLAG, theirs, once=True)
             for side, topic in cycles.poll():
                 cycles.receive(side, topic, cycles.probe(side, topic), once=True)
-        assert cycles.closed(REMOTE, TOPIC)
+        assert (REMOTE, TOPIC) in cycles.closed_ways
         assert len(errors(caplog)) == logged
 
     def test_memory_is_bounded(self, cycles: Cycles) -> None:
