@@ -264,7 +264,7 @@ class Connection:
             sock = self._client.socket
             if sock is None:
                 raise Lost(self._closed)
-            blocked = self._client.waiting
+            blocked = bool(self._client.waiting)
             poll = self._poll = self._poll or _Poll(sock.fileno(), self._wake_read.fileno())
         began = clock.since_boot()
         wait = min(timeout, self._ping_due_at - began)

@@ -28,6 +28,7 @@ from pebble.transports.zenoh.ages import MessageAges
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic, topic_to_key
 from pebble.transports.zenoh.presence import Barrier, HubView, HubWatch
 from pebble.transports.zenoh.session import HUB_SOCKET, check_process, close_at_exit, open_session, session_config
+from pebble.transports.zenoh.thread_state import keep_thread_state
 
 log = logging.getLogger(__name__)
 
@@ -486,7 +487,12 @@ class LoopbackQueue:
 
 def _direct(function: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
     """Run on Zenoh's receiving thread. Zenoh's default would queue, and then block that thread for all."""
-    return zenoh.handlers.Callback(function, indirect=False)
+
+    def run(received: Any) -> None:
+        keep_thread_state()
+        function(received)
+
+    return zenoh.handlers.Callback(run, indirect=False)
 
 
 def _live_message(sample: zenoh.Sample, stamp: wire.LiveStamp, qos: QoS, read_at: float) -> Message:

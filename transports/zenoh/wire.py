@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import struct
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -50,9 +52,8 @@ _NUMBER = struct.Struct(">Q")
 BOOT = crc32(Path("/proc/sys/kernel/random/boot_id").read_bytes())  # shared by all containers of a machine
 
 
-def since_boot_ns() -> int:
-    """A clock that all processes of a machine share; it runs on while the machine sleeps, and cannot be set."""
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+#: A clock that all processes of a machine share; it runs on while the machine sleeps, and cannot be set.
+since_boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
 
 
 class LiveStamp(NamedTuple):

@@ -1,0 +1,34 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pebble.transports import Message, QoS, create
+from pebble.transports.zenoh import thread_state
+from tests.support import until
+from tests.transports.zenoh_net import HubProcess
+
+SESSIONS, MESSAGES = 10, 20
+
+
+def test_few_states_are_kept_however_many_messages_and_sessions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, received, ensure = list[None](), list[Message](), thread_state._ensure
+    monkeypatch.setattr(thread_state, "_ensure", lambda: (made.append(None), ensure()))
+    hub = HubProcess(tmp_path).start()
+    try:
+        with create("zenoh", "sender", hub.settings) as sender:
+            for session in range(1, SESSIONS + 1):
+                with create("zenoh", "receiver", hub.settings) as receiver:
+                    receiver.subscribe("a/b", received.append, direct=True)
+                    assert until(
+                        lambda enough=session * MESSAGES: (  # type: ignore[misc]
+                            sender.publish("a/b", b"1", qos=QoS.DELIVERED) and len(received) >= enough
+                        ),
+                        10,
+                    )
+    finally:
+        hub.end()
+    assert 1 <= len(made) < SESSIONS, "made for each session, or each message"
