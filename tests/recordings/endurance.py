@@ -16,7 +16,7 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-from pebble.bench.usage import cpu_s, pss_mb
+from pebble.bench.usage import cpu_s, own_mb
 from pebble.client.viewer import Viewer
 from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
@@ -135,12 +135,12 @@ def main() -> int:
 
 
 def _observe(pid: int, operator: Operator, seconds: float) -> tuple[float, list[float]]:
-    """The recorder's share of a processor in percent, and its memory now and then."""
+    """The recorder's share of a processor in percent, and what it has allocated now and then, MB."""
     began, before, memory, due = time.monotonic(), cpu_s([pid]), list[float](), 0.0
     while (passed := time.monotonic() - began) < seconds:
         operator.step()
         if passed >= due:
-            memory.append(pss_mb(pid))
+            memory.append(own_mb(pid))
             due += _SAMPLE_S
             share = 100 * (cpu_s([pid]) - before) / max(1.0, passed)
             sys.stdout.write(f"{passed / 60:5.1f} min: {share:.2f} % of a core, {memory[-1]:.1f} MB\n")
