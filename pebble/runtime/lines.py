@@ -24,6 +24,10 @@ class LineSplitter:
         lines: list[bytes] = []
         *complete, tail = chunk.split(self._separator)
         for part in complete:
+            if not self._skipping and len(self._tail) + len(part) <= self._limit:
+                lines.append(self._tail + part)
+                self._tail = b""
+                continue
             self._grow(part, lines)
             if not self._skipping:
                 lines.append(self._tail)

@@ -110,7 +110,7 @@ class SerialService(Service, ABC):
 
     def count_discarded(self, discarded: int) -> None:
         """Count and log text lines that a splitter has discarded, ``discarded`` of them so far."""
-        too_long = discarded - self.counters["lines_discarded"]
+        too_long = discarded and discarded - self.counters["lines_discarded"]
         if too_long:
             self.counters.add("lines_discarded", too_long)
             self.device_log.warning("too long", "a line of the MCU was too long", times=too_long)

@@ -23,10 +23,7 @@ class Outbox:
         self.superseded = 0  # lines that a newer one replaced before they were sent
         self.expired = 0  # drive lines that became a stop
         self._stop, self._drive_timeout = stop, drive_timeout_s
-        self._slots: dict[str, _Waiting] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._slots)
+        self.waiting: dict[str, _Waiting] = {}  # by kind
 
     def drive(self, line: bytes, now: float, valid_s: float) -> None:
         """Add a drive line that is valid for so long, at most for the timeout."""
@@ -42,19 +39,19 @@ class Outbox:
 
     def take(self, now: float) -> bytes | None:
         """Return the line to send next, drive lines first; None if nothing waits."""
-        kind = _DRIVE if _DRIVE in self._slots else next(iter(self._slots), None)
+        kind = _DRIVE if _DRIVE in self.waiting else next(iter(self.waiting), None)
         if kind is None:
             return None
-        waiting = self._slots.pop(kind)
+        waiting = self.waiting.pop(kind)
         if now <= waiting.expires:
             return waiting.line
         self.expired += 1
         return self._stop
 
     def clear(self) -> None:
-        self._slots.clear()
+        self.waiting.clear()
 
     def _place(self, kind: str, waiting: _Waiting) -> None:
-        if self._slots.pop(kind, None) is not None:
+        if self.waiting.pop(kind, None) is not None:
             self.superseded += 1
-        self._slots[kind] = waiting
+        self.waiting[kind] = waiting

@@ -30,14 +30,15 @@ class Port:
             self._serial = serial.Serial(path, baud, timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
             raise DeviceError(f"cannot open {path}: {_reason(error)}") from error
+        self._fd = int(self._serial.fileno())  # -1 once it is closed: the number may then be another file's
 
     def fileno(self) -> int:
-        return int(self._serial.fileno())
+        return self._fd
 
     def read(self) -> bytes:
         """Return what was received, at most 4096 bytes; empty if nothing was."""
         try:
-            data = os.read(self.fileno(), _CHUNK)
+            data = os.read(self._fd, _CHUNK)
         except BlockingIOError:
             return b""
         except OSError as error:
@@ -49,7 +50,7 @@ class Port:
     def write(self, data: bytes) -> int:
         """Write as many bytes as the kernel accepts at once; return how many."""
         try:
-            return os.write(self.fileno(), data)
+            return os.write(self._fd, data)
         except BlockingIOError:
             return 0
         except OSError as error:
@@ -58,14 +59,14 @@ class Port:
     def queued(self) -> int:
         """Return how many bytes the kernel holds that are not sent yet; always 0 on a pty."""
         try:
-            answer = fcntl.ioctl(self.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
-        except OSError as error:
+            answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0\0\0\0")
+        except (OSError, ValueError) as error:
             raise DeviceError(f"{self.path} has gone: {error}") from error
         return int(struct.unpack("i", answer)[0])
 
     def discard_output(self) -> None:
         """Discard what the kernel holds and has not sent."""
-        with suppress(termios.error):  # a port that has gone raises at the next read
+        with suppress(termios.error, ValueError):  # a port that has gone raises at the next read
             termios.tcflush(self.fileno(), termios.TCOFLUSH)
 
     def is_replaced(self) -> bool:
@@ -80,6 +81,7 @@ class Port:
         with suppress(DeviceError):
             if self.queued():
                 self.discard_output()
+        self._fd = -1
         with suppress(OSError):
             self._serial.close()
 

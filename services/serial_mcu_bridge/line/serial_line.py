@@ -136,10 +136,10 @@ class SerialLine:
             if self._port is None or self._closing:
                 self.refused += 1
                 return False
-            was_idle = not self._sending and not self.outbox
+            was_idle = not self._sending and not self.outbox.waiting
             place(now)
             self._try_pump(now)
-            if was_idle and (self._sending or self.outbox):
+            if was_idle and (self._sending or self.outbox.waiting):
                 self._wake()  # so that the reading thread sends the rest
             return True
 
@@ -163,7 +163,7 @@ class SerialLine:
 
     def _next_line(self, port: Port, now: float) -> bool:
         """Take a line from the outbox if it can be sent at once: a line in the kernel cannot be replaced."""
-        if self._state is not LineState.READY or not self.outbox or now < self._busy_until or port.queued():
+        if self._state is not LineState.READY or not self.outbox.waiting or now < self._busy_until or port.queued():
             return False
         self._sending = self.outbox.take(now) or b""
         return bool(self._sending)
@@ -238,7 +238,7 @@ class SerialLine:
         """Return how long to wait for input before writing again, in seconds."""
         if self._state is LineState.BOOTING:
             return max(_RETRY_WRITE_S, min(self._read_timeout, until_ready))
-        return _RETRY_WRITE_S if self._sending or self.outbox else self._read_timeout
+        return _RETRY_WRITE_S if self._sending or self.outbox.waiting else self._read_timeout
 
     def _receive(self, chunk: bytes) -> None:
         if chunk and self._state is LineState.READY:
@@ -254,7 +254,7 @@ class SerialLine:
         if self._failure is not None:
             raise self._failure
         self._pump(now)
-        if not self._sending and not self.outbox:
+        if not self._sending and not self.outbox.waiting:
             self._blocked_since = None
         elif self._state is LineState.READY:
             if self._blocked_since is None:

@@ -18,4 +18,6 @@ class DeviceLogLine:
 def printable(raw: bytes) -> str:
     """Return at most 200 printable characters; invalid UTF-8 is escaped, so that the rest is not lost."""
     text = raw.strip()[: 4 * LIMIT].decode("utf-8", "backslashreplace")[:LIMIT]
+    if text.isprintable():
+        return text
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)

@@ -57,7 +57,7 @@ def parse(line: bytes) -> list[Report]:
     """
     kind, *rest = line.split() or [b""]
     if kind in (b"T", b"C"):
-        fields = dict(token.split(b"=", 1) for token in rest if b"=" in token)
+        fields = dict([token.split(b"=", 1) for token in rest if b"=" in token])
         reports = _touch(fields) if kind == b"T" else []
         reports += _charging(fields) + _level(fields)
         return reports or [DeviceLogLine(logging.WARNING, f"not understood: {printable(line)}")]
@@ -94,7 +94,7 @@ def flash_line(blue: float, green: float, red: float, period_s: float) -> bytes:
 def _touch(fields: dict[bytes, bytes]) -> list[Report]:
     for names in _TOUCH_NAMES:
         values = [fields.get(name, b"") for name in names]
-        if all(_INTEGER.match(value) for value in values):
+        if all(map(_INTEGER.match, values)):
             return [Touch(*map(int, values))]
     return []
 

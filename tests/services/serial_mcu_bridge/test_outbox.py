@@ -24,7 +24,7 @@ def test_a_drive_line_that_waited_too_long_is_a_stop() -> None:
     outbox.drive(b"drive", 10.0, 0.75)
     assert outbox.take(10.76) == b"stop"
     assert outbox.expired == 1
-    assert not outbox
+    assert not outbox.waiting
 
 
 def test_a_drive_line_may_be_valid_for_less_than_the_timeout_but_not_for_longer() -> None:

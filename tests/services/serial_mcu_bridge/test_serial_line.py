@@ -269,7 +269,7 @@ def stuck() -> Iterator[StuckDevice]:
 def fill(host: Host) -> float:
     """Send drive lines until the kernel's buffer is full; return the duration of the longest call in seconds."""
     longest = 0.0
-    while until(lambda: not host.line.outbox, 0.2, step=0.0002):
+    while until(lambda: not host.line.outbox.waiting, 0.2, step=0.0002):
         before = time.monotonic()
         host.line.drive(drive_line(0.3, 0.3))
         longest = max(longest, time.monotonic() - before)
