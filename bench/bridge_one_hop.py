@@ -14,8 +14,8 @@ from pebble.bench.bridge_drive import RATE_HZ, Arrived, DriveSegment
 from pebble.bench.bridge_operator import Operator, Wheels
 from pebble.bench.bridge_subscriber import CommandSubscriber
 from pebble.contract import DRIVE
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import end_all
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import end_all
 
 HOP = "one hop"
 _BASE = "pebble/robots/one-hop"

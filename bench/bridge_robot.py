@@ -12,8 +12,8 @@ from typing import Any, Self
 
 from pebble.bench.usage import children
 from pebble.contract.identity import Identity
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import Program, end_all
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import Program, end_all
 from pebble.simulation.trace import Entry, read_trace
 
 KINDS = ("mqtt", "zenoh")

@@ -23,9 +23,9 @@ from pebble.bench.control_worker import Answer, Endpoint
 from pebble.bench.null import variant_of
 from pebble.bench.usage import cpu_s, wake_ups
 from pebble.bench.worker import Worker, end_workers
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import Program, end_all
 from pebble.transports.settings import ZenohSettings
 
 _READY_S = 40.0

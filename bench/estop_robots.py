@@ -18,9 +18,9 @@ from pebble.bench.estop_operator import StopOperator
 from pebble.bench.estop_report import ALL, BOARD, COMMAND, CONFIRMED, ESTOP, HOLD, REST, WIRE, ZERO, Samples
 from pebble.bench.fleet import read_moves
 from pebble.bench.worker import Worker, end_workers
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import Program, end_all
 from pebble.simulation.fleet import Moved, members
 
 _STARTED_S = 90.0  # boards start one after the other

@@ -27,9 +27,9 @@ from pebble.bench.results import Cell, Stopwatch, Value
 from pebble.bench.tables import plain_table
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.bench.worker import Worker, end_workers
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import Program, end_all
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.simulation.fleet import MOST, Moved, members
 from pebble.simulation.wireless import KINDS

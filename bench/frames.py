@@ -24,9 +24,9 @@ from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, Stopwatch, Value
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.bench.worker import Worker, end_workers
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import end_all
 from pebble.errors import PebbleError
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import end_all
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 

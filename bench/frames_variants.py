@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pebble.demo.broker import BrokerKind, best_kind
 from pebble.errors import PebbleError
+from pebble.rig.broker import BrokerKind, best_kind
 
 VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
 ABOUT = {

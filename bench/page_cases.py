@@ -20,9 +20,9 @@ from pebble.bench.page_rig import Rig, monotonic
 from pebble.bench.usage import children, cpu_s
 from pebble.bench.worker import Worker, end_workers
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.demo.programs import Program, end_all
-from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
+from pebble.rig.programs import Program, end_all
+from pebble.rig.testbed import ROBOTS
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

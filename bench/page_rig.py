@@ -18,9 +18,9 @@ from typing import IO, TYPE_CHECKING, Any
 from pebble.bench.chromium import chromium
 from pebble.contract import CAMERA, DRIVE
 from pebble.contract.channels import Channel
-from pebble.demo.stage import Stage
-from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
+from pebble.rig.stage import Stage
+from pebble.rig.testbed import ROBOTS
 from pebble.runtime.parent import tied_to_parent
 
 if TYPE_CHECKING:

@@ -12,10 +12,10 @@ from rich.console import Console
 from pebble.bench import output
 from pebble.bench.results import Stopwatch
 from pebble.bench.traffic_report import assess, cells_of, tables
-from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.results import Traffic
+from pebble.rig.testbed import ROBOTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

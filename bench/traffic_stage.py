@@ -10,11 +10,11 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from pebble.client.media_receiver import MediaReceiver
-from pebble.demo.broker import BrokerKind
-from pebble.demo.operator import Operator
-from pebble.demo.programs import Program, end_all
-from pebble.demo.testbed import ROBOTS, Testbed
 from pebble.errors import PebbleError
+from pebble.rig.broker import BrokerKind
+from pebble.rig.operator import Operator
+from pebble.rig.programs import Program, end_all
+from pebble.rig.testbed import ROBOTS, Testbed
 from pebble.transports import MqttSettings, create
 
 VIDEO, AUDIO = "json", "pcm"  # the encodings of the paper's robots

@@ -20,11 +20,11 @@ from pebble.bench.impair.network import ImpairedNetwork, open_network
 from pebble.bench.impair.operator import CLIP
 from pebble.bench.impair.plan import Subject
 from pebble.bench.worker import Worker, end_workers
-from pebble.demo.broker import free_port, mosquitto_command
-from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
 from pebble.media.pcm import to_bytes
 from pebble.media.speech import Speech
+from pebble.rig.broker import free_port, mosquitto_command
+from pebble.rig.programs import Program, end_all
 from pebble.simulation.loudspeaker import Playback, playbacks
 from pebble.simulation.trace import Entry, read_trace
 from pebble.transports.segments import sweep

@@ -15,25 +15,30 @@ from typing import NamedTuple
 from rich.console import Console
 
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.demo import emergency, following, takeover
-from pebble.demo.broker import BrokerKind, best_kind
-from pebble.demo.emergency import CompletedStop
-from pebble.demo.following import CompletedFollow
-from pebble.demo.machine import Machine
+from pebble.demo import emergency, following
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
-from pebble.demo.operator import Operator
-from pebble.demo.page import PageServer
 from pebble.demo.results import Result, Results
-from pebble.demo.steps import ROUND_S, SCRIPT, CompletedStep, assess
-from pebble.demo.testbed import ROBOTS, Testbed
+from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
+from pebble.rig.broker import BrokerKind, best_kind
+from pebble.rig.emergency import DURATION_S as EMERGENCY_S
+from pebble.rig.emergency import NAME as EMERGENCY_STOP
+from pebble.rig.emergency import CompletedStop
+from pebble.rig.machine import Machine
+from pebble.rig.operator import Operator
+from pebble.rig.page import PageServer
+from pebble.rig.steps import ROUND_S, SCRIPT, CompletedStep
+from pebble.rig.takeover import DURATION_S as TAKEOVER_S
+from pebble.rig.takeover import NAME as BY_ITSELF
+from pebble.rig.takeover import CompletedFollow
+from pebble.rig.testbed import ROBOTS, Testbed
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT
 
-SHORTEST_S = ROUND_S + emergency.DURATION_S + takeover.DURATION_S
+SHORTEST_S = ROUND_S + EMERGENCY_S + TAKEOVER_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _POLL_S = 0.1
@@ -209,9 +214,9 @@ def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | Com
 def _steps_not_done(testbed: Testbed, results: list[Result], left_alone: set[str]) -> list[str]:
     """Of robots that nobody took from the operator."""
     driven = {(result.robot, result.step) for result in results}
-    steps = [*(step.name for step in SCRIPT), emergency.NAME]
+    steps = [*(step.name for step in SCRIPT), EMERGENCY_STOP]
     wanted = [(name, step) for name in ROBOTS for step in steps]
-    wanted += [(robot.name, following.NAME) for robot in testbed.robots if robot.has_scripts]
+    wanted += [(robot.name, BY_ITSELF) for robot in testbed.robots if robot.has_scripts]
     return [
         f"{name}, {step}: not done" for name, step in wanted if (name, step) not in driven and name not in left_alone
     ]

@@ -22,10 +22,10 @@ from pebble.bench.control_wire import parse, request, stamped
 from pebble.bench.control_worker import Answer
 from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
-from pebble.demo import broker as demo_broker
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import end_all
 from pebble.errors import PebbleError
+from pebble.rig import broker as rig_broker
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import end_all
 from pebble.runtime.inbox import Inbox
 from tests.support import until
 
@@ -340,7 +340,7 @@ def test_the_broker_gets_the_lines_of_its_variant(tmp_path: Path) -> None:
 
 def test_another_server_on_the_broker_s_port_is_not_the_broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as stranger:
-        monkeypatch.setattr(demo_broker, "free_port", lambda: stranger.getsockname()[1])
+        monkeypatch.setattr(rig_broker, "free_port", lambda: stranger.getsockname()[1])
         broker = Broker("broker", BrokerKind.MOSQUITTO, tmp_path)
         assert until(lambda: broker.program.ended)
         with pytest.raises(PebbleError, match="broker ended at once"):

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from pebble.bench import chromium as program
 from pebble.bench.usage import pss_mb
-from pebble.demo.testbed import ROBOTS
+from pebble.rig.testbed import ROBOTS
 from tests.support import quarters
 from tests.web.browser import Tab
 from tests.web.console import Console, console

@@ -8,8 +8,8 @@ import pytest
 from pebble.bench.impair.plan import SUBJECTS
 from pebble.bench.impair.robots import ImpairedRobot
 from pebble.bench.worker import Worker, end_workers
-from pebble.demo.programs import Program
 from pebble.errors import PebbleError
+from pebble.rig.programs import Program
 from tests.support import until
 
 READY = [sys.executable, "-c", "print('{\"ready\": true}', flush=True); input()"]

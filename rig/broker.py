@@ -1,6 +1,6 @@
-"""MQTT brokers for the demo, on loopback: mosquitto where it is installed, else amqtt from the extra ``demo``.
+"""MQTT brokers on loopback: mosquitto where it is installed, else amqtt from the extra ``demo``.
 
-Program: ``python -m pebble.demo.broker PORT`` runs amqtt.
+Program: ``python -m pebble.rig.broker PORT`` runs amqtt.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from pebble.demo.programs import Program
 from pebble.errors import PebbleError
+from pebble.rig.programs import Program
 
 _HOST = "127.0.0.1"
 _SBIN = "/usr/sbin:/usr/local/sbin"  # where Debian puts brokers, outside users' PATH
@@ -81,7 +81,7 @@ def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: st
 
 
 def _amqtt(port: int) -> list[str]:
-    return [sys.executable, "-m", "pebble.demo.broker", str(port)]
+    return [sys.executable, "-m", "pebble.rig.broker", str(port)]
 
 
 def free_port() -> int:

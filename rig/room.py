@@ -1,10 +1,11 @@
-"""Where Goob lives in the demo: a room with a tag on each wall; and a clip that Goob can play."""
+"""Where Goob lives: a room with a tag on each wall; and a clip that Goob can play."""
 
 from __future__ import annotations
 
 import json
 import math
 import wave
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -23,6 +24,16 @@ _SIGNALS = {
 _RATE = 16_000
 #: After the first round of driving Goob looks at that tag, and has space for further rounds wherever it is then.
 _START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The true state at the end, known to the world and the loudspeaker."""
+
+    distance_m: float  # between camera and tag
+    bearing_rad: float  # of the tag, positive to the left
+    played_s: float
+    clip_s: float
 
 
 class Room:

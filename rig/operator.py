@@ -14,13 +14,12 @@ from functools import partial
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
 from pebble.contract import DRIVE, LIGHTS_FLASH, LIGHTS_SOLID, codec
 from pebble.contract.payloads import Drive, LightsFlash
-from pebble.demo.emergency import NAME as EMERGENCY_STOP
-from pebble.demo.emergency import CompletedStop, EmergencyStop
-from pebble.demo.following import NAME as BY_ITSELF
-from pebble.demo.following import CompletedFollow
-from pebble.demo.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
-from pebble.demo.takeover import TakeOver
-from pebble.demo.visitors import Visitors
+from pebble.rig.emergency import NAME as EMERGENCY_STOP
+from pebble.rig.emergency import CompletedStop, EmergencyStop
+from pebble.rig.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
+from pebble.rig.takeover import NAME as BY_ITSELF
+from pebble.rig.takeover import CompletedFollow, TakeOver
+from pebble.rig.visitors import Visitors
 from pebble.transports import Message, MqttSettings, QoS, create
 
 STOP = Drive()

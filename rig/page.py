@@ -1,4 +1,4 @@
-"""The operator page of the demo: its server as a process of its own, with a log."""
+"""The operator page: its server as a process of its own, with a log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from pebble.demo.programs import Program
+from pebble.rig.programs import Program
 from pebble.web.extra import require_packages
 from pebble.web.program import Ready
 

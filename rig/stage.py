@@ -9,12 +9,12 @@ import time
 from types import TracebackType
 from typing import Any, Self
 
-from pebble.demo.broker import BrokerKind
-from pebble.demo.operator import Operator
-from pebble.demo.page import PageServer
-from pebble.demo.programs import Program, end_all
-from pebble.demo.testbed import ROBOTS, SimulatedRobot, Testbed
 from pebble.errors import PebbleError
+from pebble.rig.broker import BrokerKind
+from pebble.rig.operator import Operator
+from pebble.rig.page import PageServer
+from pebble.rig.programs import Program, end_all
+from pebble.rig.testbed import ROBOTS, SimulatedRobot, Testbed
 from pebble.simulation.trace import Entry
 
 _END_S = 2.5
@@ -25,10 +25,10 @@ Changes = list[tuple[int, tuple[float, float]]]
 
 
 class Stage:
-    """The demo's brokers and the named robots (none: all four), and the page's server as a process of its own.
+    """Brokers and the named robots (none: all four), and the page's server as a process of its own.
 
     ``robots``, by name, are traced: ``entries()`` is what each MCU received and did, with time.monotonic_ns().
-    ``room``: Goob sees the demo's room, in pictures as old as the room's state; else a scene that is drawn when due.
+    ``room``: Goob sees its room, in pictures as old as the room's state; else a scene that is drawn when due.
     ``settings`` are fields of WebSettings. A context manager, for the main thread. Raises PebbleError.
     """
 

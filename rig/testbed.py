@@ -1,4 +1,4 @@
-"""The brokers and simulated robots of the demo, in a temporary folder, and the order in which they start and end."""
+"""Brokers and the simulated robots that come with Pebble: where they live, and in which order they start and end."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.following import Outcome
-from pebble.demo.page import PageServer
-from pebble.demo.programs import Program, end_all
-from pebble.demo.room import CLIP_S, Room, write_clip
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.page import PageServer
+from pebble.rig.programs import Program, end_all
+from pebble.rig.room import CLIP_S, Outcome, Room, write_clip
 from pebble.simulation.loudspeaker import playbacks
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.motion import Pose

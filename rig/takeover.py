@@ -1,20 +1,25 @@
-"""The demo's operator starts a script on a robot, drives the robot for a moment in between, and gives it back."""
+"""The scripted operator starts a script on a robot, drives the robot for a moment in between, and gives it back."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from pebble.client.discovery import DiscoveredRobot
 from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, SOUNDBOARD_COMMAND, Channel, codec
 from pebble.contract.payloads import AutonomyCommand, Drive, SoundboardCommand, TagData
-from pebble.demo.following import DISTANCE_M, HOLD_S, SCRIPT, TOLERANCE_M, CompletedFollow
-from pebble.demo.room import CLIP, TAG_ID, TAG_SIZE_M
-from pebble.demo.steps import COMMAND_PERIOD_S
 from pebble.errors import PayloadError
+from pebble.motion.arbiter import HOLD_MS
+from pebble.rig.room import CLIP, TAG_ID, TAG_SIZE_M
+from pebble.rig.steps import COMMAND_PERIOD_S
 from pebble.services.serial_mcu_bridge.text.goob_base import mix
 from pebble.transports import Message, QoS, Transport
 
+NAME = "by itself"
+SCRIPT = "apriltag-follow"
+DISTANCE_M, TOLERANCE_M = 0.9, 0.05
+HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command
 _APPROACH_S, _OVERRIDE_S, _STEADY_S, _REST_S = 1.0, 1.0, 0.8, 0.5
 _START_S, _ARRIVAL_S = 10.0, 10.0  # at most, on the smallest machine
 _STATUS_S = 1.0  # until the robot's status has changed
@@ -22,6 +27,26 @@ _POLL_S = 0.02
 #: Of most runs; a slow one takes longer.
 DURATION_S = 2.0 + _APPROACH_S + _OVERRIDE_S + HOLD_S + 4.5 + _STEADY_S + _REST_S
 _BACK = Drive(x=-0.1, z=-0.5)
+
+
+Wheels = tuple[float, float]  # left and right, -1..1
+
+
+@dataclass(frozen=True, slots=True)
+class CompletedFollow:
+    """What the operator did. Times are time.monotonic() of the operator."""
+
+    robot: str  # its id
+    started: float  # the script
+    took_over: float  # first drive command
+    wheels: Wheels  # of the operator's drive commands
+    released: float  # the zero after them
+    ended: float  # the script, by a stop command
+    clip: str
+
+    @property
+    def began(self) -> float:
+        return self.started
 
 
 class TakeOver:

@@ -1,4 +1,4 @@
-"""Whether this machine had processor time left for the demo: simulated hardware stands still without it.
+"""Whether this machine has processor time left: simulated hardware stands still without it.
 
 A real motor MCU has a processor of its own, so what a simulated one does late on an overloaded machine says nothing
 about robots.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pebble.demo.testbed import LinuxRobot, McuRobot
+from pebble.rig.testbed import LinuxRobot, McuRobot
 
 
 def test_a_robot_without_outlets_has_switched_no_relay(tmp_path: Path) -> None:
