@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import tempfile
-import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import Self
 
 from pebble.bench.bridge_drive import RATE_HZ, Arrived, DriveSegment
 from pebble.bench.bridge_operator import Operator, Wheels
 from pebble.bench.bridge_subscriber import CommandSubscriber
 from pebble.contract import DRIVE
-from pebble.rig.broker import Broker, BrokerKind
-from pebble.rig.programs import end_all
+from pebble.rig.processes import Processes
 
 HOP = "one hop"
 _BASE = "pebble/robots/one-hop"
 _ARRIVE_S = 1.0
 _POLL_S = 0.02
-_END_S = 2.0
 
 
 class OneHop:
@@ -32,12 +27,10 @@ class OneHop:
     def __enter__(self) -> Self:
         """Raises PebbleError if something does not start."""
         with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
-            broker = Broker("hop", BrokerKind.MOSQUITTO, folder)
-            stack.callback(end_all, [broker.program], _END_S)
-            broker.wait(threading.Event())
-            subscriber = CommandSubscriber(broker.port, DRIVE.topic(_BASE), folder / "subscriber.log")
-            self._subscriber = stack.enter_context(subscriber)
+            processes = stack.enter_context(Processes())
+            broker = processes.broker("hop")
+            broker.wait()
+            self._subscriber = CommandSubscriber(processes, broker.port, DRIVE.topic(_BASE))
             self._operator = stack.enter_context(closing(Operator(broker.port, _BASE)))
             self._stack = stack.pop_all()
         return self
@@ -51,7 +44,7 @@ class OneHop:
         return DriveSegment(began, time.monotonic_ns(), sent)
 
     def match_arrivals(self, segments: Sequence[DriveSegment]) -> list[Arrived]:
-        """See :func:`pebble.bench.bridge_drive.match_arrivals`."""
+        """See :meth:`DrivenRobot.match_arrivals`."""
         received: dict[Wheels, int] = {}
         end = time.monotonic() + _ARRIVE_S
         while True:

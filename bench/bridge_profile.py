@@ -19,10 +19,10 @@ from pebble.bench.bridge_drive import arrivals
 from pebble.bench.bridge_driven_robot import DrivenRobot
 from pebble.bench.bridge_operator import Wheels
 from pebble.bench.bridge_plan import BridgePlan
-from pebble.bench.bridge_robot import RobotProcesses
 from pebble.bench.percentiles import percentile
 from pebble.bench.results import Cell, Stopwatch
 from pebble.bench.tables import figure, plain_table
+from pebble.rig.robot import Robot
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
@@ -74,7 +74,7 @@ def _trace_commands(kind: str, seconds: float) -> Times:
         return hops(segment.sent, [*_stations(wire.passed(), driven_robot.robot), pty])
 
 
-def _stations(passed: PassageTimes, robot: RobotProcesses) -> list[Mapping[Wheels, int]]:
+def _stations(passed: PassageTimes, robot: Robot) -> list[Mapping[Wheels, int]]:
     """The times at which commands went into and out of each broker, in order."""
     return [_first(passed, port, side) for port in robot.broker_ports for side in (1, 0)]
 

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
+from pebble.bench.bridge_driven_robot import STAND_IN
 from pebble.bench.bridge_one_hop import HOP
-from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP
 from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import LEAST_ROUNDS, paired
 from pebble.bench.results import Cell, Value
 from pebble.bench.robot_comparison import caveat, sentence
 from pebble.bench.tables import figure, latency_table, plain_table
+from pebble.rig.robot import KINDS
 
 AIMS_MS = {50: 0.7, 99: 2.0}
 LEAST_SAMPLES = {50: 1, 99: 300}  # to assess an aim: with fewer, hardly any lie beyond that percentile

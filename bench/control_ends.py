@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import struct
-import threading
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -89,36 +88,25 @@ class PahoConnection:
     """Stock paho with its own network thread and no socket options, as in the original program."""
 
     def __init__(self, port: int) -> None:
-        from paho.mqtt.client import Client
-        from paho.mqtt.enums import CallbackAPIVersion
+        from pebble.rig.stock_client import StockClient  # only these ends import paho
 
-        connected, subscribed = threading.Event(), threading.Event()
         self.received_ns = 0
-        self._subscribed = subscribed
-        self._client = Client(CallbackAPIVersion.VERSION2)
-        self._client.on_connect = lambda *_: connected.set()
-        self._client.on_subscribe = lambda *_: subscribed.set()
-        self._client.connect("127.0.0.1", port)
-        self._client.loop_start()
-        if not connected.wait(_CONNECT_S):
-            raise PebbleError(f"the broker on port {port} does not answer")
+        self._client = StockClient(at_once=False).open(port)
+        self._client.wait()
 
     def subscribe(self, filter_: str, handler: Handler) -> None:
         def on_message(_client: Any, _data: Any, message: Any) -> None:
             self.received_ns = time.monotonic_ns()
             handler(message.topic, message.payload)
 
-        self._client.on_message = on_message
-        self._client.subscribe(filter_, qos=QOS)
-        if not self._subscribed.wait(_CONNECT_S):
-            raise PebbleError(f"the broker does not answer to a subscription of {filter_}")
+        self._client.paho.on_message = on_message
+        self._client.subscribe(filter_, QOS)
 
     def publish(self, topic: str, payload: bytes) -> None:
-        self._client.publish(topic, payload, qos=QOS)
+        self._client.paho.publish(topic, payload, qos=QOS)
 
     def close(self) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
+        self._client.close()
 
 
 class Echo:

@@ -2,13 +2,11 @@
 
 ``python -m pebble.bench.control_load hog|writer|reader [mqtt|zenoh WHERE]``: a busy loop, or one end of a stream of raw
 640x480 pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing; each
-is answered with the number of pictures so far. The process ends when its standard input closes.
+is answered with the number of pictures so far.
 """
 
 from __future__ import annotations
 
-import json
-import signal
 import sys
 import threading
 import time
@@ -18,6 +16,7 @@ import numpy as np
 
 from pebble.bench.frames_loop import RATE_HZ, Reader, Writer
 from pebble.bench.frames_worker import MqttReader, MqttWriter, ZenohReader, ZenohWriter
+from pebble.rig.worker_end import answer, serve_on_thread
 
 SIZE = 640 * 480 * 3
 _READ_S = 0.2
@@ -34,7 +33,7 @@ class Switch:
         self.on = False
         self.ended = False
         self._changed = threading.Condition()
-        threading.Thread(target=self._listen, name="switch", daemon=True).start()
+        serve_on_thread(self._handle, lambda: self._set(on=False, ended=True))
 
     def wait(self, timeout: float | None = None) -> None:
         """Waits until it is on, or standard input closes."""
@@ -42,15 +41,12 @@ class Switch:
             self._changed.wait_for(lambda: self.on or self.ended, timeout)
 
     def write_count(self) -> None:
-        sys.stdout.write(json.dumps({"pictures": self.pictures}) + "\n")
-        sys.stdout.flush()
+        answer({"pictures": self.pictures})
 
-    def _listen(self) -> None:
-        for line in sys.stdin:
-            if line.strip() in ("0", "1"):
-                self._set(on=line.strip() == "1")
-            self.write_count()
-        self._set(on=False, ended=True)
+    def _handle(self, line: str) -> None:
+        if line in ("0", "1"):
+            self._set(on=line == "1")
+        self.write_count()
 
     def _set(self, *, on: bool, ended: bool = False) -> None:
         with self._changed:
@@ -60,7 +56,6 @@ class Switch:
 
 def main(arguments: list[str]) -> int:
     role, *where = arguments
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if role == "hog":
         _hog(Switch())
     elif role == "writer":

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 
@@ -22,19 +18,18 @@ from pebble.bench.control_variants import VARIANTS, Variant
 from pebble.bench.control_worker import Answer, Endpoint
 from pebble.bench.null import variant_of
 from pebble.bench.usage import cpu_s, wake_ups
-from pebble.bench.worker import Worker, end_workers
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker, BrokerKind
-from pebble.rig.programs import Program, end_all
+from pebble.rig.broker import Broker
+from pebble.rig.processes import BROKERS, Processes, python
+from pebble.rig.programs import Program
+from pebble.rig.worker import Worker
 from pebble.transports.settings import ZenohSettings
 
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
-_END_S = 4.0
 _FLOWING = 3  # pictures received until the stream counts as flowing
 _FLOW_S = 10.0
 _POLL_S = 0.02
-_PYTHON = [sys.executable, "-m"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,21 +85,22 @@ def joined(slices: Sequence[Slice]) -> Slice:
 class Backbone:
     """The broker of an MQTT variant or the hub of a Zenoh one."""
 
-    def __init__(self, variant: Variant, folder: Path) -> None:
+    def __init__(self, variant: Variant, folder: Path, processes: Processes) -> None:
         self._variant, self._run_dir = variant, folder / "z"
         self._broker: Broker | None = None
+        self.program: Program
         if variant.on_zenoh:
             settings = msgspec.json.encode(ZenohSettings(run_dir=self._run_dir), enc_hook=str).decode()
-            self.program = Program("hub", [*_PYTHON, "pebble.runtime.hub", settings], folder / "hub.log")
+            hub = Program("hub", python("pebble.runtime.hub", settings), folder / "hub.log")
+            self.program = processes.add(hub, BROKERS)
         else:
-            self._broker = Broker("broker", BrokerKind.MOSQUITTO, folder, variant.broker)
-            self.program = self._broker.program
+            self.program = self._broker = processes.broker(extra=variant.broker, folder=folder)
 
     def wait(self) -> None:
         if self._broker is not None:
-            self._broker.wait(threading.Event())
+            self._broker.wait()
         else:
-            self.program.wait_until((self._run_dir / "hub.sock").exists, _READY_S, threading.Event())
+            self.program.wait_until((self._run_dir / "hub.sock").exists, _READY_S)
 
     @property
     def endpoint(self) -> Endpoint:
@@ -122,9 +118,9 @@ class Backbone:
 class Participant:
     """The processes of one role."""
 
-    def __init__(self, role: str, folder: Path) -> None:
-        self.role, self._folder = role, folder
-        self.backbone = Backbone(VARIANTS[variant_of(role)], folder)
+    def __init__(self, role: str, folder: Path, processes: Processes) -> None:
+        self.role, self._processes = role, processes
+        self.backbone = Backbone(VARIANTS[variant_of(role)], folder, processes)
         self.ends: list[Worker] = []  # echo, sender
         self.media: list[Worker] = []  # reader, writer
 
@@ -132,17 +128,17 @@ class Participant:
         """Starts the processes; the backbone must be ready."""
         endpoint = msgspec.json.encode(self.backbone.endpoint).decode()
         for end in ("echo", "sender"):
-            self.ends.append(self._worker(end, ["pebble.bench.control_worker", end, endpoint]))
+            self.ends.append(self._worker(end, "pebble.bench.control_worker", end, endpoint))
         if media:
             for end in ("reader", "writer"):
-                self.media.append(self._worker(end, ["pebble.bench.control_load", end, *self.backbone.stream]))
+                self.media.append(self._worker(end, "pebble.bench.control_load", end, *self.backbone.stream))
 
     def run(self, spec: SliceSpec) -> Slice:
         """Runs one slice; returns the sender's answer and the resource usage of the ends and the backbone."""
         every = ([worker.pid for worker in self.ends], [self.backbone.program.pid])
         began, before = time.monotonic(), [_used(pids) for pids in every]
         line = msgspec.json.encode(spec).decode()
-        answer = msgspec.convert(_ask(self.ends[1], line, spec.seconds + _ANSWER_S), Answer)
+        answer = msgspec.convert(self.ends[1].ask(line, spec.seconds + _ANSWER_S), Answer)
         took = time.monotonic() - began
         ends, backbone = (_used(pids) - used for pids, used in zip(every, before, strict=True))
         return Slice(
@@ -153,8 +149,8 @@ class Participant:
             backbone_wake_ups=backbone.wake_ups / answer.trips,
         )
 
-    def _worker(self, end: str, arguments: Sequence[str]) -> Worker:
-        return Worker(f"{self.role}: {end}", [*_PYTHON, *arguments], self._folder / f"{end}.log")
+    def _worker(self, end: str, module: str, *arguments: str) -> Worker:
+        return self._processes.worker(f"{self.role}: {end}", module, *arguments)
 
 
 class Participants:
@@ -168,13 +164,11 @@ class Participants:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
-            stack.callback(self._end)
-            self._start(folder)
+            self._start(stack.enter_context(Processes()))
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
@@ -186,28 +180,18 @@ class Participants:
             pictures, took = self._pictures(participant, load) - before, time.monotonic() - began
         return replace(slice_, pictures_hz=pictures / took) if load == MEDIA else slice_
 
-    def _start(self, folder: Path) -> None:
+    def _start(self, processes: Processes) -> None:
         for number, role in enumerate(self._roles):
-            endpoint = folder / str(number)  # short: paths of Unix sockets begin with it
-            endpoint.mkdir()
-            self._participants[role] = Participant(role, endpoint)
+            folder = processes.folder / str(number)  # short: paths of Unix sockets begin with it
+            folder.mkdir()
+            self._participants[role] = Participant(role, folder, processes)
         for participant in self._participants.values():
             participant.backbone.wait()
             participant.start(media=MEDIA in self._loads)
         if HOG in self._loads:
-            self._hog = Worker("hog", [*_PYTHON, "pebble.bench.control_load", "hog"], folder / "hog.log")
-        for worker in self._workers():
+            self._hog = processes.worker("hog", "pebble.bench.control_load", "hog")
+        for worker in processes.workers:
             worker.answer(_READY_S)
-
-    def _end(self) -> None:
-        end_workers(self._workers())
-        end_all([participant.backbone.program for participant in self._participants.values()], _END_S)
-
-    def _workers(self) -> list[Worker]:
-        hog = [] if self._hog is None else [self._hog]
-        return hog + [
-            worker for participant in self._participants.values() for worker in (*participant.ends, *participant.media)
-        ]
 
     @contextmanager
     def _loaded(self, participant: Participant, load: str) -> Iterator[None]:
@@ -229,15 +213,9 @@ class Participants:
         return _switch_load(participant.media[0], "?") if load == MEDIA else 0
 
 
-def _ask(worker: Worker, line: str, timeout: float) -> Any:
-    """Sends a line and returns the answer. Raises PebbleError if the worker ended or does not answer."""
-    worker.send(line)
-    return worker.answer(timeout)
-
-
 def _switch_load(worker: Worker, line: str) -> int:
     """Sends a command to a load process; returns its count of pictures so far."""
-    return int(_ask(worker, line, _FLOW_S)["pictures"])
+    return int(worker.ask(line, _FLOW_S)["pictures"])
 
 
 def _wait_for_pictures(participant: Participant) -> None:

@@ -13,15 +13,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from pebble.bench.bridge_robot import KINDS
 from pebble.bench.cost_cells import cells_of
 from pebble.bench.cost_robot import RATE_HZ, STREAMS, measure
-from pebble.bench.measured_robot import check_kinds
 from pebble.bench.output import FOLDER, check_folder, finish
 from pebble.bench.percentiles import LONGEST_S
 from pebble.bench.results import Stopwatch
 from pebble.bench.rounds import Rounds
 from pebble.errors import PebbleError
+from pebble.rig.robot import KINDS, check_kinds
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 

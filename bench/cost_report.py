@@ -9,10 +9,10 @@ from statistics import median
 from rich.table import Table
 
 from pebble.bench.cost_cells import ALL, CPU, MEMORY, PER_PICTURE, PICTURES, THREADS
-from pebble.bench.measured_robot import BROKER, LAUNCHER
 from pebble.bench.results import Cell
 from pebble.bench.robot_comparison import caveat, medians, sentence
 from pebble.bench.tables import figure, plain_table
+from pebble.rig.robot import BROKER, LAUNCHER
 
 _COLUMNS = ((MEMORY, "MB"), (CPU, "%"), (THREADS, "thr."))
 #: The measures that are compared, and their names.

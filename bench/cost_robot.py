@@ -12,11 +12,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from pebble.bench.bridge_robot import BASE
-from pebble.bench.measured_robot import MeasuredRobot
 from pebble.bench.robot_subscriber import RobotSubscriber
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
+from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
 
 RATE_HZ = 20.0  # of driving
 IDLE, DRIVING = "idle", "driving"
@@ -40,8 +39,8 @@ class Reading:
 
 def measure(kind: str, seconds: float, streams: Sequence[str]) -> list[Reading]:
     """Measures all phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
-    with MeasuredRobot(kind, media=True) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
-        subscriber.wait_until_subscribed()
+    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        subscriber.wait()
         robot.launch()
         robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
         readings = [
@@ -54,7 +53,7 @@ def measure(kind: str, seconds: float, streams: Sequence[str]) -> list[Reading]:
         return readings
 
 
-def _start_streams(robot: MeasuredRobot, subscriber: RobotSubscriber, name: str) -> None:
+def _start_streams(robot: Robot, subscriber: RobotSubscriber, name: str) -> None:
     subscriber.ask_for(*STREAMS[name])
     due = {form: subscriber.arrived[form] + _FIRST for form in STREAMS[name]}
     robot.expect(
@@ -64,7 +63,7 @@ def _start_streams(robot: MeasuredRobot, subscriber: RobotSubscriber, name: str)
     )
 
 
-def _read(robot: MeasuredRobot, subscriber: RobotSubscriber, phase: str, work: Callable[[], object]) -> Reading:
+def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, work: Callable[[], object]) -> Reading:
     """Measures the robot's processes while ``work`` runs; memory is read afterwards."""
     time.sleep(_STARTUP_S)
     processes = robot.processes()

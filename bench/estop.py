@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from pebble.bench import estop_report, output
-from pebble.bench.bridge_robot import KINDS
 from pebble.bench.estop_driver import RATE_HZ
 from pebble.bench.estop_report import Sample, Samples
 from pebble.bench.estop_robots import Robots
 from pebble.bench.results import Stopwatch, Value
 from pebble.bench.rounds import Rounds
 from pebble.errors import PebbleError
+from pebble.rig.robot import KINDS
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.simulation.fleet import MOST
 from pebble.transports.segments import sweep

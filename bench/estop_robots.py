@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import random
-import sys
-import tempfile
-import threading
 import time
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from pebble.bench.bridge_robot import KINDS, RobotProcesses
 from pebble.bench.estop_driver import RATE_HZ
 from pebble.bench.estop_operator import StopOperator
 from pebble.bench.estop_report import ALL, BOARD, COMMAND, CONFIRMED, ESTOP, HOLD, REST, WIRE, ZERO, Samples
 from pebble.bench.fleet import read_moves
-from pebble.bench.worker import Worker, end_workers
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker, BrokerKind
-from pebble.rig.programs import Program, end_all
+from pebble.rig.processes import Processes
+from pebble.rig.robot import KINDS, Robot
 from pebble.simulation.fleet import Moved, members
 
 _STARTED_S = 90.0  # boards start one after the other
@@ -29,7 +24,6 @@ _MOVING_S = 10.0
 _WATCH_S = 0.3  # after a stop, while driving goes on; the fleet writes its trace ten times a second
 _POLL_S = 0.05
 _QUIET_S = 0.8  # after a reset: motor owners publish few states a second, so a stop at once is confirmed later
-_END_S = 3.0
 
 
 class Rest(NamedTuple):
@@ -58,23 +52,22 @@ class Robots:
 
     def __init__(self, boards: int) -> None:
         self._count = boards
-        self._linux: dict[str, RobotProcesses] = {}
+        self._linux: dict[str, Robot] = {}
         self._boards = [identity for _, identity in members(boards)] if boards else []
 
     def __enter__(self) -> Self:
         """Raises PebbleError if a process does not start."""
         with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
-            broker = Broker("remote", BrokerKind.MOSQUITTO, folder)
-            stack.callback(end_all, [broker.program], _END_S)
-            broker.wait(threading.Event())
-            self._folder, self._port, self._operator = folder, broker.port, StopOperator(broker.port)
+            self._processes = stack.enter_context(Processes())
+            broker = self._processes.broker("remote")
+            broker.wait()
+            self._port, self._operator = broker.port, StopOperator(broker.port)
             for kind in KINDS:
-                robot = RobotProcesses(kind, media=False, launched=False, name=f"rover-{kind}", remote_port=broker.port)
-                self._linux[kind] = stack.enter_context(robot)
-            driver = [sys.executable, "-m", "pebble.bench.estop_driver", str(broker.port)]
-            self._driver = Worker("the driver", driver, folder / "driver.log")
-            stack.callback(end_workers, [self._driver])
+                name, folder = f"rover-{kind}", self._processes.folder / kind
+                robot = Robot(self._processes, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
+                robot.prepare()
+                self._linux[kind] = robot
+            self._driver = self._processes.worker("driver", "pebble.bench.estop_driver", broker.port)
             self._stack = stack.pop_all()
         return self
 
@@ -95,7 +88,7 @@ class Robots:
         """Start all boards while a stop of all robots is held."""
         boards = [board.base for board in self._boards]
         with self._operator.sending(None, hold=True) as sending:
-            self._stack.callback(end_all, [self._start_fleet()], _END_S)
+            self._start_fleet()
             sending.wait_until_confirmed([*boards, *self._linux_bases()], _STARTED_S)
             for board in boards:
                 stop = sending.stop
@@ -137,14 +130,13 @@ class Robots:
     def _linux_bases(self) -> list[str]:
         return [robot.base for robot in self._linux.values()]
 
-    def _start_fleet(self) -> Program:
-        command = [sys.executable, "-m", "pebble.simulation.fleet_program", "--robots", str(self._count)]
-        command += ["--broker", f"127.0.0.1:{self._port}", "--trace", str(self._trace)]
-        return Program("the fleet", command, self._folder / "fleet.log")
+    def _start_fleet(self) -> None:
+        where = ["--broker", f"127.0.0.1:{self._port}", "--trace", str(self._trace)]
+        self._processes.robot("the fleet", "pebble.simulation.fleet_program", "--robots", self._count, *where)
 
     @property
     def _trace(self) -> Path:
-        return self._folder / "trace.jsonl"
+        return self._processes.folder / "trace.jsonl"
 
     def _drive(self, bases: Sequence[str]) -> None:
         """Drive these robots from now on; returns at a random moment after all of them move."""
@@ -186,6 +178,6 @@ class Robots:
         return moves | {base: changes.get(name, []) for name, base in boards.items()}
 
 
-def _changes(robot: RobotProcesses) -> list[Moved]:
+def _changes(robot: Robot) -> list[Moved]:
     entries = [(entry.ns, entry.motors) for entry in robot.lines(0)]
     return [Moved(ns, robot.base, motors) for ns, motors in entries if motors is not None]

@@ -7,13 +7,12 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
-from pebble.bench.bridge_robot import BASE
-from pebble.bench.measured_robot import MeasuredRobot
 from pebble.bench.robot_subscriber import RobotSubscriber
 from pebble.client.media_receiver import MediaReceiver
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.errors import PebbleError
 from pebble.media.decode import Decoded
+from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
 from pebble.transports import MqttSettings, Transport, create
 
 ENCODINGS = ALL_VIDEO
@@ -51,8 +50,8 @@ class _Operator(MediaReceiver):
 def measure(kind: str) -> dict[tuple[str, str], float]:
     """Milliseconds by encoding and state of the camera, of a fresh robot. Raises PebbleError."""
     waits: dict[tuple[str, str], float] = {}
-    with MeasuredRobot(kind, media=True) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
-        subscriber.wait_until_subscribed()
+    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        subscriber.wait()
         robot.launch()
         robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
         for encoding in ENCODINGS:
@@ -63,7 +62,7 @@ def measure(kind: str) -> dict[tuple[str, str], float]:
 
 
 @contextmanager
-def _operator(robot: MeasuredRobot, encoding: str) -> Iterator[_Operator]:
+def _operator(robot: Robot, encoding: str) -> Iterator[_Operator]:
     """Connected beforehand, as an operator who has the robot's page open."""
     settings = MqttSettings(host="127.0.0.1", port=robot.remote_port)
     with (

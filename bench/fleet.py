@@ -7,11 +7,8 @@ command's latency is from the operator's publish call to the resulting change of
 from __future__ import annotations
 
 import itertools
-import sys
-import tempfile
-import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,17 +23,16 @@ from pebble.bench.percentiles import LONGEST_S, percentile, rounded
 from pebble.bench.results import Cell, Stopwatch, Value
 from pebble.bench.tables import plain_table
 from pebble.bench.usage import cpu_s, pss_mb
-from pebble.bench.worker import Worker, end_workers
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker, BrokerKind
-from pebble.rig.programs import Program, end_all
+from pebble.rig.processes import Processes
+from pebble.rig.programs import Program
+from pebble.rig.worker import Worker
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.simulation.fleet import MOST, Moved, members
 from pebble.simulation.wireless import KINDS
 
 _ONLINE_S = 90.0
 _ARRIVE_S = 1.0
-_END_S = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,41 +141,24 @@ def run(plan: FleetPlan, console: Console | None = None) -> int:
 
 def measure(plan: FleetPlan, show_step: Any = lambda _text: None) -> FleetMetrics:
     """Measures one run with processes of its own. Raises PebbleError if a process does not start."""
-    with tempfile.TemporaryDirectory(prefix="pbl-") as name:
-        folder, programs, workers = Path(name), [], []
-        try:
-            broker = Broker("broker", BrokerKind.MOSQUITTO, folder)
-            programs.append(broker.program)
-            broker.wait(threading.Event())
-            fleet = _start_fleet(plan, broker.port, folder)
-            programs.insert(0, fleet)
-            operator = _start_operator(plan, broker.port, folder)
-            workers.append(operator)
-            show_step(f"{plan.robots} robots are connecting")
-            online = operator.answer(_ONLINE_S)["online"]
-            show_step(f"{online} robots are online and being driven for {plan.seconds:.0f} s")
-            return _observe(plan, online, operator, fleet, broker, folder / "trace.jsonl")
-        finally:
-            end_workers(workers)
-            end_all(programs, _END_S)
-
-
-def _start_fleet(plan: FleetPlan, port: int, folder: Path) -> Program:
-    command = [sys.executable, "-m", "pebble.simulation.fleet_program", "--robots", str(plan.robots)]
-    command += ["--kinds", ",".join(plan.kinds), "--broker", f"127.0.0.1:{port}"]
-    return Program("the fleet", [*command, "--trace", str(folder / "trace.jsonl")], folder / "fleet.log")
-
-
-def _start_operator(plan: FleetPlan, port: int, folder: Path) -> Worker:
     ids = [identity.id for _, identity in members(plan.robots, plan.kinds)]
-    command = [sys.executable, "-m", "pebble.bench.fleet_operator", str(port), str(plan.seconds), str(plan.rate_hz)]
-    return Worker("the operator", [*command, *ids], folder / "operator.log")
+    with Processes() as processes:
+        broker, trace = processes.broker(), processes.folder / "trace.jsonl"
+        broker.wait()
+        where = ["--kinds", ",".join(plan.kinds), "--broker", f"127.0.0.1:{broker.port}", "--trace", trace]
+        fleet = processes.robot("fleet", "pebble.simulation.fleet_program", "--robots", plan.robots, *where)
+        how = (broker.port, plan.seconds, plan.rate_hz)
+        operator = processes.worker("operator", "pebble.bench.fleet_operator", *how, *ids)
+        show_step(f"{plan.robots} robots are connecting")
+        online = operator.answer(_ONLINE_S)["online"]
+        show_step(f"{online} robots are online and being driven for {plan.seconds:.0f} s")
+        return _observe(plan, online, {"broker": broker, "fleet": fleet, "operator": operator}, operator, trace)
 
 
 def _observe(
-    plan: FleetPlan, online: int, operator: Worker, fleet: Program, broker: Broker, trace: Path
+    plan: FleetPlan, online: int, programs: Mapping[str, Program], operator: Worker, trace: Path
 ) -> FleetMetrics:
-    pids = {"broker": broker.program.pid, "fleet": fleet.pid, "operator": operator.pid}
+    pids = {name: program.pid for name, program in programs.items()}
     began, before = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
     answer = operator.answer(plan.seconds + _ONLINE_S)
     used = {name: cpu_s([pid]) - before[name] for name, pid in pids.items()}
@@ -197,7 +176,7 @@ def _observe(
         heartbeats_hz=[rate for heartbeats in answer["heartbeats"] if (rate := _rate(heartbeats)) is not None],
         longest_gap_s=longest_gap_s(answer["heartbeats"], answer["began"], answer["ended"]),
         cpu={name: 100 * seconds / took for name, seconds in used.items()},
-        fleet_mb=pss_mb(fleet.pid),
+        fleet_mb=pss_mb(pids["fleet"]),
     )
 
 

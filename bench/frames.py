@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import itertools
 import statistics
-import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,10 +21,10 @@ from pebble.bench.percentiles import LONGEST_S
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import Cell, Stopwatch, Value
 from pebble.bench.usage import cpu_s, pss_mb
-from pebble.bench.worker import Worker, end_workers
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker, BrokerKind
-from pebble.rig.programs import end_all
+from pebble.rig.broker import Broker
+from pebble.rig.processes import Processes
+from pebble.rig.worker import Worker
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
@@ -173,14 +171,14 @@ def _try_case(case: Case, seconds: float, console: Console) -> Round | None:
 
 def run_case(case: Case, seconds: float) -> Round:
     """Runs one writer and its readers, each as a process. Raises PebbleError if one of them fails."""
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
-        broker = stack.enter_context(_broker(folder)) if case.needs_broker else None
+    with Processes() as processes:
+        broker = processes.broker() if case.needs_broker else None
+        if broker is not None:
+            broker.wait()
         workers: list[Worker] = []
-        stack.callback(lambda: end_workers(workers))
         for name in ("writer", *(f"reader {number + 1}" for number in range(case.readers))):
-            command = case.command(name.partition(" ")[0], folder, broker.port if broker is not None else 0)
-            workers.append(Worker(f"{case}: {name}", command, folder / f"{name}.log"))
+            command = case.command(name.partition(" ")[0], processes.folder, broker.port if broker is not None else 0)
+            workers.append(processes.command(f"{case}: {name}", command))
             if name == "writer" and case.needs_writer_first:
                 workers[0].answer(_READY_S)
         for worker in workers[1 if case.needs_writer_first else 0 :]:
@@ -193,9 +191,9 @@ def _observe(case: Case, workers: Sequence[Worker], broker: Broker | None, secon
     for worker in workers:
         worker.send(f"{begin} {begin + int(seconds * 1e9)}")
     time.sleep(_STARTUP_S)
-    before = cpu_s([broker.program.pid]) if broker is not None else 0.0
+    before = cpu_s([broker.pid]) if broker is not None else 0.0
     time.sleep(seconds)
-    used = cpu_s([broker.program.pid]) - before if broker is not None else None
+    used = cpu_s([broker.pid]) - before if broker is not None else None
     answers = [worker.answer(_ANSWER_S) for worker in workers]
     bare = case.variant == "memcpy"  # has no writer
     return Round(
@@ -209,13 +207,3 @@ def _observe(case: Case, workers: Sequence[Worker], broker: Broker | None, secon
         memory_writer_mb=0.0 if bare else pss_mb(workers[0].pid),
         memory_reader_mb=0.0 if bare else statistics.fmean(pss_mb(worker.pid) for worker in workers[1:]),
     )
-
-
-@contextmanager
-def _broker(folder: Path) -> Iterator[Broker]:
-    broker = Broker("bench-broker", BrokerKind.MOSQUITTO, folder)
-    try:
-        broker.wait(threading.Event())
-        yield broker
-    finally:
-        end_all([broker.program], 1.0)

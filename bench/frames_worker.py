@@ -6,7 +6,6 @@ broker's port; ``SIZE`` is ``640x480``; a writer delays each frame by ``SLOWER_U
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections import deque
@@ -147,7 +146,6 @@ def main(arguments: list[str]) -> int:
     variant, role, where, size_, slower_us = arguments
     width, _, height = size_.partition("x")
     size = int(width) * int(height) * 3
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
         shared_memory.lockable = lambda size: False  # noqa: ARG005
     control_pipe = frames_loop.ControlPipe()

@@ -17,12 +17,12 @@ from urllib.parse import urldefrag, urlsplit
 
 from pebble.bench.estop_driver import Driver
 from pebble.bench.page_rig import Rig, monotonic
-from pebble.bench.usage import children, cpu_s
-from pebble.bench.worker import Worker, end_workers
+from pebble.bench.usage import cpu_s
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.errors import PebbleError
-from pebble.rig.programs import Program, end_all
+from pebble.rig.programs import Program, children, end_all
 from pebble.rig.testbed import ROBOTS
+from pebble.rig.worker import Worker, end_workers
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -90,8 +90,8 @@ def interruptions(rig: Rig, scale: float) -> Samples:
         "frozen to stop": frozen,
         "closed to stop": closed,
         "stalled to stop": stalled,
-        "server frozen to stop": lambda _: _signal(rig.stage.server.program.pid, signal.SIGSTOP),
-        "server killed to stop": lambda _: _signal(rig.stage.server.program.pid, signal.SIGKILL),
+        "server frozen to stop": lambda _: _signal(rig.stage.server.pid, signal.SIGSTOP),
+        "server killed to stop": lambda _: _signal(rig.stage.server.pid, signal.SIGKILL),
     }
     found: Samples = {name: [] for name in actions}
     for name, act in actions.items():
@@ -117,8 +117,8 @@ def _signal(pid: int, number: signal.Signals) -> float:
 
 def _recover(rig: Rig, page: Page) -> None:
     _signal(_network_process(), signal.SIGCONT)
-    if rig.stage.server.program.ended or _is_stopped(rig.stage.server.program.pid):
-        rig.stage.thaw_server()
+    if rig.stage.server.ended or _is_stopped(rig.stage.server.pid):
+        rig.stage.server.thaw()
         rig.stage.restart_server()
     if not page.is_closed():
         page.context.close()
@@ -265,7 +265,7 @@ def _watched(rig: Rig, count: int, seconds: float) -> tuple[float, list[float]]:
     """Bytes a second of the robot, and per cent of its frames that each viewer received."""
     module = [sys.executable, "-m", "pebble.bench.page_viewers"]
     command = [*module, rig.stage.url, rig.ref(ROBOT), str(count), str(seconds)]
-    worker = Worker("viewers", command, Path(rig.stage.folder_of_logs) / "viewers.log")
+    worker = Worker("viewers", command, rig.stage.folder / "viewers.log")
     try:
         answer = worker.answer(seconds + _COUNT_S)
     finally:
@@ -281,7 +281,7 @@ def crowd(rig: Rig, scale: float) -> Samples:
     """A hundred robots on the fleet's screen."""
     command = [sys.executable, "-m", "pebble.cli", "sim", "fleet", "-n", str(ROBOTS_SHOWN)]
     command += ["--broker", f"mqtt://127.0.0.1:{rig.stage.broker_port}"]
-    robots = Program("the fleet", command, Path(rig.stage.folder_of_logs) / "fleet.log")
+    robots = Program("the fleet", command, rig.stage.folder / "fleet.log")
     try:
         page = rig.fleet()
         count = "document.querySelectorAll('[data-test^=\"card-\"]').length"
@@ -310,7 +310,7 @@ def _busy(answer: dict[str, Any]) -> float:
 def _cost(rig: Rig, what: str) -> Iterator[Samples]:
     """CPU and memory of the server during the block."""
     found: Samples = {}
-    pid = rig.stage.server.program.pid
+    pid = rig.stage.server.pid
     before, began = cpu_s([pid]), time.monotonic()
     yield found
     found[f"{what}: CPU"] = [100 * (cpu_s([pid]) - before) / (time.monotonic() - began)]

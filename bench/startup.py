@@ -19,15 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.bench import first_picture, late_subscriber
-from pebble.bench.bridge_robot import BASE, KINDS
-from pebble.bench.measured_robot import MeasuredRobot, check_kinds
 from pebble.bench.output import FOLDER, check_folder, finish
 from pebble.bench.results import Cell, Stopwatch
 from pebble.bench.robot_comparison import against, caveat, sentence, spread
 from pebble.bench.robot_subscriber import RobotSubscriber
 from pebble.bench.rounds import Rounds
 from pebble.bench.tables import plain_table
-from pebble.bench.worker import Worker, end_workers
+from pebble.rig.robot import BASE, KINDS, Robot, check_kinds, one_robot
+from pebble.rig.worker import Worker, end_workers
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
@@ -186,10 +185,10 @@ def launch(kind: str, joins: int) -> Launch:
     """Measures one robot from its start to its end. Raises PebbleError with its log if it does not become ready."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
-        robot = stack.enter_context(MeasuredRobot(kind))
+        robot = stack.enter_context(one_robot(kind))
         service = stack.enter_context(_late_service(robot, folder))
         subscriber = stack.enter_context(closing(RobotSubscriber(robot.remote_port, BASE)))
-        subscriber.wait_until_subscribed()
+        subscriber.wait()
         started = _start(robot, subscriber)
         service.send(str(joins))  # it first counts the retained messages, which gives start-up work time to finish
         answer = service.answer(_ANSWER_S)
@@ -201,7 +200,7 @@ def launch(kind: str, joins: int) -> Launch:
         return started
 
 
-def _start(robot: MeasuredRobot, subscriber: RobotSubscriber) -> Launch:
+def _start(robot: Robot, subscriber: RobotSubscriber) -> Launch:
     with _driving(subscriber):
         began_ns = time.monotonic_ns()
         robot.launch()
@@ -214,7 +213,7 @@ def _start(robot: MeasuredRobot, subscriber: RobotSubscriber) -> Launch:
     return Launch(heartbeat_s=heartbeat_s, ready_s=ready_s, obeyed_s=obeyed_s)
 
 
-def _obeyed(robot: MeasuredRobot, since_ns: int) -> list[int]:
+def _obeyed(robot: Robot, since_ns: int) -> list[int]:
     """The times at which lines that move the wheels reached the MCU."""
     return [line.ns for line in robot.lines(since_ns) if line.drive is not None and any(line.drive)]
 
@@ -238,7 +237,7 @@ def _driving(operator: RobotSubscriber) -> Iterator[None]:
 
 
 @contextmanager
-def _late_service(robot: MeasuredRobot, folder: Path) -> Iterator[Worker]:
+def _late_service(robot: Robot, folder: Path) -> Iterator[Worker]:
     """Starts the late service beforehand, so that its imports do not disturb the launch."""
     worker = Worker(
         "late service", [sys.executable, "-m", "pebble.bench.late_subscriber", str(robot.config)], folder / "late.log"

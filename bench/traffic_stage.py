@@ -5,13 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
-from pebble.rig.broker import BrokerKind
 from pebble.rig.operator import Operator
 from pebble.rig.programs import Program, end_all
 from pebble.rig.testbed import ROBOTS, Testbed
@@ -27,10 +26,10 @@ _END_S = 10.0  # for the recorder to finish its files
 def record(folder: Path, idle_s: float, session_s: float) -> None:
     """Record all robots into ``folder``: idle for ``idle_s``, then used for ``session_s``. Raises PebbleError."""
     with Testbed(threading.Event()) as testbed:
-        testbed.start_brokers(BrokerKind.MOSQUITTO)
-        with _recorder(folder, testbed.remote_port), closing(_Session(testbed.remote_port)) as session:
+        testbed.start_brokers()
+        with _recorder(folder, testbed.broker_port), closing(_Session(testbed.broker_port)) as session:
             testbed.start_robots()
-            session.wait_until_ready(testbed.unexpected_exits)
+            session.operator.wait_until_ready(len(ROBOTS), _READY_S, testbed.unexpected_exits)
             time.sleep(idle_s)
             session.run(session_s)
             if problems := testbed.unexpected_exits():
@@ -45,12 +44,10 @@ def _recorder(folder: Path, port: int) -> Iterator[None]:
     command = [sys.executable, "-m", "pebble.cli", "record", "--url", f"mqtt://127.0.0.1:{port}", "--into"]
     recorder = Program("pebble record", [*command, str(folder / "recordings")], folder / "record.log")
     try:
-        recorder.wait_until(
-            lambda: b"Recording" in recorder.log.read_bytes(), _READY_S, threading.Event()
-        )  # it is connected
+        recorder.wait_until(lambda: b"Recording" in recorder.log.read_bytes(), _READY_S)  # it is connected
         yield
         if recorder.ended:
-            raise PebbleError(f"pebble record ended: {recorder.log.read_text()[-500:]}")
+            raise PebbleError(f"pebble record ended: {recorder.tail()}")
     finally:
         end_all([recorder], _END_S)
 
@@ -59,32 +56,24 @@ class _Session:
     """The demo's operator, and a viewer of all pictures and sound."""
 
     def __init__(self, port: int) -> None:
-        self._operator = Operator(port, "pebble-bench-operator")
-        self._operator.connect()
+        self.operator = Operator(port, "pebble-bench-operator")
+        self.operator.connect()
         self._viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
         self._watching = ExitStack()
-
-    def wait_until_ready(self, problems: Callable[[], list[str]]) -> None:
-        """Until every robot can be driven."""
-        end = time.monotonic() + _READY_S
-        while not self._operator.ready(len(ROBOTS)):
-            if problems() or time.monotonic() > end:
-                raise PebbleError("; ".join(problems()) or "the robots did not become ready to drive")
-            time.sleep(_POLL_S)
 
     def run(self, seconds: float) -> None:
         """Drive all robots while their pictures and sound arrive, of those that have them. Raises PebbleError."""
         self._viewer.open()
-        robots = self._operator.discovery.all_robots()
+        robots = self.operator.discovery.all_robots()
         receivers = [self._watch(robot.base) for robot in robots if robot.offers("video")]
         self._wait_for_media(receivers)
-        self._operator.begin()
+        self.operator.begin()
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             time.sleep(_POLL_S)
             for receiver in receivers:
                 receiver.poll()
-            self._operator.completed.clear()  # nothing is assessed here
+            self.operator.completed.clear()  # nothing is assessed here
         self._watching.close()
 
     def _wait_for_media(self, receivers: Sequence[MediaReceiver]) -> None:
@@ -98,7 +87,7 @@ class _Session:
 
     def close(self) -> None:
         self._watching.close()
-        self._operator.end()
+        self.operator.close()
         self._viewer.close()
 
     def _watch(self, base: str) -> MediaReceiver:

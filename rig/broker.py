@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
-from pebble.rig.programs import Program
+from pebble.rig.programs import Program, Wrap, unchanged
 
 _HOST = "127.0.0.1"
 _SBIN = "/usr/sbin:/usr/local/sbin"  # where Debian puts brokers, outside users' PATH
@@ -30,19 +30,29 @@ class BrokerKind(StrEnum):
     EMBEDDED = "embedded"
 
 
-class Broker:
-    """A running broker; the caller ends its ``program``."""
+class Broker(Program):
+    """A broker, from its construction on."""
 
-    def __init__(self, name: str, kind: BrokerKind, folder: Path, extra: Sequence[str] = (), port: int = 0) -> None:
+    def __init__(
+        self,
+        name: str,
+        kind: BrokerKind,
+        folder: Path,
+        extra: Sequence[str] = (),
+        port: int = 0,
+        *,
+        host: str = _HOST,
+        wrap: Wrap = unchanged,
+    ) -> None:
         """``extra``: more lines for mosquitto's configuration; amqtt has none. ``port`` 0 is a free one."""
         self.port = port or free_port()
         mosquitto = kind is BrokerKind.MOSQUITTO
-        command = mosquitto_command(self.port, folder / name, extra) if mosquitto else _amqtt(self.port)
-        self.program = Program(name, command, folder / f"{name}.log")
+        command = mosquitto_command(self.port, folder / name, extra, host) if mosquitto else _amqtt(self.port)
+        super().__init__(name, wrap(command), folder / f"{name}.log")
 
-    def wait(self, ending: threading.Event) -> None:
+    def wait(self, ending: threading.Event | None = None) -> None:
         """Wait until it answers, or ``ending``. Raises PebbleError on timeout, or if the broker has ended."""
-        self.program.wait_until(lambda: self._answers() and not self.program.ended, _START_S, ending)
+        self.wait_until(lambda: self._answers() and not self.ended, _START_S, ending)
 
     def _answers(self) -> bool:
         try:

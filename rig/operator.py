@@ -14,6 +14,7 @@ from functools import partial
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
 from pebble.contract import DRIVE, LIGHTS_FLASH, LIGHTS_SOLID, codec
 from pebble.contract.payloads import Drive, LightsFlash
+from pebble.errors import PebbleError
 from pebble.rig.emergency import NAME as EMERGENCY_STOP
 from pebble.rig.emergency import CompletedStop, EmergencyStop
 from pebble.rig.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
@@ -24,6 +25,7 @@ from pebble.transports import Message, MqttSettings, QoS, create
 
 STOP = Drive()
 NAME = "the demo's operator"
+_POLL_S = 0.02
 _COMPLETED = 1000  # finished steps that wait to be assessed
 _EVENTS = 100  # that wait to be shown
 _MOST_TIMES = 3  # for the emergency stop and for the script
@@ -65,6 +67,14 @@ class Operator:
         now = time.monotonic()
         return sum(robot.ready(now) for robot in self.discovery.all_robots()) >= wanted
 
+    def wait_until_ready(self, wanted: int, timeout: float, problems: Callable[[], list[str]]) -> None:
+        """Wait until so many robots can be driven. Raises PebbleError after a timeout, or if there are problems."""
+        end = time.monotonic() + timeout
+        while not self.ready(wanted):
+            if (found := problems()) or time.monotonic() > end:
+                raise PebbleError("; ".join(found) or "the robots did not become ready to drive")
+            time.sleep(_POLL_S)
+
     def show(self, event: str) -> None:
         """Add a line to the events."""
         self.events.append((time.monotonic(), f"operator {event}"))
@@ -81,7 +91,7 @@ class Operator:
         self._yours = yours
         self._thread.start()
 
-    def end(self) -> None:
+    def close(self) -> None:
         """Interrupt the step, stop all robots and disconnect."""
         self._stopping.set()
         if self._thread.is_alive():

@@ -14,7 +14,16 @@ from typing import IO
 from pebble.errors import PebbleError
 from pebble.runtime.parent import tied_to_parent
 
+Wrap = Callable[[Sequence[str]], Sequence[str]]
+"""Extends a command, so that it runs in another network."""
+
 _STEP_S = 0.01
+_TAIL = 2000  # characters of a log that are shown
+_PROC = Path("/proc")
+
+
+def unchanged(command: Sequence[str]) -> Sequence[str]:
+    return command
 
 
 class Program:
@@ -23,12 +32,22 @@ class Program:
     Start programs from the main thread: the kernel ends them when the thread that started them ends.
     """
 
-    def __init__(self, name: str, command: Sequence[str], log: Path, *, reports: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        log: Path,
+        *,
+        stdin: int = subprocess.DEVNULL,
+        reports: bool = False,
+        tied: bool = True,
+    ) -> None:
+        """``tied``: the kernel ends it when the thread that starts it ends."""
         self.name, self.log = name, log
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
-                tied_to_parent(command, signal.SIGTERM),
-                stdin=subprocess.DEVNULL,
+                tied_to_parent(command, signal.SIGTERM) if tied else command,
+                stdin=stdin,
                 stdout=subprocess.PIPE if reports else errors,
                 stderr=errors,
                 start_new_session=True,
@@ -49,9 +68,25 @@ class Program:
     def ended(self) -> bool:
         return self._process.poll() is not None
 
-    def wait_until(self, condition: Callable[[], bool], timeout: float, ending: threading.Event) -> None:
+    def tail(self) -> str:
+        """The end of its log."""
+        return self.log.read_text(errors="replace").strip()[-_TAIL:] if self.log.exists() else ""
+
+    def kill(self) -> None:
+        """SIGKILL; returns when it has ended."""
+        self._process.kill()
+        self._process.wait()
+
+    def freeze(self) -> None:
+        """SIGSTOP: its connections stay, and it answers nothing. A process that has ended stays so."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        self._process.send_signal(signal.SIGCONT)
+
+    def wait_until(self, condition: Callable[[], bool], timeout: float, ending: threading.Event | None = None) -> None:
         """Wait for ``condition``, or until ``ending``. Raises PebbleError on timeout or if the program ends first."""
-        end = time.monotonic() + timeout
+        end, ending = time.monotonic() + timeout, ending or threading.Event()
         while not condition() and not ending.wait(_STEP_S):
             if self.ended:
                 raise PebbleError(f"{self.name} ended at once with code {self._process.returncode}: see {self.log}")
@@ -79,3 +114,18 @@ def end_all(programs: Iterable[Program], within_s: float) -> None:
         program.ask_to_end()
     for program in programs:
         program.end(deadline)
+
+
+def children(pid: int) -> list[int]:
+    """The direct children of a process; none if it has ended.
+
+    Reads the parent of every process: not every kernel has ``/proc/<pid>/task/<tid>/children``.
+    """
+    return sorted(int(one.name) for one in _PROC.iterdir() if one.name.isdecimal() and _parent(one) == pid)
+
+
+def _parent(process: Path) -> int | None:
+    try:
+        return int((process / "stat").read_text().rpartition(")")[2].split()[1])
+    except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+        return None

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 import sys
-import tempfile
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
@@ -14,14 +12,15 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 
-from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.broker import BrokerKind
 from pebble.rig.page import PageServer
-from pebble.rig.programs import Program, end_all
+from pebble.rig.processes import MCUS, OPERATORS, Processes, python
+from pebble.rig.processes import ROBOTS as ROBOTS_END
+from pebble.rig.programs import Program
 from pebble.rig.room import CLIP_S, Outcome, Room, write_clip
 from pebble.simulation.loudspeaker import playbacks
 from pebble.simulation.mcu import Snapshot
@@ -35,8 +34,6 @@ IMU, OUTLETS = "goob_imu", "outlets"
 _LINES = {IMU: "imu", OUTLETS: "outlets"}  # instances of the serial bridge
 _OPTIONS = {OUTLETS: ("--unreachable", "o4")}
 CAMERA_FPS = 15
-_ROBOTS_END_S, _REST_END_S = 2.5, 1.0  # with the operator's disconnect: every process ends within five seconds
-_LONGEST_FOLDER = 40  # characters: unix sockets live below, and their paths end at 108 bytes
 _MCU_START_S = 10.0
 _REPORTS = 600  # a minute of reports
 _ENTRIES = 5_000  # minutes of commands
@@ -54,12 +51,12 @@ class SimulatedRobot(ABC):
     has_media = has_imu = has_scripts = False
     has_counter = True  # its camera shows a scene with a counter in it
 
-    def __init__(self, name: str, folder: Path) -> None:
-        self.name, self._folder = name, folder / name
+    def __init__(self, processes: Processes, name: str) -> None:
+        self.name, self._processes, self._folder = name, processes, processes.folder / name
         self._folder.mkdir()
         self.mcu_reports: deque[Snapshot] = deque(maxlen=_REPORTS)
+        self.programs: list[Program] = []  # all processes of it that were started
         self.mcu: Program | None = None
-        self.devices: list[Program] = []  # its other MCUs
         self.launcher: Program | None = None
         self._trace = self._folder / "trace.jsonl"
         self._trace_read = 0
@@ -68,16 +65,6 @@ class SimulatedRobot(ABC):
     @abstractmethod
     def start(self, ending: threading.Event) -> None:
         """Start its processes. Raises PebbleError if its MCU does not start; the operator detects any later failure."""
-
-    @property
-    def programs(self) -> list[Program]:
-        """All processes of it that were started."""
-        return [program for program in (self.launcher, *self.mcus) if program is not None]
-
-    @property
-    def mcus(self) -> list[Program]:
-        """Its MCUs, which end after the processes that are connected to them."""
-        return [*([] if self.mcu is None else [self.mcu]), *self.devices]
 
     def entries(self) -> list[Entry]:
         """The lines that the MCU received and the changes of its motors, oldest first."""
@@ -97,14 +84,19 @@ class SimulatedRobot(ABC):
         """What came of a script that ended at ``at``; only a robot with scripts knows."""
         raise NotImplementedError
 
-    def _start_mcu(self, module: str, *options: str) -> Program:
-        command = [sys.executable, "-m", module, "--kind", self.name, "--trace", str(self._trace), "--report", *options]
-        return self._report(Program(f"{self.name}'s MCU", command, self._folder / "mcu.log", reports=True))
+    def _start_mcu(self, module: str, *options: object) -> Program:
+        """Start the MCU of its motors and collect what it reports."""
+        command, log = python(module, *options, "--report"), self._folder / "mcu.log"
+        self.mcu = self._add(Program(f"{self.name}'s MCU", command, log, reports=True), MCUS)
+        threading.Thread(target=self._watch, args=(self.mcu,), name=f"reports of {self.name}", daemon=True).start()
+        return self.mcu
 
-    def _report(self, mcu: Program) -> Program:
-        """Collect the reports of an MCU that was just started."""
-        threading.Thread(target=self._watch, args=(mcu,), name=f"reports of {self.name}", daemon=True).start()
-        return mcu
+    def _traced(self) -> list[object]:
+        return ["--kind", self.name, "--trace", self._trace]
+
+    def _add(self, program: Program, kind: int) -> Program:
+        self.programs.append(program)
+        return self._processes.add(program, kind)
 
     def _watch(self, mcu: Program) -> None:
         for line in mcu.reports:
@@ -121,9 +113,9 @@ class LinuxRobot(SimulatedRobot):
     stop_s = 0.85  # 0.75 s watchdog, and its resolution
     has_media = True
 
-    def __init__(self, name: str, folder: Path, local_port: int, remote_port: int, *devices: str) -> None:
+    def __init__(self, processes: Processes, name: str, local_port: int, remote_port: int, *devices: str) -> None:
         """``devices``: self-describing MCUs that it has besides, by their kind."""
-        super().__init__(name, folder)
+        super().__init__(processes, name)
         self.has_imu = IMU in devices
         self._port = self._folder / "mcu"
         self._devices = {kind: self._folder / kind for kind in devices}  # their serial ports
@@ -132,24 +124,17 @@ class LinuxRobot(SimulatedRobot):
 
     def start(self, ending: threading.Event) -> None:
         """Start the MCU first, so that its port exists, then the robot."""
-        self.mcu = self._start_motors()
-        self.mcu.wait_until(self._port.exists, _MCU_START_S, ending)
+        starting = [(self._start_motors(), self._port)]
+        starting[0][0].wait_until(self._port.exists, _MCU_START_S, ending)
         for kind, port in self._devices.items():
-            options = [
-                "--kind",
-                kind,
-                "--link",
-                str(port),
-                "--trace",
-                str(self._trace_of(kind)),
-                *_OPTIONS.get(kind, ()),
-            ]
-            command = [sys.executable, "-m", "pebble.simulation.mcu", *options]
-            self.devices.append(Program(f"{self.name}'s {kind}", command, self._folder / f"{kind}.log"))
-        for device, port in zip(self.devices, self._devices.values(), strict=True):
-            device.wait_until(port.exists, _MCU_START_S, ending)
-        command = [sys.executable, "-m", "pebble.cli", "up", str(self._config)]
-        self.launcher = Program(self.name, command, self._folder / "robot.log")
+            where = ["--link", port, "--trace", self._trace_of(kind), *_OPTIONS.get(kind, ())]
+            command = python("pebble.simulation.mcu", "--kind", kind, *where)
+            device = Program(f"{self.name}'s {kind}", command, self._folder / f"{kind}.log")
+            starting.append((self._add(device, MCUS), port))
+        for program, port in starting:
+            program.wait_until(port.exists, _MCU_START_S, ending)
+        up = Program(self.name, python("pebble.cli", "up", self._config), self._folder / "robot.log")
+        self.launcher = self._add(up, ROBOTS_END)
 
     def relays(self) -> list[Entry]:
         """As its station's trace has them."""
@@ -157,7 +142,7 @@ class LinuxRobot(SimulatedRobot):
         return [entry for entry in read_trace(trace) if entry.event == "relay"] if OUTLETS in self._devices else []
 
     def _start_motors(self) -> Program:
-        return self._start_mcu("pebble.simulation.mcu", "--link", str(self._port))
+        return self._start_mcu("pebble.simulation.mcu", *self._traced(), "--link", self._port)
 
     def _trace_of(self, device: str) -> Path:
         return self._folder / f"{device}.jsonl"
@@ -199,8 +184,8 @@ class RoomRobot(LinuxRobot):
 
     has_scripts, has_counter = True, False
 
-    def __init__(self, name: str, folder: Path, local_port: int, remote_port: int) -> None:
-        super().__init__(name, folder, local_port, remote_port, IMU, OUTLETS)
+    def __init__(self, processes: Processes, name: str, local_port: int, remote_port: int) -> None:
+        super().__init__(processes, name, local_port, remote_port, IMU, OUTLETS)
         self._room = Room(self._folder)
         self._port, self._trace = port_path(self._folder, name), trace_path(self._folder, name)
         self._clip = write_clip(self._folder / "sounds")
@@ -229,9 +214,7 @@ class RoomRobot(LinuxRobot):
         return {"directory": str(self._folder / "sounds"), "player_command": player}
 
     def _start_motors(self) -> Program:
-        options = ["--folder", str(self._folder), "--trace", "--report"]
-        command = [sys.executable, "-m", "pebble.simulation.world", str(self._room.path), *options]
-        return self._report(Program(f"{self.name}'s room", command, self._folder / "room.log", reports=True))
+        return self._start_mcu("pebble.simulation.world", self._room.path, "--folder", self._folder, "--trace")
 
     def _read(self, line: bytes) -> Snapshot:
         seen = msgspec.json.decode(line, type=WorldSnapshot)
@@ -243,90 +226,61 @@ class McuRobot(SimulatedRobot):
 
     stop_s = 1.0
 
-    def __init__(self, name: str, folder: Path, runs_on: str, remote_port: int) -> None:
-        super().__init__(name, folder)
+    def __init__(self, processes: Processes, name: str, runs_on: str, remote_port: int) -> None:
+        super().__init__(processes, name)
         self.runs_on, self._broker = runs_on, f"127.0.0.1:{remote_port}"
 
     def start(self, ending: threading.Event) -> None:
-        self.mcu = self._start_mcu("pebble.simulation.networked", "--broker", self._broker)
-        self.mcu.wait_until(lambda: bool(self.mcu_reports), _MCU_START_S, ending)
+        mcu = self._start_mcu("pebble.simulation.networked", *self._traced(), "--broker", self._broker)
+        mcu.wait_until(lambda: bool(self.mcu_reports), _MCU_START_S, ending)
 
 
-class Testbed:
+class Testbed(Processes):
     """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU; or only those of ``names``.
 
     ``keep``: the folder with the logs stays after the demo. ``room``: Goob is in a simulated room, and sees it.
+    ``broker_port`` is that of the operators' broker, on loopback.
     """
 
+    ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
+
     def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS, *, room: bool = True) -> None:
+        super().__init__("pebble-demo-")
         self.keep = True
-        self._room = room
-        self._names = names
-        self.folder = Path(tempfile.mkdtemp(prefix="pebble-demo-", dir=_temporary_folder()))
-        self.robots: Sequence[SimulatedRobot] = ()
-        self.remote_port = 0
+        self.robots: dict[str, SimulatedRobot] = {}
         self.page: PageServer | None = None
-        self._ending = ending
-        self._brokers: list[Program] = []
+        self._ending, self._names, self._room = ending, names, room
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """End the page before the robots, and these while the brokers that they report offline to still run."""
-        end_all([] if self.page is None else [self.page.program], _REST_END_S)
-        end_all((robot.launcher for robot in self.robots if robot.launcher is not None), _ROBOTS_END_S)
-        end_all((mcu for robot in self.robots for mcu in robot.mcus), _REST_END_S)
-        end_all(self._brokers, _REST_END_S)
-        if not self.keep:
-            shutil.rmtree(self.folder)
-
-    def start_brokers(self, kind: BrokerKind) -> None:
+    def start_brokers(self, kind: BrokerKind = BrokerKind.MOSQUITTO) -> None:
         """Start the operators' remote broker and Fred's local one. Raises PebbleError if one fails."""
-        remote, local = (Broker(name, kind, self.folder) for name in ("remote-broker", "freds-broker"))
-        self._brokers = [remote.program, local.program]
-        for broker in (remote, local):
+        self.remote_broker, local = (self.broker(name, kind) for name in ("remote-broker", "freds-broker"))
+        for broker in (self.remote_broker, local):
             broker.wait(self._ending)
-        self.remote_port = remote.port
+        remote = self.broker_port = self.remote_broker.port
         makers: dict[str, Callable[[], SimulatedRobot]] = {
-            "goob": partial(RoomRobot, "goob", self.folder, local.port, remote.port)
+            "goob": partial(RoomRobot, self, "goob", local.port, remote)
             if self._room
-            else partial(LinuxRobot, "goob", self.folder, local.port, remote.port, IMU, OUTLETS),
-            "fred": lambda: LinuxRobot("fred", self.folder, local.port, remote.port),
-            "minilamp": lambda: McuRobot("minilamp", self.folder, "ESP32-C6", remote.port),
-            "benjr": lambda: McuRobot("benjr", self.folder, "ESP8266", remote.port),
+            else partial(LinuxRobot, self, "goob", local.port, remote, IMU, OUTLETS),
+            "fred": lambda: LinuxRobot(self, "fred", local.port, remote),
+            "minilamp": lambda: McuRobot(self, "minilamp", "ESP32-C6", remote),
+            "benjr": lambda: McuRobot(self, "benjr", "ESP8266", remote),
         }
-        self.robots = [makers[name]() for name in self._names]
+        self.robots = {name: makers[name]() for name in self._names}
 
     def start_page(self, port: int = 0, **settings: Any) -> PageServer:
-        """Start the operator page's server; the caller waits for it. Raises PebbleError."""
-        self.page = PageServer(self.folder, self.remote_port, port, **{"server": "demo", **settings})
-        return self.page
+        """Start the operator page's server, and end one that was started before; wait for it. Raises PebbleError."""
+        if self.page is not None:
+            self.end(self.page)
+        self.page = PageServer(self.folder, self.broker_port, port, **{"server": "demo", **settings})
+        return self.add(self.page, OPERATORS)
 
-    @property
-    def remote_broker(self) -> Program:
-        """The operators' broker."""
-        return self._brokers[0]
-
-    def restart_remote_broker(self) -> None:
-        """Start another one at the same port, without the old one's retained messages. Raises PebbleError."""
-        end_all([self.remote_broker], _REST_END_S)
-        broker = Broker("remote-broker", BrokerKind.MOSQUITTO, self.folder, port=self.remote_port)
-        self._brokers[0] = broker.program
-        broker.wait(self._ending)
+    def restart_broker(self) -> None:
+        """Start the operators' broker again at the same port, without its retained messages. Raises PebbleError."""
+        self.end(self.remote_broker)
+        self.remote_broker = self.broker("remote-broker", port=self.broker_port)
+        self.remote_broker.wait(self._ending)
 
     def start_robots(self) -> None:
         """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
-        for robot in self.robots:
+        for robot in self.robots.values():
             robot.start(self._ending)
-
-    def unexpected_exits(self) -> list[str]:
-        """The processes that should still run and do not."""
-        page = [] if self.page is None else [self.page.program]
-        programs = [*self._brokers, *page, *(program for robot in self.robots for program in robot.programs)]
-        return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
-
-
-def _temporary_folder() -> str:
-    usual = tempfile.gettempdir()
-    return usual if len(usual) <= _LONGEST_FOLDER else "/tmp"  # noqa: S108 - mkdtemp makes a 0700 folder in it

@@ -2,45 +2,59 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Self
+
+import msgspec
 
 from pebble.bench.impair.conditions import Condition
-from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.network_process import NetworkProcess, Traffic
 from pebble.errors import PebbleError
 
 KINDS = ("auto", "namespaces", "proxy")
 
 
-class ImpairedNetwork(Protocol):
-    """One robot's network. Several may be open at the same time, independent of each other."""
+class ImpairedNetwork(ABC):
+    """One robot's network. Several may be open at the same time, independent of each other.
+
+    A context manager; ``process`` is what impairs.
+    """
 
     kind: str  # "namespaces" or "proxy"
     broker_host: str  # the address on which the broker must listen
 
+    def __init__(self, name: str, module: str) -> None:
+        self.process = NetworkProcess(f"network {name}".strip(), module)
+
+    @abstractmethod
     def broker_address(self, port: int) -> tuple[str, int]:
         """The robot's address for a broker that listens on ``broker_host:port``."""
 
     def on_robot(self, command: Sequence[str]) -> list[str]:
         """Wraps a command so that it runs on the robot's side. The process is replaced: pid and signals stay."""
+        return list(command)
 
     def on_remote(self, command: Sequence[str]) -> list[str]:
         """Wraps a command so that it runs on the broker's side."""
+        return list(command)
 
     def apply(self, condition: Condition) -> None:
         """Applies a condition. Connections stay; the condition's time starts at 0."""
+        self.process.ask(msgspec.json.encode(condition).decode())
 
+    @abstractmethod
     def traffic(self) -> Traffic: ...
 
     def close(self) -> None:
         """Closes the network and cuts all connections; may be called repeatedly."""
+        self.process.close()
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def open_network(kind: str = "auto", *, name: str = "") -> ImpairedNetwork:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pebble.bench.worker import Worker, end_workers
 from pebble.errors import PebbleError
+from pebble.rig.worker import Worker, end_workers
 
 _ANSWER_S = 10.0
 
@@ -58,10 +58,7 @@ class NetworkProcess:
             if not self._open:
                 raise PebbleError(f"{self._worker.name} is closed")
             try:
-                self._worker.send(line)
-                return self._worker.answer(_ANSWER_S)
-            except BrokenPipeError:
-                raise PebbleError(f"{self._worker.name} has ended") from None
+                return self._worker.ask(line, _ANSWER_S)
             except PebbleError:
                 self._close()
                 raise

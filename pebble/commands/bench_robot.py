@@ -161,7 +161,7 @@ def page(
 
 
 def _kinds(variants: str | None) -> list[str]:
-    from pebble.bench.bridge_robot import KINDS
+    from pebble.rig.robot import KINDS
 
     return list(KINDS) if variants is None else split_names(variants)
 

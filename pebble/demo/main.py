@@ -69,7 +69,7 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
     kind = broker or best_kind()
     with _ending_on_signals() as ending, Testbed(ending) as testbed:
         results, media, problems, left_alone = _run_demo(testbed, kind, seconds, ending, console)
-        with_media = [robot.name for robot in testbed.robots if robot.has_media]
+        with_media = [robot.name for robot in testbed.robots.values() if robot.has_media]
         if seconds is not None:
             problems += _steps_not_done(testbed, results.all(), left_alone)
         if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
@@ -99,13 +99,13 @@ def _run_demo(
     console.print("MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on simulated pins.")
     url = _start_page(testbed, ending, console)
     testbed.start_robots()
-    operator = Operator(testbed.remote_port)
+    operator = Operator(testbed.broker_port)
     operator.connect()
-    counting = [robot.name for robot in testbed.robots if robot.has_counter]
+    counting = [robot.name for robot in testbed.robots.values() if robot.has_counter]
     machine = Machine()
-    media_check = MediaCheck(testbed.remote_port, counting, partial(machine.overloaded, on_average=True))
+    media_check = MediaCheck(testbed.broker_port, counting, partial(machine.overloaded, on_average=True))
     try:
-        with View(console, operator, media_check, testbed.robots, ending, url) as view:
+        with View(console, operator, media_check, list(testbed.robots.values()), ending, url) as view:
             if not _discovered(operator, view, ending):
                 problems = [] if ending.is_set() else [*_not_ready(operator), *testbed.unexpected_exits()]
                 return _Observed(Results(), [], problems, set())
@@ -120,7 +120,7 @@ def _run_demo(
         return _Observed(results, list(media_check.results), problems, operator.left_alone)
     finally:
         media_check.end()
-        operator.end()
+        operator.close()
 
 
 def _start_page(testbed: Testbed, ending: threading.Event, console: Console) -> str:
@@ -164,7 +164,7 @@ def _not_ready(operator: Operator) -> list[str]:
 
 def _without_imu(testbed: Testbed, operator: Operator) -> list[str]:
     received = {seen.name for seen in operator.discovery.all_robots() if seen.attitude is not None}
-    wanted = [robot.name for robot in testbed.robots if robot.has_imu]
+    wanted = [robot.name for robot in testbed.robots.values() if robot.has_imu]
     return [f"{name}: its inertial sensor published nothing" for name in wanted if name not in received]
 
 
@@ -182,7 +182,7 @@ def _watch(
         machine.sample()
         view.update()
         _assess_completed(testbed, operator, machine, results, now - _REPORTED_S)
-    operator.end()
+    operator.close()
     time.sleep(_REPORTED_S)
     _assess_completed(testbed, operator, machine, results, math.inf)
     return results
@@ -201,7 +201,7 @@ def _assess_completed(testbed: Testbed, operator: Operator, machine: Machine, re
 
 
 def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop | CompletedFollow) -> Result:
-    robot = next(robot for robot in testbed.robots if robot.name == completed.robot)
+    robot = testbed.robots[completed.robot]
     if isinstance(completed, CompletedStop):
         return emergency.assess(completed, robot.entries())
     if isinstance(completed, CompletedFollow):
@@ -216,7 +216,7 @@ def _steps_not_done(testbed: Testbed, results: list[Result], left_alone: set[str
     driven = {(result.robot, result.step) for result in results}
     steps = [*(step.name for step in SCRIPT), EMERGENCY_STOP]
     wanted = [(name, step) for name in ROBOTS for step in steps]
-    wanted += [(robot.name, BY_ITSELF) for robot in testbed.robots if robot.has_scripts]
+    wanted += [(robot.name, BY_ITSELF) for robot in testbed.robots.values() if robot.has_scripts]
     return [
         f"{name}, {step}: not done" for name, step in wanted if (name, step) not in driven and name not in left_alone
     ]

@@ -16,10 +16,11 @@ from pebble.bench.bridge_drive import Arrived, DriveSegment, all_arrived, arriva
 from pebble.bench.bridge_one_hop import HOP
 from pebble.bench.bridge_operator import wheels, wheels_of
 from pebble.bench.bridge_plan import BridgePlan, Mode, plan
-from pebble.bench.bridge_robot import RobotProcesses
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP, Tally
 from pebble.bench.results import Cell, Value
 from pebble.errors import PebbleError
+from pebble.rig.processes import Processes
+from pebble.rig.robot import Robot
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch
 from pebble.simulation.trace import Entry
 
@@ -156,11 +157,10 @@ def test_shared_memory_is_swept_however_it_ends(
 
 
 def test_the_local_broker_counts_as_part_of_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = RobotProcesses("mqtt", media=False)
-    pids = {"remote": -1, "local": -2}
-    brokers = {name: SimpleNamespace(program=SimpleNamespace(pid=pid)) for name, pid in pids.items()}
-    monkeypatch.setattr(robot, "_brokers", brokers)
-    monkeypatch.setattr(robot, "_launcher", SimpleNamespace(pid=-3))
+    with Processes() as processes:
+        robot = Robot(processes, "mqtt", ("127.0.0.1", 1))
+    monkeypatch.setattr(robot, "local_broker", SimpleNamespace(pid=-2))
+    monkeypatch.setattr(robot, "_started", [SimpleNamespace(pid=-3)])
     assert robot.pids() == [-3, -2]
 
 

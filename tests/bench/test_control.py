@@ -20,8 +20,8 @@ from pebble.bench.control_plan import ControlPlan
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP
 from pebble.bench.control_variants import VARIANTS
 from pebble.bench.results import load
-from pebble.bench.usage import children
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
 from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker, Child, until
 

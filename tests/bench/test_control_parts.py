@@ -2,7 +2,6 @@
 
 import io
 import socket
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -335,16 +334,16 @@ def test_the_broker_gets_the_lines_of_its_variant(tmp_path: Path) -> None:
     try:
         assert "set_tcp_nodelay true" in (tmp_path / "broker.conf").read_text().splitlines()
     finally:
-        end_all([broker.program], 5.0)
+        end_all([broker], 5.0)
 
 
 def test_another_server_on_the_broker_s_port_is_not_the_broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         monkeypatch.setattr(rig_broker, "free_port", lambda: stranger.getsockname()[1])
         broker = Broker("broker", BrokerKind.MOSQUITTO, tmp_path)
-        assert until(lambda: broker.program.ended)
+        assert until(lambda: broker.ended)
         with pytest.raises(PebbleError, match="broker ended at once"):
-            broker.wait(threading.Event())
+            broker.wait()
 
 
 class Idle:
@@ -366,11 +365,11 @@ class Idle:
 def test_a_reader_that_is_off_still_runs_its_network_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broker, looped = Broker("broker", BrokerKind.MOSQUITTO, tmp_path), []
     try:
-        broker.wait(threading.Event())
+        broker.wait()
         reader = MqttReader(broker.port)
         loop = reader._client.loop
         monkeypatch.setattr(reader._client, "loop", lambda timeout: (looped.append(timeout), loop(timeout)))
         control_load._read(reader, Idle())  # type: ignore[arg-type]
     finally:
-        end_all([broker.program], 5.0)
+        end_all([broker], 5.0)
     assert len(looped) >= 3

@@ -27,8 +27,8 @@ from pebble.bench.estop_report import (
 from pebble.bench.estop_robots import Rest, is_moving, rest
 from pebble.bench.plots import pictures
 from pebble.bench.results import Cell, Results, load
-from pebble.bench.worker import Worker, end_workers
 from pebble.errors import PebbleError
+from pebble.rig.worker import Worker, end_workers
 from pebble.simulation.fleet import Moved
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.support import Broker, until

@@ -15,8 +15,8 @@ from pebble.bench import frames, frames_variants
 from pebble.bench.frames import FramesPlan
 from pebble.bench.frames_variants import Case, Size, parse_size
 from pebble.bench.results import load
-from pebble.bench.usage import children
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
 from tests.support import ROOT, gone, until
 
 

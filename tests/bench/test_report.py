@@ -21,9 +21,9 @@ from pebble.bench.report_plan import COMPARISONS, Comparison, chosen
 from pebble.bench.report_run import Outcome, Run
 from pebble.bench.report_text import Section, text
 from pebble.bench.results import Results
-from pebble.bench.usage import children
 from pebble.commands import bench, impair
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
 from tests.bench import synthetic
 from tests.support import ROOT, Child, gone, until
 

@@ -86,7 +86,7 @@ def operator(broker: Broker, robot: Robot) -> Iterator[Operator]:
     running.connect()
     assert until(lambda: running.ready(1), START_S)
     yield running
-    running.end()
+    running.close()
 
 
 def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(robot: Robot, operator: Operator) -> None:
@@ -117,7 +117,7 @@ def test_what_may_be_due_to_the_machine_is_repeated_but_not_for_ever(broker: Bro
 
     operator._until_right("x", is_right)
     assert times == [1, 2, 2, 2, 3]
-    operator.end()
+    operator.close()
 
 
 def test_a_persons_stop_is_left_to_the_person(robot: Robot, operator: Operator) -> None:

@@ -13,10 +13,10 @@ from rich.console import Console
 from pebble.bench import bridge, bridge_null, bridge_profile, output
 from pebble.bench.bridge_media import FLOWS
 from pebble.bench.bridge_plan import Mode, plan
-from pebble.bench.bridge_robot import KINDS
 from pebble.bench.results import Cell, load
-from pebble.bench.usage import children
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
+from pebble.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
 from tests.support import until
 

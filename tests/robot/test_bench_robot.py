@@ -12,11 +12,12 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import bridge, cost, cost_robot, startup
+from pebble.bench.bridge_driven_robot import STAND_IN
 from pebble.bench.bridge_plan import Mode, plan
-from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.bridge_tally import DOWN, UNLOADED, UP
 from pebble.bench.results import load
-from pebble.bench.usage import children
+from pebble.rig.programs import children
+from pebble.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, Child, until
 

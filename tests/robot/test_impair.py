@@ -18,7 +18,7 @@ from pebble.bench.impair.network import why_no_namespaces
 from pebble.bench.impair.plan import ImpairPlan
 from pebble.bench.impair.run import run
 from pebble.bench.results import load
-from pebble.bench.usage import children
+from pebble.rig.programs import children
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, until
 

@@ -1,4 +1,4 @@
-"""A worker process of a comparison: reads lines from standard input, answers in JSON lines, and ends with its input."""
+"""Worker processes: each reads lines from its standard input, answers in JSON lines, and ends with its input."""
 
 from __future__ import annotations
 
@@ -7,36 +7,23 @@ import json
 import queue
 import subprocess
 import threading
-import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
+from pebble.rig.programs import Program, end_all
 
 _END_S = 4.0
-_TAIL = 600  # characters of a log that are shown
 
 
-class Worker:
+class Worker(Program):
     """Runs the process. It ends when its standard input closes, and so also when this process ends in any way."""
 
     def __init__(self, name: str, command: Sequence[str], log: Path) -> None:
-        self.name, self._log = name, log
         self._answers: queue.Queue[dict[str, Any] | None] = queue.Queue()
-        with log.open("ab") as errors:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                start_new_session=True,  # only the starting process handles Ctrl-C
-            )
+        super().__init__(name, command, log, stdin=subprocess.PIPE, reports=True, tied=False)
         threading.Thread(target=self._listen, name=f"answers of {name}", daemon=True).start()
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid
 
     def answer(self, timeout: float) -> dict[str, Any]:
         """The next answer. Raises PebbleError if the process ends, or does not answer within ``timeout`` seconds."""
@@ -55,36 +42,27 @@ class Worker:
                 self._process.stdin.write(line.encode() + b"\n")
                 self._process.stdin.flush()
 
-    def close_input(self) -> None:
+    def ask(self, line: str, timeout: float) -> dict[str, Any]:
+        """Sends a line and returns the next answer."""
+        self.send(line)
+        return self.answer(timeout)
+
+    def ask_to_end(self) -> None:
+        """Closes standard input."""
         if self._process.stdin is not None and not self._process.stdin.closed:
             with contextlib.suppress(BrokenPipeError):  # it ended by itself
                 self._process.stdin.close()
 
-    def end(self, deadline: float) -> None:
-        """Waits until ``deadline`` (monotonic), then kills the process."""
-        try:
-            self._process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
     def _listen(self) -> None:
-        stdout = self._process.stdout
-        if stdout is not None:
-            for line in stdout:
-                self._answers.put(json.loads(line))
+        for line in self.reports:
+            self._answers.put(json.loads(line))
         self._answers.put(None)
 
     def _tail(self) -> str:
-        text = self._log.read_text(errors="replace").strip()
-        return f":\n{text[-_TAIL:]}" if text else ""
+        text = self.tail()
+        return f":\n{text}" if text else ""
 
 
 def end_workers(workers: Iterable[Worker]) -> None:
     """Ends all workers at the same time; kills those that do not end within seconds."""
-    workers = list(workers)
-    deadline = time.monotonic() + _END_S
-    for worker in workers:
-        worker.close_input()
-    for worker in workers:
-        worker.end(deadline)
+    end_all(workers, _END_S)
