@@ -19,7 +19,7 @@ from pebble.contract import AUDIO, CAMERA
 from pebble.errors import PebbleError
 from pebble.rig.robot import Robot
 from pebble.rig.stock_client import StockClient
-from pebble.rig.worker import Worker, end_workers
+from pebble.rig.worker import Worker
 from pebble.rig.worker_end import serve, serve_on_thread
 from pebble.transports.frames import FrameReader
 
@@ -42,13 +42,11 @@ class MediaLoad:
 
     def __enter__(self) -> Self:
         """Raises PebbleError naming what does not flow."""
-        module, log = [sys.executable, "-m", "pebble.bench.bridge_media"], self._robot.run_dir.with_name("load.log")
-        self._before = len(self._robot.pids())
-        where = {"frames": [str(self._robot.run_dir)], "media": [str(self._robot.remote_port), self._robot.base]}
+        self._before, start = len(self._robot.pids()), self._robot.running.worker
+        module, where = "pebble.bench.bridge_media", (self._robot.remote_port, self._robot.base)
         try:
-            self._workers += [
-                Worker(f"reader of {what}", [*module, what, *there], log) for what, there in where.items()
-            ]
+            self._workers.append(start("frame reader", module, "frames", self._robot.run_dir))
+            self._workers.append(start("media operator", module, "media", *where))
             self._operator.media(True)
             self._wait()
         except BaseException:
@@ -58,7 +56,8 @@ class MediaLoad:
 
     def __exit__(self, *_: object) -> None:
         self._operator.media(False)
-        end_workers(self._workers)
+        for worker in self._workers:
+            self._robot.running.end(worker)
         end = time.monotonic() + _STOP_S
         while len(self._robot.pids()) > self._before and time.monotonic() < end:
             time.sleep(_POLL_S)

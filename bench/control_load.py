@@ -1,8 +1,8 @@
 """A load during the measurement of commands, as a process that standard input switches on and off.
 
-``python -m pebble.bench.control_load hog|writer|reader [mqtt|zenoh WHERE]``: a busy loop, or one end of a stream of raw
-640x480 pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing; each
-is answered with the number of pictures so far.
+``python -m pebble.bench.control_load hog|writer|reader [mqtt|zenoh-shm WHERE]``: a busy loop, or one end of a stream of
+raw 640x480 pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing;
+each is answered with the number of pictures so far.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 
+from pebble.bench import frames_worker
 from pebble.bench.frames_loop import RATE_HZ, Reader, Writer
-from pebble.bench.frames_worker import MqttReader, MqttWriter, ZenohReader, ZenohWriter
 from pebble.rig.worker_end import answer, serve_on_thread
 
 SIZE = 640 * 480 * 3
@@ -55,13 +54,13 @@ class Switch:
 
 
 def main(arguments: list[str]) -> int:
-    role, *where = arguments
+    role, kind, where = (*arguments, "", "")[:3]
     if role == "hog":
         _hog(Switch())
     elif role == "writer":
-        _write(_writer(*where), Switch())
+        _write(frames_worker.writer(kind, where, SIZE), Switch())
     else:
-        _read(_reader(*where), Switch())
+        _read(frames_worker.reader(kind, where), Switch())
     return 0
 
 
@@ -101,16 +100,6 @@ def _read(reader: Reader, switch: Switch) -> None:
             del frame
             reader.done()
     reader.close()
-
-
-def _writer(kind: str, where: str) -> Writer:
-    return (
-        MqttWriter(int(where), SIZE) if kind == "mqtt" else ZenohWriter(Path(where), SIZE, in_segment=True, shared=True)
-    )
-
-
-def _reader(kind: str, where: str) -> Reader:
-    return MqttReader(int(where)) if kind == "mqtt" else ZenohReader(Path(where), views=True, shared=True)
 
 
 if __name__ == "__main__":

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Self
 
 import msgspec
 
@@ -44,36 +43,18 @@ class Slice:
     pictures_hz: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessUsage:
-    """Resource usage of some processes, in total or between two moments."""
-
-    cpu_s: float
-    wake_ups: int
-
-    def __sub__(self, earlier: ProcessUsage) -> ProcessUsage:
-        return ProcessUsage(self.cpu_s - earlier.cpu_s, self.wake_ups - earlier.wake_ups)
-
-
-def _used(pids: Sequence[int]) -> ProcessUsage:
-    return ProcessUsage(cpu_s(pids), wake_ups(pids))
+def _used(pids: Sequence[int]) -> tuple[float, int]:
+    """CPU seconds and wake-ups so far."""
+    return cpu_s(pids), wake_ups(pids)
 
 
 def joined(slices: Sequence[Slice]) -> Slice:
     """Merges slices of the same role and condition; at least one."""
-    answers = [one.answer for one in slices]
     rates = [one.pictures_hz for one in slices if one.pictures_hz is not None]
+    answers = [msgspec.structs.asdict(one.answer) for one in slices]
+    sums = {name: sum((answer[name] for answer in answers), type(zero)()) for name, zero in answers[0].items()}
     return Slice(
-        answer=Answer(
-            trips=sum(answer.trips for answer in answers),
-            sent=sum(answer.sent for answer in answers),
-            late=sum(answer.late for answer in answers),
-            one_way=[sample for answer in answers for sample in answer.one_way],
-            round_trip=[sample for answer in answers for sample in answer.round_trip],
-            call=[sample for answer in answers for sample in answer.call],
-            transport_times=[sample for answer in answers for sample in answer.transport_times],
-            inbox=[sample for answer in answers for sample in answer.inbox],
-        ),
+        answer=Answer(**sums),
         cpu=fmean(one.cpu for one in slices),
         backbone_cpu=fmean(one.backbone_cpu for one in slices),
         wake_ups=fmean(one.wake_ups for one in slices),
@@ -112,7 +93,7 @@ class Backbone:
     @property
     def stream(self) -> list[str]:
         """Arguments that let pictures flow through the same broker or hub."""
-        return ["zenoh", str(self._run_dir)] if self._broker is None else ["mqtt", str(self._broker.port)]
+        return ["zenoh-shm", str(self._run_dir)] if self._broker is None else ["mqtt", str(self._broker.port)]
 
 
 class Participant:
@@ -140,36 +121,25 @@ class Participant:
         line = msgspec.json.encode(spec).decode()
         answer = msgspec.convert(self.ends[1].ask(line, spec.seconds + _ANSWER_S), Answer)
         took = time.monotonic() - began
-        ends, backbone = (_used(pids) - used for pids, used in zip(every, before, strict=True))
+        after = [_used(pids) for pids in every]
+        cpu, backbone_cpu = (100 * (now[0] - then[0]) / took for now, then in zip(after, before, strict=True))
+        woken, backbone_woken = ((now[1] - then[1]) / answer.trips for now, then in zip(after, before, strict=True))
         return Slice(
-            answer=answer,
-            cpu=100 * ends.cpu_s / took,
-            backbone_cpu=100 * backbone.cpu_s / took,
-            wake_ups=ends.wake_ups / answer.trips,
-            backbone_wake_ups=backbone.wake_ups / answer.trips,
+            answer=answer, cpu=cpu, backbone_cpu=backbone_cpu, wake_ups=woken, backbone_wake_ups=backbone_woken
         )
 
     def _worker(self, end: str, module: str, *arguments: str) -> Worker:
         return self._processes.worker(f"{self.role}: {end}", module, *arguments)
 
 
-class Participants:
+class Participants(Processes):
     """All participants of some rounds; they are ready when the ``with`` block begins."""
 
     def __init__(self, roles: Sequence[str], loads: Sequence[str]) -> None:
+        super().__init__()
         self._roles, self._loads = roles, loads
         self._participants: dict[str, Participant] = {}
         self._hog: Worker | None = None
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            self._start(stack.enter_context(Processes()))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
     def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
         """Runs one slice. Raises PebbleError if a process ended, or pictures do not flow."""
@@ -180,17 +150,17 @@ class Participants:
             pictures, took = self._pictures(participant, load) - before, time.monotonic() - began
         return replace(slice_, pictures_hz=pictures / took) if load == MEDIA else slice_
 
-    def _start(self, processes: Processes) -> None:
+    def start(self) -> None:
         for number, role in enumerate(self._roles):
-            folder = processes.folder / str(number)  # short: paths of Unix sockets begin with it
+            folder = self.folder / str(number)  # short: paths of Unix sockets begin with it
             folder.mkdir()
-            self._participants[role] = Participant(role, folder, processes)
+            self._participants[role] = Participant(role, folder, self)
         for participant in self._participants.values():
             participant.backbone.wait()
             participant.start(media=MEDIA in self._loads)
         if HOG in self._loads:
-            self._hog = processes.worker("hog", "pebble.bench.control_load", "hog")
-        for worker in processes.workers:
+            self._hog = self.worker("hog", "pebble.bench.control_load", "hog")
+        for worker in self.workers:
             worker.answer(_READY_S)
 
     @contextmanager

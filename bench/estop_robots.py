@@ -5,9 +5,8 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from pebble.bench.estop_driver import RATE_HZ
 from pebble.bench.estop_operator import StopOperator
@@ -44,35 +43,29 @@ def is_moving(moves: Sequence[Moved]) -> bool:
     return bool(moves) and any(moves[-1].motors)
 
 
-class Robots:
-    """Starts in ``with`` the environment of two Linux robots, one of each kind; :meth:`hold_linux` launches them.
+class Robots(Processes):
+    """The environment of two Linux robots, one of each kind; :meth:`hold_linux` launches them.
 
     Each measurement ends with the stopped robots reset.
     """
 
     def __init__(self, boards: int) -> None:
+        super().__init__()
         self._count = boards
         self._linux: dict[str, Robot] = {}
         self._boards = [identity for _, identity in members(boards)] if boards else []
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         """Raises PebbleError if a process does not start."""
-        with ExitStack() as stack:
-            self._processes = stack.enter_context(Processes())
-            broker = self._processes.broker("remote")
-            broker.wait()
-            self._port, self._operator = broker.port, StopOperator(broker.port)
-            for kind in KINDS:
-                name, folder = f"rover-{kind}", self._processes.folder / kind
-                robot = Robot(self._processes, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
-                robot.prepare()
-                self._linux[kind] = robot
-            self._driver = self._processes.worker("driver", "pebble.bench.estop_driver", broker.port)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        broker = self.broker("remote")
+        broker.wait()
+        self._port, self._operator = broker.port, StopOperator(broker.port)
+        for kind in KINDS:
+            name, folder = f"rover-{kind}", self.folder / kind
+            robot = Robot(self, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
+            robot.prepare()
+            self._linux[kind] = robot
+        self._driver = self.worker("driver", "pebble.bench.estop_driver", broker.port)
 
     def hold_linux(self, samples: Samples) -> None:
         """Launch the Linux robots, one after the other, while a stop of all robots is held."""
@@ -132,11 +125,11 @@ class Robots:
 
     def _start_fleet(self) -> None:
         where = ["--broker", f"127.0.0.1:{self._port}", "--trace", str(self._trace)]
-        self._processes.robot("the fleet", "pebble.simulation.fleet_program", "--robots", self._count, *where)
+        self.robot("the fleet", "pebble.simulation.fleet_program", "--robots", self._count, *where)
 
     @property
     def _trace(self) -> Path:
-        return self._processes.folder / "trace.jsonl"
+        return self.folder / "trace.jsonl"
 
     def _drive(self, bases: Sequence[str]) -> None:
         """Drive these robots from now on; returns at a random moment after all of them move."""

@@ -8,8 +8,8 @@ command is, bounds a queue, or stops the motors when commands end.
 
 from __future__ import annotations
 
-import argparse
 import json
+import sys
 import time
 from typing import Any
 
@@ -20,6 +20,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble.contract import DRIVE, INCOMING, ONLINE, OUTGOING, STATUS, TOUCH_SENSORS
 
 _HEARTBEAT_S = 1.0
+_BAUD = 460_800
 _TOUCH = ("a0", "a1", "a2")
 
 
@@ -71,20 +72,13 @@ def serial_bridge(local_port: int, base: str, device: str, baud: int) -> None:
             local.publish(TOUCH_SENSORS.topic(base), json.dumps({"value": touch}))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m pebble.bench.stand_in", description=__doc__)
-    parser.add_argument("part", choices=("bridge", "serial"))
-    parser.add_argument("--remote", type=int, default=0, help="port of the remote broker")
-    parser.add_argument("--local", type=int, required=True, help="port of the local broker")
-    parser.add_argument("--base", required=True, help="of the robot's topics")
-    parser.add_argument("--device", default="", help="of the serial line")
-    parser.add_argument("--baud", type=int, default=460800)
-    options = parser.parse_args()
-    if options.part == "bridge":
-        bridge(options.remote, options.local, options.base)
+def main(part: str, local: str, remote: str, base: str, device: str) -> None:
+    """Ports of the two brokers, the base of the robot's topics, and its serial line."""
+    if part == "bridge":
+        bridge(int(remote), int(local), base)
     else:
-        serial_bridge(options.local, options.base, options.device, options.baud)
+        serial_bridge(int(local), base, device, _BAUD)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

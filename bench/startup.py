@@ -6,12 +6,10 @@ broker; for the first pictures another one, with a camera.
 
 from __future__ import annotations
 
-import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,7 +24,6 @@ from pebble.bench.robot_subscriber import RobotSubscriber
 from pebble.bench.rounds import Rounds
 from pebble.bench.tables import plain_table
 from pebble.rig.robot import BASE, KINDS, Robot, check_kinds, one_robot
-from pebble.rig.worker import Worker, end_workers
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
@@ -183,11 +180,9 @@ def _by_measure(cells: Sequence[Cell]) -> Iterator[tuple[str, list[Cell]]]:
 
 def launch(kind: str, joins: int) -> Launch:
     """Measures one robot from its start to its end. Raises PebbleError with its log if it does not become ready."""
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
-        robot = stack.enter_context(one_robot(kind))
-        service = stack.enter_context(_late_service(robot, folder))
-        subscriber = stack.enter_context(closing(RobotSubscriber(robot.remote_port, BASE)))
+    with one_robot(kind) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        service = robot.running.worker("late service", "pebble.bench.late_subscriber", robot.config)
+        service.answer(_ANSWER_S)  # it is started beforehand, so that its imports do not disturb the launch
         subscriber.wait()
         started = _start(robot, subscriber)
         service.send(str(joins))  # it first counts the retained messages, which gives start-up work time to finish
@@ -234,16 +229,3 @@ def _driving(operator: RobotSubscriber) -> Iterator[None]:
     finally:
         enough.set()
         thread.join()
-
-
-@contextmanager
-def _late_service(robot: Robot, folder: Path) -> Iterator[Worker]:
-    """Starts the late service beforehand, so that its imports do not disturb the launch."""
-    worker = Worker(
-        "late service", [sys.executable, "-m", "pebble.bench.late_subscriber", str(robot.config)], folder / "late.log"
-    )
-    try:
-        worker.answer(_ANSWER_S)
-        yield worker
-    finally:
-        end_workers([worker])

@@ -6,6 +6,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar, Final, Self, TypeVar
 
@@ -21,7 +22,11 @@ P = TypeVar("P", bound=Program)
 
 
 class Processes:
-    """Ends all of them with its ``with`` block, those of a kind at the same time; then deletes the folder."""
+    """Ends all of them with its ``with`` block, those of a kind at the same time; then deletes the folder.
+
+    A subclass starts what it consists of in :meth:`start`; what is to be closed before all processes goes to
+    ``closing``. The block does not begin if that fails.
+    """
 
     ends_s: ClassVar[tuple[float, ...]] = (4.0, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
     keep = False  # the folder
@@ -30,13 +35,23 @@ class Processes:
         usual = tempfile.gettempdir()
         short = usual if len(usual) <= _LONGEST_FOLDER else "/tmp"  # noqa: S108 - mkdtemp makes a 0700 folder in it
         self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=short))
+        self.closing = ExitStack()
         self.workers: list[Worker] = []
         self._programs: tuple[list[Program], ...] = ([], [], [], [])
 
     def __enter__(self) -> Self:
+        try:
+            self.start()
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
+    def start(self) -> None:
+        """Called as the ``with`` block begins."""
+
     def __exit__(self, *_: object) -> None:
+        self.closing.close()
         for programs, within_s in zip(self._programs, self.ends_s, strict=True):
             end_all(programs, within_s)
         if not self.keep:

@@ -37,12 +37,12 @@ class Robot:
 
     ``services``: fields of its services' configs besides these connections; one that is named is enabled. ``reports``:
     whether every report of its MCU is recorded and forwarded, 50 a second; None: as is usual. ``wrap`` extends the
-    commands of all processes that use the network. Its processes end with ``processes``.
+    commands of all processes that use the network. Its processes are among ``running``, and end with them.
     """
 
     def __init__(
         self,
-        processes: Processes,
+        running: Processes,
         kind: str,
         remote: tuple[str, int],
         *,
@@ -53,11 +53,11 @@ class Robot:
         wrap: Wrap = unchanged,
     ) -> None:
         self.kind, self.name, self.remote, self.base = kind, name, remote, Identity("pebble", "robots", name).base
-        self.folder = folder or processes.folder
+        self.folder = folder or running.folder
         self.run_dir, self.config = self.folder / "run", self.folder / "robot.json"
         self.port, self._trace = self.folder / "mcu", self.folder / "trace.jsonl"
         self.local_broker: Broker | None = None
-        self._processes, self._services, self._reports, self._wrap = processes, services or {}, reports, wrap
+        self.running, self._services, self._reports, self._wrap = running, services or {}, reports, wrap
         self._mcu: Program | None = None
         self._started: list[Program] = []
 
@@ -65,13 +65,13 @@ class Robot:
         """Starts what the robot needs and writes its config. Raises PebbleError if a process does not start."""
         self.folder.mkdir(exist_ok=True)
         if self.kind != "zenoh":
-            self.local_broker = self._processes.broker("local", folder=self.folder, wrap=self._wrap)
+            self.local_broker = self.running.broker("local", folder=self.folder, wrap=self._wrap)
             if self._wrap is unchanged:  # else it is in another network
                 self.local_broker.wait()
         self._trace.touch()
         options = ["--link", self.port, "--trace", self._trace, *(["--trace-said"] if self._reports else [])]
         command = python("pebble.simulation.mcu", "--kind", "goob", *options)
-        self._mcu = self._processes.add(Program("MCU", command, self.folder / "mcu.log"), MCUS)
+        self._mcu = self.running.add(Program("MCU", command, self.folder / "mcu.log"), MCUS)
         self._mcu.wait_until(self.port.exists, _MCU_START_S)
         self.config.write_text(json.dumps(self._contents(), indent=1))
 
@@ -145,7 +145,7 @@ class Robot:
     def start(self, name: str, command: Sequence[str]) -> None:
         """One of the robot's own processes."""
         program = Program(name, self._wrap(command), self.folder / "robot.log")
-        self._started.append(self._processes.add(program, ROBOTS))
+        self._started.append(self.running.add(program, ROBOTS))
 
     def _contents(self) -> dict[str, Any]:
         """Of its config file."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import closing
-from typing import Any, Self
+from typing import Any
 
 from pebble.errors import PebbleError
 from pebble.rig.operator import Operator
@@ -30,19 +30,14 @@ class Stage(Testbed):
         super().__init__(threading.Event(), names or ROBOTS, room=room)
         self.keep, self._settings = False, settings
 
-    def __enter__(self) -> Self:
-        try:
-            self.start_brokers()
-            self.start_page(**self._settings)
-            self.start_robots()
-            self.server.wait()
-            with closing(Operator(self.broker_port, "stage")) as operator:
-                operator.connect()
-                operator.wait_until_ready(len(self.robots), _DRIVABLE_S, self.unexpected_exits)
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
+    def start(self) -> None:
+        self.start_brokers()
+        self.start_page(**self._settings)
+        self.start_robots()
+        self.server.wait()
+        with closing(Operator(self.broker_port, "stage")) as operator:
+            operator.connect()
+            operator.wait_until_ready(len(self.robots), _DRIVABLE_S, self.unexpected_exits)
 
     def __exit__(self, *_: object) -> None:
         if self.page is not None:

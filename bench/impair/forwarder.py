@@ -24,7 +24,7 @@ from typing import Any
 import msgspec
 
 from pebble.bench.impair.conditions import Condition, Schedule, Shape
-from pebble.bench.impair.network_process import UnavailableError
+from pebble.bench.impair.network import UnavailableError
 from pebble.errors import PebbleError
 from pebble.rig import worker_end
 

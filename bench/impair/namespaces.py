@@ -17,8 +17,7 @@ from typing import Any
 
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.forwarder import TIMED
-from pebble.bench.impair.network import ImpairedNetwork
-from pebble.bench.impair.network_process import Traffic, UnavailableError
+from pebble.bench.impair.network import ImpairedNetwork, Traffic, UnavailableError
 from pebble.errors import PebbleError
 
 WIRE = "wire"

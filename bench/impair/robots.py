@@ -6,7 +6,7 @@ import sys
 import wave
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 
@@ -115,17 +115,12 @@ class TestBed(Processes):
         self.robots: list[ImpairedRobot] = []
         self._subjects, self._kind = subjects, kind
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         """Raises PebbleError if something does not start."""
-        try:
-            for number, subject in enumerate(self._subjects):
-                self.robots.append(ImpairedRobot(subject, self._kind, self, self.folder / str(number)))
-            for robot in self.robots:
-                robot.start()
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
+        for number, subject in enumerate(self._subjects):
+            self.robots.append(ImpairedRobot(subject, self._kind, self, self.folder / str(number)))
+        for robot in self.robots:
+            robot.start()
 
     def __exit__(self, *_: object) -> None:
         super().__exit__()

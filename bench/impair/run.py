@@ -14,8 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.messages import RecoveryRequest
-from pebble.bench.impair.network import resolved
-from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.network import Traffic, resolved
 from pebble.bench.impair.plan import ImpairPlan, Subject
 from pebble.bench.impair.report import QUOTED, assessment, tables
 from pebble.bench.impair.robots import CLIP_S, FPS, HEIGHT, WIDTH, ImpairedRobot, TestBed

@@ -12,7 +12,7 @@ from rich.console import Console
 from pebble.bench.impair import cells, metrics
 from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.messages import ClipCommand, Command, Heartbeat, Picture, Record, Sound, Window
-from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.plan import NAMES, QUICK, ImpairPlan
 from pebble.bench.impair.report import assessment, tables
 from pebble.bench.results import Cell, Results

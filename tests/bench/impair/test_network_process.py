@@ -5,8 +5,8 @@ import signal
 
 import pytest
 
-from pebble.bench.impair import network_process as module
-from pebble.bench.impair.network_process import NetworkProcess
+from pebble.bench.impair import network as module
+from pebble.bench.impair.network import NetworkProcess
 from pebble.errors import PebbleError
 from pebble.rig import worker
 

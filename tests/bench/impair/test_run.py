@@ -15,7 +15,7 @@ from rich.console import Console
 from pebble.bench.impair import run as module
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.messages import ClipCommand, OperatorReport, Record, RecoveryRequest, TrialRequest, Window
-from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.plan import ImpairPlan, Subject
 from pebble.bench.impair.run import run
 from pebble.bench.results import load
