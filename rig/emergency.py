@@ -11,7 +11,7 @@ from pebble.client.discovery import DiscoveredRobot
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.contract.payloads import Drive
-from pebble.rig.steps import COMMAND_PERIOD_S
+from pebble.rig.steps import COMMAND_PERIOD_S, repeat
 from pebble.transports import Message, Transport
 
 NAME = "emergency stop"
@@ -102,13 +102,8 @@ class EmergencyStop:
         return stop is not None and stop.by != self._by
 
     def _keep_driving(self, seconds: float) -> bool:
-        """Repeat a drive command; True if the demo ends."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._drive(_FORWARD)
-            if self._wait(COMMAND_PERIOD_S):
-                return True
-        return False
+        """True if the demo ends."""
+        return repeat(lambda: self._drive(_FORWARD), self._wait, seconds)
 
     def _take(self, sender: StopSender) -> None:
         """Pass on what was received."""

@@ -17,7 +17,7 @@ from pebble.contract.payloads import Drive, LightsFlash
 from pebble.errors import PebbleError
 from pebble.rig.emergency import NAME as EMERGENCY_STOP
 from pebble.rig.emergency import CompletedStop, EmergencyStop
-from pebble.rig.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step
+from pebble.rig.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step, repeat
 from pebble.rig.takeover import NAME as BY_ITSELF
 from pebble.rig.takeover import CompletedFollow, TakeOver
 from pebble.rig.visitors import Visitors
@@ -199,9 +199,7 @@ class Operator:
 
     def _back_off(self, robot: DiscoveredRobot) -> None:
         """Away from the tag before which it arrived, so that there is a way to drive."""
-        end = time.monotonic() + _BACK_OFF_S
-        while time.monotonic() < end and not self._wait_with(robot, COMMAND_PERIOD_S):
-            self._send(_BACK_OFF, [robot])
+        repeat(lambda: self._send(_BACK_OFF, [robot]), partial(self._wait_with, robot), _BACK_OFF_S)
         self._send(STOP, [robot])
 
     def _wait_with(self, robot: DiscoveredRobot, seconds: float) -> bool:

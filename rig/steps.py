@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from pebble.contract.payloads import Drive, LightsFlash, LightsSolid
@@ -39,3 +41,13 @@ SCRIPT = (
     Step("back, stop", Drive(z=-0.5), 0.8, True, 1.4, LightsSolid(b=0.3, g=0.3, r=0.3)),
 )
 ROUND_S = sum(step.drive_s + step.rest_s for step in SCRIPT)
+
+
+def repeat(send: Callable[[], None], wait: Callable[[float], bool], seconds: float) -> bool:
+    """Send a drive command again and again, as a held stick does; True if ``wait(seconds)`` says that the demo ends."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        send()
+        if wait(COMMAND_PERIOD_S):
+            return True
+    return False

@@ -12,7 +12,7 @@ from pebble.contract.payloads import AutonomyCommand, Drive, SoundboardCommand, 
 from pebble.errors import PayloadError
 from pebble.motion.arbiter import HOLD_MS
 from pebble.rig.room import CLIP, TAG_ID, TAG_SIZE_M
-from pebble.rig.steps import COMMAND_PERIOD_S
+from pebble.rig.steps import repeat
 from pebble.services.serial_mcu_bridge.text.goob_base import mix
 from pebble.transports import Message, QoS, Transport
 
@@ -84,7 +84,7 @@ class TakeOver:
             return None
         self._note("TAKES OVER", f"drives {name}, {SCRIPT} is overruled")
         took_over = time.monotonic()
-        if self._drive_back(took_over + _OVERRIDE_S):
+        if repeat(lambda: self._drive(_BACK), self._wait, _OVERRIDE_S):
             return None
         self._drive(Drive())
         released = time.monotonic()
@@ -106,14 +106,6 @@ class TakeOver:
         self._publish(AUTONOMY_COMMAND, AutonomyCommand(action="start", file=SCRIPT, config=config))
         self._publish(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
         return started
-
-    def _drive_back(self, end: float) -> bool:
-        """Repeat a drive command, as a held stick does; True if the demo ends."""
-        while time.monotonic() < end:
-            self._drive(_BACK)
-            if self._wait(COMMAND_PERIOD_S):
-                return True
-        return False
 
     def _arrival(self) -> Callable[[], bool]:
         """A condition: the tag has been at the wanted distance for a while."""

@@ -47,7 +47,7 @@ class NamespaceNetwork(ImpairedNetwork):
 
     def __init__(self, name: str = "") -> None:
         super().__init__(name, "pebble.bench.impair.forwarder")
-        paths = {side: f"/proc/{self.process.pid}/fd/{self.process.greeting[side]}" for side in ("robot", "remote")}
+        paths = {side: f"/proc/{self.pid}/fd/{self.greeting[side]}" for side in ("robot", "remote")}
         self._robot = _Side(paths["robot"], ROBOT, REMOTE)
         self._remote = _Side(paths["remote"], REMOTE, ROBOT)
         self._dropped_before = {self._robot: 0, self._remote: 0}
@@ -81,7 +81,7 @@ class NamespaceNetwork(ImpairedNetwork):
         self._remote.send_over(device)
 
     def traffic(self) -> Traffic:
-        counts = self.process.ask("count")
+        counts = self.ask("count")
         bytes_up, packets_up = _on_the_wire(counts["up"])
         bytes_down, packets_down = _on_the_wire(counts["down"])
         return Traffic(

@@ -71,6 +71,7 @@ class NetworkProcess:
                 raise
 
     def close(self) -> None:
+        """Ends it, which cuts all connections of the network; may be called repeatedly."""
         with self._lock:
             self._close()
 
@@ -90,17 +91,14 @@ class NetworkProcess:
         return answer
 
 
-class ImpairedNetwork(ABC):
-    """One robot's network. Several may be open at the same time, independent of each other.
-
-    A context manager; ``process`` is what impairs.
-    """
+class ImpairedNetwork(NetworkProcess, ABC):
+    """One robot's network, and the process that impairs it. Several may be open at the same time, independent."""
 
     kind: str  # "namespaces" or "proxy"
     broker_host: str  # the address on which the broker must listen
 
     def __init__(self, name: str, module: str) -> None:
-        self.process = NetworkProcess(f"network {name}".strip(), module)
+        super().__init__(f"network {name}".strip(), module)
 
     @abstractmethod
     def broker_address(self, port: int) -> tuple[str, int]:
@@ -116,14 +114,10 @@ class ImpairedNetwork(ABC):
 
     def apply(self, condition: Condition) -> None:
         """Applies a condition. Connections stay; the condition's time starts at 0."""
-        self.process.ask(msgspec.json.encode(condition).decode())
+        self.ask(msgspec.json.encode(condition).decode())
 
     @abstractmethod
     def traffic(self) -> Traffic: ...
-
-    def close(self) -> None:
-        """Closes the network and cuts all connections; may be called repeatedly."""
-        self.process.close()
 
     def __enter__(self) -> Self:
         return self
@@ -144,11 +138,11 @@ class ProxyNetwork(ImpairedNetwork):
 
     def broker_address(self, port: int) -> tuple[str, int]:
         if port not in self._ports:
-            self._ports[port] = int(self.process.ask(f"listen {port}")["port"])
+            self._ports[port] = int(self.ask(f"listen {port}")["port"])
         return LOOPBACK, self._ports[port]
 
     def traffic(self) -> Traffic:
-        return msgspec.convert(self.process.ask("count"), Traffic)
+        return msgspec.convert(self.ask("count"), Traffic)
 
 
 def open_network(kind: str = "auto", *, name: str = "") -> ImpairedNetwork:
