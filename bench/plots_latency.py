@@ -56,7 +56,7 @@ def distributions(results: Results, title: str) -> list[Picture]:
     return found
 
 
-def ratios(results: Results, baseline: str, title: str) -> list[Picture]:
+def ratios(results: Results, title: str, baseline: str) -> list[Picture]:
     """The medians as ratios to the baseline's; no picture without a baseline."""
     found = []
     for cell in results.cells:

@@ -58,6 +58,17 @@ class Cell(msgspec.Struct, kw_only=True):
         return ", ".join(str(value) for value in self.params.values())
 
 
+class Judged(msgspec.Struct, kw_only=True):
+    """An aim: what was to be reached, whether it was (``met``, ``missed`` or ``not judged``), and what was measured."""
+
+    what: str
+    outcome: str
+    measured: str
+
+    def __str__(self) -> str:
+        return f"aim: {self.what}: {self.outcome} ({self.measured})"
+
+
 class Results(msgspec.Struct, kw_only=True):
     """One run of one comparison."""
 
@@ -72,6 +83,7 @@ class Results(msgspec.Struct, kw_only=True):
     quick: bool = False
     cells: list[Cell] = []
     assessment: list[str] = msgspec.field(name="verdict", default_factory=list)  # sentences
+    aims: list[Judged] = []
 
     def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
         """The first cell that matches."""
@@ -117,7 +129,9 @@ class Stopwatch:
         self._machine = machine()
         self._began, self._since = time.gmtime(), time.monotonic()
 
-    def results(self, cells: Sequence[Cell], assessment: Sequence[str] = (), *, quick: bool = False) -> Results:
+    def results(
+        self, cells: Sequence[Cell], assessment: Sequence[str | Judged] = (), *, quick: bool = False
+    ) -> Results:
         return Results(
             bench=self._bench,
             command=self._command,
@@ -127,7 +141,8 @@ class Stopwatch:
             took_s=round(time.monotonic() - self._since, 1),
             quick=quick,
             cells=list(cells),
-            assessment=list(assessment),
+            assessment=[line for line in assessment if isinstance(line, str)],
+            aims=[line for line in assessment if isinstance(line, Judged)],
         )
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from pebble.bench.measured_robot import check_kinds
 from pebble.bench.results import Cell
-from pebble.bench.robot_comparison import against, caveat, sentence, spread
+from pebble.bench.tables import against, caveat, sentence, spread
 from pebble.errors import PebbleError
 
 
