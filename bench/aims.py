@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from pebble.bench.percentiles import percentile
-from pebble.bench.results import Cell, Judged
+from pebble.bench.results import Cell, Judged, percentile
 from pebble.bench.tables import figure
 
 MET, MISSED, NOT_JUDGED = "met", "missed", "not judged"

@@ -17,8 +17,7 @@ from pebble.bench.bridge_driven_robot import DrivenRobot
 from pebble.bench.bridge_plan import BridgePlan
 from pebble.bench.bridge_tally import Tally
 from pebble.bench.engine import finish
-from pebble.bench.percentiles import percentile
-from pebble.bench.results import Stopwatch
+from pebble.bench.results import Stopwatch, percentile
 from pebble.bench.tables import latency_table
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals

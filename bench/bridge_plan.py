@@ -13,8 +13,7 @@ from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.comparison import FOLDER
 from pebble.bench.engine import check_folder
 from pebble.bench.measured_robot import check_kinds
-from pebble.bench.percentiles import LONGEST_S
-from pebble.bench.results import Value
+from pebble.bench.results import LONGEST_S, Value
 from pebble.errors import PebbleError
 
 

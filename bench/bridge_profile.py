@@ -20,8 +20,7 @@ from pebble.bench.bridge_operator import Wheels
 from pebble.bench.bridge_plan import BridgePlan
 from pebble.bench.bridge_robot import RobotProcesses
 from pebble.bench.engine import finish
-from pebble.bench.percentiles import percentile
-from pebble.bench.results import Cell, Stopwatch
+from pebble.bench.results import Cell, Stopwatch, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep

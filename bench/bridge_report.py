@@ -11,9 +11,8 @@ from pebble.bench.aims import outcome
 from pebble.bench.bridge_one_hop import HOP
 from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP
-from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell, Judged, Value
+from pebble.bench.results import Cell, Judged, Value, percentile
 from pebble.bench.tables import caveat, figure, latency_table, plain_table, sentence
 
 AIMS_MS = {50: 0.7, 99: 2.0}

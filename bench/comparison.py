@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench.percentiles import LONGEST_S
-from pebble.bench.results import Cell, Judged, Results, Value
+from pebble.bench.results import LONGEST_S, Cell, Judged, Results, Value
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
-    from pebble.bench.plots_style import Picture
+    from pebble.bench.plots import Picture
 
 FOLDER: Final = Path("bench-results")
 

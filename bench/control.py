@@ -13,9 +13,8 @@ from pebble.bench.control_participants import Participants, Slice, joined
 from pebble.bench.control_plan import Condition, ControlPlan
 from pebble.bench.control_report import MEASURES, ONE_WAY, assessment, legend, tables, wake_up_cost
 from pebble.bench.engine import check_folder, finish
-from pebble.bench.percentiles import percentile, rounded
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Judged, Stopwatch, Value
+from pebble.bench.results import Cell, Judged, Stopwatch, Value, percentile, rounded
 from pebble.bench.wake_up import wake_up_us
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals

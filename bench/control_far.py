@@ -20,8 +20,7 @@ from pebble.bench.control_plan import check_slices, command_of, rate_name, size_
 from pebble.bench.control_report import ROUND_TRIP
 from pebble.bench.control_wire import Exchange
 from pebble.bench.engine import check_folder, finish
-from pebble.bench.percentiles import percentile, rounded
-from pebble.bench.results import Cell, Stopwatch, Value
+from pebble.bench.results import Cell, Stopwatch, Value, percentile, rounded
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
 from pebble.runtime.inbox import Inbox

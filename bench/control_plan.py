@@ -10,8 +10,7 @@ from pebble.bench.comparison import FOLDER
 from pebble.bench.control_variants import P2P, VARIANTS
 from pebble.bench.control_wire import SMALLEST
 from pebble.bench.null import roles, variant_of
-from pebble.bench.percentiles import LONGEST_S
-from pebble.bench.results import Value
+from pebble.bench.results import LONGEST_S, Value
 from pebble.errors import PebbleError
 
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")

@@ -15,9 +15,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pebble.bench import null
 from pebble.bench.comparison import Case, Combine, Comparison, Round, Run
-from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Results, Stopwatch, Value
+from pebble.bench.results import Cell, Results, Stopwatch, Value, percentile
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep

@@ -20,9 +20,8 @@ import msgspec
 
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
 from pebble.bench.fleet_operator import STEPS
-from pebble.bench.percentiles import percentile, rounded
 from pebble.bench.pictures import ecdf
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, percentile, rounded
 from pebble.bench.tables import COUNT, Grid, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.bench.worker import Worker, end_workers

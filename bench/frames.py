@@ -20,9 +20,8 @@ from pebble.bench.comparison import FOLDER
 from pebble.bench.engine import check_folder, finish
 from pebble.bench.frames_report import Round, assessment, cell_of, complete, legend, tables
 from pebble.bench.frames_variants import VARIANTS, Case, missing, parse_size
-from pebble.bench.percentiles import LONGEST_S
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Stopwatch, Value
+from pebble.bench.results import LONGEST_S, Cell, Stopwatch, Value
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.bench.worker import Worker, end_workers
 from pebble.demo.broker import Broker, BrokerKind

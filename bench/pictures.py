@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pebble.bench.results import Results
 
 if TYPE_CHECKING:
-    from pebble.bench.plots_style import Picture
+    from pebble.bench.plots import Picture
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +53,3 @@ def bars(title: str, *, measures: tuple[str, ...] = (), panel: str = "", group: 
 def tails(title: str) -> Drawn:
     """Bars to the medians, lines to the 99th percentiles; one panel for each condition."""
     return Drawn("pebble.bench.plots_bars:tails", (title,))
-
-
-def over_time() -> Drawn:
-    """A dot for each message of the measures ``… over time``."""
-    return Drawn("pebble.bench.plots_time:over_time")

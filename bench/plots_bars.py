@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pebble.bench.percentiles import percentile
-from pebble.bench.plots_style import (
+from pebble.bench.plots import (
     Picture,
     Style,
     file_name,
@@ -25,7 +24,7 @@ from pebble.bench.plots_style import (
     unique,
     unit_of,
 )
-from pebble.bench.results import Cell, Results
+from pebble.bench.results import Cell, Results, percentile
 from pebble.bench.tables import figure as digits
 
 _BAR = 0.8

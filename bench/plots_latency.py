@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from pebble.bench import null
-from pebble.bench.plots_style import (
+from pebble.bench.plots import (
     Picture,
     Style,
     file_name,

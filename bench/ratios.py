@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 
 LEVEL = 0.99
 #: Fewer rounds than this do not support a 99 % interval: it is computed, but means little.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import shutil
@@ -13,11 +14,11 @@ from pathlib import Path
 
 import msgspec
 
-from pebble.bench.percentiles import percentile
 from pebble.errors import PebbleError
 from pebble.version import __version__
 
 FORMAT = 1
+LONGEST_S = 3600.0  # of one phase of a comparison
 OVER_TIME = " over time"  # suffix of the measure of a cell that holds a curve: times, then values
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
 _MOSQUITTO = "/usr/sbin:/usr/local/sbin"
@@ -191,3 +192,18 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def percentile(figures: Sequence[float], percent: float) -> float:
+    """The smallest value that at least ``percent`` per cent of the values do not exceed; NaN without values."""
+    if not figures:
+        return math.nan
+    ordered = sorted(figures)
+    return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
+
+
+def rounded(figure: float | int | None, digits: int) -> float | int | None:
+    """Rounds for JSON, which has no NaN: None means not measured."""
+    if figure is None or not math.isfinite(figure):
+        return None
+    return figure if isinstance(figure, int) else round(figure, digits)

@@ -10,9 +10,8 @@ from statistics import median
 from rich import box
 from rich.table import Table
 
-from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, paired
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, percentile
 
 _PERCENTS = (50, 95, 99, 100)
 _LEAST_APART = 5  # rounds: with three, equal robots are disjoint in one run of ten, with five in one of 126

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pebble.bench.plots_style import Picture
+    from pebble.bench.plots import Picture
 
 _ANALYSIS: Final = "analysis"  # figure of a cell: all of a RobotTraffic, as JSON
 _SAME: Final = 0.01  # of the paper's PCM
@@ -298,7 +298,7 @@ def _latencies(robots: Robots) -> Iterator[str]:
 
 def figures(results: Results) -> list[Picture]:
     """Figures 4.1 to 4.6 of the paper, drawn as `pebble analyse` draws them, of those robots that were analysed."""
-    from pebble.bench.plots_style import Picture, panels
+    from pebble.bench.plots import Picture, panels
     from pebble.recordings.traffic.figures import draw_bandwidth, draw_latency, draw_outages
 
     def latency(axes: Axes, robot: RobotTraffic) -> None:

@@ -6,7 +6,7 @@ Their command lines are in pebble.commands, and their runs in modules of their o
 from __future__ import annotations
 
 from pebble.bench.comparison import Budget, Comparison
-from pebble.bench.pictures import Drawn, ecdf, null_ratios, over_time, ratios, tails
+from pebble.bench.pictures import Drawn, ecdf, null_ratios, ratios, tails
 
 CONTROL = Comparison(
     name="control",
@@ -97,5 +97,5 @@ IMPAIR = Comparison(
     quick=Budget(85),
     summary_lines=9,
     words=("impair",),
-    pictures=(Drawn("pebble.bench.plots_impair:over_trials"), over_time()),
+    pictures=(Drawn("pebble.bench.impair.pictures:over_trials"), Drawn("pebble.bench.impair.pictures:over_time")),
 )

@@ -10,7 +10,7 @@ from pebble.bench.comparison import FOLDER
 from pebble.bench.impair.conditions import Condition, chosen, trials
 from pebble.bench.impair.messages import TrialRequest
 from pebble.bench.impair.network import KINDS
-from pebble.bench.percentiles import LONGEST_S
+from pebble.bench.results import LONGEST_S
 from pebble.errors import PebbleError
 
 QUICK = ("base-start", "256k", "64k+5%", "base-end")

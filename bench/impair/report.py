@@ -13,9 +13,8 @@ from pebble.bench.aims import outcome
 from pebble.bench.impair import cells as measures
 from pebble.bench.impair.conditions import trials
 from pebble.bench.impair.plan import SUBJECTS, Subject
-from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import paired
-from pebble.bench.results import Cell, Judged, Results
+from pebble.bench.results import Cell, Judged, Results, percentile
 from pebble.bench.tables import figure, plain_table
 
 WIDE = 105  # columns of a terminal that the long form needs

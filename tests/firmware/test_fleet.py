@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 import time
@@ -127,7 +128,7 @@ def test_figures_are_shown_and_written(tmp_path: Path) -> None:
     measured = replace(FLEET, measure=lambda case: [cell_of(case, 2, answer, moves, {"fleet": 1.0}, 8.0)])
     out = StringIO()
     assert engine.run(measured.run_of(robots=2, output=tmp_path, console=Console(file=out, width=100))) == 0
-    assert out.getvalue().split() != ["2", "10 Hz"]
+    assert re.search(r"2 +10 Hz +1.00 +9.00 +9.00 +9.00 +2 +3 +0", out.getvalue())  # p50 … max, n, sent, late
     results = load(tmp_path / "fleet.json")
     assert results.cells[0].rounds == [[1.0, 9.0]]
     assert results.assessment[0] == "2 of 2 robots were online; of 3 commands 1 were overtaken or lost"
