@@ -13,14 +13,13 @@ from itertools import pairwise
 from rich.console import Console
 from rich.progress import track
 
-from pebble.bench import output
 from pebble.bench.bridge_capture import PacketCapture, PassageTimes
 from pebble.bench.bridge_drive import arrivals
 from pebble.bench.bridge_driven_robot import DrivenRobot
 from pebble.bench.bridge_operator import Wheels
 from pebble.bench.bridge_plan import BridgePlan
-from pebble.bench.percentiles import percentile
-from pebble.bench.results import Cell, Stopwatch
+from pebble.bench.engine import finish
+from pebble.bench.results import Cell, Stopwatch, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.rig.robot import Robot
 from pebble.runtime.signals import interrupted_by_signals
@@ -59,7 +58,7 @@ def run(plan: BridgePlan, console: Console | None = None) -> int:
     lines = [
         line for kind, rounds in found.items() for line in assessment(kind, [hops for one in rounds for hops in one])
     ]
-    output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
+    finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
     return 0 if all(cell.samples for cell in cells) else 1
 
 

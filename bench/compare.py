@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
-from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, student, unpaired
-from pebble.bench.results import OVER_TIME, Cell, Results
+from pebble.bench.results import OVER_TIME, Cell, Results, percentile
 
 CHANCE = 0.01
 #: Memory layout and core placement of new processes shift medians by this factor between runs, which no number of

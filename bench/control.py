@@ -12,10 +12,9 @@ from pebble.bench.control_ends import SliceSpec
 from pebble.bench.control_participants import Participants, Slice, joined
 from pebble.bench.control_plan import Condition, ControlPlan
 from pebble.bench.control_report import MEASURES, ONE_WAY, assessment, legend, tables, wake_up_cost
-from pebble.bench.output import check_folder, finish
-from pebble.bench.percentiles import percentile, rounded
+from pebble.bench.engine import check_folder, finish
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Stopwatch, Value
+from pebble.bench.results import Cell, Judged, Stopwatch, Value, percentile, rounded
 from pebble.bench.wake_up import wake_up_us
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
@@ -43,7 +42,8 @@ def run(plan: ControlPlan, console: Console | None = None) -> int:
         finally:
             sweep()  # Zenoh leaves a file behind even after a regular end
     cells = cells_of(plan, measured)
-    lines = null.assessment(cells) if plan.null else [*wake_up_cost(cells, *wake_ups_us), *assessment(cells)]
+    tested = null.assessment(cells) if plan.null else [*wake_up_cost(cells, *wake_ups_us), *assessment(cells)]
+    lines: list[str | Judged] = list(tested)
     if len(measured) < plan.rounds:
         why = ", ".join(dict.fromkeys(problems))
         lines.insert(0, f"{plan.rounds - len(measured)} of {plan.rounds} rounds failed and were left out: {why}")

@@ -14,13 +14,13 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.bench.clock import Offset, estimate, one_way_ns
+from pebble.bench.comparison import FOLDER
 from pebble.bench.control_ends import Clock, Echo, Sender, SliceSpec, TransportConnection
 from pebble.bench.control_plan import check_slices, command_of, rate_name, size_name
 from pebble.bench.control_report import ROUND_TRIP
 from pebble.bench.control_wire import Exchange
-from pebble.bench.output import FOLDER, check_folder, finish
-from pebble.bench.percentiles import percentile, rounded
-from pebble.bench.results import Cell, Stopwatch, Value
+from pebble.bench.engine import check_folder, finish
+from pebble.bench.results import Cell, Stopwatch, Value, percentile, rounded
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
 from pebble.runtime.inbox import Inbox

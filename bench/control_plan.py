@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pebble.bench.comparison import FOLDER
 from pebble.bench.control_variants import P2P, VARIANTS
 from pebble.bench.control_wire import SMALLEST
 from pebble.bench.null import roles, variant_of
-from pebble.bench.output import FOLDER
-from pebble.bench.percentiles import LONGEST_S
-from pebble.bench.results import Value
+from pebble.bench.results import LONGEST_S, Value
 from pebble.errors import PebbleError
 
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 from rich.table import Table
 
+from pebble.bench.aims import MISSED, NOT_JUDGED, outcome
 from pebble.bench.control_plan import HOG, LOADED_SIZE, MEDIA, NONE, rate_name, size_name
 from pebble.bench.control_variants import BASELINE, HUB, MQTT, P2P, VARIANTS
 from pebble.bench.frames_loop import RATE_HZ
 from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, Judged
 from pebble.bench.tables import base_of, figure, plain_table
 
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
@@ -120,7 +121,7 @@ def wake_up_cost(cells: Sequence[Cell], same_us: float, other_us: float) -> list
     ]
 
 
-def assessment(cells: Sequence[Cell]) -> list[str]:
+def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
     """One sentence for each comparison that was measured, warnings, and the aims."""
     by_variant = _judged(cells)
     lines = ["40 B at 200 Hz, one way, medians unless p99 is named; with the 99 % interval of the ratio."]
@@ -132,7 +133,7 @@ def assessment(cells: Sequence[Cell]) -> list[str]:
             lines += _pair(by_variant, (slow, NONE), ("mqtt-nodelay", NONE), percent, why="Nagle: ")
     lines += _pair(by_variant, ("mqtt5", NONE), ("mqtt-nodelay", NONE), 50)
     lines = lines if len(lines) > 1 else []
-    return lines + _warnings(cells) + _aims({key: _with_lost(cell) for key, cell in by_variant.items()})
+    return [*lines, *_warnings(cells), *_aims({key: _with_lost(cell) for key, cell in by_variant.items()})]
 
 
 def _judged(cells: Sequence[Cell]) -> _CellsByVariant:
@@ -246,7 +247,7 @@ def _with_lost(cell: Cell) -> Cell:
     return replace(cell, rounds=[[*one, *[math.inf] * (each - len(one))] for one in cell.rounds])
 
 
-def _aims(by_variant: _CellsByVariant) -> list[str]:
+def _aims(by_variant: _CellsByVariant) -> list[Judged]:
     """The aim for p50 applies to the upper end of the interval, the one for p99 to the ratio, as they were set.
 
     If too many messages were lost in total, the aim is missed even if few rounds lost them.
@@ -262,14 +263,14 @@ def _aims(by_variant: _CellsByVariant) -> list[str]:
     return lines
 
 
-def _aim(what: str, value: float, aim: float, interval: Interval) -> str:
+def _aim(what: str, value: float, aim: float, interval: Interval) -> Judged:
     """A ratio that is equal to 1 within noise does not meet an aim."""
     if interval.few:
-        outcome, why = "not judged", f" of {interval.rounds} rounds"
+        how, why = NOT_JUDGED, f" of {interval.rounds} rounds"
     elif math.isinf(value):
-        outcome, why = "missed", ", too much was lost"
+        how, why = MISSED, ", too much was lost"
     elif interval.equal:
-        outcome, why = "missed", ", equal within noise"
+        how, why = MISSED, ", equal within noise"
     else:
-        outcome, why = "met" if value <= aim else "missed", ""
-    return f"aim: {what}, at most {aim:.2f}: {outcome} ({interval}{why})"
+        how, why = outcome(value <= aim), ""
+    return Judged(what=f"{what}, at most {aim:.2f}", outcome=how, measured=f"{interval}{why}")

@@ -14,12 +14,12 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from pebble.bench import output
+from pebble.bench.comparison import FOLDER
+from pebble.bench.engine import check_folder, finish
 from pebble.bench.frames_report import Round, assessment, cell_of, complete, legend, tables
 from pebble.bench.frames_variants import VARIANTS, Case, missing, parse_size
-from pebble.bench.percentiles import LONGEST_S
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Stopwatch, Value
+from pebble.bench.results import LONGEST_S, Cell, Stopwatch, Value
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
 from pebble.rig.broker import Broker
@@ -48,7 +48,7 @@ class FramesPlan:
     sizes: Sequence[str] = SIZES
     readers: Sequence[int] = READERS
     variants: Sequence[str] = VARIANTS
-    output: Path = output.FOLDER
+    output: Path = FOLDER
     quick: bool = False  # the results are marked as quick
 
     def check(self) -> None:
@@ -64,7 +64,7 @@ class FramesPlan:
             raise PebbleError("a variant, size or number of readers is named twice")
         for size in self.sizes:
             parse_size(size)
-        output.check_folder(self.output)
+        check_folder(self.output)
 
     def options(self) -> dict[str, Value | list[Value]]:
         """All options that affect the results."""
@@ -109,7 +109,7 @@ def run(plan: FramesPlan, console: Console | None = None) -> int:
         console.print(line, style="dim", highlight=False)
     for figures in tables(cells):
         console.print(figures)
-    output.finish(watch.results(cells, assessment(cells), quick=plan.quick), plan.output, console)
+    finish(watch.results(cells, assessment(cells), quick=plan.quick), plan.output, console)
     return 0 if complete(cells, plan.rounds) else 1
 
 

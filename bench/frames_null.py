@@ -7,7 +7,8 @@ from typing import Any
 
 from rich.console import Console
 
-from pebble.bench import null, output
+from pebble.bench import null
+from pebble.bench.engine import finish
 from pebble.bench.frames import READERS, SIZES, FramesPlan, Measured, cells_of, measure
 from pebble.bench.frames_report import OURS, complete, failed_rounds, tables
 from pebble.bench.frames_variants import Case, missing, parse_size
@@ -42,7 +43,7 @@ def run(plan: FramesPlan, console: Console | None = None) -> int:
     for figures in tables(cells):
         console.print(figures)
     words = [*null.assessment(cells), *failed_rounds(cells)]
-    output.finish(watch.results(cells, words, quick=plan.quick), plan.output, console)
+    finish(watch.results(cells, words, quick=plan.quick), plan.output, console)
     return 0 if complete(cells, plan.rounds) else 1
 
 

@@ -11,9 +11,8 @@ from rich.table import Table
 
 from pebble.bench.frames_variants import ABOUT, VARIANTS, Case, parse_size, readers
 from pebble.bench.null import variant_of
-from pebble.bench.percentiles import rounded
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell, Value
+from pebble.bench.results import Cell, Value, rounded
 from pebble.bench.tables import figure, plain_table
 
 MEASURE = "frame"

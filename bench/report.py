@@ -15,9 +15,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pebble.bench import report_run
-from pebble.bench.output import check_folder
-from pebble.bench.report_plan import COMPARISONS, Comparison
+from pebble.bench import catalogue, report_run
+from pebble.bench.comparison import Comparison
+from pebble.bench.engine import check_folder
 from pebble.bench.report_run import HUNG, INTERRUPTED, Outcome, Run
 from pebble.bench.report_text import HEADING, Section, text
 from pebble.bench.results import Results, load
@@ -88,7 +88,9 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
     _require_matplotlib()
     _check_not_foreign(folder)
     known = report_run.load(folder)
-    sections = [section for one in COMPARISONS if (section := _section(one, folder, known, redraw)) is not None]
+    sections = [
+        section for one in catalogue.reported() if (section := _section(one, folder, known, redraw)) is not None
+    ]
     if not sections:
         raise PebbleError(f"{folder} has no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME

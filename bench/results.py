@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import shutil
@@ -13,11 +14,11 @@ from pathlib import Path
 
 import msgspec
 
-from pebble.bench.percentiles import percentile
 from pebble.errors import PebbleError
 from pebble.version import __version__
 
 FORMAT = 1
+LONGEST_S = 3600.0  # of one phase of a comparison
 OVER_TIME = " over time"  # suffix of the measure of a cell that holds a curve: times, then values
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
 _MOSQUITTO = "/usr/sbin:/usr/local/sbin"
@@ -58,6 +59,17 @@ class Cell(msgspec.Struct, kw_only=True):
         return ", ".join(str(value) for value in self.params.values())
 
 
+class Judged(msgspec.Struct, kw_only=True):
+    """An aim: what was to be reached, whether it was (``met``, ``missed`` or ``not judged``), and what was measured."""
+
+    what: str
+    outcome: str
+    measured: str
+
+    def __str__(self) -> str:
+        return f"aim: {self.what}: {self.outcome} ({self.measured})"
+
+
 class Results(msgspec.Struct, kw_only=True):
     """One run of one comparison."""
 
@@ -72,6 +84,7 @@ class Results(msgspec.Struct, kw_only=True):
     quick: bool = False
     cells: list[Cell] = []
     assessment: list[str] = msgspec.field(name="verdict", default_factory=list)  # sentences
+    aims: list[Judged] = []
 
     def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
         """The first cell that matches."""
@@ -117,7 +130,9 @@ class Stopwatch:
         self._machine = machine()
         self._began, self._since = time.gmtime(), time.monotonic()
 
-    def results(self, cells: Sequence[Cell], assessment: Sequence[str] = (), *, quick: bool = False) -> Results:
+    def results(
+        self, cells: Sequence[Cell], assessment: Sequence[str | Judged] = (), *, quick: bool = False
+    ) -> Results:
         return Results(
             bench=self._bench,
             command=self._command,
@@ -127,7 +142,8 @@ class Stopwatch:
             took_s=round(time.monotonic() - self._since, 1),
             quick=quick,
             cells=list(cells),
-            assessment=list(assessment),
+            assessment=[line for line in assessment if isinstance(line, str)],
+            aims=[line for line in assessment if isinstance(line, Judged)],
         )
 
 
@@ -176,3 +192,18 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def percentile(figures: Sequence[float], percent: float) -> float:
+    """The smallest value that at least ``percent`` per cent of the values do not exceed; NaN without values."""
+    if not figures:
+        return math.nan
+    ordered = sorted(figures)
+    return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
+
+
+def rounded(figure: float | int | None, digits: int) -> float | int | None:
+    """Rounds for JSON, which has no NaN: None means not measured."""
+    if figure is None or not math.isfinite(figure):
+        return None
+    return figure if isinstance(figure, int) else round(figure, digits)

@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from pebble.bench.output import FOLDER
+from pebble.bench.comparison import FOLDER
 from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
 from pebble.transports import MqttSettings

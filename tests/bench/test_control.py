@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, control_far, output
+from pebble.bench import control, control_far
 from pebble.bench.control_ends import SliceSpec
 from pebble.bench.control_far import BACK, THERE, FarPlan
 from pebble.bench.control_participants import Participants
@@ -42,7 +42,7 @@ def command(*options: str) -> list[str]:
 @pytest.fixture
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plots have tests of their own."""
-    monkeypatch.setattr(output, "find_spec", lambda _name: None)
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)
 
 
 @pytest.mark.thorough

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.output import check_folder
+from pebble.bench.engine import check_folder
 from pebble.bench.results import FORMAT, Cell, Results, Stopwatch, load, machine
 from pebble.errors import PebbleError
 

@@ -3,7 +3,7 @@
 import pytest
 
 from pebble.bench.results import Cell
-from pebble.bench.robot_comparison import against, caveat, sentence, spread
+from pebble.bench.tables import against, caveat, sentence, spread
 from pebble.errors import PebbleError
 from pebble.rig.robot import check_kinds
 

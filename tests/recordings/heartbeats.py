@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 from pebble.contract import ONLINE
 from pebble.rig.stage import Stage
 from pebble.rig.testbed import ROBOTS

@@ -44,7 +44,7 @@ def permitted(kind: str) -> None:
 def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     kind: str, subject: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pebble.bench.output.find_spec", lambda _name: None)  # no plots
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
     monkeypatch.setattr("pebble.bench.impair.run._QUIET_QUICK_S", 0.1)
     monkeypatch.setattr(
         ImpairPlan, "request", lambda _plan, one: TrialRequest(video=one.video, audio=one.audio, **SHORT)

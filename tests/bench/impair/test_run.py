@@ -107,7 +107,7 @@ def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int, network: str 
     log: list[str] = []
     printed = io.StringIO()
     monkeypatch.setattr(module, "TestBed", FakeTestBed(log, trials))
-    monkeypatch.setattr("pebble.bench.output.find_spec", lambda _name: None)  # no plots
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
     plan = ImpairPlan(trials=PLAN.trials, subjects=PLAN.subjects, network=network, output=folder)
     try:
         run(plan, Console(file=printed, width=120))
