@@ -147,3 +147,12 @@ def test_the_command_line_of_results_repeats_them(tmp_path: Path) -> None:
     assert " ".join(plan.command()) == (
         "pebble bench frames --seconds 0.5 --rounds 2 --size 640x480 --readers 1 --variants mqtt --quick"
     )
+
+
+def test_what_the_systems_python_runs_as_plain_files_imports_nothing_of_pebble() -> None:
+    folder = ROOT / "pebble" / "bench"
+    code = f"import sys; sys.path.insert(0, {str(folder)!r}); import frames_gstreamer; print('pebble' in sys.modules)"
+    assert (
+        subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True).stdout
+        == "False\n"
+    )
