@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, ClassVar, Final, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 from pebble.rig.broker import Broker, BrokerKind
 from pebble.rig.programs import Program, Wrap, end_all, unchanged
@@ -16,7 +16,6 @@ from pebble.rig.worker import Worker
 
 #: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
 OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
-_LONGEST_FOLDER: Final = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 
 P = TypeVar("P", bound=Program)
 
@@ -31,10 +30,9 @@ class Processes:
     ends_s: ClassVar[tuple[float, ...]] = (4.0, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
     keep = False  # the folder
 
-    def __init__(self, prefix: str = "pbl-") -> None:
-        usual = tempfile.gettempdir()
-        short = usual if len(usual) <= _LONGEST_FOLDER else "/tmp"  # noqa: S108 - mkdtemp makes a 0700 folder in it
-        self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=short))
+    def __init__(self, prefix: str = "pbl-", into: str | None = None) -> None:
+        """The folder's name begins with ``prefix``; it is in the usual place for temporary ones unless ``into``."""
+        self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=into))
         self.closing = ExitStack()
         self.workers: list[Worker] = []
         self._programs: tuple[list[Program], ...] = ([], [], [], [])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import tempfile
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
@@ -35,6 +36,7 @@ _LINES = {IMU: "imu", OUTLETS: "outlets"}  # instances of the serial bridge
 _OPTIONS = {OUTLETS: ("--unreachable", "o4")}
 CAMERA_FPS = 15
 _MCU_START_S = 10.0
+_LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 _REPORTS = 600  # a minute of reports
 _ENTRIES = 5_000  # minutes of commands
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
@@ -245,7 +247,7 @@ class Testbed(Processes):
     ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
 
     def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS, *, room: bool = True) -> None:
-        super().__init__("pebble-demo-")
+        super().__init__("pebble-demo-", _temporary_folder())
         self.keep = True
         self.robots: dict[str, SimulatedRobot] = {}
         self.page: PageServer | None = None
@@ -284,3 +286,8 @@ class Testbed(Processes):
         """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
         for robot in self.robots.values():
             robot.start(self._ending)
+
+
+def _temporary_folder() -> str:
+    usual = tempfile.gettempdir()
+    return usual if len(usual) <= _LONGEST_FOLDER else "/tmp"  # noqa: S108 - mkdtemp makes a 0700 folder in it
