@@ -113,7 +113,7 @@ def _key(cell: Cell) -> Hashable:
 
 def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
     """The percentiles for which most rounds have enough samples."""
-    fewest = min(statistics.median(len(samples) for samples in cell.rounds if samples) for cell in (one, other))
+    fewest = min(statistics.median(size for size in cell.sizes if size) for cell in (one, other))
     return _PERCENTS if fewest >= _LEAST_SAMPLES else _PERCENTS[:1]
 
 
@@ -154,7 +154,7 @@ def _counts(cell: Cell) -> bool:
 
 
 def _lost_shares(cell: Cell) -> list[float]:
-    arrived = [len(samples) for samples in cell.rounds if samples]
+    arrived = [size for size in cell.sizes if size]
     each = int(cell.figures["sent"] or 0) / len(arrived)
     return [1 - count / each for count in arrived]
 

@@ -20,7 +20,7 @@ from pebble.bench.comparison import Comparison
 from pebble.bench.engine import check_folder
 from pebble.bench.report_run import HUNG, INTERRUPTED, Outcome, Run
 from pebble.bench.report_text import HEADING, Section, text
-from pebble.bench.results import Results, load
+from pebble.bench.results import Results, load, pack
 from pebble.errors import PebbleError
 from pebble.runtime.parent import tied_to_parent
 from pebble.runtime.signals import interrupted_by_signals
@@ -62,6 +62,7 @@ def run(
             write(folder, redraw=False)
         raise
     write(folder, redraw=False)
+    pack(folder)
     console.print(f"Written: {folder / NAME}", highlight=False, soft_wrap=True)
     failed = {one.name: problem for one in comparisons if (problem := known.ended[one.name].problem)}
     for name, why in failed.items():

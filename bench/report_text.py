@@ -93,8 +93,9 @@ def _head(sections: Sequence[Section], run: Run) -> Iterator[str]:
     took = _span(sum(section.took_s for section in sections))
     when = f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1])))}, in {took}. " if days else ""
     yield (
-        f"{when}Everything here, including this text, is made by `make report{' QUICK=1' if quick else ''}`; every "
-        "sample is in the `.json` file of its comparison, with the options and versions of the run."
+        f"{when}Everything here, including this text, is made by `make report{' QUICK=1' if quick else ''}`; each "
+        "comparison has a `.json` file with the options and versions of the run; the samples are in `samples.json.xz`, "
+        "at most 2,000 of each case, taken so that percentiles stay as they were."
     )
 
 
