@@ -91,7 +91,7 @@ def compare(
         pebble bench frames --output after
         pebble bench compare before/frames.json after/frames.json
     """
-    from pebble.bench.compare_report import run
+    from pebble.bench.compare import run
 
     return run(a, b, threshold=threshold, everything=everything)
 
