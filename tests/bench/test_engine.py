@@ -180,7 +180,8 @@ def test_a_declaration_is_a_command_with_its_modes(tmp_path: Path, monkeypatch: 
     ran: list[Run] = []
     monkeypatch.setattr(engine, "run", lambda run: ran.append(run) or 3)
     flag = Option(name="with-media", kind=bool, help="Also with media.")
-    options = (*declared().options, Option(name="sizes", kind=int, many=True, help="Bytes."), flag)
+    readers = Option(name="readers", kind=int, many=True, repeated=True, least=1, help="Readers.")
+    options = (*declared().options, Option(name="sizes", kind=int, many=True, help="Bytes."), flag, readers)
     mode = declared(name="wake-up-media", options=options)
     about = declared(options=options, modes={"with-media": mode}, help="Wakes up.\n\nMore.")
     app = typer.Typer()
@@ -188,11 +189,16 @@ def test_a_declaration_is_a_command_with_its_modes(tmp_path: Path, monkeypatch: 
     command = typer.main.get_command(app)
     words = ["--rounds", "3", "--sizes", "40,1024", "--variants", "socket", "--output", str(tmp_path)]
     assert command.main(words, standalone_mode=False) == 3
-    assert command.main([*words, "--with-media", "--quick"], standalone_mode=False) == 3
+    assert (
+        command.main([*words, "--with-media", "--readers", "1", "--readers", "3", "--quick"], standalone_mode=False)
+        == 3
+    )
     plain, media = ran
     assert (plain.comparison, media.comparison) == (about, mode)
     assert (plain["rounds"], plain["sizes"], plain["variants"], plain.output) == (3, [40, 1024], ["socket"], tmp_path)
-    assert media.command[-1] == "--quick"
+    assert plain.options.get("readers") is None
+    assert media["readers"] == [1, 3]
+    assert media.command[-5:] == ["--readers", "1", "--readers", "3", "--quick"]
     assert "--with-media" in media.command
     with pytest.raises(PebbleError, match="not a list of numbers"):
         command.main(["--sizes", "big"], standalone_mode=False)
