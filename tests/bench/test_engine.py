@@ -205,7 +205,7 @@ def test_a_declaration_is_a_command_with_its_modes(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("name", catalogue.MODULES)
-def test_every_comparison_is_where_the_catalogue_says(name: str) -> None:
+def test_every_comparison_is_in_the_module_that_the_catalogue_names(name: str) -> None:
     about = catalogue.find(name)
     assert about.name == name
     assert about.title
