@@ -117,7 +117,7 @@ def _aims(cell: Cell) -> list[Judged]:
         what = f"{cell.variant}, {WAYS[cell.measure]}, p{percent} at most {aim:g} ms"
         took_text = "not within 1 s" if math.isinf(took) else f"{figure(took)} ms"
         if judged and aim < took < math.inf:
-            took_text += f", {took - aim:.2f} ms more"
+            took_text += f", by {took - aim:.2f} ms"
         found.append(Judged(what=what, outcome=outcome(took <= aim, judged=judged), measured=took_text))
     return found
 

@@ -35,9 +35,9 @@ def find(name: str) -> Comparison:
 
 
 def commands() -> list[str]:
-    """The comparisons that are commands: a mode such as ``control-null`` is an option of another one."""
-    modes = ("-null", "-profile")
-    return [name for name, module in MODULES.items() if module != "unported" and not name.endswith(modes)]
+    """What follows ``pebble bench``: a mode such as ``control-null`` is an option of another one."""
+    others = ("-null", "-profile", "impair")
+    return [name for name, module in MODULES.items() if module != "unported" and not name.endswith(others)]
 
 
 def reported() -> list[Comparison]:

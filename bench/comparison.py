@@ -37,6 +37,7 @@ class Option:
     help: str
     kind: type[Any] = str  # of one value; bool: a flag
     many: bool = False  # several values, separated by commas
+    repeated: bool = False  # or each in an option of its own
     known: Sequence[str] = ()  # the values that there are
     least: float | None = None
     most: float | None = None
@@ -62,6 +63,8 @@ class Option:
             return [f"--{self.name}"] if value else []
         if value is None or (self.many and list(value) == list(default)):
             return []
+        if self.repeated:
+            return [word for one in value for word in (f"--{self.name}", _word(one))]
         return [f"--{self.name}", ",".join(map(_word, value if self.many else [value]))]
 
 

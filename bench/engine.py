@@ -98,7 +98,10 @@ def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
 
             run.show = show
             with rounds.attempt(number), environment.of(number) as env:
-                collected.add(_round(Round(run=run, number=number, env=env, plan=plan)))
+                round_ = Round(run=run, number=number, env=env, plan=plan)
+                if about.is_null and about.measure is not None and not collected.pilot:
+                    collected.pilot = list(about.measure(next(round_.cases())))
+                collected.add(_round(round_))
 
 
 def _round(round_: Round) -> Iterator[Cell]:
@@ -169,6 +172,7 @@ class Collected:
         self._about = comparison
         self._cells: dict[Hashable, Cell] = {}
         self._figures: dict[tuple[Hashable, str], list[Value]] = {}
+        self.pilot: list[Cell] = []  # of a null test, before the first round
 
     def add(self, cells: Iterable[Cell]) -> None:
         """Adds a round: all of it, or nothing if an error is raised meanwhile. Passes of a round are one."""
@@ -203,7 +207,7 @@ class Collected:
             return 0.0
         usual = [
             _IN_US[cell.unit] * percentile(cell.samples, 50)
-            for cell in self._cells.values()
+            for cell in [*self._cells.values()] or self.pilot
             if not null.is_slowed(cell.variant) and cell.samples and condition.items() <= cell.params.items()
         ]
         return null.SLOWDOWN * percentile(usual, 50) if usual else 0.0

@@ -7,11 +7,12 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import msgspec
+
 from pebble.bench import catalogue, null
 from pebble.bench.aims import MISSED
 from pebble.bench.comparison import Comparison
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.report_run import Outcome, Run
 from pebble.bench.results import Results
 
 HEADING = "# Results"  # the first line of every report
@@ -21,6 +22,40 @@ _LONG = 45  # lines of output: more are collapsed
 _BOLD = {MISSED: f"**{MISSED}**"}
 _PIPE = "\\|"
 _TAIL = 12  # lines of a failed command's output
+
+
+HUNG, INTERRUPTED = -1, -2
+
+
+class Outcome(msgspec.Struct, kw_only=True):
+    """One command line of a report: its exit code, and how long it took with all its processes."""
+
+    code: int
+    took_s: float
+    results: bool = True  # whether it wrote results
+
+    @property
+    def problem(self) -> str:
+        """Why it failed; empty if it did not."""
+        if self.code == HUNG:
+            return "hung and was ended"
+        if self.code == INTERRUPTED:
+            return "was interrupted"
+        if self.code:
+            return f"ended with code {self.code}"
+        return "" if self.results else "measured nothing"
+
+
+class Run(msgspec.Struct, kw_only=True):
+    """The runs that wrote into a folder, by the names of the comparisons."""
+
+    ended: dict[str, Outcome] = {}
+    left_out: list[str] = []  # not permitted for this user
+    interrupted: str = ""  # in which comparison, after how many
+
+    @property
+    def took_s(self) -> float:
+        return sum(one.took_s for one in self.ended.values())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,8 +128,9 @@ def _head(sections: Sequence[Section], run: Run) -> Iterator[str]:
     took = _span(sum(section.took_s for section in sections))
     when = f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1])))}, in {took}. " if days else ""
     yield (
-        f"{when}Everything here, including this text, is made by `make report{' QUICK=1' if quick else ''}`; every "
-        "sample is in the `.json` file of its comparison, with the options and versions of the run."
+        f"{when}Everything here, including this text, is made by `make report{' QUICK=1' if quick else ''}`; each "
+        "comparison has a `.json` file with the options and versions of the run; the samples are in `samples.json.xz`, "
+        "at most 2,000 of each case, taken so that percentiles stay as they were."
     )
 
 

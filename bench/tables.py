@@ -186,12 +186,13 @@ class Grid:
         groups: dict[tuple[str, ...], list[Cell]] = {}
         for cell in cells:
             groups.setdefault(tuple(_field(cell, name) for name in self.rows), []).append(cell)
-        heads = [" ".join(filter(None, (one, column.head))) for one in variants for column in self.columns]
+        named = variants if len(variants) > 1 or self.ratio else [None]
+        heads = [" ".join(filter(None, (one, column.head))) for one in named for column in self.columns]
         heads += [f"{variants[1]} / {variants[0]}"] if self.ratio and len(variants) > 1 else []
         table = plain_table(self.title, [*(self.heads or self.rows), *heads], left=len(self.rows))
-        before = None
+        firsts, before = [row[0] for row in groups], None
         for row in sorted(groups, key=lambda names: self._order(names, list(groups))):
-            if before is not None and len(row) > 1 and before != row[0]:
+            if before not in (None, row[0]) and max(map(firsts.count, (before, row[0]))) > 1:
                 table.add_section()
             shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
             shown += [against(groups[row])] if self.ratio and len(variants) > 1 else []

@@ -91,7 +91,7 @@ def compare(
         pebble bench frames --output after
         pebble bench compare before/frames.json after/frames.json
     """
-    from pebble.bench.compare_report import run
+    from pebble.bench.compare import run
 
     return run(a, b, threshold=threshold, everything=everything)
 
@@ -175,8 +175,8 @@ def command_of(about: Comparison) -> Callable[..., int]:
 
 def _annotation(about: Comparison, option: Option) -> Any:
     """The option for typer: None if it is not given."""
-    kind = str if option.many else option.kind
-    low, high = (None, None) if kind in (str, bool) else (option.least, option.most)
+    kind: Any = list[option.kind] if option.repeated else str if option.many else option.kind  # type: ignore[name-defined]
+    low, high = (None, None) if option.kind in (str, bool) or option.many else (option.least, option.most)
     help_ = f"{option.help}{_default(about, option)}"
     name = f"--{option.name}"
     return Annotated[
@@ -192,6 +192,8 @@ def _default(about: Comparison, option: Option) -> str:
 
 
 def _parsed(option: Option, value: Any) -> Any:
+    if option.repeated:
+        return value or None
     if value is None or not option.many:
         return value
     try:

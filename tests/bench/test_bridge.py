@@ -205,7 +205,7 @@ def test_the_assessment_names_ratios_media_floor_and_aims() -> None:
 
 def test_a_missed_aim_is_shown_with_the_difference() -> None:
     last = lines_of([cell("zenoh", 2.0)])[-1]
-    assert last == "aim: zenoh, command to the wheels, p99 at most 2 ms: missed (2.20 ms, 0.20 ms more)"
+    assert last == "aim: zenoh, command to the wheels, p99 at most 2 ms: missed (2.20 ms, by 0.20 ms)"
 
 
 def test_lost_commands_count_as_infinitely_late() -> None:

@@ -18,8 +18,7 @@ from rich.console import Console
 from pebble.bench import catalogue, report
 from pebble.bench.catalogue import chosen
 from pebble.bench.comparison import Budget, Comparison
-from pebble.bench.report_run import Outcome, Run
-from pebble.bench.report_text import Section, limits, text
+from pebble.bench.report_text import Outcome, Run, Section, limits, text
 from pebble.bench.results import Judged, Results
 from pebble.commands import bench, impair
 from pebble.errors import PebbleError
