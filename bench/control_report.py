@@ -9,28 +9,25 @@ from msgspec.structs import replace
 from rich.table import Table
 
 from pebble.bench.aims import MISSED, NOT_JUDGED, outcome
-from pebble.bench.control_plan import HOG, LOADED_SIZE, MEDIA, NONE, rate_name, size_name
-from pebble.bench.control_variants import BASELINE, HUB, MQTT, P2P, VARIANTS
-from pebble.bench.frames_loop import RATE_HZ
+from pebble.bench.control_participants import BASELINE, HOG, HUB, MEDIA, MQTT, NONE, P2P, VARIANTS
 from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Judged
 from pebble.bench.tables import base_of, figure, plain_table
 
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
-MEASURES = {ONE_WAY: "one_way", ROUND_TRIP: "round_trip"}  # by the field of a worker's answer
+RATE_HZ = 30.0  # of the pictures, as in bench/frames_loop.py
 _LONG_US = 995.0
 _MUCH_LATE, _MUCH_LOST = 0.05, 0.005
 _FEWER = 0.9 * RATE_HZ  # pictures: the load is lighter than intended
 AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
-_JUDGED = {"size": size_name(LOADED_SIZE), "rate": rate_name(200)}
-
+_JUDGED = {"size": "40 B", "rate": "200 Hz"}
 
 _CellsByVariant = dict[tuple[str, str], Cell]  # by variant and load
 
 
-def legend(roles: Sequence[str]) -> list[str]:
-    names = dict.fromkeys(variant_of(role) for role in roles)
+def legend(cells: Sequence[Cell]) -> list[str]:
+    names = dict.fromkeys(variant_of(cell.variant) for cell in cells)
     return [f"{name}: {VARIANTS[name].about}" for name in names]
 
 

@@ -39,7 +39,7 @@ def run(run: Run) -> int:
             _measure(run, collected, rounds)
         finally:
             sweep()  # Zenoh leaves files behind even after a regular end
-    cells = collected.cells()
+    cells = about.derived(collected.cells())
     for table in about.shown(cells):
         console.print(table)
     for line in about.legend(cells):

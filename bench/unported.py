@@ -8,29 +8,6 @@ from __future__ import annotations
 from pebble.bench.comparison import Budget, Comparison
 from pebble.bench.pictures import Drawn, ecdf, null_ratios, ratios
 
-CONTROL = Comparison(
-    name="control",
-    title="Service to service",
-    what="A message of a drive command's size goes from one process to another and back, as between a robot's "
-    "services: unloaded, with camera frames on the same transport, and beside a process that uses a whole core. "
-    "One-way is from just before the publish call until the receiver's handler runs; both ends use the same clock.",
-    full=Budget(700),
-    quick=Budget(40),
-    summary_lines=5,
-    pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
-)
-CONTROL_NULL = Comparison(
-    name="control-null",
-    title="Service to service: the null test",
-    what="One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
-    "The first interval must include 1.00, the second must lie above it; otherwise the comparison above finds "
-    "differences that do not exist, or misses some that do.",
-    full=Budget(180),
-    quick=Budget(10),
-    words=("bench", "control"),
-    reported=("--null",),
-    pictures=(null_ratios("Null test of control"), ecdf("Null test of control")),
-)
 BRIDGE = Comparison(
     name="bridge",
     title="Operator to wheels, and back",

@@ -14,8 +14,8 @@ import typer
 from typer.core import TyperGroup
 
 from pebble.bench.comparison import FOLDER, Comparison, Option
-from pebble.commands import bench_control, bench_robot
-from pebble.commands.options import Output, Quick, split_names
+from pebble.commands import bench_robot
+from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
@@ -48,6 +48,21 @@ def compare(
     from pebble.bench.compare import run
 
     return run(a, b, threshold=threshold, everything=everything)
+
+
+def echo(
+    url: Annotated[str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", show_default=False)],
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine.
+
+    \b
+        pebble bench echo mqtt://broker.local
+    """
+    from pebble.bench.control_far import serve, settings_of
+
+    return serve(settings_of(url, password_file, ca_cert))
 
 
 def report(
@@ -170,6 +185,6 @@ def _python(option: Option) -> str:
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (*bench_control.COMMANDS, *bench_robot.COMMANDS, compare, report):
+    for command in (*bench_robot.COMMANDS, compare, echo, report):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")
