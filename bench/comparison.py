@@ -29,6 +29,16 @@ Tables = Callable[[Sequence[Cell]], Iterable[Table]]
 Assess = Callable[[Sequence[Cell]], Iterable[str | Judged]]
 
 
+def of_known(how: Callable[[Sequence[float]], float], digits: int) -> Combine:
+    """Joins the values of the rounds that have one; None without any."""
+
+    def combine(values: Sequence[float | None]) -> float | None:
+        known = [one for one in values if one is not None]
+        return round(how(known), digits) if known else None
+
+    return combine
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
     """One option of the command line. Its defaults are values of the budgets, under the same name."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from pebble.bench import control_far as far
 from pebble.bench import null
-from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, rounds, seconds, variants
+from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, of_known, rounds, seconds, variants
 from pebble.bench.control_ends import SMALLEST, SliceSpec, rate_name, size_name
 from pebble.bench.control_participants import LOADS, MEDIA, NONE, P2P, VARIANTS, Participants
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, legend, tables, wake_up_cost
@@ -79,20 +79,12 @@ def wake_ups(cells: Sequence[Cell]) -> Iterator[str]:
         yield str(error)
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [one for one in values if one is not None]
-    return round(fmean(known), 1) if known else None
-
-
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [one for one in values if one is not None]
-    return round(median(known), 1) if known else None
-
-
 _JOINED: Mapping[str, Combine] = {
     "late": sum,
-    **dict.fromkeys(("call_us", "fabric_us", "inbox_us"), _median),
-    **dict.fromkeys(("cpu_percent", "broker_cpu_percent", "wake_ups", "broker_wake_ups", "pictures_hz"), _mean),
+    **dict.fromkeys(("call_us", "fabric_us", "inbox_us"), of_known(median, 1)),
+    **dict.fromkeys(
+        ("cpu_percent", "broker_cpu_percent", "wake_ups", "broker_wake_ups", "pictures_hz"), of_known(fmean, 1)
+    ),
 }
 _OPTIONS = (
     variants(tuple(VARIANTS)),

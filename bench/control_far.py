@@ -14,11 +14,12 @@ from typing import Any
 from msgspec.structs import replace
 from rich.console import Console
 
+from pebble.bench.aims import single
 from pebble.bench.clock import estimate, one_way_ns
-from pebble.bench.comparison import Case, Combine, Run
+from pebble.bench.comparison import Case, Combine, Run, of_known
 from pebble.bench.control_ends import Clock, Echo, Sender, SliceSpec, TransportConnection, rate_name, size_name
 from pebble.bench.control_report import ROUND_TRIP
-from pebble.bench.results import Cell, Value, rounded
+from pebble.bench.results import Cell, Value
 from pebble.bench.tables import Column, Grid, figure
 from pebble.errors import PebbleError
 from pebble.runtime.inbox import Inbox
@@ -140,13 +141,10 @@ def measure(case: Case) -> Iterator[Cell]:
 
 JOINED: Mapping[str, Combine] = {
     "late": sum,
-    "clock_offset_ms": lambda values: median(known) if (known := _known(values)) else None,
-    "clock_error_ms": lambda values: max(_known(values), default=None),
+    "clock_offset_ms": of_known(median, 6),  # ns
+    "clock_error_ms": of_known(max, 6),
 }
-
-
-def _known(values: Sequence[float | None]) -> list[float]:
-    return [one for one in values if one is not None]
+_OFFSET_MS, _ERROR_MS = single("clock_offset_ms"), single("clock_error_ms")
 
 
 def derived(cells: list[Cell]) -> list[Cell]:
@@ -158,20 +156,13 @@ def derived(cells: list[Cell]) -> list[Cell]:
 
 
 def _with_error(cell: Cell) -> Cell:
-    error = _single(cell, "clock_error_ms")
-    figures = {name: rounded(one, 3) if isinstance(one, float) else one for name, one in cell.figures.items()}
+    error = _ERROR_MS(cell)
     known = cell.percentile(50) > error  # False if either is NaN
     return replace(
         cell,
         params={**cell.params, "clocks": f"± {figure(error)} ms"},
         rounds=cell.rounds if known else [[] for _ in cell.rounds],
-        figures=figures,
     )
-
-
-def _single(cell: Cell, name: str) -> float:
-    value = cell.figures.get(name)
-    return float(value) if isinstance(value, (int, float)) else math.nan
 
 
 def _both(cell: Cell) -> str:
@@ -186,7 +177,7 @@ TABLES = (
             Column("round trip", _both, ROUND_TRIP),
             Column("there", _both, THERE),
             Column("back", _both, BACK),
-            Column("±", lambda cell: figure(_single(cell, "clock_error_ms")), THERE),
+            Column("±", lambda cell: figure(_ERROR_MS(cell)), THERE),
             Column("lost", lambda cell: str(cell.lost), ROUND_TRIP),
         ),
     ),
@@ -201,13 +192,13 @@ def assessment(cells: Sequence[Cell]) -> Iterator[str]:
 
 
 def _sentences(trip: Cell, ways: Sequence[Cell]) -> Iterator[str]:
-    what, error_ms = f"{trip.params['size']} at {trip.params['rate']}", _single(ways[0], "clock_error_ms")
+    what, error_ms = f"{trip.params['size']} at {trip.params['rate']}", _ERROR_MS(ways[0])
     error = f"± {figure(error_ms)} ms"
     yield f"{what}: {_both(trip)} ms there and back (p50/p99)"
     if math.isnan(error_ms):
         yield f"{what}: too few replies to compare the clocks: one-way times are unknown"
         return
-    yield f"{what}: the far clock is {_single(ways[0], 'clock_offset_ms'):+.3f} ms from ours, {error}"
+    yield f"{what}: the far clock is {_OFFSET_MS(ways[0]):+.3f} ms from ours, {error}"
     for way in ways:
         unknown = f"unknown: below the clock error of {error}"
         yield f"{what}: {way.measure}: {f'{_both(way)} ms {error}' if way.samples else unknown}"

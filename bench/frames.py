@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pebble.bench import null
-from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, rounds, seconds, variants
+from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import ecdf, null_ratios, tails
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell, Value, rounded
+from pebble.bench.results import Cell, Value
 from pebble.bench.tables import COUNT, LOST, Column, Grid, figure, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
@@ -174,15 +174,13 @@ def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seco
     )
 
 
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [one for one in values if one is not None]
-    return rounded(statistics.median(known), 2) if known else None
-
-
 _JOINED: Mapping[str, Combine] = {
     "torn": sum,
     "fallbacks": sum,
-    **dict.fromkeys(("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb"), _median),
+    **dict.fromkeys(
+        ("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb"),
+        of_known(statistics.median, 2),
+    ),
 }
 
 
