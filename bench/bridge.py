@@ -14,15 +14,15 @@ from contextlib import ExitStack
 from rich.console import Console
 from rich.progress import Progress
 
-from pebble.bench import bridge_report, output
+from pebble.bench import bridge_report
 from pebble.bench.bridge_drive import Arrived, DriveSegment
 from pebble.bench.bridge_driven_robot import DrivenRobot
 from pebble.bench.bridge_media import MediaLoad
 from pebble.bench.bridge_one_hop import HOP, OneHop
 from pebble.bench.bridge_plan import BridgePlan
 from pebble.bench.bridge_tally import LOADED, UNLOADED, Tally
+from pebble.bench.engine import Rounds, finish
 from pebble.bench.results import Stopwatch
-from pebble.bench.rounds import Rounds
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
@@ -50,7 +50,7 @@ def run(plan: BridgePlan, console: Console | None = None) -> int:
     cells = [cell for tally in tallies for cell in tally.cells()]
     bridge_report.show(cells, console)
     lines = [*rounds.notes(), *bridge_report.assessment(cells)]
-    output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
+    finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
     return rounds.code(cells)
 
 

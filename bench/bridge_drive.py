@@ -1,21 +1,16 @@
-"""One segment of driving a whole robot, and which of its commands and of the MCU's reports arrived."""
+"""One segment of driving a whole robot, and which of its commands and of the MCU's reports arrived. Pure."""
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from pebble.bench.bridge_operator import Operator, Wheels
-from pebble.bench.bridge_robot import RobotProcesses
-from pebble.bench.usage import cpu_s
+from pebble.bench.bridge_operator import Wheels
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 from pebble.simulation.trace import Entry
 
 RATE_HZ = 20.0
-_ARRIVE_S = 1.0  # commands and reports that take longer count as lost
-_POLL_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,35 +31,6 @@ class Arrived:
     up: list[float] = field(default_factory=list)
     sent: int = 0
     reports: int = 0
-
-
-def drive(
-    robot: RobotProcesses,
-    operator: Operator,
-    seconds: float,
-    rate_hz: float,
-    *,
-    work_us: float,
-    slowed: bool,
-) -> DriveSegment:
-    """Drives for ``seconds``; ``work_us`` and ``slowed`` are passed to the operator."""
-    pids = robot.pids()
-    began, used = time.monotonic_ns(), cpu_s(pids)
-    sent = operator.drive(seconds, rate_hz, work_us=work_us, slowed=slowed)
-    return DriveSegment(began, time.monotonic_ns(), sent, cpu_s(pids) - used)
-
-
-def match_arrivals(robot: RobotProcesses, operator: Operator, segments: Sequence[DriveSegment]) -> list[Arrived]:
-    """Waits for the last commands and reports, or until they count as lost; returns one result for each segment."""
-    since = min(segment.began for segment in segments)
-    end = time.monotonic() + _ARRIVE_S
-    while True:
-        late = time.monotonic() > end
-        entries = robot.lines(since)
-        commands, reports = arrivals(entries), matched(entries, operator.received(since))
-        if late or all_arrived(segments[-1], commands, reports):
-            return [arrived_of(segment, commands, reports) for segment in segments]
-        time.sleep(_POLL_S)
 
 
 def arrivals(entries: Sequence[Entry]) -> dict[Wheels, int]:

@@ -1,40 +1,52 @@
-"""Puts a robot's camera and microphone in use: frames for a program on the robot, video and audio for an operator."""
+"""Puts a robot's camera and microphone in use: a program on the robot reads frames, an operator gets video and audio.
+
+As a process: ``python -m pebble.bench.bridge_media frames RUN_DIR`` or ``media PORT BASE``. It answers every line with
+the counts so far.
+"""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
+from pathlib import Path
 from typing import Self
 
+from paho.mqtt.client import MQTTMessage
+
 from pebble.bench.bridge_operator import Operator
-from pebble.bench.bridge_robot import BASE, RobotProcesses
-from pebble.bench.worker import Worker, end_workers
+from pebble.contract import AUDIO, CAMERA
 from pebble.errors import PebbleError
+from pebble.rig.robot import Robot
+from pebble.rig.stock_client import StockClient
+from pebble.rig.worker import Worker
+from pebble.rig.worker_end import serve, serve_on_thread
+from pebble.transports.frames import FrameReader
 
 FLOWS = ("frames", "video", "audio")
 _START_S = 20.0
 _STOP_S = 10.0
 _ANSWER_S = 5.0
 _POLL_S = 0.1
+_READ_S = 0.2
+_EVERY = 16  # bytes: one in so many of a picture's is read
 
 
 class MediaLoad:
     """Starts all media in ``with`` and waits until they flow; stops them at the end."""
 
-    def __init__(self, robot: RobotProcesses, operator: Operator) -> None:
+    def __init__(self, robot: Robot, operator: Operator) -> None:
         self._robot, self._operator = robot, operator
         self._workers: list[Worker] = []
         self._before = 0  # processes of the robot without media
 
     def __enter__(self) -> Self:
         """Raises PebbleError naming what does not flow."""
-        module, log = [sys.executable, "-m", "pebble.bench.bridge_load"], self._robot.run_dir.with_name("load.log")
-        self._before = len(self._robot.pids())
+        self._before, start = len(self._robot.pids()), self._robot.running.worker
+        module, where = "pebble.bench.bridge_media", (self._robot.remote_port, self._robot.base)
         try:
-            self._workers += [
-                Worker("the frame reader", [*module, "frames", str(self._robot.run_dir)], log),
-                Worker("the media operator", [*module, "media", str(self._robot.remote_port), BASE], log),
-            ]
+            self._workers.append(start("frame reader", module, "frames", self._robot.run_dir))
+            self._workers.append(start("media operator", module, "media", *where))
             self._operator.media(True)
             self._wait()
         except BaseException:
@@ -44,7 +56,8 @@ class MediaLoad:
 
     def __exit__(self, *_: object) -> None:
         self._operator.media(False)
-        end_workers(self._workers)
+        for worker in self._workers:
+            self._robot.running.end(worker)
         end = time.monotonic() + _STOP_S
         while len(self._robot.pids()) > self._before and time.monotonic() < end:
             time.sleep(_POLL_S)
@@ -62,3 +75,40 @@ class MediaLoad:
             if time.monotonic() > end:
                 raise PebbleError(f"no {', '.join(missing)} after {_START_S:.0f} s\n{self._robot.log()}")
             time.sleep(_POLL_S)
+
+
+def main(arguments: list[str]) -> int:
+    what, *where = arguments
+    counts: Counter[str] = Counter()
+    if what == "frames":
+        _read_frames(Path(where[0]), counts)
+    else:
+        _watch(int(where[0]), where[1], counts)
+    return 0
+
+
+def _read_frames(run_dir: Path, counts: Counter[str]) -> None:
+    ended = serve_on_thread(lambda _line: dict(counts))
+    with FrameReader(run_dir, "camera", views=True) as reader:
+        while not ended.is_set():
+            frame = reader.read(_READ_S)
+            if frame is not None:
+                counts["frames"] += bool(frame.data[::_EVERY].any())
+                frame.release()
+
+
+def _watch(port: int, base: str, counts: Counter[str]) -> None:
+    names = {CAMERA.topic(base): "video", AUDIO.topic(base): "audio"}
+
+    def count(message: MQTTMessage) -> None:
+        name = names[message.topic]
+        counts[name] += 1
+        counts[f"{name}_bytes"] += len(message.payload)
+
+    client = StockClient(count, [(topic, 0) for topic in names], at_once=False).open(port)
+    serve(lambda _line: dict(counts))
+    client.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

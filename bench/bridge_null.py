@@ -11,13 +11,13 @@ import time
 from rich.console import Console
 from rich.progress import track
 
-from pebble.bench import null, output
+from pebble.bench import null
 from pebble.bench.bridge_drive import DriveSegment
 from pebble.bench.bridge_driven_robot import DrivenRobot
 from pebble.bench.bridge_plan import BridgePlan
 from pebble.bench.bridge_tally import Tally
-from pebble.bench.percentiles import percentile
-from pebble.bench.results import Stopwatch
+from pebble.bench.engine import finish
+from pebble.bench.results import Stopwatch, percentile
 from pebble.bench.tables import latency_table
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
@@ -44,7 +44,7 @@ def run(plan: BridgePlan, console: Console | None = None) -> int:
     cells = [cell for tally in tallies for cell in tally.cells()]
     console.print(latency_table(f"{kind} against itself", cells, kind))
     lines = [*null.assessment(cells), _method_note(work_us, plan.rounds)]
-    output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
+    finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
     return 0 if all(cell.samples for cell in cells) else 1
 
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections import deque
 from typing import Any
 
-from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion
+from paho.mqtt.client import Client, MQTTMessage
 
 from pebble.bench.null import spin
-from pebble.bench.tcp import acknowledge, send_at_once
 from pebble.contract import (
     AUDIO_CONTROL,
     DRIVE,
@@ -22,9 +19,9 @@ from pebble.contract import (
     STATUS,
     TOUCH_SENSORS,
     VIDEO_CONTROL,
-    Channel,
 )
 from pebble.errors import PebbleError
+from pebble.rig.stock_client import StockClient, steadily
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch
 
 Wheels = tuple[float, float]
@@ -36,32 +33,23 @@ _POLL_S = 0.02
 _REPORTS_LIMIT = 50_000  # reports; a robot sends 50 a second
 
 
-class Operator:
+class Operator(StockClient):
     """One MQTT connection to the remote broker. Each command is identified by the wheel speeds it causes.
 
-    It uses the same TCP options as our own clients. TCP_NODELAY: otherwise a stock paho client that also receives
-    heartbeats delays one command in a hundred by up to 40 ms, until the broker's delayed ACK. TCP_QUICKACK: otherwise a
-    stock broker delays a report as long while its answer to a command is not acknowledged. Without them the comparison
-    would measure that.
+    It uses the same TCP options as our own clients. TCP_NODELAY: see :class:`StockClient`. TCP_QUICKACK: otherwise a
+    stock broker delays a report by up to 40 ms while its answer to a command is not acknowledged. Without them the
+    comparison would measure that.
     """
 
     def __init__(self, port: int, base: str) -> None:
         self._base, self._number = base, 0
         self._services: dict[str, Any] = {}
         self._heartbeats = 0
-        self._received: deque[tuple[int, bytes]] = deque(maxlen=_REPORTS_LIMIT)
-        self._client = Client(CallbackAPIVersion.VERSION2)
-        self._client.on_socket_open = send_at_once
-        self._client.on_connect = self._subscribe
-        self._client.on_message = self._on_message
-        self._client.on_publish = lambda client, *_: acknowledge(client)
-        self._client.message_callback_add(TOUCH_SENSORS.topic(base), self._on_report)
-        self._client.connect("127.0.0.1", port)
-        self._client.loop_start()
-
-    def close(self) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
+        self._received: deque[tuple[int, bytes | bytearray]] = deque(maxlen=_REPORTS_LIMIT)
+        super().__init__(self._on_message, [(channel.topic(base), 1) for channel in (STATUS, ONLINE, TOUCH_SENSORS)])
+        self.paho.on_publish = lambda *_: self.acknowledge()
+        self.paho.message_callback_add(TOUCH_SENSORS.topic(base), self._on_report)
+        self.open(port)
 
     def wait_until_ready(self) -> None:
         """Waits until every service is ready and heartbeats arrive. Raises PebbleError after a timeout."""
@@ -77,9 +65,9 @@ class Operator:
     def media(self, wanted: bool) -> None:
         """Allows and requests video and audio, or stops both."""
         for flag in (MQTT_VIDEO, MQTT_AUDIO):
-            self._send(flag, wanted, retain=True)
+            self.send(flag, self._base, wanted)
         for request in (VIDEO_CONTROL, AUDIO_CONTROL):
-            self._send(request, {"enabled": wanted})
+            self.send(request, self._base, {"enabled": wanted})
 
     def drive(self, seconds: float, rate_hz: float, *, work_us: float = 0.0, slowed: bool = False) -> dict[Wheels, int]:
         """Returns the time (CLOCK_MONOTONIC, ns) at which the command for each pair of wheel speeds was published.
@@ -87,38 +75,29 @@ class Operator:
         It works for ``work_us`` before each: before it reads the clock, or, if ``slowed``, after that.
         """
         sent: dict[Wheels, int] = {}
-        pause, due = threading.Event(), time.monotonic()
-        for _ in range(round(seconds * rate_hz)):
+        for _ in steadily(seconds, rate_hz):
             self._number += 1
             left, right = wheels(self._number)
             spin(0.0 if slowed else work_us)
             sent[left, right] = time.monotonic_ns()
             spin(work_us if slowed else 0.0)
-            self._send(DRIVE, {"x": (left - right) / 2, "z": (left + right) / 2})
-            due += 1 / rate_hz
-            pause.wait(max(0.0, due - time.monotonic()))
+            self.send(DRIVE, self._base, {"x": (left - right) / 2, "z": (left + right) / 2})
         return sent
 
     def received(self, since_ns: int) -> list[tuple[int, Touch]]:
         """The MCU's reports after ``since_ns``, each with its time of arrival."""
         return [(ns, Touch(**json.loads(payload)["value"])) for ns, payload in self._received.copy() if ns >= since_ns]
 
-    def _send(self, channel: Channel, body: Any, *, retain: bool = False) -> None:
-        self._client.publish(channel.topic(self._base), json.dumps(body), qos=channel.default_qos, retain=retain)
-
-    def _subscribe(self, client: Client, *_: Any) -> None:
-        client.subscribe([(channel.topic(self._base), 1) for channel in (STATUS, ONLINE, TOUCH_SENSORS)])
-
-    def _on_message(self, client: Client, _data: Any, message: Any) -> None:
-        acknowledge(client)
+    def _on_message(self, message: MQTTMessage) -> None:
+        self.acknowledge()
         if message.topic == STATUS.topic(self._base):
             self._services = json.loads(message.payload).get("value", {}).get("services", {})
         elif not message.retain:
             self._heartbeats += 1
 
-    def _on_report(self, client: Client, _data: Any, message: Any) -> None:
+    def _on_report(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
         self._received.append((time.monotonic_ns(), message.payload))
-        acknowledge(client)
+        self.acknowledge()
 
 
 def wheels(number: int) -> Wheels:

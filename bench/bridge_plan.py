@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from pebble.bench.bridge_drive import RATE_HZ
-from pebble.bench.bridge_robot import KINDS, STAND_IN
-from pebble.bench.measured_robot import check_kinds
-from pebble.bench.output import FOLDER, check_folder
-from pebble.bench.percentiles import LONGEST_S
-from pebble.bench.results import Value
+from pebble.bench.bridge_driven_robot import STAND_IN
+from pebble.bench.comparison import FOLDER
+from pebble.bench.engine import check_folder
+from pebble.bench.results import LONGEST_S, Value
 from pebble.errors import PebbleError
+from pebble.rig.robot import KINDS, check_kinds
 
 
 class Mode(StrEnum):

@@ -13,16 +13,15 @@ from itertools import pairwise
 from rich.console import Console
 from rich.progress import track
 
-from pebble.bench import output
 from pebble.bench.bridge_capture import PacketCapture, PassageTimes
 from pebble.bench.bridge_drive import arrivals
 from pebble.bench.bridge_driven_robot import DrivenRobot
 from pebble.bench.bridge_operator import Wheels
 from pebble.bench.bridge_plan import BridgePlan
-from pebble.bench.bridge_robot import RobotProcesses
-from pebble.bench.percentiles import percentile
-from pebble.bench.results import Cell, Stopwatch
+from pebble.bench.engine import finish
+from pebble.bench.results import Cell, Stopwatch, percentile
 from pebble.bench.tables import figure, plain_table
+from pebble.rig.robot import Robot
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
 
@@ -59,7 +58,7 @@ def run(plan: BridgePlan, console: Console | None = None) -> int:
     lines = [
         line for kind, rounds in found.items() for line in assessment(kind, [hops for one in rounds for hops in one])
     ]
-    output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
+    finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
     return 0 if all(cell.samples for cell in cells) else 1
 
 
@@ -74,7 +73,7 @@ def _trace_commands(kind: str, seconds: float) -> Times:
         return hops(segment.sent, [*_stations(wire.passed(), driven_robot.robot), pty])
 
 
-def _stations(passed: PassageTimes, robot: RobotProcesses) -> list[Mapping[Wheels, int]]:
+def _stations(passed: PassageTimes, robot: Robot) -> list[Mapping[Wheels, int]]:
     """The times at which commands went into and out of each broker, in order."""
     return [_first(passed, port, side) for port in robot.broker_ports for side in (1, 0)]
 

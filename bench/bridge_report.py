@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
+from pebble.bench.aims import outcome
+from pebble.bench.bridge_driven_robot import STAND_IN
 from pebble.bench.bridge_one_hop import HOP
-from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP
-from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell, Value
-from pebble.bench.robot_comparison import caveat, sentence
-from pebble.bench.tables import figure, latency_table, plain_table
+from pebble.bench.results import Cell, Judged, Value, percentile
+from pebble.bench.tables import caveat, figure, latency_table, plain_table, sentence
+from pebble.rig.robot import KINDS
 
 AIMS_MS = {50: 0.7, 99: 2.0}
 LEAST_SAMPLES = {50: 1, 99: 300}  # to assess an aim: with fewer, hardly any lie beyond that percentile
@@ -38,7 +38,7 @@ def show(cells: Sequence[Cell], console: Console) -> None:
     console.print(cost)
 
 
-def assessment(cells: Sequence[Cell]) -> list[str]:
+def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
     """One sentence for each comparison, and one for each aim."""
     lines = [*_transports(cells), *_media(cells), *_floor(cells), *_lost(cells)]
     plain = [cell for way in WAYS for cell in _robots(cells, way, UNLOADED)]
@@ -107,23 +107,19 @@ def _media_suffix(load: Value) -> str:
     return ", media flowing" if load == LOADED else ""
 
 
-def _aims(cell: Cell) -> list[str]:
+def _aims(cell: Cell) -> list[Judged]:
     """Compares p50 and p99 with the aims; what did not arrive counts as infinitely late."""
-    lines = []
+    found = []
     for percent, aim in AIMS_MS.items():
         times = [*cell.samples, *[math.inf] * (cell.lost or 0)]
         judged = len(cell.rounds) >= LEAST_ROUNDS and len(times) >= LEAST_SAMPLES[percent]
         took = percentile(times, percent)
         what = f"{cell.variant}, {WAYS[cell.measure]}, p{percent} at most {aim:g} ms"
         took_text = "not within 1 s" if math.isinf(took) else f"{figure(took)} ms"
-        lines.append(f"aim: {what}: {_outcome(took - aim) if judged else 'not judged'} ({took_text})")
-    return lines
-
-
-def _outcome(beyond_ms: float) -> str:
-    if beyond_ms <= 0:
-        return "met"
-    return "missed" if math.isinf(beyond_ms) else f"missed by {beyond_ms:.2f} ms"
+        if judged and aim < took < math.inf:
+            took_text += f", by {took - aim:.2f} ms"
+        found.append(Judged(what=what, outcome=outcome(took <= aim, judged=judged), measured=took_text))
+    return found
 
 
 def _robots(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from pebble.bench.bridge_drive import Arrived, DriveSegment
-from pebble.bench.percentiles import rounded
-from pebble.bench.results import Cell, Value
+from pebble.bench.results import Cell, Value, rounded
 
 UNLOADED, LOADED = "none", "media"
 DOWN, UP = "down", "up"

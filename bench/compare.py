@@ -1,4 +1,4 @@
-"""Compares two runs of a comparison: did any metric get worse beyond random variation? Pure.
+"""Compares two runs of a comparison: did any metric get worse beyond random variation?
 
 Many metrics mean many chances of a false alarm: the confidence level of each grows with their number, so that two runs
 of the same program have a chance of about :data:`CHANCE` to show any change at all.
@@ -11,11 +11,16 @@ import statistics
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
-from pebble.bench.percentiles import percentile
+from rich.console import Console
+from rich.table import Table
+
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, student, unpaired
-from pebble.bench.results import OVER_TIME, Cell, Results
+from pebble.bench.results import OVER_TIME, Cell, Results, load, percentile
+from pebble.bench.tables import figure, plain_table
+from pebble.errors import PebbleError
 
 CHANCE = 0.01
 #: Memory layout and core placement of new processes shift medians by this factor between runs, which no number of
@@ -114,7 +119,7 @@ def _key(cell: Cell) -> Hashable:
 
 def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
     """The percentiles for which most rounds have enough samples."""
-    fewest = min(statistics.median(len(samples) for samples in cell.rounds if samples) for cell in (one, other))
+    fewest = min(statistics.median(size for size in cell.sizes if size) for cell in (one, other))
     return _PERCENTS if fewest >= _LEAST_SAMPLES else _PERCENTS[:1]
 
 
@@ -155,7 +160,7 @@ def _counts(cell: Cell) -> bool:
 
 
 def _lost_shares(cell: Cell) -> list[float]:
-    arrived = [len(samples) for samples in cell.rounds if samples]
+    arrived = [size for size in cell.sizes if size]
     each = int(cell.figures["sent"] or 0) / len(arrived)
     return [1 - count / each for count in arrived]
 
@@ -206,3 +211,58 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
 
 def _width(ratio: Interval) -> float:
     return max(ratio.high / ratio.ratio, ratio.ratio / ratio.low)
+
+
+# -- what is printed
+
+_COLOURS = {
+    Kind.NO_SAMPLES: "red",
+    Kind.WORSE: "red",
+    Kind.ONLY_A: "yellow",
+    Kind.ONLY_B: "yellow",
+    Kind.BETTER: "green",
+}
+
+
+def run(
+    a: Path, b: Path, *, threshold: float = THRESHOLD, everything: bool = False, console: Console | None = None
+) -> int:
+    """0 if nothing got worse, 1 if something did. Raises PebbleError for files that cannot be compared."""
+    console = console or Console()
+    if not (math.isfinite(threshold) and threshold >= 1):
+        raise PebbleError(
+            f"--threshold {threshold:g}: a factor of 1 or more is needed (1.05 ignores changes below 5 %)"
+        )
+    before, after = load(a), load(b)
+    if before.bench != after.bench:
+        raise PebbleError(
+            f"{a} is of bench {before.bench}, {b} of bench {after.bench}: compare two runs of the same bench"
+        )
+    for line in differences(before, after):
+        console.print(f"not the same: {line}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+    with console.status("comparing"):  # hundreds of intervals take a few seconds
+        findings = compare(before, after, threshold)
+    shown = [finding for finding in findings if everything or finding.changed]
+    if shown:
+        console.print(_table(shown, before.bench))
+    for line in summary(findings, threshold):
+        console.print(line, highlight=False, soft_wrap=True)
+    return int(any(finding.worse for finding in findings))
+
+
+def _table(findings: Sequence[Finding], bench: str) -> Table:
+    table = plain_table(f"{bench}: B against A", ("what", "metric", "A", "B", "B / A", ""), left=2)
+    table.columns[0].no_wrap = False  # long names wrap, so that the outcome is never cut off
+    for finding in findings:
+        cell = finding.cell
+        table.add_row(
+            ", ".join(filter(None, (cell.variant, cell.measure, cell.conditions()))),
+            finding.what,
+            figure(finding.a),
+            figure(finding.b),
+            str(finding.ratio),
+            finding.kind,
+            style=_COLOURS.get(finding.kind),
+        )
+    table.columns[-1].justify = "left"
+    return table

@@ -1,23 +1,21 @@
 """A load during the measurement of commands, as a process that standard input switches on and off.
 
-``python -m pebble.bench.control_load hog|writer|reader [mqtt|zenoh WHERE]``: a busy loop, or one end of a stream of raw
-640x480 pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing; each
-is answered with the number of pictures so far. The process ends when its standard input closes.
+``python -m pebble.bench.control_load hog|writer|reader [mqtt|zenoh-shm WHERE]``: a busy loop, or one end of a stream of
+raw 640x480 pictures at 30 Hz, as in ``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing;
+each is answered with the number of pictures so far.
 """
 
 from __future__ import annotations
 
-import json
-import signal
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 
+from pebble.bench import frames_worker
 from pebble.bench.frames_loop import RATE_HZ, Reader, Writer
-from pebble.bench.frames_worker import MqttReader, MqttWriter, ZenohReader, ZenohWriter
+from pebble.rig.worker_end import answer, serve_on_thread
 
 SIZE = 640 * 480 * 3
 _READ_S = 0.2
@@ -34,7 +32,7 @@ class Switch:
         self.on = False
         self.ended = False
         self._changed = threading.Condition()
-        threading.Thread(target=self._listen, name="switch", daemon=True).start()
+        serve_on_thread(self._handle, lambda: self._set(on=False, ended=True))
 
     def wait(self, timeout: float | None = None) -> None:
         """Waits until it is on, or standard input closes."""
@@ -42,15 +40,12 @@ class Switch:
             self._changed.wait_for(lambda: self.on or self.ended, timeout)
 
     def write_count(self) -> None:
-        sys.stdout.write(json.dumps({"pictures": self.pictures}) + "\n")
-        sys.stdout.flush()
+        answer({"pictures": self.pictures})
 
-    def _listen(self) -> None:
-        for line in sys.stdin:
-            if line.strip() in ("0", "1"):
-                self._set(on=line.strip() == "1")
-            self.write_count()
-        self._set(on=False, ended=True)
+    def _handle(self, line: str) -> None:
+        if line in ("0", "1"):
+            self._set(on=line == "1")
+        self.write_count()
 
     def _set(self, *, on: bool, ended: bool = False) -> None:
         with self._changed:
@@ -59,14 +54,13 @@ class Switch:
 
 
 def main(arguments: list[str]) -> int:
-    role, *where = arguments
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    role, kind, where = (*arguments, "", "")[:3]
     if role == "hog":
         _hog(Switch())
     elif role == "writer":
-        _write(_writer(*where), Switch())
+        _write(frames_worker.writer(kind, where, SIZE), Switch())
     else:
-        _read(_reader(*where), Switch())
+        _read(frames_worker.reader(kind, where), Switch())
     return 0
 
 
@@ -106,16 +100,6 @@ def _read(reader: Reader, switch: Switch) -> None:
             del frame
             reader.done()
     reader.close()
-
-
-def _writer(kind: str, where: str) -> Writer:
-    return (
-        MqttWriter(int(where), SIZE) if kind == "mqtt" else ZenohWriter(Path(where), SIZE, in_segment=True, shared=True)
-    )
-
-
-def _reader(kind: str, where: str) -> Reader:
-    return MqttReader(int(where)) if kind == "mqtt" else ZenohReader(Path(where), views=True, shared=True)
 
 
 if __name__ == "__main__":

@@ -1,45 +1,66 @@
-"""The processes of the control comparison: brokers and hubs, two ends for each role, and the loads."""
+"""The variants of the control comparison and their processes: brokers and hubs, two ends for each role, and loads."""
 
 from __future__ import annotations
 
-import sys
-import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
-from types import TracebackType
-from typing import Any, Self
 
 import msgspec
 
 from pebble.bench.control_ends import SliceSpec
-from pebble.bench.control_plan import HOG, MEDIA, NONE
-from pebble.bench.control_variants import VARIANTS, Variant
 from pebble.bench.control_worker import Answer, Endpoint
 from pebble.bench.null import variant_of
 from pebble.bench.usage import cpu_s, wake_ups
-from pebble.bench.worker import Worker, end_workers
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import Program, end_all
 from pebble.errors import PebbleError
+from pebble.rig.broker import Broker
+from pebble.rig.processes import BROKERS, Processes, python
+from pebble.rig.programs import Program
+from pebble.rig.worker import Worker
 from pebble.transports.settings import ZenohSettings
 
+NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
-_END_S = 4.0
 _FLOWING = 3  # pictures received until the stream counts as flowing
 _FLOW_S = 10.0
 _POLL_S = 0.02
-_PYTHON = [sys.executable, "-m"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """``kind`` is a transport, or ``paho``; ``broker`` holds lines of mosquitto's configuration."""
+
+    about: str
+    kind: str
+    protocol: str = "3.1.1"
+    broker: tuple[str, ...] = ()
+    client: bool = False  # Zenoh client mode: everything goes through the hub
+
+    @property
+    def on_zenoh(self) -> bool:
+        return self.kind == "zenoh"
+
+
+_NODELAY = ("set_tcp_nodelay true",)
+VARIANTS = {
+    "paho": Variant(about="stock paho at both ends, stock mosquitto: TCP_NODELAY nowhere", kind="paho"),
+    "mqtt": Variant(about="Pebble's MQTT transport (TCP_NODELAY), stock mosquitto (without)", kind="mqtt"),
+    "mqtt-nodelay": Variant(about="the same, with TCP_NODELAY in the broker", kind="mqtt", broker=_NODELAY),
+    "mqtt5": Variant(about="MQTT 5, TCP_NODELAY on both sides", kind="mqtt", protocol="5", broker=_NODELAY),
+    "zenoh-p2p": Variant(about="Pebble's Zenoh transport, peer to peer", kind="zenoh"),
+    "zenoh-hub": Variant(about="the same, through the hub", kind="zenoh", client=True),
+}
+BASELINE = "mqtt"
+P2P, HUB = "zenoh-p2p", "zenoh-hub"
+MQTT = tuple(name for name, variant in VARIANTS.items() if not variant.on_zenoh)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slice:
-    """Results of one role under one condition in one round; CPU in % of one core, wake-ups per round trip."""
+    """Results of one slice of one role; CPU in % of one core, wake-ups per round trip."""
 
     answer: Answer
     cpu: float
@@ -49,62 +70,30 @@ class Slice:
     pictures_hz: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessUsage:
-    """Resource usage of some processes, in total or between two moments."""
-
-    cpu_s: float
-    wake_ups: int
-
-    def __sub__(self, earlier: ProcessUsage) -> ProcessUsage:
-        return ProcessUsage(self.cpu_s - earlier.cpu_s, self.wake_ups - earlier.wake_ups)
-
-
-def _used(pids: Sequence[int]) -> ProcessUsage:
-    return ProcessUsage(cpu_s(pids), wake_ups(pids))
-
-
-def joined(slices: Sequence[Slice]) -> Slice:
-    """Merges slices of the same role and condition; at least one."""
-    answers = [one.answer for one in slices]
-    rates = [one.pictures_hz for one in slices if one.pictures_hz is not None]
-    return Slice(
-        answer=Answer(
-            trips=sum(answer.trips for answer in answers),
-            sent=sum(answer.sent for answer in answers),
-            late=sum(answer.late for answer in answers),
-            one_way=[sample for answer in answers for sample in answer.one_way],
-            round_trip=[sample for answer in answers for sample in answer.round_trip],
-            call=[sample for answer in answers for sample in answer.call],
-            transport_times=[sample for answer in answers for sample in answer.transport_times],
-            inbox=[sample for answer in answers for sample in answer.inbox],
-        ),
-        cpu=fmean(one.cpu for one in slices),
-        backbone_cpu=fmean(one.backbone_cpu for one in slices),
-        wake_ups=fmean(one.wake_ups for one in slices),
-        backbone_wake_ups=fmean(one.backbone_wake_ups for one in slices),
-        pictures_hz=fmean(rates) if rates else None,
-    )
+def _used(pids: Sequence[int]) -> tuple[float, int]:
+    """CPU seconds and wake-ups so far."""
+    return cpu_s(pids), wake_ups(pids)
 
 
 class Backbone:
     """The broker of an MQTT variant or the hub of a Zenoh one."""
 
-    def __init__(self, variant: Variant, folder: Path) -> None:
+    def __init__(self, variant: Variant, folder: Path, processes: Processes) -> None:
         self._variant, self._run_dir = variant, folder / "z"
         self._broker: Broker | None = None
+        self.program: Program
         if variant.on_zenoh:
             settings = msgspec.json.encode(ZenohSettings(run_dir=self._run_dir), enc_hook=str).decode()
-            self.program = Program("hub", [*_PYTHON, "pebble.runtime.hub", settings], folder / "hub.log")
+            hub = Program("hub", python("pebble.runtime.hub", settings), folder / "hub.log")
+            self.program = processes.add(hub, BROKERS)
         else:
-            self._broker = Broker("broker", BrokerKind.MOSQUITTO, folder, variant.broker)
-            self.program = self._broker.program
+            self.program = self._broker = processes.broker(extra=variant.broker, folder=folder)
 
     def wait(self) -> None:
         if self._broker is not None:
-            self._broker.wait(threading.Event())
+            self._broker.wait()
         else:
-            self.program.wait_until((self._run_dir / "hub.sock").exists, _READY_S, threading.Event())
+            self.program.wait_until((self._run_dir / "hub.sock").exists, _READY_S)
 
     @property
     def endpoint(self) -> Endpoint:
@@ -116,15 +105,15 @@ class Backbone:
     @property
     def stream(self) -> list[str]:
         """Arguments that let pictures flow through the same broker or hub."""
-        return ["zenoh", str(self._run_dir)] if self._broker is None else ["mqtt", str(self._broker.port)]
+        return ["zenoh-shm", str(self._run_dir)] if self._broker is None else ["mqtt", str(self._broker.port)]
 
 
 class Participant:
     """The processes of one role."""
 
-    def __init__(self, role: str, folder: Path) -> None:
-        self.role, self._folder = role, folder
-        self.backbone = Backbone(VARIANTS[variant_of(role)], folder)
+    def __init__(self, role: str, folder: Path, processes: Processes) -> None:
+        self.role, self._processes = role, processes
+        self.backbone = Backbone(VARIANTS[variant_of(role)], folder, processes)
         self.ends: list[Worker] = []  # echo, sender
         self.media: list[Worker] = []  # reader, writer
 
@@ -132,50 +121,37 @@ class Participant:
         """Starts the processes; the backbone must be ready."""
         endpoint = msgspec.json.encode(self.backbone.endpoint).decode()
         for end in ("echo", "sender"):
-            self.ends.append(self._worker(end, ["pebble.bench.control_worker", end, endpoint]))
+            self.ends.append(self._worker(end, "pebble.bench.control_worker", end, endpoint))
         if media:
             for end in ("reader", "writer"):
-                self.media.append(self._worker(end, ["pebble.bench.control_load", end, *self.backbone.stream]))
+                self.media.append(self._worker(end, "pebble.bench.control_load", end, *self.backbone.stream))
 
     def run(self, spec: SliceSpec) -> Slice:
         """Runs one slice; returns the sender's answer and the resource usage of the ends and the backbone."""
         every = ([worker.pid for worker in self.ends], [self.backbone.program.pid])
         began, before = time.monotonic(), [_used(pids) for pids in every]
         line = msgspec.json.encode(spec).decode()
-        answer = msgspec.convert(_ask(self.ends[1], line, spec.seconds + _ANSWER_S), Answer)
+        answer = msgspec.convert(self.ends[1].ask(line, spec.seconds + _ANSWER_S), Answer)
         took = time.monotonic() - began
-        ends, backbone = (_used(pids) - used for pids, used in zip(every, before, strict=True))
+        after = [_used(pids) for pids in every]
+        cpu, backbone_cpu = (100 * (now[0] - then[0]) / took for now, then in zip(after, before, strict=True))
+        woken, backbone_woken = ((now[1] - then[1]) / answer.trips for now, then in zip(after, before, strict=True))
         return Slice(
-            answer=answer,
-            cpu=100 * ends.cpu_s / took,
-            backbone_cpu=100 * backbone.cpu_s / took,
-            wake_ups=ends.wake_ups / answer.trips,
-            backbone_wake_ups=backbone.wake_ups / answer.trips,
+            answer=answer, cpu=cpu, backbone_cpu=backbone_cpu, wake_ups=woken, backbone_wake_ups=backbone_woken
         )
 
-    def _worker(self, end: str, arguments: Sequence[str]) -> Worker:
-        return Worker(f"{self.role}: {end}", [*_PYTHON, *arguments], self._folder / f"{end}.log")
+    def _worker(self, end: str, module: str, *arguments: str) -> Worker:
+        return self._processes.worker(f"{self.role}: {end}", module, *arguments)
 
 
-class Participants:
+class Participants(Processes):
     """All participants of some rounds; they are ready when the ``with`` block begins."""
 
     def __init__(self, roles: Sequence[str], loads: Sequence[str]) -> None:
+        super().__init__()
         self._roles, self._loads = roles, loads
         self._participants: dict[str, Participant] = {}
         self._hog: Worker | None = None
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="pbl-")))
-            stack.callback(self._end)
-            self._start(folder)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._stack.close()
 
     def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
         """Runs one slice. Raises PebbleError if a process ended, or pictures do not flow."""
@@ -186,28 +162,18 @@ class Participants:
             pictures, took = self._pictures(participant, load) - before, time.monotonic() - began
         return replace(slice_, pictures_hz=pictures / took) if load == MEDIA else slice_
 
-    def _start(self, folder: Path) -> None:
+    def start(self) -> None:
         for number, role in enumerate(self._roles):
-            endpoint = folder / str(number)  # short: paths of Unix sockets begin with it
-            endpoint.mkdir()
-            self._participants[role] = Participant(role, endpoint)
+            folder = self.folder / str(number)  # short: paths of Unix sockets begin with it
+            folder.mkdir()
+            self._participants[role] = Participant(role, folder, self)
         for participant in self._participants.values():
             participant.backbone.wait()
             participant.start(media=MEDIA in self._loads)
         if HOG in self._loads:
-            self._hog = Worker("hog", [*_PYTHON, "pebble.bench.control_load", "hog"], folder / "hog.log")
-        for worker in self._workers():
+            self._hog = self.worker("hog", "pebble.bench.control_load", "hog")
+        for worker in self.workers:
             worker.answer(_READY_S)
-
-    def _end(self) -> None:
-        end_workers(self._workers())
-        end_all([participant.backbone.program for participant in self._participants.values()], _END_S)
-
-    def _workers(self) -> list[Worker]:
-        hog = [] if self._hog is None else [self._hog]
-        return hog + [
-            worker for participant in self._participants.values() for worker in (*participant.ends, *participant.media)
-        ]
 
     @contextmanager
     def _loaded(self, participant: Participant, load: str) -> Iterator[None]:
@@ -229,15 +195,9 @@ class Participants:
         return _switch_load(participant.media[0], "?") if load == MEDIA else 0
 
 
-def _ask(worker: Worker, line: str, timeout: float) -> Any:
-    """Sends a line and returns the answer. Raises PebbleError if the worker ended or does not answer."""
-    worker.send(line)
-    return worker.answer(timeout)
-
-
 def _switch_load(worker: Worker, line: str) -> int:
     """Sends a command to a load process; returns its count of pictures so far."""
-    return int(_ask(worker, line, _FLOW_S)["pictures"])
+    return int(worker.ask(line, _FLOW_S)["pictures"])
 
 
 def _wait_for_pictures(participant: Participant) -> None:

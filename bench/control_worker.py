@@ -1,22 +1,20 @@
 """One end of the control comparison as a process: ``python -m pebble.bench.control_worker echo|sender ENDPOINT``.
 
-``ENDPOINT`` (JSON) names the broker or hub. The process writes ``{"ready": true}`` to standard output. A sender
-receives slices as JSON lines on standard input and answers each with one line. Both end when standard input closes.
+``ENDPOINT`` (JSON) names the broker or hub. The process writes ``{"ready": true}``. A sender receives slices as JSON
+and answers each.
 """
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from pebble.bench.control_ends import Connection, Echo, PahoConnection, Sender, SliceSpec, TransportConnection
 from pebble.errors import PebbleError
+from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.runtime.inbox import Inbox
 from pebble.transports import MqttSettings, ZenohSettings, create
 
@@ -50,7 +48,6 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
 
 def main(arguments: list[str]) -> int:
     role, endpoint = arguments
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     inbox = Inbox()
     try:
         connection = open_connection(msgspec.json.decode(endpoint, type=Endpoint), role, inbox)
@@ -74,31 +71,36 @@ def open_connection(endpoint: Endpoint, name: str, inbox: Inbox) -> Connection:
 
 def _echo(connection: Connection, inbox: Inbox) -> None:
     Echo(connection, WHO, time.monotonic_ns)
-    ended = threading.Event()
-    _listen(inbox, lambda _line: None, ended.set)
-    _write_line(b'{"ready": true}')
+    ended = serve_on_thread(lambda _line: None, lambda: inbox.post_internal(lambda: None))
+    answer({"ready": True})
     while not ended.is_set():
-        job = inbox.take(None)
-        if job is not None:
-            job()
+        _work(inbox)
     connection.close()
 
 
 def _send(connection: Connection, inbox: Inbox) -> None:
     sender = Sender(connection, WHO, time.monotonic_ns, inbox)
 
+    def run(line: str) -> None:
+        inbox.post_internal(lambda: answer(msgspec.json.encode(_run(sender, line))))
+
     def end() -> None:
         sender.ended = True
+        inbox.post_internal(lambda: None)
 
-    _listen(inbox, lambda line: _write_line(msgspec.json.encode(_run(sender, line))), end)
+    serve_on_thread(run, end)
     if not sender.warm_up(_WARM_UP, _WARM_UP_S):
         raise PebbleError("the echo does not answer")
-    _write_line(b'{"ready": true}')
+    answer({"ready": True})
     while not sender.ended:
-        job = inbox.take(None)
-        if job is not None:
-            job()
+        _work(inbox)
     connection.close()
+
+
+def _work(inbox: Inbox) -> None:
+    job = inbox.take(None)
+    if job is not None:
+        job()
 
 
 def _run(sender: Sender, line: str) -> Answer:
@@ -113,23 +115,6 @@ def _run(sender: Sender, line: str) -> Answer:
         transport_times=[(exchange.transport_ns - exchange.t3) / 1000 for exchange in exchanges],
         inbox=[(exchange.t4 - exchange.transport_ns) / 1000 for exchange in exchanges],
     )
-
-
-def _listen(inbox: Inbox, obey: Callable[[str], None], end: Callable[[], None]) -> None:
-    """Reads standard input on a thread of its own and runs each line on the inbox's thread."""
-
-    def read() -> None:
-        for line in sys.stdin:
-            inbox.post_internal(lambda line=line: obey(line))  # type: ignore[misc]
-        end()
-        inbox.post_internal(lambda: None)
-
-    threading.Thread(target=read, name="orders", daemon=True).start()
-
-
-def _write_line(line: bytes) -> None:
-    sys.stdout.buffer.write(line + b"\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

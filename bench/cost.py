@@ -1,102 +1,186 @@
 """Measures memory, CPU and threads of each process of a robot, idle and active, on MQTT and on Zenoh.
 
 Whole robots with a synthetic camera and microphone, stock mosquitto, a simulated MCU. The phases have a fixed order;
-each starts with the memory that the one before left allocated.
+each starts with the memory that the one before left allocated. Shared libraries divide their memory among the processes
+that map them: nothing large is imported here, since that would reduce the robot's PSS.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
 
-from rich.console import Console
-
-from pebble.bench.bridge_robot import KINDS
-from pebble.bench.cost_cells import cells_of
-from pebble.bench.cost_robot import RATE_HZ, STREAMS, measure
-from pebble.bench.measured_robot import check_kinds
-from pebble.bench.output import FOLDER, check_folder, finish
-from pebble.bench.percentiles import LONGEST_S
-from pebble.bench.results import Stopwatch
-from pebble.bench.rounds import Rounds
+from pebble.bench.comparison import Budget, Case, Comparison, Run, rounds, seconds, variants
+from pebble.bench.pictures import bars
+from pebble.bench.results import Cell
+from pebble.bench.robot_subscriber import RobotSubscriber
+from pebble.bench.tables import Claims, Grid, figure, median_column, medians
+from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports.segments import sweep
+from pebble.rig.robot import BASE, BROKER, KINDS, LAUNCHER, MEDIA, Robot, one_robot
 
-ROUNDS, QUICK_ROUNDS = 8, 1
-SECONDS, QUICK_SECONDS = 1.5, 0.7
+ALL = "all"  # the processes of a robot together
+MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
+PICTURES, PER_PICTURE = "pictures", "CPU per picture"
+RATE_HZ = 20.0  # of driving
+IDLE, DRIVING = "idle", "driving"
+#: The encodings requested in each media phase, by the name of the phase.
+STREAMS = {"json+pcm": ("json", "pcm"), "h264+opus": ("h264", "opus")}
+_WITHOUT_AV = "json+pcm"
+#: The measures that are compared, and their names.
+_COMPARED = {MEMORY: "memory", CPU: "CPU", PER_PICTURE: "CPU per delivered picture"}
+_UP_S = _FLOW_S = 20.0
+_STARTUP_S = 0.5  # for start-up work, or a change of the streams, to finish
+_FIRST = 5  # pictures and sound packets until a stream counts as flowing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CostPlan:
-    """Each round starts a fresh robot of each kind and runs each phase for ``seconds``."""
+class Reading:
+    """One robot in one phase. By process: memory in MB, CPU in per cent of one core, threads."""
 
-    rounds: int | None = None  # None: the default
-    seconds: float | None = None
-    kinds: Sequence[str] = KINDS
-    quick: bool = False
-    output: Path = FOLDER
-
-    @property
-    def robots(self) -> int:
-        return self.rounds or (QUICK_ROUNDS if self.quick else ROUNDS)
-
-    @property
-    def phase_s(self) -> float:
-        return self.seconds or (QUICK_SECONDS if self.quick else SECONDS)
-
-    def check(self) -> None:
-        """Raises PebbleError naming an invalid option."""
-        check_kinds(self.kinds)
-        if not 0 < self.phase_s <= LONGEST_S:
-            raise PebbleError(f"seconds must be positive, and at most {LONGEST_S:.0f}")
-        check_folder(self.output)
-
-    def command(self) -> list[str]:
-        """The command line that repeats the run."""
-        kinds = [] if tuple(self.kinds) == KINDS else ["--variants", ",".join(self.kinds)]
-        amount = ["--rounds", str(self.robots), "--seconds", f"{self.phase_s:g}"]
-        return ["pebble", "bench", "cost", *amount, *kinds, *(["--quick"] if self.quick else [])]
+    phase: str
+    memory: Mapping[str, float]
+    cpu: Mapping[str, float]
+    threads: Mapping[str, float]
+    pictures_per_s: float | None = None  # delivered to the operator; None: none were requested
 
 
-def run(plan: CostPlan, console: Console | None = None) -> int:
-    """Measures, prints and writes; returns 0 if everything has results of enough rounds. Raises PebbleError."""
-    console = console or Console()
-    plan.check()
-    streams = _installed(console)
-    options = {"rounds": plan.robots, "seconds": plan.phase_s, "rate_hz": RATE_HZ}
-    watch = Stopwatch("cost", plan.command(), options)
-    rounds, done = Rounds(plan.robots, console), []
-    with interrupted_by_signals(), console.status("") as status:
-        try:
-            for number in range(plan.robots):
-                with rounds.attempt(number):
-                    one = {}
-                    for kind in plan.kinds[:: -1 if number % 2 else 1]:
-                        status.update(f"round {number + 1} of {plan.robots}: {kind}")
-                        one[kind] = measure(kind, plan.phase_s, streams)
-                    done.append(one)
-        finally:
-            sweep()  # Zenoh leaves files behind even after a regular end
-    from pebble.bench.cost_report import (  # numpy: importing it earlier would change the robots' PSS
-        assessment,
-        legend,
-        table,
+def measure(case: Case) -> Iterator[Cell]:
+    """All phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
+    for reading in read(case.variant, case.run["seconds"]):
+        yield from cells_of(case, reading)
+
+
+def read(kind: str, seconds: float) -> Iterator[Reading]:
+    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        subscriber.wait()
+        robot.launch()
+        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
+        yield _read(robot, subscriber, IDLE, lambda: time.sleep(seconds))
+        yield _read(robot, subscriber, DRIVING, lambda: subscriber.drive(seconds, RATE_HZ))
+        for name in STREAMS:
+            if name == _WITHOUT_AV or _has_av():
+                _start_streams(robot, subscriber, name)
+                yield _read(robot, subscriber, name, lambda: time.sleep(seconds))
+
+
+def _start_streams(robot: Robot, subscriber: RobotSubscriber, name: str) -> None:
+    subscriber.ask_for(*STREAMS[name])
+    due = {form: subscriber.arrived[form] + _FIRST for form in STREAMS[name]}
+    robot.expect(
+        lambda: all(subscriber.arrived[form] >= count for form, count in due.items()) and robot.complete(),
+        f"{name} does not flow",
+        _FLOW_S,
     )
 
-    cells = cells_of({kind: [one[kind] for one in done] for kind in plan.kinds})
-    console.print(table(cells))
-    for line in legend(cells):
-        console.print(line, style="dim", highlight=False, soft_wrap=True)
-    finish(watch.results(cells, [*rounds.notes(), *assessment(cells)], quick=plan.quick), plan.output, console)
-    return rounds.code(cells)
+
+def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, work: Callable[[], object]) -> Reading:
+    """Measures the robot's processes while ``work`` runs; memory is read afterwards."""
+    time.sleep(_STARTUP_S)
+    processes = robot.processes()
+    before = {name: cpu_s([pid]) for name, pid in processes.items()}
+    pictures, began = _pictures(subscriber, phase), time.monotonic()
+    work()
+    took = time.monotonic() - began
+    cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in processes.items()}
+    arrived = _pictures(subscriber, phase) - pictures
+    if robot.processes() != processes:
+        raise PebbleError(f"{phase}: processes of the robot ended or started meanwhile\n{robot.log()}")
+    return Reading(
+        phase=phase,
+        memory={name: pss_mb(pid) for name, pid in processes.items()},
+        cpu=cpu,
+        threads={name: len(list(Path(f"/proc/{pid}/task").glob("*"))) for name, pid in processes.items()},
+        pictures_per_s=arrived / took if phase in STREAMS else None,
+    )
 
 
-def _installed(console: Console) -> list[str]:
-    """The media phases that this machine can run; prints which one is left out."""
-    if find_spec("av") is not None:
-        return list(STREAMS)
-    console.print("h264+opus is left out: pip install 'pebble-robot[media]'", style="yellow", highlight=False)
-    return ["json+pcm"]
+def _pictures(subscriber: RobotSubscriber, phase: str) -> int:
+    return subscriber.arrived[STREAMS[phase][0]] if phase in STREAMS else 0
+
+
+def cells_of(case: Case, reading: Reading) -> Iterator[Cell]:
+    """By measure and process; and by picture the CPU time of the whole robot, including its sound."""
+    found = ((MEMORY, "MB", reading.memory), (CPU, "%", reading.cpu), (THREADS, "", reading.threads))
+    for measure_, unit, values in found:
+        for process, value in {**values, ALL: sum(values.values())}.items():
+            figures = {"processes": len(values)} if process == ALL else {}
+            yield case.cell(measure_, unit, [value], {"phase": reading.phase, "process": process}, **figures)
+    if (rate := reading.pictures_per_s) is not None:
+        params = {"phase": reading.phase, "process": ALL}
+        yield case.cell(PICTURES, "1/s", [rate], params)
+        yield case.cell(PER_PICTURE, "ms", [10 * sum(reading.cpu.values()) / rate] if rate else [], params)
+
+
+def legend(cells: Sequence[Cell]) -> Iterator[str]:
+    """What the sum includes, and the rate of delivered pictures."""
+    yield (
+        f"{ALL}: {LAUNCHER} and its children; on mqtt also {BROKER}, the local broker."
+        " Without the remote broker, the operator and the simulated MCU."
+    )
+    for cell in cells:
+        if cell.measure == PICTURES:
+            rate = figure(median(medians(cell)))
+            yield f"{cell.params['phase']}, {cell.variant}: {rate} pictures per second reached the operator"
+
+
+def _has_av() -> bool:
+    return find_spec("av") is not None
+
+
+def prepare(run: Run) -> None:
+    if not _has_av():
+        hint = "h264+opus is left out: pip install 'pebble-robot[media]'"
+        run.console.print(hint, style="yellow", highlight=False)
+
+
+COST = Comparison(
+    name="cost",
+    title="Memory and CPU",
+    what="What each process of a robot needs while it is idle, driven, and streaming. Memory is PSS, in which "
+    "shared pages are divided among their users; CPU is per cent of one core.",
+    help="""What a robot costs: memory, CPU and threads of each of its processes.
+
+    Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator in two
+    forms. Whole simulated robots; needs mosquitto.
+
+    \b
+        pebble bench cost
+        pebble bench cost --variants zenoh --seconds 10
+    """,
+    options=(
+        rounds("Robots of each variant."),
+        seconds("Length of each phase.", least=0.4),
+        variants(KINDS, "mqtt or zenoh."),
+    ),
+    full=Budget(180, rounds=8, seconds=1.5),
+    quick=Budget(20, rounds=1, seconds=0.7),
+    constants={"rate_hz": RATE_HZ},
+    variants=KINDS,
+    prepare=prepare,
+    measure=measure,
+    tables=(
+        Grid(
+            title="memory (PSS), CPU (of one core), threads; medians", rows=("phase", "process"), last=ALL,
+            columns=(
+                median_column("MB", MEMORY), median_column("%", CPU), median_column("thr.", THREADS, "{:.0f}".format),
+            ),
+        ),
+    ),
+    legend=legend,
+    assessment=(
+        Claims(
+            what="{phase}, {quantity}",
+            of=lambda cell: cell.params["process"] == ALL and cell.measure in _COMPARED,
+            quantity=_COMPARED,
+            judged=lambda cell: cell.params["process"] == ALL,
+        ),
+    ),
+    pictures=(bars("What a robot costs", measures=(MEMORY, CPU), panel="phase", group="process"),),
+    summary_lines=10,
+)  # fmt: skip

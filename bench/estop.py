@@ -7,113 +7,291 @@ all the time by a process of its own; stops and resets come from this one. Real 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+import random
+import time
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
 
-from rich.console import Console
-from rich.progress import Progress
-
-from pebble.bench import estop_report, output
-from pebble.bench.bridge_robot import KINDS
+from pebble.bench.aims import Aim, outcome, with_lost
+from pebble.bench.comparison import Budget, Comparison, Option, Round, Run, rounds
 from pebble.bench.estop_driver import RATE_HZ
-from pebble.bench.estop_report import Sample, Samples
-from pebble.bench.estop_robots import Robots
-from pebble.bench.results import Stopwatch, Value
-from pebble.bench.rounds import Rounds
+from pebble.bench.estop_operator import StopOperator
+from pebble.bench.fleet import read_moves
+from pebble.bench.pictures import ecdf
+from pebble.bench.results import Cell, Judged, Value
+from pebble.bench.tables import COUNT, Claims, Grid, figure, percentile_column
 from pebble.errors import PebbleError
-from pebble.runtime.signals import interrupted_by_signals
-from pebble.simulation.fleet import MOST
-from pebble.transports.segments import sweep
+from pebble.rig.processes import Processes
+from pebble.rig.robot import KINDS, Robot
+from pebble.simulation.fleet import MOST, Moved, members
 
-ROUNDS, QUICK_ROUNDS = 10, 2
-STOPS, QUICK_STOPS = 12, 3  # of each Linux robot in a round
-ALL_STOPS, QUICK_ALL_STOPS = 3, 2  # of all robots in a round
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EstopPlan:
-    """The options of a run. In each round all processes are new."""
-
-    rounds: int | None = None  # None: the default
-    boards: int = 50
-    quick: bool = False
-    output: Path = output.FOLDER
-
-    @property
-    def count(self) -> int:
-        return self.rounds or (QUICK_ROUNDS if self.quick else ROUNDS)
-
-    @property
-    def stops(self) -> int:
-        return QUICK_STOPS if self.quick else STOPS
-
-    @property
-    def all_stops(self) -> int:
-        return QUICK_ALL_STOPS if self.quick else ALL_STOPS
-
-    def check(self) -> None:
-        """Raises PebbleError naming an invalid option."""
-        if not 0 <= self.boards <= MOST:
-            raise PebbleError(f"boards must be 0 to {MOST}")
-        output.check_folder(self.output)
-
-    def options(self) -> dict[str, Value | list[Value]]:
-        """All options that affect the results."""
-        counts: dict[str, Value | list[Value]] = {"stops": self.stops, "all_stops": self.all_stops}
-        return {"rounds": self.count, "boards": self.boards, "rate_hz": RATE_HZ, **counts}
-
-    def command(self) -> list[str]:
-        """The command line that repeats the run."""
-        words = ["pebble", "bench", "estop", "--rounds", str(self.count), "--boards", str(self.boards)]
-        return [*words, *(["--quick"] if self.quick else [])]
+REST, CONFIRMED, HOLD, WIRE = MEASURES = ("wheels at rest", "confirmed", "latched under a hold", "first stop sent")
+STOP, COMMAND, ZERO = "emergency stop", "pebble estop", "plain zero"
+ALL, BOARD = "all together", "board"
+_STARTED_S = 90.0  # boards start one after the other
+_CONFIRMED_S = 10.0
+_MOVING_S = 10.0
+_WATCH_S = 0.3  # after a stop, while driving goes on; the fleet writes its trace ten times a second
+_POLL_S = 0.05
+_QUIET_S = 0.8  # after a reset: motor owners publish few states a second, so a stop at once is confirmed later
 
 
-def run(plan: EstopPlan, console: Console | None = None) -> int:
-    """Measures, prints and writes; returns 0 if everything has results of enough rounds. Raises PebbleError."""
-    console = console or Console()
-    plan.check()
-    load = os.getloadavg()[0]
-    watch = Stopwatch("estop", plan.command(), plan.options())
-    rounds = Rounds(plan.count, console)
-    done: list[list[Sample]] = []
-    with interrupted_by_signals(), Progress(console=console, transient=True) as progress:
-        task = progress.add_task("", total=plan.count)
-        try:
-            for number in range(plan.count):
+class Rest(NamedTuple):
+    """When motors came to rest after a stop (CLOCK_MONOTONIC, ns), None: not; and whether they moved again."""
 
-                def show_step(what: str, number: int = number) -> None:
-                    text = f"round {number + 1} of {plan.count}: {what}"
-                    progress.update(task, completed=number, description=text)
-
-                with rounds.attempt(number):
-                    done.append(_round(plan, show_step).all)
-        finally:
-            sweep()  # Zenoh leaves files behind even after a regular end
-    cells = estop_report.cells_of(done)
-    estop_report.show(cells, console)
-    lines = [*rounds.notes(), *estop_report.assessment(cells), f"Load of the machine before the run: {load:.2f}"]
-    output.finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
-    return rounds.code(cells)
+    ns: int | None
+    again: bool
 
 
-def _round(plan: EstopPlan, show_step: Callable[[str], None]) -> Samples:
-    """Measures one round. Raises PebbleError."""
-    samples = Samples()
-    with Robots(plan.boards) as robots:
-        show_step("Linux robots start while a stop is held")
-        robots.hold_linux(samples)
-        for number in range(plan.stops):
-            show_step(f"stop {number + 1} of {plan.stops} of one robot")
-            for kind in KINDS[:: -1 if number % 2 else 1]:
-                robots.stop_one(kind, samples)
+def rest(moves: Iterable[Moved], since: int) -> Rest:
+    """The first moment from ``since`` at which the motors are off."""
+    after = [move for move in moves if move.ns >= since]
+    off = next((move.ns for move in after if not any(move.motors)), None)
+    return Rest(off, off is not None and any(any(move.motors) for move in after if move.ns > off))
+
+
+def is_moving(moves: Sequence[Moved]) -> bool:
+    return bool(moves) and any(moves[-1].motors)
+
+
+def sample(measure: str, robot: str, variant: str, began: int, ended: int | None, *, again: bool = False) -> Cell:
+    """One time (CLOCK_MONOTONIC, ns); ``robot`` is a Linux robot's transport, BOARD or ALL. None: it did not happen."""
+    ms = [] if ended is None else [(ended - began) / 1e6]
+    more: dict[str, Value] = {"sent": 1, "again": int(again)}  # again: wheels turned while the robot was stopped
+    return Cell(variant=variant, params={"robot": robot}, measure=measure, unit="ms", rounds=[ms], figures=more)
+
+
+class Robots(Processes):
+    """Two Linux robots, one of each kind, and boards; who drives and stops them, and each way of stopping, measured.
+
+    Each measurement ends with the stopped robots reset.
+    """
+
+    def __init__(self, boards: int) -> None:
+        super().__init__()
+        self._boards = [identity for _, identity in members(boards)] if boards else []
+        self._linux: dict[str, Robot] = {}
+        self._trace = self.folder / "trace.jsonl"
+
+    def start(self) -> None:
+        """Starts what the robots need. Raises PebbleError if a process does not start."""
+        broker = self.broker("remote")
+        broker.wait()
+        self._port, self._operator = broker.port, StopOperator(broker.port)
         for kind in KINDS:
-            show_step(f"pebble estop of {kind}")
-            robots.stop_by_command(kind, samples)
-        if plan.boards:
-            show_step(f"{plan.boards} boards start while a stop is held")
-            robots.hold_boards(samples)
-        for number in range(plan.all_stops):
-            show_step(f"stop {number + 1} of {plan.all_stops} of all robots")
-            robots.stop_all(samples)
-    return samples
+            name, folder = f"rover-{kind}", self.folder / kind
+            robot = Robot(self, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
+            robot.prepare()
+            self._linux[kind] = robot
+        self._driver = self.worker("driver", "pebble.bench.estop_driver", broker.port)
+
+    def hold_linux(self) -> Iterator[Cell]:
+        """Launch the Linux robots, one after the other, while a stop of all robots is held."""
+        with self._operator.sending(None, hold=True) as sending:
+            for kind, robot in self._linux.items():
+                robot.launch()
+                sending.wait_until_confirmed([robot.base], _STARTED_S)
+                stop = sending.stop
+                yield sample(HOLD, kind, STOP, stop.received[robot.base], stop.latched[robot.base])
+        self._reset(self._linux_bases())
+
+    def hold_boards(self) -> Iterator[Cell]:
+        """Start all boards while a stop of all robots is held."""
+        boards = [board.base for board in self._boards]
+        with self._operator.sending(None, hold=True) as sending:
+            self._start_fleet()
+            sending.wait_until_confirmed([*boards, *self._linux_bases()], _STARTED_S)
+            stop = sending.stop
+            yield from (sample(HOLD, BOARD, STOP, stop.received[base], stop.latched[base]) for base in boards)
+        self._reset([*boards, *self._linux_bases()])
+
+    def stop_one(self, kind: str) -> Iterator[Cell]:
+        """Stop a driven robot by an emergency stop, and by a plain zero."""
+        base = self._linux[kind].base
+        self._drive([base])
+        stop = self._operator.stop([base], every=False, timeout=_CONFIRMED_S)
+        yield self._rest(kind, STOP, [base], stop.began)
+        yield sample(CONFIRMED, kind, STOP, stop.began, stop.confirmed[base])
+        self._reset([base])
+        self._drive([base])
+        yield self._rest(kind, ZERO, [base], self._operator.zero(base))
+        self._release([base])
+
+    def stop_by_command(self, kind: str) -> Iterator[Cell]:
+        """Stop a driven robot by the shell command; times begin with the start of its process."""
+        base = self._linux[kind].base
+        self._drive([base])
+        began, received, ended = self._operator.command(base)
+        yield sample(WIRE, kind, COMMAND, began, received)
+        yield self._rest(kind, COMMAND, [base], began)
+        yield sample(CONFIRMED, kind, COMMAND, began, ended)
+        self._reset([base])
+
+    def stop_all(self) -> Iterator[Cell]:
+        """Stop all robots, which are driven, by one emergency stop."""
+        bases = [*self._linux_bases(), *(board.base for board in self._boards)]
+        self._drive(bases)
+        stop = self._operator.stop(bases, every=True, timeout=_CONFIRMED_S)
+        yield self._rest(ALL, STOP, bases, stop.began)
+        yield sample(CONFIRMED, ALL, STOP, stop.began, max(stop.confirmed[base] for base in bases))
+        self._reset(bases)
+
+    def _linux_bases(self) -> list[str]:
+        return [robot.base for robot in self._linux.values()]
+
+    def _start_fleet(self) -> None:
+        where = ("--broker", f"127.0.0.1:{self._port}", "--trace", self._trace)
+        self.robot("the fleet", "pebble.simulation.fleet_program", "--robots", len(self._boards), *where)
+
+    def _drive(self, bases: Sequence[str]) -> None:
+        """Drive these robots from now on; returns at a random moment after all of them move."""
+        self._driver.send(" ".join(bases))
+        self._wait_until(bases, moving=True)
+        time.sleep(random.random() / RATE_HZ)  # noqa: S311  (no secret)
+
+    def _release(self, bases: Sequence[str]) -> None:
+        """Drive no robot."""
+        self._driver.send("")
+        self._wait_until(bases, moving=False)
+
+    def _reset(self, bases: Sequence[str]) -> None:
+        self._release(bases)
+        self._operator.reset(bases)
+        time.sleep(_QUIET_S)
+
+    def _wait_until(self, bases: Sequence[str], *, moving: bool) -> None:
+        end = time.monotonic() + _MOVING_S
+        while others := [base for base, moves in self._moves(bases).items() if is_moving(moves) != moving]:
+            if time.monotonic() > end:
+                what = "do not move when they are driven" if moving else "do not come to rest"
+                raise PebbleError(f"{len(others)} robots {what}, among them {others[0]}")
+            time.sleep(_POLL_S)
+
+    def _rest(self, robot: str, variant: str, bases: Sequence[str], began: int) -> Cell:
+        """When the last of these robots came to rest, and whether one of them moved again meanwhile."""
+        time.sleep(_WATCH_S)
+        found = [rest(moves, began) for moves in self._moves(bases).values()]
+        times = [one.ns for one in found if one.ns is not None]
+        last = max(times) if len(times) == len(found) else None
+        return sample(REST, robot, variant, began, last, again=any(one.again for one in found))
+
+    def _moves(self, bases: Collection[str]) -> dict[str, list[Moved]]:
+        """Every change of their motors so far, by base."""
+        moves = {
+            robot.base: [Moved(one.ns, robot.base, one.motors) for one in robot.lines(0) if one.motors is not None]
+            for robot in self._linux.values()
+            if robot.base in bases
+        }
+        boards = {board.id: board.base for board in self._boards if board.base in bases}
+        changes = read_moves(self._trace) if boards else {}
+        return moves | {base: changes.get(name, []) for name, base in boards.items()}
+
+
+@contextmanager
+def robots(run: Run) -> Iterator[Robots]:
+    with Robots(run["boards"]) as robots:
+        yield robots
+
+
+def measure(round_: Round) -> Iterator[Cell]:
+    """One round, with processes of its own. Raises PebbleError."""
+    run, env = round_.run, round_.env
+    run.show("Linux robots start while a stop is held")
+    yield from env.hold_linux()
+    for number in range(run["stops"]):
+        run.show(f"stop {number + 1} of {run['stops']} of one robot")
+        for kind in KINDS[:: -1 if number % 2 else 1]:
+            yield from env.stop_one(kind)
+    for kind in KINDS:
+        run.show(f"pebble estop of {kind}")
+        yield from env.stop_by_command(kind)
+    if run["boards"]:
+        run.show(f"{run['boards']} boards start while a stop is held")
+        yield from env.hold_boards()
+    for number in range(run["all_stops"]):
+        run.show(f"stop {number + 1} of {run['all_stops']} of all robots")
+        yield from env.stop_all()
+
+
+# -- the report
+
+
+def by_command(cells: Sequence[Cell]) -> Iterator[str]:
+    """The time that a person who enters the command waits."""
+    for cell in cells:
+        if cell.measure == WIRE:
+            yield (
+                f"{cell.conditions()}: pebble estop sends its first stop {figure(cell.percentile(50))} ms (p50) after"
+                f" it is entered, {figure(cell.percentile(100))} ms at most"
+            )
+
+
+def _aim(measure_: str, at_most: float, *robots_: str) -> Aim:
+    return Aim(
+        what="{robot}, {measure}, p95 at most {bound:g} ms",
+        of=lambda cell: (cell.variant, cell.measure) == (STOP, measure_) and cell.params["robot"] in robots_,
+        value=with_lost(95), at_most=at_most, unit="ms", least=10,
+    )  # fmt: skip
+
+
+def stay_at_rest(cells: Sequence[Cell]) -> Iterator[Judged]:
+    """Whether wheels turned after an emergency stop, though drive commands went on."""
+    stops = [cell for cell in cells if cell.measure == REST and cell.variant != ZERO]
+    sent, again = (sum(int(cell.figures[name] or 0) for cell in stops) for name in ("sent", "again"))
+    what, measured = "wheels stay at rest after a stop while driving goes on", f"{again} of {sent} turned again"
+    yield Judged(what=what, outcome=outcome(not again), measured=measured)
+
+
+def prepare(run: Run) -> None:
+    run.notes.append(f"Load of the machine before the run: {os.getloadavg()[0]:.2f}")
+
+
+ESTOP = Comparison(
+    name="estop",
+    title="Emergency stop",
+    what="Times from an emergency stop until the wheels are at rest, and until every motor owner has confirmed it.",
+    help="""The emergency stop: until the wheels are at rest, and until it is confirmed.
+
+    Of a Linux robot on either transport, compared with a plain zero; of two of them and 50 boards together; and a stop
+    that is held for robots which are switched on later. All robots are driven meanwhile. Needs mosquitto.
+
+    \b
+        pebble bench estop
+        pebble bench estop --quick --boards 10
+    """,
+    options=(
+        rounds("How often robots are started."),
+        Option(name="boards", kind=int, least=0, most=MOST, help="Boards with Wi-Fi that are stopped together."),
+    ),
+    full=Budget(600, rounds=10, boards=50, stops=12, all_stops=3),
+    quick=Budget(90, rounds=2, stops=3, all_stops=2),
+    constants={"rate_hz": RATE_HZ},
+    prepare=prepare,
+    environment=robots,
+    measure_round=measure,
+    measures=MEASURES,
+    figures={"again": sum},
+    tables=(
+        Grid(
+            title="From the stop, while driving goes on; ms", rows=("measure", "robot", "variant"),
+            heads=("", "robot", "by"), columns=(COUNT, *map(percentile_column, (50, 95, 100))),
+        ),
+    ),
+    assessment=(
+        Claims(
+            what="{measure}, {robot}",
+            of=lambda cell: cell.measure == REST and cell.params["robot"] in KINDS and cell.variant != COMMAND,
+            order=(ZERO, STOP),
+            judged=lambda cell: cell.measure == REST and cell.variant == STOP,
+        ),
+        by_command,
+        _aim(REST, 50.0, *KINDS),
+        _aim(REST, 250.0, ALL),
+        _aim(CONFIRMED, 500.0, *KINDS, ALL),
+        _aim(HOLD, 1000.0, *KINDS, BOARD),
+        stay_at_rest,
+    ),
+    pictures=(ecdf("Estop"),),
+    reported=None,
+)  # fmt: skip

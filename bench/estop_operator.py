@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-
-from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.bench.estop_driver import ZERO
 from pebble.client.connection import Listener, Target, connected
@@ -20,6 +16,7 @@ from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.contract import CAPABILITIES, DRIVE, ESTOP, ESTOP_STATE
 from pebble.errors import PebbleError
+from pebble.rig.stock_client import StockClient
 from pebble.transports import Message, Transport
 
 _BY = "bench"
@@ -112,16 +109,11 @@ class StopOperator:
 
     def zero(self, base: str) -> int:
         """Send a zero as a stock client does; returns when."""
-        ready = threading.Event()
-        client = Client(CallbackAPIVersion.VERSION2)
-        client.on_connect = lambda *_: ready.set()
-        client.connect("127.0.0.1", self._port)
-        client.loop_start()
-        ready.wait(_ANSWER_S)
+        client = StockClient(at_once=False).open(self._port)
+        client.wait()
         began = time.monotonic_ns()
-        client.publish(DRIVE.topic(base), ZERO, qos=DRIVE.default_qos).wait_for_publish(_ANSWER_S)
-        client.disconnect()
-        client.loop_stop()
+        client.paho.publish(DRIVE.topic(base), ZERO, qos=DRIVE.default_qos).wait_for_publish(_ANSWER_S)
+        client.close()
         return began
 
     def command(self, base: str) -> tuple[int, int, int]:

@@ -7,198 +7,70 @@ command's latency is from the operator's publish call to the resulting change of
 from __future__ import annotations
 
 import itertools
-import sys
-import tempfile
-import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich.console import Console
-from rich.table import Table
 
-from pebble.bench import output
+from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
 from pebble.bench.fleet_operator import STEPS
-from pebble.bench.percentiles import LONGEST_S, percentile, rounded
-from pebble.bench.results import Cell, Stopwatch, Value
-from pebble.bench.tables import plain_table
+from pebble.bench.pictures import ecdf
+from pebble.bench.results import Cell, percentile, rounded
+from pebble.bench.tables import COUNT, Grid, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
-from pebble.bench.worker import Worker, end_workers
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import Program, end_all
-from pebble.errors import PebbleError
-from pebble.runtime.signals import interrupted_by_signals
+from pebble.rig.processes import Processes
 from pebble.simulation.fleet import MOST, Moved, members
 from pebble.simulation.wireless import KINDS
 
 _ONLINE_S = 90.0
 _ARRIVE_S = 1.0
-_END_S = 3.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetPlan:
-    """Every robot is driven at ``rate_hz`` for ``seconds``."""
-
-    robots: int = 200
-    seconds: float = 60.0
-    rate_hz: float = 10.0
-    kinds: Sequence[str] = KINDS
-    output: Path = output.FOLDER
-    quick: bool = False  # the results are marked as quick
-
-    def check(self) -> None:
-        """Raises PebbleError naming an invalid option."""
-        if not 1 <= self.robots <= MOST or not 0 < self.seconds <= LONGEST_S or not 0 < self.rate_hz <= 20:
-            raise PebbleError(f"robots must be 1 to {MOST}, seconds at most {LONGEST_S:.0f}, rate at most 20 Hz")
-        output.check_folder(self.output)
-
-    def options(self) -> dict[str, Value | list[Value]]:
-        """All options that affect the results."""
-        return {"robots": self.robots, "seconds": self.seconds, "rate_hz": self.rate_hz, "kinds": list(self.kinds)}
-
-    def command(self) -> list[str]:
-        """The command line that repeats the run."""
-        words = ["pebble", "bench", "fleet", "--robots", str(self.robots)]
-        words += ["--seconds", f"{self.seconds:g}", "--rate", f"{self.rate_hz:g}"]
-        return [*words, *(["--quick"] if self.quick else [])]
-
-
-def plan(*, quick: bool = False, **given: Any) -> FleetPlan:
-    """The default or quick plan, with the ``given`` options replaced."""
-    usual = {"robots": 30, "seconds": 5.0} if quick else {}
-    return FleetPlan(quick=quick, **{**usual, **given})
-
-
-@dataclass(slots=True, kw_only=True)
-class FleetMetrics:
-    """Results of one run; latencies in ms, rates in Hz, CPU in % of one core."""
-
-    robots: int
-    seconds: float
-    online: int
-    sent: int
-    late: int  # commands that the operator could not send in time
-    latencies_ms: list[float] = field(default_factory=list)
-    heartbeats_hz: list[float] = field(default_factory=list)
-    longest_gap_s: float = 0.0  # between two heartbeats of one robot
-    cpu: dict[str, float] = field(default_factory=dict)
-    fleet_mb: float = 0.0
-
-    @property
-    def lost(self) -> int:
-        return self.sent - len(self.latencies_ms)
-
-    def cell(self, rate_hz: float) -> Cell:
-        """A single round: one fleet, started once."""
-        return Cell(
-            variant="mqtt",
-            params={"robots": self.robots, "rate": f"{rate_hz:g} Hz"},
-            measure="command to pins",
-            unit="ms",
-            rounds=[self.latencies_ms],
-            figures=self._figures(),
-        )
-
-    def assessment(self) -> list[str]:
-        """Sentences about connections, latency and heartbeats."""
-        half, most = (percentile(self.latencies_ms, percent) for percent in (50, 99))
-        return [
-            f"{self.online} of {self.robots} robots were online; of {self.sent} commands {self.lost} were overtaken or"
-            " lost",
-            f"the wheels obeyed within {half:.1f} ms (p50) and {most:.1f} ms (p99)",
-            f"the longest time without a heartbeat of one robot was {self.longest_gap_s:.2f} s",
-        ]
-
-    def _figures(self) -> dict[str, Value]:
-        heartbeats = {f"beats_{n}_hz": rounded(percentile(self.heartbeats_hz, p), 3) for n, p in _SPREAD.items()}
-        return {
-            "sent": self.sent,
-            "online": self.online,
-            "late": self.late,
-            **heartbeats,
-            "longest_gap_s": rounded(self.longest_gap_s, 3),
-            **{f"cpu_{name}": rounded(share, 1) for name, share in self.cpu.items()},
-            "fleet_mb": rounded(self.fleet_mb, 1),
-            "mb_per_robot": rounded(self.fleet_mb / self.robots, 3),
-        }
-
-
 _SPREAD = {"min": 0, "median": 50, "max": 100}
 
 
-def run(plan: FleetPlan, console: Console | None = None) -> int:
-    """Measures, prints and writes; returns 0 if every robot was online and could be driven. Raises PebbleError."""
-    console = console or Console()
-    plan.check()
-    watch = Stopwatch("fleet", plan.command(), plan.options())
-    with interrupted_by_signals(), console.status("starting") as status:
-        metrics = measure(plan, status.update)
-    console.print(_table(metrics))
-    results = watch.results([metrics.cell(plan.rate_hz)], metrics.assessment(), quick=plan.quick)
-    output.finish(results, plan.output, console)
-    return 0 if metrics.online == plan.robots and metrics.latencies_ms else 1
+def measure(case: Case) -> Iterator[Cell]:
+    """One fleet, with processes of its own. Raises PebbleError if a process does not start."""
+    run, count = case.run, case.run["robots"]
+    ids = [identity.id for _, identity in members(count, KINDS)]
+    with Processes() as processes:
+        broker, trace = processes.broker(), processes.folder / "trace.jsonl"
+        broker.wait()
+        where = ("--kinds", ",".join(KINDS), "--broker", f"127.0.0.1:{broker.port}", "--trace", trace)
+        fleet = processes.robot("fleet", "pebble.simulation.fleet_program", "--robots", count, *where)
+        how = (broker.port, run["seconds"], run["rate"])
+        operator = processes.worker("operator", "pebble.bench.fleet_operator", *how, *ids)
+        run.show(f"{count} robots are connecting")
+        online = operator.answer(_ONLINE_S)["online"]
+        run.show(f"{online} robots are online and being driven for {run['seconds']:.0f} s")
+        pids = {"broker": broker.pid, "fleet": fleet.pid, "operator": operator.pid}
+        began, before = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
+        answer = operator.answer(run["seconds"] + _ONLINE_S)
+        took = time.monotonic() - began
+        cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in pids.items()}
+        time.sleep(_ARRIVE_S)  # commands in flight arrive, or count as lost
+        yield cell_of(case, online, answer, read_moves(trace), cpu, pss_mb(fleet.pid))
 
 
-def measure(plan: FleetPlan, show_step: Any = lambda _text: None) -> FleetMetrics:
-    """Measures one run with processes of its own. Raises PebbleError if a process does not start."""
-    with tempfile.TemporaryDirectory(prefix="pbl-") as name:
-        folder, programs, workers = Path(name), [], []
-        try:
-            broker = Broker("broker", BrokerKind.MOSQUITTO, folder)
-            programs.append(broker.program)
-            broker.wait(threading.Event())
-            fleet = _start_fleet(plan, broker.port, folder)
-            programs.insert(0, fleet)
-            operator = _start_operator(plan, broker.port, folder)
-            workers.append(operator)
-            show_step(f"{plan.robots} robots are connecting")
-            online = operator.answer(_ONLINE_S)["online"]
-            show_step(f"{online} robots are online and being driven for {plan.seconds:.0f} s")
-            return _observe(plan, online, operator, fleet, broker, folder / "trace.jsonl")
-        finally:
-            end_workers(workers)
-            end_all(programs, _END_S)
-
-
-def _start_fleet(plan: FleetPlan, port: int, folder: Path) -> Program:
-    command = [sys.executable, "-m", "pebble.simulation.fleet_program", "--robots", str(plan.robots)]
-    command += ["--kinds", ",".join(plan.kinds), "--broker", f"127.0.0.1:{port}"]
-    return Program("the fleet", [*command, "--trace", str(folder / "trace.jsonl")], folder / "fleet.log")
-
-
-def _start_operator(plan: FleetPlan, port: int, folder: Path) -> Worker:
-    ids = [identity.id for _, identity in members(plan.robots, plan.kinds)]
-    command = [sys.executable, "-m", "pebble.bench.fleet_operator", str(port), str(plan.seconds), str(plan.rate_hz)]
-    return Worker("the operator", [*command, *ids], folder / "operator.log")
-
-
-def _observe(
-    plan: FleetPlan, online: int, operator: Worker, fleet: Program, broker: Broker, trace: Path
-) -> FleetMetrics:
-    pids = {"broker": broker.program.pid, "fleet": fleet.pid, "operator": operator.pid}
-    began, before = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
-    answer = operator.answer(plan.seconds + _ONLINE_S)
-    used = {name: cpu_s([pid]) - before[name] for name, pid in pids.items()}
-    took = time.monotonic() - began
-    time.sleep(_ARRIVE_S)  # commands in flight arrive, or count as lost
-    sent: list[list[int]] = answer["sent"]
-    ids = [identity.id for _, identity in members(plan.robots, plan.kinds)]
-    return FleetMetrics(
-        robots=plan.robots,
-        seconds=plan.seconds,
-        online=online,
+def cell_of(
+    case: Case, online: int, answer: dict[str, Any], moves: dict[str, list[Moved]], cpu: dict[str, float], mb: float
+) -> Cell:
+    """Latencies in ms, rates in Hz, CPU in % of one core; ``answer`` is the operator's."""
+    robots, sent = case.run["robots"], answer["sent"]
+    rates = [rate for heartbeats in answer["heartbeats"] if (rate := _rate(heartbeats)) is not None]
+    ids = [identity.id for _, identity in members(robots, KINDS)]
+    return case.cell(
+        "command to pins", "ms", latencies_ms(dict(zip(ids, sent, strict=True)), moves),
+        {"robots": robots, "rate": f"{case.run['rate']:g} Hz"},
         sent=sum(map(len, sent)),
+        online=online,
         late=answer["late"],
-        latencies_ms=latencies_ms(dict(zip(ids, sent, strict=True)), read_moves(trace)),
-        heartbeats_hz=[rate for heartbeats in answer["heartbeats"] if (rate := _rate(heartbeats)) is not None],
-        longest_gap_s=longest_gap_s(answer["heartbeats"], answer["began"], answer["ended"]),
-        cpu={name: 100 * seconds / took for name, seconds in used.items()},
-        fleet_mb=pss_mb(fleet.pid),
-    )
+        **{f"beats_{name}_hz": rounded(percentile(rates, percent), 3) for name, percent in _SPREAD.items()},
+        longest_gap_s=rounded(longest_gap_s(answer["heartbeats"], answer["began"], answer["ended"]), 3),
+        **{f"cpu_{name}": rounded(share, 1) for name, share in cpu.items()},
+        fleet_mb=rounded(mb, 1),
+        mb_per_robot=rounded(mb / robots, 3),
+    )  # fmt: skip
 
 
 def latencies_ms(sent: dict[str, list[int]], moves: dict[str, list[Moved]]) -> list[float]:
@@ -239,21 +111,59 @@ def longest_gap_s(robots: list[list[int]], began: int, ended: int) -> float:
     return max(gaps, default=0) / 1e9
 
 
-def _table(metrics: FleetMetrics) -> Table:
-    table = plain_table(f"{metrics.robots} MCU robots on one broker, {metrics.seconds:.0f} s", ("what", "value"))
-    heartbeats = [f"{percentile(metrics.heartbeats_hz, percent):.2f}" for percent in _SPREAD.values()]
-    times = [f"{percentile(metrics.latencies_ms, percent):.1f}" for percent in (50, 95, 99, 100)]
-    rows = {
-        "robots online": f"{metrics.online}",
-        "heartbeats of a robot, Hz: min / median / max": " / ".join(heartbeats),
-        "longest time without one, s": f"{metrics.longest_gap_s:.2f}",
-        "command to pins, ms: p50 / p95 / p99 / max": " / ".join(times),
-        "commands sent / obeyed / overtaken or lost": f"{metrics.sent} / {len(metrics.latencies_ms)} / {metrics.lost}",
-        "commands sent late": f"{metrics.late}",
-        **{f"CPU of the {name}, % of a core": f"{share:.1f}" for name, share in metrics.cpu.items()},
-        "CPU of a robot, % of a core": f"{metrics.cpu.get('fleet', 0.0) / metrics.robots:.3f}",
-        "memory of the fleet / of a robot, MB": f"{metrics.fleet_mb:.0f} / {metrics.fleet_mb / metrics.robots:.2f}",
-    }
-    for what, figure in rows.items():
-        table.add_row(what, figure)
-    return table
+# -- the report
+
+
+def sentences(cells: Sequence[Cell]) -> Iterator[str]:
+    """About connections, latency and heartbeats."""
+    for cell in cells:
+        yield (
+            f"{cell.figures['online']} of {cell.params['robots']} robots were online; of {cell.figures['sent']}"
+            f" commands {cell.lost} were overtaken or lost"
+        )
+        yield f"the wheels obeyed within {cell.percentile(50):.1f} ms (p50) and {cell.percentile(99):.1f} ms (p99)"
+        yield f"the longest time without a heartbeat of one robot was {cell.figures['longest_gap_s']:.2f} s"
+
+
+FLEET = Comparison(
+    name="fleet",
+    title="A fleet on one broker",
+    what="Robots that are their own MCU, the real firmware on simulated pins, all on one stock broker and driven "
+    "by one operator at 10 Hz each. The latency is from the operator's publish call to the change of the pins.",
+    help="""Hundreds of MCU robots on one broker: heartbeats, command latency, cost.
+
+    The real firmware files on simulated pins, real TCP; one operator drives all of them. Needs mosquitto.
+
+    \b
+        pebble bench fleet
+        pebble bench fleet --robots 20 --seconds 10
+    """,
+    options=(
+        Option(name="robots", kind=int, least=1, most=MOST, help="How many robots with Wi-Fi."),
+        seconds("Driving time.", least=1),
+        Option(name="rate", kind=float, least=0.1, most=20, help="Commands a second to each robot."),
+    ),
+    full=Budget(35, robots=200, seconds=60.0, rate=10.0),
+    quick=Budget(12, robots=30, seconds=5.0),
+    variants=("mqtt",),
+    measure=measure,
+    tables=(
+        Grid(
+            title="Command to pins, ms", rows=("robots", "rate"),
+            columns=(*map(percentile_column, (50, 95, 99, 100)), COUNT, single_column("sent", "sent"),
+                     single_column("late", "late")),
+        ),
+        Grid(
+            title="Heartbeats of a robot, Hz; CPU, % of a core; memory, MB", rows=("robots",),
+            columns=tuple(single_column(*words) for words in (
+                ("least", "beats_min_hz"), ("median", "beats_median_hz"), ("most", "beats_max_hz"),
+                ("longest gap, s", "longest_gap_s"), ("broker", "cpu_broker"), ("fleet", "cpu_fleet"),
+                ("operator", "cpu_operator"), ("fleet, MB", "fleet_mb"), ("each", "mb_per_robot"),
+            )),
+        ),
+    ),
+    assessment=(sentences,),
+    complete=lambda cells: all(cell.samples and cell.figures["online"] == cell.params["robots"] for cell in cells),
+    pictures=(ecdf("Fleet"),),
+    reported_full=("--robots", "100", "--seconds", "20"),
+)  # fmt: skip

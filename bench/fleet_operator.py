@@ -1,7 +1,7 @@
 """The operator of a fleet, as a process: drives every robot at a steady rate and subscribes to all heartbeats.
 
 ``python -m pebble.bench.fleet_operator PORT SECONDS RATE_HZ ID…`` writes JSON lines: one when every robot is online,
-then the results when it has driven for ``SECONDS``. It ends when its standard input closes.
+then the results when it has driven for ``SECONDS``.
 """
 
 from __future__ import annotations
@@ -9,18 +9,17 @@ from __future__ import annotations
 import json
 import os
 import sys
-import threading
 import time
 from array import array
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
-from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion
+from paho.mqtt.client import MQTTMessage
 
-from pebble.bench.tcp import send_at_once
 from pebble.contract import DRIVE, ONLINE
 from pebble.contract.identity import Identity
+from pebble.rig.stock_client import MANY, StockClient
+from pebble.rig.worker_end import answer, serve_on_thread
 
 #: Wheel speeds, left and right, in sequence: no robot gets the same command twice within eight commands.
 STEPS: Final = ((1, 1), (-1, -1), (1, 0), (-1, 0), (1, -1), (0, 1), (-1, 1), (0, -1))
@@ -29,7 +28,7 @@ _ONLINE_S = 60.0
 _POLL_S = 0.05
 
 
-class FleetOperator:
+class FleetOperator(StockClient):
     """One MQTT connection. Commands are spread evenly over time, robot after robot."""
 
     def __init__(self, port: int, ids: Sequence[str]) -> None:
@@ -38,13 +37,8 @@ class FleetOperator:
         self._index = {ONLINE.topic(base): number for number, base in enumerate(bases)}
         self.heartbeats = [array("q") for _ in ids]  # CLOCK_MONOTONIC, ns
         self.late = 0  # commands that were not sent in time
-        self._client = Client(CallbackAPIVersion.VERSION2)
-        self._client.max_inflight_messages_set(65_535)
-        self._client.on_socket_open = send_at_once
-        self._client.on_connect = self._subscribe
-        self._client.on_message = self._on_message
-        self._client.connect("127.0.0.1", port)
-        self._client.loop_start()
+        super().__init__(self._on_message, [(topic, 0) for topic in self._index], in_flight=MANY)
+        self.open(port)
 
     def wait_until_online(self) -> int:
         """Waits until all robots are online, or for a timeout; returns how many are."""
@@ -67,45 +61,28 @@ class FleetOperator:
             elif left < -1 / rate_hz:
                 self.late += 1
             sent[robot].append(time.monotonic_ns())
-            self._client.publish(self._drives[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
+            self.paho.publish(self._drives[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
         return sent
 
-    def close(self) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
-
-    def _subscribe(self, client: Client, *_: Any) -> None:
-        client.subscribe([(topic, 0) for topic in self._index])
-
-    def _on_message(self, _client: Client, _data: Any, message: Any) -> None:
+    def _on_message(self, message: MQTTMessage) -> None:
         if not message.retain and b"true" in message.payload:
             self.heartbeats[self._index[message.topic]].append(time.monotonic_ns())
 
 
 def main(arguments: list[str]) -> int:
     port, seconds, rate_hz, *ids = arguments
-    threading.Thread(target=_end_with_input, daemon=True).start()
+    serve_on_thread(lambda _line: None, lambda: os._exit(0))
     operator = FleetOperator(int(port), ids)
-    _write_line({"online": operator.wait_until_online()})
+    answer({"online": operator.wait_until_online()})
     began, cpu = time.monotonic_ns(), time.process_time()
     sent = operator.drive(float(seconds), float(rate_hz))
     ended, cpu = time.monotonic_ns(), time.process_time() - cpu
     heartbeats = [[heartbeat for heartbeat in robot if began <= heartbeat <= ended] for robot in operator.heartbeats]
-    _write_line(
+    answer(
         {"began": began, "ended": ended, "cpu_s": cpu, "late": operator.late, "sent": sent, "heartbeats": heartbeats}
     )
     operator.close()
     return 0
-
-
-def _write_line(what: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(what) + "\n")
-    sys.stdout.flush()
-
-
-def _end_with_input() -> None:
-    sys.stdin.read()
-    os._exit(0)
 
 
 if __name__ == "__main__":

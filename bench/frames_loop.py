@@ -1,22 +1,28 @@
 """Writes and reads time-stamped frames at a steady rate, and measures during a given window.
 
-Runs in two Pythons: Pebble's own, and the system's, which has GStreamer. So it imports only the standard library and
-numpy, nothing of Pebble.
+Runs in two Pythons: Pebble's own, and the system's, which has GStreamer. So it imports only the standard library,
+numpy, and the other end of a worker.
 
 A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
-time is written last. A process writes ``{"ready": true}`` to standard output, receives ``FROM UNTIL`` (CLOCK_MONOTONIC,
-ns) on standard input, answers with one JSON object after that window, and ends when its standard input closes.
+time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns) and answers
+after that window.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+
+if __package__:
+    from pebble.rig import worker_end
+else:  # the system's Python runs plain files
+    sys.path.append(str(Path(__file__).parents[1] / "rig"))
+    import worker_end  # type: ignore[import-not-found, no-redef]
 
 RATE_HZ = 30.0
 SMALLEST = 24  # bytes: two stamps and a number
@@ -55,22 +61,15 @@ class Reader(Protocol):
 
 
 class ControlPipe:
-    """Reads the window from standard input on a thread, and writes answers."""
+    """The window that this process was given; the other end of a worker."""
 
     def __init__(self) -> None:
         self.window: tuple[int, int] | None = None
-        self.ended = threading.Event()
-        threading.Thread(target=self._listen, name="orders", daemon=True).start()
+        self.ended = worker_end.serve_on_thread(self._take)
 
-    def write_answer(self, what: dict[str, Any]) -> None:
-        sys.stdout.write(json.dumps(what) + "\n")
-        sys.stdout.flush()
-
-    def _listen(self) -> None:
-        for line in iter(sys.stdin.readline, ""):
-            begin, end = line.split()
-            self.window = (int(begin), int(end))
-        self.ended.set()
+    def _take(self, line: str) -> None:
+        begin, end = line.split()
+        self.window = (int(begin), int(end))
 
 
 class Cpu:
@@ -98,7 +97,7 @@ def write(writer: Writer, size: int, control_pipe: ControlPipe, *, slower_us: fl
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
     cpu, number, sent, refused, due = Cpu(), 0, 0, 0, time.monotonic()
     reported = False
-    control_pipe.write_answer({"ready": True})
+    worker_end.answer({"ready": True})
     while not control_pipe.ended.is_set():
         due += 1 / RATE_HZ
         control_pipe.ended.wait(max(0.0, due - time.monotonic()))
@@ -114,9 +113,7 @@ def write(writer: Writer, size: int, control_pipe: ControlPipe, *, slower_us: fl
         cpu.poll(control_pipe.window, time.monotonic_ns())
         if cpu.percent is not None and not reported:
             reported = True
-            control_pipe.write_answer(
-                {"cpu": cpu.percent, "sent": sent, "refused": refused, "fallbacks": writer.fallbacks}
-            )
+            worker_end.answer({"cpu": cpu.percent, "sent": sent, "refused": refused, "fallbacks": writer.fallbacks})
     writer.close()
 
 
@@ -164,13 +161,13 @@ def read(reader: Reader, control_pipe: ControlPipe, *, bare_copy: int = 0) -> No
                 if copier is not None:
                     copier.copy(control_pipe.ended)
             if frames == _WARM_UP:
-                control_pipe.write_answer({"ready": True})
+                worker_end.answer({"ready": True})
         if not reported and control_pipe.window is not None and now >= control_pipe.window[1] + _LATE_NS:
             reported = True
             answer = {"cpu": cpu.percent, "latencies_us": latencies, "torn": torn}
             if copier is not None:
                 answer |= copier.answer(control_pipe.window)
-            control_pipe.write_answer(answer)
+            worker_end.answer(answer)
     reader.close()
 
 

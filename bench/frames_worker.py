@@ -6,7 +6,6 @@ broker's port; ``SIZE`` is ``640x480``; a writer delays each frame by ``SLOWER_U
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections import deque
@@ -147,24 +146,23 @@ def main(arguments: list[str]) -> int:
     variant, role, where, size_, slower_us = arguments
     width, _, height = size_.partition("x")
     size = int(width) * int(height) * 3
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
         shared_memory.lockable = lambda size: False  # noqa: ARG005
     control_pipe = frames_loop.ControlPipe()
     if role == "writer":
-        frames_loop.write(_writer(variant, where, size), size, control_pipe, slower_us=float(slower_us))
+        frames_loop.write(writer(variant, where, size), size, control_pipe, slower_us=float(slower_us))
     else:
-        frames_loop.read(_reader(variant, where), control_pipe, bare_copy=size if variant == "memcpy" else 0)
+        frames_loop.read(reader(variant, where), control_pipe, bare_copy=size if variant == "memcpy" else 0)
     return 0
 
 
-def _writer(variant: str, where: str, size: int) -> frames_loop.Writer:
+def writer(variant: str, where: str, size: int) -> frames_loop.Writer:
     if variant == "mqtt":
         return MqttWriter(int(where), size)
     return ZenohWriter(Path(where), size, in_segment=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
 
 
-def _reader(variant: str, where: str) -> frames_loop.Reader:
+def reader(variant: str, where: str) -> frames_loop.Reader:
     if variant == "mqtt":
         return MqttReader(int(where))
     return ZenohReader(Path(where), views=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")

@@ -6,14 +6,12 @@ every number on its standard input it opens a service's transport that often and
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import time
 from collections.abc import Set
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
@@ -21,6 +19,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 import pebble.transports.mqtt.transport  # noqa: F401  (otherwise the first subscriber would include the import)
 from pebble.config import load
 from pebble.errors import PebbleError
+from pebble.rig.worker_end import answer, serve
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, MqttSettings, Transport, create
 
@@ -95,22 +94,20 @@ def retained_topics(transport: Transport, base: str) -> set[str]:
 
 def main(arguments: list[str]) -> int:
     config = load(Path(arguments[0]))
-    _write_line({"ready": True})
-    for line in sys.stdin:
+
+    def measure(count: str) -> dict[str, object]:
         retained = retained_topics(local_transport(config, "retained-topics"), config.base)
-        times = [retained_ms(local_transport(config, "late-service"), config.base, retained) for _ in range(int(line))]
-        _write_line({"retained": sorted(retained), "ms": times})
+        times = [retained_ms(local_transport(config, "late-service"), config.base, retained) for _ in range(int(count))]
+        return {"retained": sorted(retained), "ms": times}
+
+    answer({"ready": True})
+    serve(measure)
     return 0
 
 
 def _check(who: str, missing: Set[str]) -> None:
     if missing:
         raise PebbleError(f"{who} did not receive {', '.join(sorted(missing))} within {_LIMIT_S:.0f} s")
-
-
-def _write_line(what: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(what) + "\n")
-    sys.stdout.flush()
 
 
 if __name__ == "__main__":

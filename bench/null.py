@@ -9,8 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+from pebble.bench.aims import outcome
 from pebble.bench.ratios import Interval, paired
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, Judged
 
 AGAIN, SLOWED = " again", " +20 %"
 SLOWDOWN = 0.2
@@ -49,14 +50,15 @@ def intervals(cells: Sequence[Cell]) -> list[tuple[Cell, Interval]]:
     ]
 
 
-def assessment(cells: Sequence[Cell]) -> list[str]:
+def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
     """One line for each role, ``MISSED`` where the comparison was wrong, and the aim. Few rounds are not judged."""
     found = intervals(cells)
     few = any(interval.few for _, interval in found)
-    outcome = "not judged" if few else "met" if passed(cells) else "missed"
+    how = outcome(passed(cells), judged=not few)
     shown = ", ".join(f"{cell.variant} {interval}" for cell, interval in found)
     lines = [_ratio(cell, interval) if few else _line(cell, interval) for cell, interval in found]
-    return [*lines, f"aim: no difference found where there is none, and the planted 20 % found: {outcome} ({shown})"]
+    what = "no difference found where there is none, and the planted 20 % found"
+    return [*lines, Judged(what=what, outcome=how, measured=shown)]
 
 
 def passed(cells: Sequence[Cell]) -> bool:

@@ -20,10 +20,9 @@ from rich.table import Table
 
 from pebble.bench import page_cases as cases
 from pebble.bench import page_links as links
-from pebble.bench.output import check_folder
+from pebble.bench.engine import check_folder
 from pebble.bench.page_rig import Rig, rig
-from pebble.bench.percentiles import percentile
-from pebble.bench.results import Cell, Results, Stopwatch
+from pebble.bench.results import Cell, Results, Stopwatch, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals

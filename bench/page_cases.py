@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import os
 import signal
-import sys
 import threading
 import time
 import urllib.request
@@ -17,12 +16,11 @@ from urllib.parse import urldefrag, urlsplit
 
 from pebble.bench.estop_driver import Driver
 from pebble.bench.page_rig import Rig, monotonic
-from pebble.bench.usage import children, cpu_s
-from pebble.bench.worker import Worker, end_workers
+from pebble.bench.usage import cpu_s
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.demo.programs import Program, end_all
-from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
+from pebble.rig.testbed import ROBOTS
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -32,7 +30,6 @@ Samples = dict[str, list[float]]
 KEY, ROBOT = "KeyW", "goob"
 VIEWERS, ROBOTS_SHOWN = 30, 100
 _HELD_S = 0.4
-_END_S = 3.0
 _COUNT_S = 40.0  # for processes of viewers to answer, beyond their time
 _LATER_S = 5.0  # the page has fetched its other screens by then
 _REST_S = 8.0  # after the last viewer: the server lets go after 5, the camera rests then
@@ -90,8 +87,8 @@ def interruptions(rig: Rig, scale: float) -> Samples:
         "frozen to stop": frozen,
         "closed to stop": closed,
         "stalled to stop": stalled,
-        "server frozen to stop": lambda _: _signal(rig.stage.server.program.pid, signal.SIGSTOP),
-        "server killed to stop": lambda _: _signal(rig.stage.server.program.pid, signal.SIGKILL),
+        "server frozen to stop": lambda _: _signal(rig.stage.server.pid, signal.SIGSTOP),
+        "server killed to stop": lambda _: _signal(rig.stage.server.pid, signal.SIGKILL),
     }
     found: Samples = {name: [] for name in actions}
     for name, act in actions.items():
@@ -117,8 +114,8 @@ def _signal(pid: int, number: signal.Signals) -> float:
 
 def _recover(rig: Rig, page: Page) -> None:
     _signal(_network_process(), signal.SIGCONT)
-    if rig.stage.server.program.ended or _is_stopped(rig.stage.server.program.pid):
-        rig.stage.thaw_server()
+    if rig.stage.server.ended or _is_stopped(rig.stage.server.pid):
+        rig.stage.server.thaw()
         rig.stage.restart_server()
     if not page.is_closed():
         page.context.close()
@@ -263,13 +260,9 @@ def viewers(rig: Rig, scale: float) -> Samples:
 
 def _watched(rig: Rig, count: int, seconds: float) -> tuple[float, list[float]]:
     """Bytes a second of the robot, and per cent of its frames that each viewer received."""
-    module = [sys.executable, "-m", "pebble.bench.page_viewers"]
-    command = [*module, rig.stage.url, rig.ref(ROBOT), str(count), str(seconds)]
-    worker = Worker("viewers", command, Path(rig.stage.folder_of_logs) / "viewers.log")
-    try:
-        answer = worker.answer(seconds + _COUNT_S)
-    finally:
-        end_workers([worker])
+    viewers = rig.stage.worker("viewers", "pebble.bench.page_viewers", rig.stage.url, rig.ref(ROBOT), count, seconds)
+    answer = viewers.answer(seconds + _COUNT_S)
+    rig.stage.end(viewers)
     began, ended = answer["began"], answer["ended"]
     published = [size for at, ref, size in rig.frames if ref == rig.ref(ROBOT) and began <= at < ended]
     if not published:
@@ -279,9 +272,8 @@ def _watched(rig: Rig, count: int, seconds: float) -> tuple[float, list[float]]:
 
 def crowd(rig: Rig, scale: float) -> Samples:
     """A hundred robots on the fleet's screen."""
-    command = [sys.executable, "-m", "pebble.cli", "sim", "fleet", "-n", str(ROBOTS_SHOWN)]
-    command += ["--broker", f"mqtt://127.0.0.1:{rig.stage.broker_port}"]
-    robots = Program("the fleet", command, Path(rig.stage.folder_of_logs) / "fleet.log")
+    broker = f"mqtt://127.0.0.1:{rig.stage.broker_port}"
+    robots = rig.stage.robot("the fleet", "pebble.cli", "sim", "fleet", "-n", ROBOTS_SHOWN, "--broker", broker)
     try:
         page = rig.fleet()
         count = "document.querySelectorAll('[data-test^=\"card-\"]').length"
@@ -297,7 +289,7 @@ def crowd(rig: Rig, scale: float) -> Samples:
         busy = _busy(session.send("Performance.getMetrics")) - before
         return {**found, f"{ROBOTS_SHOWN} robots: ms an update": [1000 * busy / max(1, page.evaluate("bench.updates"))]}
     finally:
-        end_all([robots], _END_S)
+        rig.stage.end(robots)
 
 
 def _busy(answer: dict[str, Any]) -> float:
@@ -310,7 +302,7 @@ def _busy(answer: dict[str, Any]) -> float:
 def _cost(rig: Rig, what: str) -> Iterator[Samples]:
     """CPU and memory of the server during the block."""
     found: Samples = {}
-    pid = rig.stage.server.program.pid
+    pid = rig.stage.server.pid
     before, began = cpu_s([pid]), time.monotonic()
     yield found
     found[f"{what}: CPU"] = [100 * (cpu_s([pid]) - before) / (time.monotonic() - began)]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,10 +17,11 @@ from typing import IO, TYPE_CHECKING, Any
 from pebble.bench.chromium import chromium
 from pebble.contract import CAMERA, DRIVE
 from pebble.contract.channels import Channel
-from pebble.demo.stage import Stage
-from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
-from pebble.runtime.parent import tied_to_parent
+from pebble.rig.processes import OPERATORS
+from pebble.rig.programs import Program
+from pebble.rig.stage import Stage
+from pebble.rig.testbed import ROBOTS
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -223,25 +223,21 @@ def rig(*names: str, program: str | None = None, flags: tuple[str, ...] = (), **
             return context.new_page()
 
         made = Rig(stage, open_page)
-        stack.enter_context(_subscribed(stage.broker_port, DRIVE, "%U %t %p", made.receive_drives))
-        stack.enter_context(_subscribed(stage.broker_port, CAMERA, "%U %t %l", made.receive_frames))
+        stack.enter_context(_subscribed(stage, DRIVE, "%U %t %p", made.receive_drives))
+        stack.enter_context(_subscribed(stage, CAMERA, "%U %t %l", made.receive_frames))
         yield made
 
 
 @contextmanager
-def _subscribed(port: int, channel: Channel, line: str, receive: Callable[[IO[bytes]], None]) -> Iterator[None]:
+def _subscribed(stage: Stage, channel: Channel, line: str, receive: Callable[[IO[bytes]], None]) -> Iterator[None]:
     """``receive`` reads a line for each message, on a thread; ``line`` is mosquitto_sub's format."""
     program = shutil.which("mosquitto_sub")
     if program is None:
         raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
-    command = [program, "-h", "127.0.0.1", "-p", str(port), "-t", channel.filter("+/+/+"), "-F", line]
-    with subprocess.Popen(tied_to_parent(command), stdout=subprocess.PIPE) as subscriber:
-        assert subscriber.stdout is not None  # noqa: S101
-        reader = threading.Thread(target=receive, args=(subscriber.stdout,), name="subscriber", daemon=True)
-        reader.start()
-        try:
-            yield
-            if subscriber.poll() is not None or not reader.is_alive():
-                raise PebbleError("mosquitto_sub has ended: what it should have received is missing")
-        finally:
-            subscriber.kill()
+    command = [program, "-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", channel.filter("+/+/+"), "-F", line]
+    subscriber = stage.add(Program("mosquitto_sub", command, stage.folder / "subscriber.log", reports=True), OPERATORS)
+    reader = threading.Thread(target=receive, args=(subscriber.reports,), name="subscriber", daemon=True)
+    reader.start()
+    yield
+    if subscriber.ended or not reader.is_alive():
+        raise PebbleError("mosquitto_sub has ended: what it should have received is missing")

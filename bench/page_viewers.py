@@ -7,7 +7,6 @@ stopped (time.monotonic()), and the pictures of each viewer between.
 from __future__ import annotations
 
 import asyncio
-import json
 import struct
 import sys
 import time
@@ -15,6 +14,8 @@ from typing import Any
 from urllib.parse import urlencode, urlsplit
 
 from websockets.asyncio.client import connect
+
+from pebble.rig.worker_end import answer
 
 _CAN = "h264,pbvz,pbvd,json,jpeg"
 _FLOW_S = 4.0  # until the camera is running and every viewer has a key frame
@@ -47,8 +48,7 @@ async def measure(url: str, ref: str, count: int, seconds: float) -> dict[str, A
 
 def main(arguments: list[str]) -> int:
     url, ref, count, seconds = arguments
-    answer = asyncio.run(measure(url, ref, int(count), float(seconds)))
-    sys.stdout.write(json.dumps(answer) + "\n")
+    answer(asyncio.run(measure(url, ref, int(count), float(seconds))))
     return 0
 
 

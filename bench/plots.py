@@ -1,19 +1,76 @@
-"""The pictures of each comparison, and their files."""
+"""Draws the pictures that a comparison declares, in the common style: colours of the variants, panels, legends."""
 
 from __future__ import annotations
 
+import io
+import math
+import re
+import textwrap
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
-from pebble.bench.plots_bars import amounts, costs, launches, tails
-from pebble.bench.plots_impair import over_trials
-from pebble.bench.plots_latency import distributions, null_ratios, ratios
-from pebble.bench.plots_style import Picture, save
-from pebble.bench.plots_time import over_time
-from pebble.bench.plots_traffic import traffic_figures
-from pebble.bench.results import Results
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from PIL import Image
+
+from pebble.bench import catalogue
+from pebble.bench.pictures import ecdf
+from pebble.bench.results import Cell, Results
 from pebble.errors import PebbleError
 
-BASELINE = "mqtt"
+_DPI = 150
+_COLOURS = 255  # of the palette, which reduces files to a third
+_FEW_DECADES = {"x": 2.5, "y": 3.2}  # a logarithmic axis with fewer decades has ticks between the powers of ten
+_GREY = "#8a8a8a"
+_BACKGROUND = "white"
+_WIDEST = 13.0  # inches
+
+_SETTINGS: dict[Any, Any] = {
+    "font.size": 9,
+    "font.family": "DejaVu Sans",
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8.5,
+    "figure.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.5,
+    "figure.facecolor": _BACKGROUND,
+}
+
+
+Dash = Literal["-", "--", "-.", ":", ""]
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """The style of a variant in every picture. Dash and marker differ as well, for colour-blind readers."""
+
+    colour: str
+    dash: Dash = "-"
+    marker: str = "o"
+    hollow: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture: its file name without ending, its caption, and the function that draws it."""
+
+    name: str
+    caption: str
+    make: Callable[[], Figure]
 
 
 def draw(results: Results, folder: Path) -> list[Path]:
@@ -23,34 +80,9 @@ def draw(results: Results, folder: Path) -> list[Path]:
 
 def pictures(results: Results) -> list[Picture]:
     """The pictures that :func:`draw` draws, with captions; names are file names without their endings."""
-    match results.bench:
-        case "control":
-            title = "Service to service"
-            return [*distributions(results, title), *ratios(results, BASELINE, title)]
-        case "bridge":
-            title = "Operator to wheels and back"
-            return [*distributions(results, title), *ratios(results, BASELINE, title)]
-        case "control-null" | "bridge-null" | "frames-null":
-            title = f"Null test of {results.bench.removesuffix('-null')}"
-            return [*null_ratios(results, title), *distributions(results, title)]
-        case "startup":
-            return launches(results, "Start-up")
-        case "cost":
-            return costs(results, "What a robot costs")
-        case "frames":
-            return [*tails(results, "Frames between processes"), *distributions(results, "Frames between processes")]
-        case "bridge-profile":
-            return distributions(results, "Operator to wheels, hop by hop")
-        case "video":
-            return amounts(results, "Video at equal quality")
-        case "sound":
-            return amounts(results, "Sound")
-        case "traffic":
-            return traffic_figures(results)
-        case "impair":
-            return [*over_trials(results), *over_time(results)]
-        case _:
-            return distributions(results, results.bench.replace("-", " ").capitalize())
+    known = results.bench in catalogue.MODULES
+    drawn = catalogue.find(results.bench).pictures if known else (ecdf(results.bench.replace("-", " ").capitalize()),)
+    return [picture for one in drawn for picture in one.pictures(results)]
 
 
 def _file(picture: Picture, results: Results, folder: Path) -> Path:
@@ -60,3 +92,164 @@ def _file(picture: Picture, results: Results, folder: Path) -> Path:
     except OSError as error:
         raise PebbleError(f"{path}: {error.strerror}") from None
     return path
+
+
+_BLUES = ("#0072B2", "#2AA198", "#56B4E9", "#1B3A6B")
+_REDS = ("#D55E00", "#E69F00", "#A4133C", "#8C510A")
+_GREYS = ("#4d4d4d", "#8a8a8a", "#1a1a1a", "#b3b3b3")
+_GREENS = ("#117733", "#6DBE8B")
+_DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+_KNOWN = {
+    "zenoh": Style(_BLUES[0]),
+    "zenoh-p2p": Style(_BLUES[0]),
+    "zenoh-shm": Style(_BLUES[0]),
+    "zenoh-hub": Style(_BLUES[1], "--", "s"),
+    "zenoh-copy": Style(_BLUES[1], "--", "s"),
+    "zenoh-net": Style(_BLUES[2], "-.", "^"),
+    "mqtt": Style(_REDS[0], marker="D"),
+    "mqtt-nodelay": Style(_REDS[1], "--", "v"),
+    "mqtt5": Style(_REDS[2], "-.", "P"),
+    "paho": Style(_REDS[3], ":", "X"),
+    "one hop": Style(_GREYS[0], ":", "X"),
+    "memcpy": Style(_GREYS[0], ":", "X"),
+    "gstreamer-shm": Style(_GREYS[1], "--", "v"),
+    "reference": Style(_GREYS[3]),
+    "json": Style(_GREYS[1]),
+    "pcm": Style(_GREYS[1]),
+    "pbvd": Style("#CC79A7", "--", "s"),
+    "pbvz": Style("#7B4F9E", "-.", "^"),
+    "h264": Style(_GREENS[0], marker="D"),
+    "h264, key/5": Style(_GREENS[1], ":", "v"),
+    "opus": Style(_GREENS[0], marker="D"),
+    "zenoh original": Style(_BLUES[2], "--", "s", hollow=True),
+    "zenoh h264 opus": Style(_BLUES[0]),
+    "mqtt original": Style(_REDS[1], "--", "v", hollow=True),
+    "mqtt h264 opus": Style(_REDS[0], marker="D"),
+}
+
+
+def styles(variants: Sequence[str]) -> dict[str, Style]:
+    """The fixed style of each known variant, and one from its family's colours for every other."""
+    found = {name: _KNOWN[name] for name in variants if name in _KNOWN}
+    for name in variants:
+        if name not in found:
+            family = _BLUES if name.startswith("zenoh") else _REDS if name.startswith(("mqtt", "paho")) else _GREYS
+            used = {style.colour for style in found.values()}
+            colour = next((one for one in family if one not in used), family[len(found) % len(family)])
+            turn = len(found)
+            found[name] = Style(colour, _DASHES[turn % len(_DASHES)], _MARKERS[turn % len(_MARKERS)])
+    return {name: found[name] for name in variants}
+
+
+def unique(values: Sequence[str]) -> list[str]:
+    """In the order of their first appearance."""
+    return list(dict.fromkeys(values))
+
+
+def file_name(*words: str) -> str:
+    """Converts text such as ``one-way there, ± 0.4 ms`` to a file name."""
+    return "-".join(re.sub(r"[^a-z0-9]+", "-", word.lower()).strip("-") for word in words)
+
+
+def finite(samples: Sequence[float | None]) -> list[float]:
+    """The finite samples, without NaN and None."""
+    return [sample for sample in samples if sample is not None and math.isfinite(sample)]
+
+
+def place(cell: Cell) -> str:
+    """The conditions of a cell as text: ``40 B, 200 Hz, with media``."""
+    return ", ".join(filter(None, (_answers(*one) for one in cell.params.items()))) or _unloaded(cell)
+
+
+def _answers(name: str, value: object) -> str:
+    if name == "load":
+        return "" if value in (None, "none") else f"with {value}"
+    if value is None or isinstance(value, str):
+        return value or ""
+    return f"{value} {name.removesuffix('s') if value == 1 else name}"
+
+
+def _unloaded(cell: Cell) -> str:
+    return "unloaded" if "load" in cell.params else ""
+
+
+def short(text: str, width: int = 30) -> str:
+    """Wraps long names to two lines and truncates them."""
+    return "\n".join(textwrap.wrap(text, width, max_lines=2, placeholder="…")) or text
+
+
+def panels(count: int, columns: int, size: tuple[float, float], title: str) -> tuple[Figure, list[Axes]]:
+    """A figure with ``count`` panels of ``size`` inches each, as many in a row as fit."""
+    columns = max(1, min(columns, count))
+    rows = math.ceil(count / columns)
+    width = max(5.5, min(_WIDEST, columns * size[0]))
+    figure = Figure(figsize=(width, rows * size[1] + 0.9), dpi=_DPI, layout="constrained")
+    wrapped = "\n".join(textwrap.wrap(title, int(width * 11.5) - 14))  # leaves room for the “quick run” mark
+    figure.suptitle(wrapped, x=0.01, ha="left")
+    return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
+
+
+def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] = (), lines: bool = True) -> None:
+    """Adds a legend below the panels."""
+    handles = [
+        Line2D(
+            [], [], color=style.colour, label=short(name, 40), linestyle=style.dash if lines else "",
+            marker=style.marker, markersize=5, markerfacecolor=_BACKGROUND if style.hollow else style.colour,
+        )
+        for name, style in entries.items()
+    ]  # fmt: skip
+    handles += more
+    columns = max(1, min(len(handles), int(figure.get_figwidth() // 1.8)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
+
+
+def save(picture: Picture, path: Path, results: Results) -> None:
+    """Draws a PNG with a palette; a quick run is marked in the corner."""
+    buffer = io.BytesIO()
+    with mpl.rc_context(_SETTINGS):
+        figure = picture.make()
+        if results.quick:
+            figure.text(0.995, 0.993, "quick run", ha="right", va="top", color="#A4133C", weight="bold")
+        figure.savefig(buffer, format="png", dpi="figure")
+    drawn = Image.open(buffer).convert("RGB")
+    image = drawn.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    image.save(path, optimize=True, dpi=(_DPI, _DPI))
+
+
+def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
+    """Sets a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
+    axis: Axis = axes.xaxis if which == "x" else axes.yaxis
+    if which == "x":
+        axes.set_xscale("log")
+        axes.set_xlim(low, high)
+    else:
+        axes.set_yscale("log")
+        axes.set_ylim(low, high)
+    decades = math.log10(high / low)
+    steps = (1.0,) if decades > _FEW_DECADES[which] else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
+    axis.set_major_locator(LogLocator(subs=steps, numticks=20))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}"))
+    axis.set_minor_formatter(NullFormatter())
+    if decades <= _FEW_DECADES[which]:
+        axis.set_minor_locator(NullLocator())
+    axis.set_label_text(label)
+
+
+def around(values: Sequence[float | None]) -> tuple[float, float]:
+    """Ends of a logarithmic axis with some margin around all positive values."""
+    positive = [value for value in finite(values) if value > 0] or [1.0]
+    return 0.75 * min(positive), 1.4 * max(positive)
+
+
+def unit_of(unit: str) -> str:
+    return "µs" if unit == "us" else unit
+
+
+def guide(axes: Axes, value: float, text: str) -> None:
+    """Draws a thin line at a reference value, with its name at the end."""
+    axes.axhline(value, color=_GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+    axes.annotate(
+        text, (1.0, value), xycoords=axes.get_yaxis_transform(), xytext=(4, 0), textcoords="offset points", fontsize=8,
+        color="#555", ha="left", va="center", annotation_clip=False,
+    )  # fmt: skip

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pebble.bench.percentiles import percentile
-from pebble.bench.plots_style import (
+from pebble.bench.plots import (
     Picture,
     Style,
     file_name,
@@ -24,60 +24,57 @@ from pebble.bench.plots_style import (
     unique,
     unit_of,
 )
-from pebble.bench.results import Cell, Results
+from pebble.bench.results import Cell, Results, percentile
 from pebble.bench.tables import figure as digits
 
 _BAR = 0.8
 _SUM = "all"  # the process that stands for the sum
-_COSTS = ("PSS", "CPU")  # other measures are in the table only
 _WORDS = {"wire": "on the wire", "PSS": "memory (PSS)"}
 _LONGEST = 34  # characters of a label at an axis
 
 
-def launches(results: Results, title: str) -> list[Picture]:
+def dots(results: Results, title: str) -> list[Picture]:
     """One dot per launch, and the median."""
-    cells = [cell for cell in results.cells if finite(cell.samples)]
     caption = f"{title}: a dot for each launch or late subscriber, a line at the median of the rounds"
-    return [Picture(results.bench, caption, lambda: _dots(cells, caption))] if cells else []
-
-
-def costs(results: Results, title: str) -> list[Picture]:
-    """Memory and CPU of the processes of each variant, one panel per phase."""
-    found = []
-    for measure in _COSTS:
-        cells = [cell for cell in results.cells if cell.measure == measure and finite(cell.samples)]
-        if not cells:
-            continue
-        caption = f"{title}: {measure}, medians"
-        found.append(Picture(file_name(results.bench, measure), caption, lambda c=cells, t=caption: _phases(c, t)))  # type: ignore[misc]
-    return found
+    return _picture(results.bench, caption, _measured(results), _dots)
 
 
 def tails(results: Results, title: str) -> list[Picture]:
     """Medians as bars, with a line to the 99th percentile; one panel per condition."""
-    cells = [cell for cell in results.cells if finite(cell.samples)]
     caption = f"{title}: bars to the median, lines to the 99th percentile"
-    return [Picture(f"{results.bench}-bars", caption, lambda: _tails(cells, caption))] if cells else []
+    return _picture(f"{results.bench}-bars", caption, _measured(results), _tails)
 
 
-def amounts(results: Results, title: str) -> list[Picture]:
+def bars(results: Results, title: str, measures: Sequence[str], panel: str, group: str) -> list[Picture]:
     """One picture per measure: a bar per variant and condition for the median of the samples."""
+    measured = _measured(results)
     found = []
-    for measure in unique([cell.measure for cell in results.cells if finite(cell.samples)]):
-        cells = [cell for cell in results.cells if cell.measure == measure and finite(cell.samples)]
-        name = file_name(results.bench, measure)
-        caption = f"{title}: {_measure_text(measure)}"
-        found.append(Picture(name, caption, lambda c=cells, t=caption: _amounts(c, t)))  # type: ignore[misc]
+    for measure in measures or unique([cell.measure for cell in measured]):
+        cells = [cell for cell in measured if cell.measure == measure]
+        caption = f"{title}: {measure}, medians" if panel else f"{title}: {_measure_text(measure)}"
+        make = partial(_panels, panel=panel, group=group) if panel else _amounts
+        found += _picture(file_name(results.bench, measure), caption, cells, make)
     return found
 
 
+def _measured(results: Results) -> list[Cell]:
+    return [cell for cell in results.cells if finite(cell.samples)]
+
+
+def _picture(
+    name: str, caption: str, cells: Sequence[Cell], make: Callable[[Sequence[Cell], str], Figure]
+) -> list[Picture]:
+    """No picture without cells."""
+    return [Picture(name, caption, lambda: make(cells, caption))] if cells else []
+
+
 def _dots(cells: Sequence[Cell], title: str) -> Figure:
-    kinds = unique([f"{cell.measure}\n{place(cell)}".strip() for cell in cells])
+    kinds = unique([_kind(cell) for cell in cells])
     figure, every = panels(len(kinds), 3, (3.6, 2.9), title)
     style_of = styles(unique([cell.variant for cell in cells]))
     spread = np.random.default_rng(1)
     for axes, kind in zip(every, kinds, strict=True):
-        shown = [cell for cell in cells if f"{cell.measure}\n{place(cell)}".strip() == kind]
+        shown = [cell for cell in cells if _kind(cell) == kind]
         for at, cell in enumerate(shown):
             samples, style = finite(cell.samples), style_of[cell.variant]
             beside = spread.uniform(-0.16, 0.16, len(samples))
@@ -96,22 +93,28 @@ def _dots(cells: Sequence[Cell], title: str) -> Figure:
     return figure
 
 
-def _phases(cells: Sequence[Cell], title: str) -> Figure:
-    phases = unique([str(cell.params.get("phase", "")) for cell in cells])
-    processes = sorted(unique([_process(cell) for cell in cells]), key=lambda name: name == _SUM)  # the sum comes last
+def _kind(cell: Cell) -> str:
+    return f"{cell.measure}\n{place(cell)}".strip()
+
+
+def _panels(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Figure:
+    """A panel for each value of the parameter ``panel``, in which ``group`` names the bars; the sum comes last."""
+
+    def group_of(cell: Cell) -> str:
+        return str(cell.params.get(group, ""))
+
+    phases = unique([str(cell.params.get(panel, "")) for cell in cells])
+    groups = sorted(unique([group_of(cell) for cell in cells]), key=lambda name: name == _SUM)
     end = 1.14 * max(percentile(finite(cell.samples), 50) for cell in cells)
-    variants = unique([cell.variant for cell in cells])
-    figure, every = panels(
-        len(phases), 2, (5.2, 0.9 + 0.17 * len(processes) * len(variants) + 0.1 * len(processes)), title
-    )
-    style_of = styles(variants)
+    style_of = styles(unique([cell.variant for cell in cells]))
+    size = (5.2, 0.9 + 0.17 * len(groups) * len(style_of) + 0.1 * len(groups))
+    figure, every = panels(len(phases), 2, size, title)
     for axes, phase in zip(every, phases, strict=True):
-        shown = [cell for cell in cells if str(cell.params.get("phase", "")) == phase]
-        _grouped(axes, shown, processes, _process, style_of)
+        _grouped(axes, [cell for cell in cells if str(cell.params.get(panel, "")) == phase], groups, group_of, style_of)
         axes.set_xlim(0, end or 1.0)
         axes.set_title(short(phase, 50), loc="left")
         axes.set_xlabel(_axis(cells[0]))
-    legend(figure, {name: Style(style.colour, "", "s") for name, style in style_of.items()}, lines=False)
+    _squares(figure, style_of)
     return figure
 
 
@@ -122,11 +125,15 @@ def _amounts(cells: Sequence[Cell], title: str) -> Figure:
     style_of = styles(variants)
     if len(groups) == 1 or len(variants) * len(groups) == len(cells):
         _grouped(axes, cells, groups, place, style_of)
-        legend(figure, {name: Style(style.colour, "", "s") for name, style in style_of.items()}, lines=False)
+        _squares(figure, style_of)
     else:  # most variants have conditions of their own: each bar has its full name as label
         _grouped(axes, cells, unique([_name(cell) for cell in cells]), _name, style_of)
     axes.set_xlabel(_axis(cells[0]))
     return figure
+
+
+def _squares(figure: Figure, style_of: dict[str, Style]) -> None:
+    legend(figure, {name: Style(style.colour, "", "s") for name, style in style_of.items()}, lines=False)
 
 
 def _name(cell: Cell) -> str:
@@ -147,9 +154,13 @@ def _grouped(
             y = at + _BAR * ((number + 0.5) / len(members) - 0.5)
             axes.barh(y, value, height=min(0.5, 0.9 * _BAR / len(members)), color=style_of[cell.variant].colour)
             axes.annotate(f" {digits(value)}", (value, y), fontsize=8, va="center")
-    axes.set_yticks(range(len(groups)), [short(name or "all", _LONGEST) for name in groups])
-    axes.set_ylim(len(groups) - 0.4, -0.6)
+    _names(axes, [name or "all" for name in groups])
     axes.set_xlim(0, 1.14 * longest or 1.0)
+
+
+def _names(axes: Axes, names: Sequence[str]) -> None:
+    axes.set_yticks(range(len(names)), [short(name, _LONGEST) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
 
 
@@ -158,28 +169,20 @@ def _tails(cells: Sequence[Cell], title: str) -> Figure:
     variants = unique([cell.variant for cell in cells])
     figure, every = panels(len(conditions), 2, (5.0, 0.9 + 0.32 * len(variants)), title)
     style_of = styles(variants)
-    lows = [percentile(finite(cell.samples), 50) for cell in cells]
-    highs = [percentile(finite(cell.samples), 99) for cell in cells]
-    left, right = 0.5 * min((low for low in lows if low > 0), default=1.0), 9 * max(highs)
+    ends = [(percentile(finite(cell.samples), 50), percentile(finite(cell.samples), 99)) for cell in cells]
+    left, right = 0.5 * min((low for low, _ in ends if low > 0), default=1.0), 9 * max(high for _, high in ends)
     for axes, condition in zip(every, conditions, strict=True):
         log_axis(axes, "x", f"latency, {unit_of(cells[0].unit)}", left, right)
-        shown = [cell for cell in cells if place(cell) == condition]
-        for cell in shown:
-            at, samples, style = variants.index(cell.variant), finite(cell.samples), style_of[cell.variant]
-            middle, high = percentile(samples, 50), percentile(samples, 99)
-            axes.barh(at, middle - left, left=left, height=0.62, color=style.colour, alpha=0.75)
-            axes.plot([middle, high], [at, at], color="#222", linewidth=1.1)
-            axes.plot(high, at, marker="|", color="#222", markersize=7, markeredgewidth=1.3)
-            axes.annotate(f"  {digits(middle)} / {digits(high)}", (high, at), fontsize=8, va="center")
-        axes.set_yticks(range(len(variants)), [short(name, _LONGEST) for name in variants])
-        axes.set_ylim(len(variants) - 0.4, -0.6)
-        axes.grid(visible=False, axis="y")
+        for cell, (middle, high) in zip(cells, ends, strict=True):
+            if place(cell) == condition:
+                at = variants.index(cell.variant)
+                axes.barh(at, middle - left, left=left, height=0.62, color=style_of[cell.variant].colour, alpha=0.75)
+                axes.plot([middle, high], [at, at], color="#222", linewidth=1.1)
+                axes.plot(high, at, marker="|", color="#222", markersize=7, markeredgewidth=1.3)
+                axes.annotate(f"  {digits(middle)} / {digits(high)}", (high, at), fontsize=8, va="center")
+        _names(axes, variants)
         axes.set_title(short(condition, 50), loc="left")
     return figure
-
-
-def _process(cell: Cell) -> str:
-    return str(cell.params.get("process", ""))
 
 
 def _axis(cell: Cell) -> str:

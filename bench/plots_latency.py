@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from pebble.bench import null
-from pebble.bench.plots_style import (
+from pebble.bench.plots import (
     Picture,
     Style,
     file_name,
@@ -56,7 +56,7 @@ def distributions(results: Results, title: str) -> list[Picture]:
     return found
 
 
-def ratios(results: Results, baseline: str, title: str) -> list[Picture]:
+def ratios(results: Results, title: str, baseline: str) -> list[Picture]:
     """The medians as ratios to the baseline's; no picture without a baseline."""
     found = []
     for cell in results.cells:

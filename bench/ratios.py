@@ -10,11 +10,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 
 LEVEL = 0.99
 #: Fewer rounds than this do not support a 99 % interval: it is computed, but means little.
@@ -24,7 +22,10 @@ _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
 _SEED = 1  # the same samples give the same interval
 
-_Floats = np.ndarray[Any, np.dtype[np.float64]]
+if TYPE_CHECKING:  # importing numpy earlier than it is needed would change the memory of measured processes
+    import numpy as np
+
+    _Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,8 @@ def paired(
     ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
     if not ratios:
         return Interval(math.nan, math.nan, math.nan, level, 0)
+    import numpy as np
+
     logs = np.log(ratios)
     picked = _generator().integers(0, len(logs), (_RESAMPLES, len(logs)))
     return _interval(float(np.median(logs)), np.median(logs[picked], axis=1), len(logs), level)
@@ -95,6 +98,8 @@ def unpaired(
     level: float = LEVEL,
 ) -> Interval:
     """The same for two runs at different times: the ratio of the medians of their rounds' percentiles."""
+    import numpy as np
+
     a, b = (
         np.log([value for one in rounds if one and (value := percentile(one, percent)) > 0])
         for rounds in (ours, theirs)
@@ -107,6 +112,8 @@ def unpaired(
 
 
 def _interval(ratio: float, resampled: _Floats, rounds: int, level: float) -> Interval:
+    import numpy as np
+
     if rounds < 2:
         return Interval(math.exp(ratio), 0.0, math.inf, level, rounds)
     tail = (1 - level) / 2
@@ -128,4 +135,6 @@ def _digits(ratio: float) -> str:
 
 
 def _generator() -> np.random.Generator:
+    import numpy as np
+
     return np.random.default_rng(_SEED)

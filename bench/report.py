@@ -9,23 +9,25 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pebble.bench import report_run
-from pebble.bench.output import check_folder
-from pebble.bench.report_plan import COMPARISONS, Comparison
-from pebble.bench.report_run import HUNG, INTERRUPTED, Outcome, Run
-from pebble.bench.report_text import HEADING, Section, text
-from pebble.bench.results import Results, load
+from pebble.bench import catalogue
+from pebble.bench.comparison import Comparison
+from pebble.bench.engine import check_folder
+from pebble.bench.report_text import HEADING, HUNG, INTERRUPTED, Outcome, Run, Section, text
+from pebble.bench.results import load, pack
 from pebble.errors import PebbleError
 from pebble.runtime.parent import tied_to_parent
 from pebble.runtime.signals import interrupted_by_signals
 
 NAME = "README.md"
+_ENDED = "report.json"
 _WIDTH = 120  # characters of the comparisons' tables
 _POLL_S = 0.2
 _TIMEOUT_FACTOR = 4  # a comparison that takes this many times the expected time,
@@ -53,7 +55,12 @@ def run(
     expected = sum(one.expected_s(quick) for one in comparisons)
     about = f"{expected / 60:.0f} min" if expected > 120 else f"{expected} s"
     console.print(f"{len(comparisons)} comparisons: about {about}", highlight=False)
-    known = _begin(comparisons, left_out, folder)
+    known = _known(folder)
+    for one in left_out:
+        _delete_results(one, folder)
+        known.ended.pop(one.name, None)
+    shown = {one.name for one in (*comparisons, *left_out)}
+    known.left_out = [*(name for name in known.left_out if name not in shown), *(one.name for one in left_out)]
     try:
         with interrupted_by_signals():
             _measure(comparisons, folder, quick, known, console)
@@ -62,22 +69,12 @@ def run(
             write(folder, redraw=False)
         raise
     write(folder, redraw=False)
+    pack(folder)
     console.print(f"Written: {folder / NAME}", highlight=False, soft_wrap=True)
     failed = {one.name: problem for one in comparisons if (problem := known.ended[one.name].problem)}
     for name, why in failed.items():
         console.print(f"{name} {why}: see {folder / name}.txt", style="red", highlight=False, soft_wrap=True)
     return 1 if failed else 0
-
-
-def _begin(comparisons: Sequence[Comparison], left_out: Sequence[Comparison], folder: Path) -> Run:
-    """Loads the state of the folder, without the comparisons to be measured now or left out."""
-    known = report_run.load(folder)
-    for one in left_out:
-        _delete_results(one, folder)
-        known.ended.pop(one.name, None)
-    shown = {one.name for one in (*comparisons, *left_out)}
-    known.left_out = [*(name for name in known.left_out if name not in shown), *(one.name for one in left_out)]
-    return known
 
 
 def write(folder: Path, *, redraw: bool = True) -> Path:
@@ -87,8 +84,10 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
     """
     _require_matplotlib()
     _check_not_foreign(folder)
-    known = report_run.load(folder)
-    sections = [section for one in COMPARISONS if (section := _section(one, folder, known, redraw)) is not None]
+    known = _known(folder)
+    sections = [
+        section for one in catalogue.reported() if (section := _section(one, folder, known, redraw)) is not None
+    ]
     if not sections:
         raise PebbleError(f"{folder} has no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME
@@ -117,75 +116,48 @@ def _check_not_foreign(folder: Path) -> None:
 
 def _section(comparison: Comparison, folder: Path, known: Run, redraw: bool) -> Section | None:
     """None for a comparison without results and output."""
+    from pebble.bench.plots import draw, pictures
+
     output, measured = folder / f"{comparison.name}.txt", folder / f"{comparison.name}.json"
-    if not output.exists() and not measured.exists():
-        return None
     words = output.read_text(errors="replace") if output.exists() else ""
-    ended = known.ended.get(comparison.name)
+    found = Section(comparison=comparison, results=None, output=words, ended=known.ended.get(comparison.name))
     if not measured.exists():
-        return Section(comparison=comparison, results=None, output=words, ended=ended)
+        return found if output.exists() else None
     try:
         results = load(measured)
     except PebbleError as error:  # of another version: the other sections are still written
-        return Section(comparison=comparison, results=None, output=str(error), ended=ended)
-    pictures = _pictures(results, folder, redraw)
-    return Section(comparison=comparison, results=results, output=words, ended=ended, pictures=pictures)
-
-
-def _pictures(results: Results, folder: Path, redraw: bool) -> list[tuple[str, str]]:
-    """Files and captions. A comparison that was run just now has already drawn its pictures."""
-    from pebble.bench.plots import draw, pictures
-
+        return replace(found, output=str(error))
     named = [(f"{picture.name}.png", picture.caption) for picture in pictures(results)]
-    if redraw or not all((folder / name).exists() for name, _ in named):
+    if redraw or not all(
+        (folder / name).exists() for name, _ in named
+    ):  # a comparison that ran just now has drawn its own
         draw(results, folder)
-    return named
-
-
-class _Bar:
-    """The progress of the whole report, by expected times."""
-
-    def __init__(self, progress: Progress, comparisons: Sequence[Comparison], quick: bool) -> None:
-        self._progress, self._quick, self._count = progress, quick, len(comparisons)
-        self._task = progress.add_task("", total=sum(one.expected_s(quick) for one in comparisons), left="")
-        self._number, self._done = 0, 0
-        self._now: Comparison | None = None
-
-    def next(self, comparison: Comparison) -> None:
-        if self._now is not None:
-            self._done += self._now.expected_s(self._quick)
-        self._now = comparison
-        self._number += 1
-
-    def tick(self, since_s: float) -> None:
-        if self._now is None:
-            return
-        expected = self._now.expected_s(self._quick)
-        self._progress.update(
-            self._task,
-            description=f"{self._number} of {self._count}: {self._now.name}",
-            completed=self._done + min(since_s, expected),
-            left=f"{since_s:.0f} s of about {expected}",
-        )
+    return replace(found, results=results, pictures=named)
 
 
 def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known: Run, console: Console) -> None:
     """Runs all comparisons; each outcome is saved at once."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"), TimeElapsedColumn())
+    expected = [one.expected_s(quick) for one in comparisons]
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
-        bar = _Bar(progress, comparisons, quick)
+        bar = progress.add_task("", total=sum(expected))
         for number, one in enumerate(comparisons):
+
+            def tick(since_s: float, number: int = number, name: str = one.name) -> None:
+                text = f"{number + 1} of {len(comparisons)}: {name}, {since_s:.0f} s of about {expected[number]}"
+                done = sum(expected[:number]) + min(since_s, expected[number])
+                progress.update(bar, description=text, completed=done)
+
             _delete_results(one, folder)
             known.ended[one.name] = Outcome(code=INTERRUPTED, took_s=0.0)  # until it ends
             known.interrupted = f"in {one.name}, after {number} of {len(comparisons)}"
-            known.save(folder)
-            bar.next(one)
+            _save(known, folder)
             began = time.monotonic()
-            code = _run(one, folder, quick, bar.tick)
+            code = _run(one, folder, quick, tick)
             left = (folder / f"{one.name}.json").exists()
             ended = Outcome(code=code, took_s=round(time.monotonic() - began, 1), results=left)
             known.ended[one.name], known.interrupted = ended, ""
-            known.save(folder)
+            _save(known, folder)
             took = f"{one.name}: {ended.took_s:.0f} s"
             console.print(", ".join(filter(None, (took, ended.problem))), highlight=False, soft_wrap=True)
 
@@ -243,3 +215,25 @@ def _delete_results(comparison: Comparison, folder: Path) -> None:
         old = []
     for name in (*old, measured.name, f"{comparison.name}.txt"):
         (folder / name).unlink(missing_ok=True)
+
+
+# -- how the comparisons ended: stored beside their results, since a result file does not contain it
+
+
+def _save(known: Run, folder: Path) -> None:
+    path = folder / _ENDED
+    try:
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(known)) + b"\n")
+    except OSError as error:
+        raise PebbleError(f"{path}: {error.strerror}") from None
+
+
+def _known(folder: Path) -> Run:
+    """The state of a folder; empty without the file. Raises PebbleError for an invalid file."""
+    path = folder / _ENDED
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Run)
+    except FileNotFoundError:
+        return Run()
+    except (OSError, msgspec.DecodeError) as error:
+        raise PebbleError(f"{path} cannot be read: {error}") from None

@@ -5,25 +5,57 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from pebble.bench import null
+import msgspec
+
+from pebble.bench import catalogue, null
+from pebble.bench.aims import MISSED
+from pebble.bench.comparison import Comparison
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.report_limits import limits
-from pebble.bench.report_plan import Comparison, title_of
-from pebble.bench.report_run import Outcome, Run
 from pebble.bench.results import Results
 
 HEADING = "# Results"  # the first line of every report
-#: ``aim: <what>: met (<figure>)``, ``… missed by <figure>``, ``… not judged (<figure>)`` or ``… <figure>, met``
-_AIM = re.compile(
-    r"aim: (?P<aim>.+): (?:(?P<before>[^:]+), )?(?P<how>met|missed|not judged)"
-    r"(?P<by> by [^()]+)?(?: \((?P<figure>.*)\))?\.?"
-)
 _NULL = "-null"
 _NOT_THE_TABLE = ("Written:", "No plots:")  # what a command prints about its files
 _LONG = 45  # lines of output: more are collapsed
+_BOLD = {MISSED: f"**{MISSED}**"}
+_PIPE = "\\|"
 _TAIL = 12  # lines of a failed command's output
+
+
+HUNG, INTERRUPTED = -1, -2
+
+
+class Outcome(msgspec.Struct, kw_only=True):
+    """One command line of a report: its exit code, and how long it took with all its processes."""
+
+    code: int
+    took_s: float
+    results: bool = True  # whether it wrote results
+
+    @property
+    def problem(self) -> str:
+        """Why it failed; empty if it did not."""
+        if self.code == HUNG:
+            return "hung and was ended"
+        if self.code == INTERRUPTED:
+            return "was interrupted"
+        if self.code:
+            return f"ended with code {self.code}"
+        return "" if self.results else "measured nothing"
+
+
+class Run(msgspec.Struct, kw_only=True):
+    """The runs that wrote into a folder, by the names of the comparisons."""
+
+    ended: dict[str, Outcome] = {}
+    left_out: list[str] = []  # not permitted for this user
+    interrupted: str = ""  # in which comparison, after how many
+
+    @property
+    def took_s(self) -> float:
+        return sum(one.took_s for one in self.ended.values())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,18 +66,16 @@ class Section:
     results: Results | None
     output: str = ""
     ended: Outcome | None = None  # None: unknown
-    pictures: Sequence[tuple[str, str]] = field(default_factory=tuple)
+    pictures: Sequence[tuple[str, str]] = ()
 
     @property
-    def assessment(self) -> list[str]:
-        """The sentences without the aims."""
-        return [line for line in self._lines() if not line.startswith("aim:")]
+    def link(self) -> str:
+        """The anchor that GitHub generates for its heading."""
+        return "#" + re.sub(r"[^\w\- ]", "", self.comparison.title.lower()).replace(" ", "-")
 
     @property
-    def aims(self) -> list[tuple[str, str, str]]:
-        """Each aim, whether it was met, and the measured value."""
-        found = filter(None, map(_AIM.fullmatch, self._lines()))
-        return [(one["aim"], one["how"], _figure(one["before"], one["by"], one["figure"])) for one in found]
+    def sentences(self) -> list[str]:
+        return [] if self.results is None else self.results.assessment
 
     @property
     def problem(self) -> str:
@@ -61,9 +91,6 @@ class Section:
     @property
     def quick(self) -> bool:
         return self.results is not None and self.results.quick
-
-    def _lines(self) -> list[str]:
-        return [] if self.results is None else self.results.assessment
 
 
 def text(sections: Sequence[Section], run: Run | None = None) -> str:
@@ -101,14 +128,15 @@ def _head(sections: Sequence[Section], run: Run) -> Iterator[str]:
     took = _span(sum(section.took_s for section in sections))
     when = f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1])))}, in {took}. " if days else ""
     yield (
-        f"{when}Everything here, including this text, is made by `make report{' QUICK=1' if quick else ''}`; every "
-        "sample is in the `.json` file of its comparison, with the options and versions of the run."
+        f"{when}Everything here, including this text, is made by `make report{' QUICK=1' if quick else ''}`; each "
+        "comparison has a `.json` file with the options and versions of the run; the samples are in `samples.json.xz`, "
+        "at most 2,000 of each case, taken so that percentiles stay as they were."
     )
 
 
 def _has_quick(section: Section) -> bool:
     about = section.comparison
-    return section.results is not None and list(about.quick) != list(about.full)
+    return section.results is not None and about.has_quick
 
 
 def _span(seconds: float) -> str:
@@ -119,29 +147,23 @@ def _span(seconds: float) -> str:
 def _summary(sections: Sequence[Section], run: Run) -> Iterator[str]:
     lines = []
     for section in sections:
-        about = section.comparison
-        link = f"* [{about.title}](#{_anchor(about.title)})"
-        found = [f"  * {line}" for line in section.assessment[: about.summary_lines]]
+        link = f"* [{section.comparison.title}]({section.link})"
+        found = [f"  * {line}" for line in section.sentences[: section.comparison.summary_lines]]
         if section.results is None:
             lines.append(f"{link}: **failed**, {section.problem or 'nothing was measured'}")
         elif section.problem:
             lines += [f"{link}: **incomplete**, it {section.problem}", *found]
         elif found:
             lines += [link, *found]
-    lines += [f"* {title_of(name)}: left out, needs root" for name in run.left_out]
-    lines += _null_tests(sections)
+    lines += [f"* {catalogue.find(name).title}: left out, needs root" for name in run.left_out]
+    if tests := [results for results in _measured(sections) if results.bench.endswith(_NULL)]:
+        shown = [f"{results.bench.removesuffix(_NULL)} {_null(results)}" for results in tests]
+        lines.append(
+            f"* Null tests, each variant against itself and against itself slowed by a fifth: {', '.join(shown)}"
+        )
     if lines:
         yield "## In short"
         yield "\n".join(lines)
-
-
-def _null_tests(sections: Sequence[Section]) -> list[str]:
-    """One line with the results of the null tests."""
-    tests = [results for results in _measured(sections) if results.bench.endswith(_NULL)]
-    if not tests:
-        return []
-    shown = [f"{results.bench.removesuffix(_NULL)} {_null(results)}" for results in tests]
-    return [f"* Null tests, each variant against itself and against itself slowed by a fifth: {', '.join(shown)}"]
 
 
 def _null(results: Results) -> str:
@@ -152,29 +174,24 @@ def _null(results: Results) -> str:
 
 def _aims(sections: Sequence[Section]) -> Iterator[str]:
     rows = [
-        f"| {_cell(aim)} | [{section.comparison.name}](#{_anchor(section.comparison.title)}) "
-        f"| {'**missed**' if how == 'missed' else how} | {_cell(figure)} |"
+        (aim.what, f"[{section.comparison.name}]({section.link})", _BOLD.get(aim.outcome, aim.outcome), aim.measured)
         for section in sections
-        for aim, how, figure in section.aims
+        if section.results is not None
+        for aim in section.results.aims
     ]
     if rows:
         yield "## Aims"
-        yield "\n".join(["| aim | comparison | | measured |", "|---|---|---|---|", *rows])
+        yield _table(("aim", "comparison", "", "measured"), rows)
 
 
 def _machine(sections: Sequence[Section]) -> Iterator[str]:
-    measured = _measured(sections)
-    rows: dict[str, list[str]] = {}
-    for results in measured:
+    rows: dict[str, dict[str, None]] = {}
+    for results in _measured(sections):
         for name, value in {**results.machine, "pebble": results.pebble}.items():
-            shown = rows.setdefault(name, [])
-            if str(value) not in shown:
-                shown.append("not installed" if value is None else str(value))
+            rows.setdefault(name, {})["not installed" if value is None else str(value)] = None
     if rows:
         yield "## The machine"
-        yield "\n".join(
-            ["| | |", "|---|---|", *(f"| {name} | {_cell(' / '.join(shown))} |" for name, shown in rows.items())]
-        )
+        yield _table(("", ""), [(name, " / ".join(shown)) for name, shown in rows.items()])
 
 
 def _section(section: Section, quick: bool) -> Iterator[str]:
@@ -192,8 +209,8 @@ def _section(section: Section, quick: bool) -> Iterator[str]:
         yield f"Started {results.began[:10]} {results.began[11:16]} UTC, {_span(section.took_s)}{quickly}."
     if section.problem:
         yield f"**It {section.problem}: something could not be measured.** See its output."
-    if results.assessment:
-        yield "\n".join(f"* {line}" for line in results.assessment)
+    if lines := [*results.assessment, *results.aims]:
+        yield "\n".join(f"* {line}" for line in lines)
     for file, caption in section.pictures:
         yield f"![{caption}]({file})"
     yield from _output(section, results)
@@ -201,37 +218,91 @@ def _section(section: Section, quick: bool) -> Iterator[str]:
 
 def _output(section: Section, results: Results) -> Iterator[str]:
     """The printed tables, without the assessment, which is above."""
+    known = {*results.assessment, *map(str, results.aims)}
     lines = [
         line.rstrip()
         for line in section.output.splitlines()
-        if line.strip() not in results.assessment and not line.startswith(_NOT_THE_TABLE)
+        if line.strip() not in known and not line.startswith(_NOT_THE_TABLE)
     ]
-    while lines and not lines[-1]:
-        lines.pop()
-    while lines and not lines[0]:
-        lines.pop(0)
-    if not lines:
+    if not any(lines):
         return
-    if len(lines) <= _LONG:
-        yield _fenced(lines)
-    else:
+    lines = "\n".join(lines).strip("\n").split("\n")
+    folded = len(lines) > _LONG
+    if folded:
         yield f"<details><summary>The tables, {len(lines)} lines</summary>"
-        yield _fenced(lines)
+    yield _fenced(lines)
+    if folded:
         yield "</details>"
-
-
-def _figure(*parts: str | None) -> str:
-    return ", ".join(part.strip() for part in parts if part)
 
 
 def _fenced(lines: Sequence[str]) -> str:
     return "\n".join(["```text", *lines, "```"])
 
 
-def _cell(words: str) -> str:
-    return words.replace("|", "\\|")
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = ["|" + "---|" * len(heads)]
+    for line in (heads, *rows):
+        lines.append(f"| {' | '.join(cell.replace('|', _PIPE) for cell in line)} |".replace("|  |", "| |"))
+    return "\n".join([lines[1], lines[0], *lines[2:]])
 
 
-def _anchor(title: str) -> str:
-    """The anchor that GitHub generates for a heading."""
-    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
+# -- limits
+
+
+_NO_REAL = (
+    "No radio. Every byte went over loopback or a veth pair. Wi-Fi has contention between stations, retries, changing "
+    "rates and power save. The profiles of the impaired network imitate the effect of these on bandwidth, delay and "
+    "loss, not their cause.",
+    "No second machine. Both ends of every latency use the same clock and share the same cores: brokers, operators and "
+    "the measuring programs compete with the robot, which they do not on a real robot.",
+    "No Raspberry Pi. Its cores are slower, its memory and USB behave differently, and it throttles when hot. Ratios "
+    "between variants transfer better than times, and only where both are limited by the same resource.",
+    "No camera and no microphone. Pictures and sound are synthetic: a moving scene and speech that are the same in "
+    "every run. Real ones are noisier, which costs every encoder bytes, and a real device adds latency.",
+    "No hardware encoder. H.264 is x264 on the CPU, as on a robot without one.",
+    "No MCU. Its end of the serial line is a simulated board on a pty, which has no baud rate: at 115,200 baud a "
+    "command's line of about 15 bytes takes another 1.3 ms, on each transport alike.",
+    "No other language. Both ends are Python, with paho and with Zenoh's Python binding; the results include the "
+    "interpreter. A C++ node would be faster on either transport, with other ratios.",
+    "No large network: no router between hub and peers, no TLS, no other robots on the broker, except in the fleet.",
+    "No long run. Each case took seconds to minutes; leaks, and brokers that have run for a month, are not covered.",
+)
+_OF_QUICK = (
+    "A quick run has too few rounds for a narrow 99 % interval, and leaves out most sizes, rates, loads and trials. "
+    "“Equal within noise” here mostly means that there was not enough time to measure a difference."
+)
+_OF_NULL_TESTS = (
+    "A null test shows that a comparison finds no difference where there is none. It does not show the cause of the "
+    "differences that it finds."
+)
+
+
+def limits(measured: Sequence[Results]) -> list[str]:
+    """The limits as sentences, the most important first."""
+    return [
+        *([_OF_QUICK] if any(one.quick for one in measured) else []),
+        _this_machine(measured),
+        *_proxy_limits(measured),
+        *_NO_REAL,
+        _OF_NULL_TESTS,
+    ]
+
+
+def _this_machine(measured: Sequence[Results]) -> str:
+    machine = measured[0].machine if measured else {}
+    cpu, cores = machine.get("cpu") or "an unknown CPU", machine.get("cores") or "some"
+    return (
+        f"One machine, {cores} cores of {cpu}. Intervals are over the rounds of one run, so they include the noise of "
+        "that hour; another run, another kernel or another load on the same host changes medians by more than they "
+        "show. On a virtual machine the host can take CPU time away for milliseconds: the slowest percent shows it."
+    )
+
+
+def _proxy_limits(measured: Sequence[Results]) -> Iterator[str]:
+    """How the impaired network was made, if by a proxy."""
+    for options in (one.options for one in measured if one.bench == "impair" and one.options.get("link") == "proxy"):
+        why = f" ({options['why_proxy']})" if options.get("why_proxy") else ""
+        yield (
+            f"No namespaces: the impaired network was a TCP proxy{why}. A proxy ends TCP on each side, so loss is "
+            "modelled as the delay of TCP's retransmission; no packet is lost or resent on any wire."
+        )

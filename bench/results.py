@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import lzma
+import math
 import os
 import platform
 import shutil
@@ -13,11 +16,14 @@ from pathlib import Path
 
 import msgspec
 
-from pebble.bench.percentiles import percentile
 from pebble.errors import PebbleError
 from pebble.version import __version__
 
 FORMAT = 1
+SAMPLES = "samples.json.xz"  # of the results in the same folder, after a report
+MOST = 2000  # samples of a thinned cell
+_PERCENTS = (50, 95, 99, 100)  # kept of a thinned cell
+LONGEST_S = 3600.0  # of one phase of a comparison
 OVER_TIME = " over time"  # suffix of the measure of a cell that holds a curve: times, then values
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
 _MOSQUITTO = "/usr/sbin:/usr/local/sbin"
@@ -38,6 +44,8 @@ class Cell(msgspec.Struct, kw_only=True):
     unit: str  # of the samples: "us", "ms", "s", "MB", "%"
     rounds: list[list[float]] = []  # the samples of each round, in the order they were taken
     figures: dict[str, Value] = {}  # single values: sent, cpu, …
+    counts: list[int] = []  # of a thinned cell: all samples of each round,
+    percentiles: dict[str, float] = {}  # and their percentiles
 
     @property
     def samples(self) -> list[float]:
@@ -47,15 +55,42 @@ class Cell(msgspec.Struct, kw_only=True):
     def lost(self) -> int | None:
         """Messages that were sent and never arrived; None if they were not counted."""
         sent = self.figures.get("sent")
-        return int(sent) - len(self.samples) if isinstance(sent, int) else None
+        return int(sent) - sum(self.sizes) if isinstance(sent, int) else None
+
+    @property
+    def sizes(self) -> list[int]:
+        """How many samples each round had, before the cell was thinned."""
+        return self.counts or [len(one) for one in self.rounds]
 
     def percentile(self, percent: float) -> float:
         """A percentile of all samples; NaN without samples."""
-        return percentile(self.samples, percent)
+        known = self.percentiles.get(f"{percent:g}")
+        return percentile(self.samples, percent) if known is None else known
+
+    def thinned(self) -> Cell:
+        """At most :data:`MOST` samples, or 100 of each round, evenly taken: percentiles of each round stay as they are.
+
+        Those of a round are sorted, except in a curve.
+        """
+        curve, most = self.measure.endswith(OVER_TIME), max(100, MOST // max(1, len(self.rounds)) // 100 * 100)
+        rounds = [_thinned(one if curve else sorted(one), most) for one in self.rounds]
+        found = {f"{percent}": self.percentile(percent) for percent in _PERCENTS if self.samples}
+        return msgspec.structs.replace(self, rounds=rounds, counts=self.sizes, percentiles=found)
 
     def conditions(self) -> str:
         """The conditions as text: ``40 B, 200 Hz``."""
         return ", ".join(str(value) for value in self.params.values())
+
+
+class Judged(msgspec.Struct, kw_only=True):
+    """An aim: what was to be reached, whether it was (``met``, ``missed`` or ``not judged``), and what was measured."""
+
+    what: str
+    outcome: str
+    measured: str
+
+    def __str__(self) -> str:
+        return f"aim: {self.what}: {self.outcome} ({self.measured})"
 
 
 class Results(msgspec.Struct, kw_only=True):
@@ -72,6 +107,7 @@ class Results(msgspec.Struct, kw_only=True):
     quick: bool = False
     cells: list[Cell] = []
     assessment: list[str] = msgspec.field(name="verdict", default_factory=list)  # sentences
+    aims: list[Judged] = []
 
     def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
         """The first cell that matches."""
@@ -96,6 +132,45 @@ class Results(msgspec.Struct, kw_only=True):
             raise PebbleError(f"{path}: {error.strerror}") from None
 
 
+def _thinned(samples: Sequence[float], most: int) -> list[float]:
+    """The last sample of each of ``most`` equal parts: if there are 100, 200, …, whole percentiles are the same."""
+    if len(samples) <= most:
+        return list(samples)
+    return [samples[math.ceil(len(samples) * part / most) - 1] for part in range(1, most + 1)]
+
+
+def pack(folder: Path) -> None:
+    """Moves the samples of all results in a folder into one small file, thinned. Raises PebbleError."""
+    packed: dict[str, list[list[list[float]]]] = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            results = load(path)
+        except PebbleError:  # of another version, or not of a comparison
+            continue
+        results.cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
+        packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in results.cells]
+        for cell in results.cells:
+            cell.rounds = []
+        results.save(path)
+    (folder / SAMPLES).write_bytes(lzma.compress(msgspec.json.encode(packed), preset=9))
+
+
+def _steps(samples: Sequence[float]) -> list[float]:
+    """Differences of neighbours, which compress well."""
+    whole = [round(sample * 10**_DIGITS) for sample in samples]
+    return [*whole[:1], *(one - before for before, one in itertools.pairwise(whole))]
+
+
+def _unpack(results: Results, path: Path) -> None:
+    """Reads the thinned samples of results. Raises PebbleError."""
+    try:
+        packed = msgspec.json.decode(lzma.decompress(path.read_bytes()), type=dict[str, list[list[list[int]]]])
+        for cell, rounds in zip(results.cells, packed[results.bench], strict=True):
+            cell.rounds = [[value / 10**_DIGITS for value in itertools.accumulate(one)] for one in rounds]
+    except (OSError, lzma.LZMAError, msgspec.DecodeError, KeyError, ValueError) as error:
+        raise PebbleError(f"{path} does not hold the samples of {results.bench}: {error}") from None
+
+
 def load(path: Path) -> Results:
     """Raises PebbleError if the file holds no results."""
     try:
@@ -106,6 +181,8 @@ def load(path: Path) -> Results:
         raise PebbleError(f"{path} holds no results of pebble bench: {error}") from None
     if results.format != FORMAT:
         raise PebbleError(f"{path} has format {results.format}, this pebble reads {FORMAT}: measure again")
+    if any(cell.counts and not cell.rounds for cell in results.cells):
+        _unpack(results, path.with_name(SAMPLES))
     return results
 
 
@@ -117,7 +194,9 @@ class Stopwatch:
         self._machine = machine()
         self._began, self._since = time.gmtime(), time.monotonic()
 
-    def results(self, cells: Sequence[Cell], assessment: Sequence[str] = (), *, quick: bool = False) -> Results:
+    def results(
+        self, cells: Sequence[Cell], assessment: Sequence[str | Judged] = (), *, quick: bool = False
+    ) -> Results:
         return Results(
             bench=self._bench,
             command=self._command,
@@ -127,7 +206,8 @@ class Stopwatch:
             took_s=round(time.monotonic() - self._since, 1),
             quick=quick,
             cells=list(cells),
-            assessment=list(assessment),
+            assessment=[line for line in assessment if isinstance(line, str)],
+            aims=[line for line in assessment if isinstance(line, Judged)],
         )
 
 
@@ -176,3 +256,18 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def percentile(figures: Sequence[float], percent: float) -> float:
+    """The smallest value that at least ``percent`` per cent of the values do not exceed; NaN without values."""
+    if not figures:
+        return math.nan
+    ordered = sorted(figures)
+    return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
+
+
+def rounded(figure: float | int | None, digits: int) -> float | int | None:
+    """Rounds for JSON, which has no NaN: None means not measured."""
+    if figure is None or not math.isfinite(figure):
+        return None
+    return figure if isinstance(figure, int) else round(figure, digits)

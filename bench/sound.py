@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.table import Table
 
-from pebble.bench import output
-from pebble.bench.results import Cell, Stopwatch
-from pebble.bench.tables import plain_table
+from pebble.bench.aims import Aim, single
+from pebble.bench.comparison import Budget, Case, Comparison, Run
+from pebble.bench.pictures import bars
+from pebble.bench.results import Cell, Value
+from pebble.bench.tables import Grid, percentile_column, single_column
 from pebble.contract import AUDIO
 from pebble.errors import PebbleError
 from pebble.media.opus import BUNDLE_LIMIT
@@ -24,29 +23,14 @@ from pebble.media.speech import Speech
 
 TOPIC = AUDIO.topic("pebble/robots/goob")
 AIM = 0.16  # of PCM's bytes
+BITRATES = (16_000, 24_000, 32_000)
+RATE = 16_000
 _IP, _TCP = 20, 32  # bytes; version 4 without options, TCP with time stamps as Linux sends them
 _CHUNK_MS = 20
 _DELAY_S = 0.02  # at most, of codec and resampler
 _STEP_S = 0.02  # of an envelope
-_FIGURES = ("packets_per_s", "payload_kbits", "ratio", "likeness", "encode_cpu", "decode_cpu")
 
 Wave = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """One encoding of the same sound. ``likeness``: of the samples for PCM, of the envelopes for Opus."""
-
-    encoding: str
-    bitrate: int | None
-    bundle: int
-    packets_per_s: float
-    payload_kbits: float
-    wire_kbits: float
-    ratio: float  # of PCM's bytes on the wire
-    likeness: float
-    encode_cpu: float  # share of one core
-    decode_cpu: float
 
 
 def wire_bytes(payload: int, topic: str = TOPIC) -> int:
@@ -56,73 +40,47 @@ def wire_bytes(payload: int, topic: str = TOPIC) -> int:
     return _IP + _TCP + 1 + digits + length
 
 
-def run(
-    folder: Path = output.FOLDER,
-    seconds: float = 10.0,
-    *,
-    rate: int = 16_000,
-    bitrates: Sequence[int] = (16_000, 24_000, 32_000),
-    console: Console | None = None,
-) -> int:
-    """Measures, prints and writes; returns 0. Raises PebbleError without PyAV."""
-    if "opus" not in SOUND_ENCODINGS:
-        raise PebbleError("Opus needs PyAV, which is not installed: pip install 'pebble-robot[media]'")
-    if seconds < 1:
-        raise PebbleError("seconds must be at least 1")
-    console = console or Console()
-    output.check_folder(folder)
-    watch = Stopwatch("sound", ["pebble", "bench", "sound"], {"seconds": seconds, "rate": rate})
-    rows = list(measure(seconds, rate, bitrates))
-    console.print(table(rows, rate))
-    most = max(row.ratio for row in rows if row.encoding == "opus" and row.bundle > 1)
-    met = "met" if most <= AIM else "missed"
-    assessment = [f"aim: Opus with several parts in a packet takes at most {AIM} of PCM's bytes: {met} ({most:.3f})"]
-    output.finish(watch.results([_cell(row) for row in rows], assessment), folder, console)
-    return 0
-
-
-def measure(seconds: float, rate: int, bitrates: Sequence[int]) -> Iterator[Row]:
-    """One row per encoding; PCM comes first, as the reference of the others."""
-    speech = Speech(rate).samples(0, round(seconds * rate))
-    pcm, pcm_bytes = _row("pcm", speech, rate, None, 1, None)
-    yield pcm
-    for bitrate in bitrates:
+def measure(case: Case) -> Iterator[Cell]:
+    """One cell per encoding; PCM comes first, as the reference of the others."""
+    speech = Speech(RATE).samples(0, round(case.run["seconds"] * RATE))
+    pcm = _coded(speech, "pcm")
+    yield _cell(case, "pcm", pcm, pcm, {})
+    for bitrate in case.run["bitrates"]:
         for bundle in range(1, BUNDLE_LIMIT + 1):
-            yield _row("opus", speech, rate, bitrate, bundle, pcm_bytes)[0]
+            parts = "1 part" if bundle == 1 else f"{bundle} parts"
+            opus = _coded(speech, "opus", bitrate, bundle)
+            yield _cell(case, "opus", opus, pcm, {"bitrate": f"{bitrate // 1000} kbit/s", "packet": parts})
 
 
-def _row(
-    name: str, speech: npt.NDArray[np.int16], rate: int, bitrate: int | None, bundle: int, pcm_rate: float | None
-) -> tuple[Row, float]:
-    """The row, and the bytes on the wire for a second of sound."""
-    encoder = make_sound_encoder(
-        name, rate=rate, channels=1, chunk_ms=_CHUNK_MS, bitrate=bitrate or 24_000, bundle=bundle
-    )
-    size = rate * _CHUNK_MS // 1000
+def _coded(speech: npt.NDArray[np.int16], name: str, bitrate: int = 24_000, bundle: int = 1) -> dict[str, float]:
+    """Values for a second of sound; ``likeness``: of the samples for PCM, of the envelopes for Opus."""
+    encoder = make_sound_encoder(name, rate=RATE, channels=1, chunk_ms=_CHUNK_MS, bitrate=bitrate, bundle=bundle)
+    size = RATE * _CHUNK_MS // 1000
     began = time.process_time()
     packets = []
     for at in range(0, len(speech), size):
-        packets += encoder.encode(to_bytes(speech[at : at + size]), round(1000 * at / rate))
+        packets += encoder.encode(to_bytes(speech[at : at + size]), round(1000 * at / RATE))
     encoded = time.process_time()
     decoder = SoundDecoder()
     received = [one.samples for one in map(decoder.feed, packets) if one is not None]
     decoded = time.process_time()
     sound = np.concatenate(received)[:, 0].astype(np.float64)
     seconds = len(sound) / encoder.rate
-    wire = sum(wire_bytes(len(packet)) for packet in packets) / seconds
-    row = Row(
-        encoding=name,
-        bitrate=bitrate,
-        bundle=bundle,
-        packets_per_s=len(packets) / seconds,
-        payload_kbits=sum(map(len, packets)) * 8 / 1000 / seconds,
-        wire_kbits=wire * 8 / 1000,
-        ratio=1.0 if pcm_rate is None else wire / pcm_rate,
-        likeness=likeness(sound, speech[:, 0].astype(np.float64), rate, by_envelope=name != "pcm"),
-        encode_cpu=(encoded - began) / seconds,
-        decode_cpu=(decoded - encoded) / seconds,
-    )
-    return row, wire
+    return {
+        "wire_kbits": sum(wire_bytes(len(packet)) for packet in packets) / seconds * 8 / 1000,
+        "packets_per_s": len(packets) / seconds,
+        "payload_kbits": sum(map(len, packets)) * 8 / 1000 / seconds,
+        "likeness": likeness(sound, speech[:, 0].astype(np.float64), RATE, by_envelope=name != "pcm"),
+        "encode_cpu": (encoded - began) / seconds,  # share of one core
+        "decode_cpu": (decoded - encoded) / seconds,
+    }
+
+
+def _cell(case: Case, variant: str, found: dict[str, float], pcm: dict[str, float], params: dict[str, Value]) -> Cell:
+    """One sample: bytes are the same in every run with the same programs."""
+    figures: dict[str, Value] = {name: round(value, 4) for name, value in found.items() if name != "wire_kbits"}
+    figures["ratio"] = round(found["wire_kbits"] / pcm["wire_kbits"], 4)
+    return replace(case, role=variant).cell("wire", "kbit/s", [found["wire_kbits"]], params, **figures)
 
 
 def likeness(received: Wave, speech: Wave, rate: int, *, by_envelope: bool) -> float:
@@ -144,38 +102,44 @@ def _envelope(wave: Wave, rate: int) -> Wave:
     return loudness
 
 
-def table(rows: Sequence[Row], rate: int) -> Table:
-    title = f"Sound of {rate / 1000:g} kHz mono on the wire, chunks of {_CHUNK_MS} ms"
-    heads = ("encoding", "parts", "packets/s", "payload", "wire", "× PCM", "likeness", "CPU %")
-    shown = plain_table(title, heads)
-    for row in rows:
-        shown.add_row(
-            row.encoding + (f" {row.bitrate // 1000} kbit/s" if row.bitrate else ""),
-            str(row.bundle),
-            f"{row.packets_per_s:.1f}",
-            f"{row.payload_kbits:.1f}",
-            f"{row.wire_kbits:.1f}",
-            f"{row.ratio:.3f}",
-            f"{row.likeness:.3f}",
-            f"{100 * row.encode_cpu:.1f} / {100 * row.decode_cpu:.1f}",
-        )
-    shown.caption = (
-        f"payload, wire: kbit/s, topic {TOPIC}\nCPU: encoder / decoder\n"
-        "likeness: correlation of samples (pcm), of envelopes by 20 ms (opus)"
-    )
-    shown.caption_justify = "left"
-    return shown
+def prepare(_run: Run) -> None:
+    if "opus" not in SOUND_ENCODINGS:
+        raise PebbleError("Opus needs PyAV, which is not installed: pip install 'pebble-robot[media]'")
 
 
-def _cell(row: Row) -> Cell:
-    """One sample per cell: bytes are the same in every run with the same programs."""
-    parts = "1 part" if row.bundle == 1 else f"{row.bundle} parts"
-    figures = asdict(row)
-    return Cell(
-        variant=figures.pop("encoding"),
-        params={"bitrate": f"{row.bitrate // 1000} kbit/s", "packet": parts} if row.bitrate else {},
-        measure="wire",
-        unit="kbit/s",
-        rounds=[[figures.pop("wire_kbits")]],
-        figures={name: round(figures[name], 4) for name in _FIGURES},
-    )
+_BUDGET = Budget(6, seconds=10.0, bitrates=BITRATES)
+
+SOUND = Comparison(
+    name="sound",
+    title="Sound on the wire",
+    what="Bytes of each sound encoding with the headers of MQTT, TCP and IP. Nothing is sent: these are the "
+    "encoders' bytes for synthetic speech.",
+    help="Sound on the wire: bytes of every encoding, with all headers.",
+    full=_BUDGET,
+    quick=_BUDGET,
+    constants={"rate": RATE},
+    prepare=prepare,
+    measure=measure,
+    tables=(
+        Grid(
+            title=f"Sound of {RATE / 1000:g} kHz mono on the wire, chunks of {_CHUNK_MS} ms",
+            rows=("variant", "bitrate", "packet"), heads=("encoding", "", ""),
+            columns=(
+                single_column("pack./s", "packets_per_s", ".1f"), single_column("payload", "payload_kbits", ".1f"),
+                percentile_column(50, "wire"), single_column("× PCM", "ratio", ".3f"),
+                single_column("likeness", "likeness", ".3f"), single_column("enc.", "encode_cpu", ".1%"),
+                single_column("dec.", "decode_cpu", ".1%"),
+            ),
+            caption=f"payload, wire: kbit/s, topic {TOPIC}\nenc., dec.: CPU of the encoder and the decoder\n"
+            "likeness: correlation of samples (pcm), of envelopes by 20 ms (opus)",
+        ),
+    ),
+    assessment=(
+        Aim(
+            what=f"Opus with several parts in a packet takes at most {AIM} of PCM's bytes",
+            of=lambda cell: cell.variant == "opus" and cell.params["packet"] != "1 part",
+            value=single("ratio"), at_most=AIM, worst=True, shown="{:.3f}".format,
+        ),
+    ),
+    pictures=(bars("Sound"),),
+)  # fmt: skip

@@ -8,9 +8,9 @@ command is, bounds a queue, or stops the motors when commands end.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -23,6 +23,7 @@ from pebble.contract import DRIVE, INCOMING, ONLINE, OUTGOING, STATUS, TOUCH_SEN
 
 _HEARTBEAT_S = 0.25  # as a robot of ours, so that both carry the same
 _STATUS_EVERY = 4  # heartbeats
+_BAUD = 460_800
 _READ_S = 1.0
 _PIECE = 4096  # bytes
 _TOUCH = ("a0", "a1", "a2")
@@ -60,7 +61,7 @@ def bridge(remote_port: int, local_port: int, base: str) -> None:
 
 def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> None:
     """Writes a line for each drive command, and with ``reports`` publishes each one of the touch sensors."""
-    port = serial.Serial(device, 460_800, timeout=_READ_S)
+    port = serial.Serial(device, _BAUD, timeout=_READ_S)
 
     def drive(_client: Client, _data: Any, message: MQTTMessage) -> None:
         wanted = json.loads(message.payload)
@@ -87,20 +88,13 @@ def _lines(port: serial.Serial) -> Iterator[bytes]:
         yield from lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m pebble.bench.stand_in", description=__doc__)
-    parser.add_argument("part", choices=("bridge", "serial"))
-    parser.add_argument("--remote", type=int, default=0, help="port of the remote broker")
-    parser.add_argument("--local", type=int, required=True, help="port of the local broker")
-    parser.add_argument("--base", required=True, help="of the robot's topics")
-    parser.add_argument("--device", default="", help="of the serial line")
-    parser.add_argument("--reports", action="store_true", help="publish what the MCU reports")
-    options = parser.parse_args()
-    if options.part == "bridge":
-        bridge(options.remote, options.local, options.base)
+def main(part: str, local: str, remote: str, base: str, device: str, *reports: str) -> None:
+    """Ports of the two brokers, the base of the robot's topics, its serial line; ``reports`` if it sends them."""
+    if part == "bridge":
+        bridge(int(remote), int(local), base)
     else:
-        serial_bridge(options.local, options.base, options.device, reports=options.reports)
+        serial_bridge(int(local), base, device, reports=bool(reports))
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

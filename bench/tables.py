@@ -1,17 +1,20 @@
-"""Tables of latencies: one row per cell, with its ratio to a baseline."""
+"""Tables and sentences: what a row of each table looks like, and what is claimed of two variants."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import median
 
 from rich import box
 from rich.table import Table
 
-from pebble.bench.ratios import paired
-from pebble.bench.results import Cell
+from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, paired
+from pebble.bench.results import Cell, percentile
 
 _PERCENTS = (50, 95, 99, 100)
+_LEAST_APART = 5  # rounds: with three, equal robots are disjoint in one run of ten, with five in one of 126
 
 
 def plain_table(title: str, columns: Sequence[str], *, left: int = 1) -> Table:
@@ -59,3 +62,188 @@ def figure(value: float) -> str:
     if math.isnan(value):
         return "–"
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+
+
+def medians(cell: Cell) -> list[float]:
+    """The median of each round that has samples."""
+    return [percentile(one, 50) for one in cell.rounds if one]
+
+
+def spread(cell: Cell) -> str:
+    """``0.34 (0.31 to 0.39)``: the median of the rounds, and their minimum and maximum if there are several."""
+    rounds = medians(cell)
+    if not rounds:
+        return "–"
+    middle = figure(median(rounds))
+    return middle if len(rounds) == 1 else f"{middle} ({figure(min(rounds))} to {figure(max(rounds))})"
+
+
+def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
+    """Compares the robots in one measure; ``quantity`` as in "takes 0.9× the time".
+
+    ``cells`` are one or two, the baseline first.
+    """
+    unit = f" {cells[0].unit}" if cells[0].unit else ""
+    values = ", ".join(f"{cell.variant} {spread(cell)}{unit}" for cell in cells)
+    if len(cells) < 2:
+        return f"{what}: {values}"
+    theirs, ours = cells
+    if enough(cells):
+        words = paired(ours.rounds, theirs.rounds).words(ours.variant, theirs.variant, quantity)
+        return f"{what}: {words}; {values}"
+    return f"{what}: {values}{_without_interval(ours, theirs, quantity)}"
+
+
+def against(cells: Sequence[Cell]) -> str:
+    """The second robot's value divided by the first's, with an interval if there are enough rounds."""
+    interval = paired(cells[1].rounds, cells[0].rounds)
+    return str(interval) if enough(cells) else figure(interval.ratio)
+
+
+def enough(cells: Sequence[Cell]) -> bool:
+    """Whether there are enough rounds for an interval."""
+    return all(len(medians(cell)) >= LEAST_ROUNDS for cell in cells)
+
+
+def caveat(cells: Sequence[Cell]) -> list[str]:
+    """A note below sentences without intervals."""
+    if enough(cells):
+        return []
+    few = min(len(medians(cell)) for cell in cells)
+    if few < 2:
+        return [f"One round is not enough to compare; a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}."]
+    return [
+        f"{few} rounds, and a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}:"
+        " these are medians, with minimum and maximum."
+    ]
+
+
+def _without_interval(ours: Cell, theirs: Cell, quantity: str) -> str:
+    """States whether all rounds of one robot lie below those of the other."""
+    a, b = medians(ours), medians(theirs)
+    if min(len(a), len(b)) < _LEAST_APART:
+        return ""
+    if max(a) < min(b):
+        return f": {ours.variant} takes less {quantity} in every round"
+    return f": {theirs.variant} takes less {quantity} in every round" if max(b) < min(a) else ": no clear difference"
+
+
+# -- tables and sentences as data
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """What a column shows of a row's cell, or with ``measure`` of the row's cell of this measure."""
+
+    head: str
+    value: Callable[[Cell], str]
+    measure: str | None = None
+
+
+def percentile_column(percent: float, head: str = "") -> Column:
+    return Column(head or ("max" if percent == 100 else f"p{percent:g}"), lambda cell: figure(cell.percentile(percent)))
+
+
+def single_column(head: str, name: str, how: str = "g") -> Column:
+    """A single value of the cell, formatted as ``how``; empty without one."""
+
+    def value(cell: Cell) -> str:
+        found = cell.figures.get(name)
+        return format(found, how) if isinstance(found, (int, float)) else ""
+
+    return Column(head, value)
+
+
+COUNT = Column("n", lambda cell: str(len(cell.samples)))
+LOST = Column("lost", lambda cell: "" if cell.lost is None else str(cell.lost))
+SPREAD = Column("", lambda cell: spread(cell))
+
+
+def median_column(head: str, measure: str | None = None, how: Callable[[float], str] = figure) -> Column:
+    """The median of the rounds."""
+    return Column(head, lambda cell: how(median(medians(cell) or [math.nan])), measure)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """A table: a row for each value of the ``rows`` (parameters, ``measure``, ``unit`` or ``variant``).
+
+    The columns are repeated side by side for each variant, unless it is one of the rows; with ``ratio`` the second
+    variant's value as a ratio to the first's comes last. A row of the name ``last`` comes last, in bold. There is one
+    table for all values of ``each`` of these parameters, which the title may name.
+    """
+
+    title: str
+    rows: Sequence[str]
+    columns: Sequence[Column]
+    heads: Sequence[str] | None = None  # of the rows
+    of: Callable[[Cell], bool] = lambda _cell: True
+    ratio: bool = False
+    last: str = ""
+    caption: str = ""
+    each: Sequence[str] = ()
+
+    def __call__(self, cells: Sequence[Cell]) -> Iterator[Table]:
+        tables: dict[tuple[str, ...], list[Cell]] = {} if self.each else {(): []}
+        for cell in filter(self.of, cells):
+            tables.setdefault(tuple(_field(cell, name) for name in self.each), []).append(cell)
+        for names, some in tables.items():
+            yield self._table(self.title.format(**dict(zip(self.each, names, strict=True))), some)
+
+    def _table(self, title: str, cells: Sequence[Cell]) -> Table:
+        variants = list(dict.fromkeys(cell.variant for cell in cells)) if "variant" not in self.rows else [None]
+        groups: dict[tuple[str, ...], list[Cell]] = {}
+        for cell in cells:
+            groups.setdefault(tuple(_field(cell, name) for name in self.rows), []).append(cell)
+        named = variants if len(variants) > 1 or self.ratio else [None]
+        heads = [" ".join(filter(None, (one, column.head))) for one in named for column in self.columns]
+        heads += [f"{variants[1]} / {variants[0]}"] if self.ratio and len(variants) > 1 else []
+        table = plain_table(title, [*(self.heads or self.rows), *heads], left=len(self.rows))
+        firsts, before = [row[0] for row in groups], None
+        for row in sorted(groups, key=lambda names: self._order(names, list(groups))):
+            if before not in (None, row[0]) and max(map(firsts.count, (before, row[0]))) > 1:
+                table.add_section()
+            shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
+            shown += [against(groups[row])] if self.ratio and len(variants) > 1 else []
+            names = ["" if row[0] == before and len(row) > 1 else row[0], *row[1:]]
+            table.add_row(*names, *shown, style="bold" if self.last in row and self.last else None)
+            before = row[0]
+        table.caption, table.caption_justify = self.caption or None, "left"
+        return table
+
+    def _order(self, row: tuple[str, ...], rows: list[tuple[str, ...]]) -> tuple[int, bool, int]:
+        """Rows of the same first name stay together, and the last one comes last."""
+        return next(at for at, one in enumerate(rows) if one[0] == row[0]), self.last in row, rows.index(row)
+
+    def _value(self, group: Sequence[Cell], variant: str | None, column: Column) -> str:
+        found = [one for one in group if variant in (None, one.variant) and column.measure in (None, one.measure)]
+        return column.value(found[0]) if found else ""
+
+
+def _field(cell: Cell, name: str) -> str:
+    return str(getattr(cell, name) if name in ("measure", "unit", "variant") else cell.params.get(name, ""))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Claims:
+    """A sentence for each measure and condition: the variants, the second one as a ratio to the first.
+
+    ``what`` may name the ``{measure}`` and parameters; ``quantity`` as in "takes 0.9× the time", by measure.
+    """
+
+    what: str = "{measure}"
+    of: Callable[[Cell], bool] = lambda _cell: True
+    quantity: Mapping[str, str] = field(default_factory=dict)
+    order: Sequence[str] = ()  # of the variants; else as they were measured
+    judged: Callable[[Cell], bool] = lambda _cell: True  # the cells whose number of rounds is noted if it is too small
+
+    def __call__(self, cells: Sequence[Cell]) -> Iterator[str]:
+        groups: dict[Hashable, list[Cell]] = {}
+        for cell in filter(self.of, cells):
+            groups.setdefault((*cell.params.items(), cell.measure), []).append(cell)
+        for group in groups.values():
+            quantity = self.quantity.get(group[0].measure, "time")
+            group.sort(key=lambda cell: self.order.index(cell.variant) if self.order else 0)
+            what = self.what.format(measure=group[0].measure, quantity=quantity, **group[0].params)
+            yield sentence(what, group, quantity=quantity)
+        yield from caveat([cell for cell in cells if self.judged(cell)])

@@ -1,62 +1,348 @@
-"""The paper's section 4.1 with simulated robots: their traffic is recorded, and analysed as by ``pebble analyse``."""
+"""The paper's section 4.1 with simulated robots: their traffic is recorded, and analysed as by ``pebble analyse``.
+
+The demo's robots on a real mosquitto: idle, then driven and watched, recorded by ``pebble record``.
+"""
 
 from __future__ import annotations
 
+import sys
 import tempfile
-from dataclasses import dataclass
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-from rich.console import Console
+import msgspec
+from rich.table import Table
 
-from pebble.bench import output
-from pebble.bench.results import Stopwatch
-from pebble.bench.traffic_report import assess, cells_of, tables
-from pebble.demo.testbed import ROBOTS
+from pebble.bench.aims import NOT_JUDGED, outcome
+from pebble.bench.comparison import Budget, Case, Comparison, Run
+from pebble.bench.paper import MONO_PCM_KBPS, TABLE_4_1
+from pebble.bench.pictures import Drawn
+from pebble.bench.results import Cell, Judged, Results
+from pebble.bench.tables import plain_table
+from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
-from pebble.recordings.traffic.results import Traffic
+from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, Bandwidth, RobotTraffic, Traffic
+from pebble.recordings.traffic.tables import BRIEF_MS
+from pebble.rig.operator import Operator
+from pebble.rig.programs import Program, end_all
+from pebble.rig.testbed import ROBOTS, Testbed
+from pebble.transports import MqttSettings, create
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from pebble.bench.plots import Picture
+
+_ANALYSIS: Final = "analysis"  # figure of a cell: all of a RobotTraffic, as JSON
+_SAME: Final = 0.01  # of the paper's PCM
+LEAST_SECONDS: Final = 20  # with sound, to judge its bandwidth
+_READY_S = 30.0
+_POLL_S = 0.1
+_LAST_S = 0.5  # until what was published last is recorded
+_END_S = 10.0  # for the recorder to finish its files
+#: A range of one second is also what stamps make that are cut to whole seconds.
+_PAPER_LATENCIES: Final = {
+    "goob": "mostly 20 to 40 ms, across the internet",
+    "benjr": "about 100 to 1100 ms, a range as of stamps of whole seconds",
+    "minilamp": "about 100 to 1100 ms, over Starlink, a range as of stamps of whole seconds",
+}
+
+Robots = dict[str, RobotTraffic]  # by name
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """Seconds of each part of the recording, and where the results go."""
-
-    idle_s: float = 40.0
-    session_s: float = 80.0
-    quick: bool = False
-    output: Path = output.FOLDER
-
-
-def plan(*, quick: bool = False, output: Path = output.FOLDER) -> Plan:
-    return Plan(quick=True, idle_s=7.0, session_s=6.0, output=output) if quick else Plan(output=output)
-
-
-def run(plan: Plan, console: Console | None = None) -> int:
-    """Records, analyses, prints and writes; returns 0. Raises PebbleError, also without the extra ``archive``."""
-    console = console or Console()
+def prepare(_run: Run) -> None:
     if find_spec("duckdb") is None:
         raise PebbleError('left out: the analysis of recordings needs DuckDB: pip install "pebble-robot[archive]"')
-    output.check_folder(plan.output)
-    command = ["pebble", "bench", "traffic", *(["--quick"] if plan.quick else [])]
-    watch = Stopwatch("traffic", command, {"idle_s": plan.idle_s, "session_s": plan.session_s, "robots": list(ROBOTS)})
-    traffic = measure(plan)
-    for table in tables(traffic):
-        console.print(table)
-    results = watch.results(cells_of(traffic), assess(traffic), quick=plan.quick)
-    output.finish(results, plan.output, console)
-    return 0
 
 
-def measure(plan: Plan) -> Traffic:
+def measure(case: Case) -> Iterator[Cell]:
     """The analysis of a recording that is made now. Raises PebbleError."""
-    from pebble.bench.traffic_stage import record
     from pebble.recordings.traffic.analysis import analyse
     from pebble.recordings.traffic.sources import sources
 
     with tempfile.TemporaryDirectory(prefix="pebble-traffic-") as name:
         folder, scratch = Path(name) / "stage", Path(name) / "scratch"
-        record(folder, plan.idle_s, plan.session_s)
+        record(folder, case.run["idle_s"], case.run["session_s"])
         scratch.mkdir()
         found = sources([folder / "recordings"], scratch, since_ns=0, until_ns=FOREVER_NS)
-        return analyse(found, scratch)
+        yield from cells_of(analyse(found, scratch))
+
+
+def record(folder: Path, idle_s: float, session_s: float) -> None:
+    """Record all robots into ``folder``: idle for ``idle_s``, then used for ``session_s``. Raises PebbleError."""
+    with Testbed(threading.Event()) as testbed:
+        testbed.start_brokers()
+        with _recorder(folder, testbed.broker_port), closing(_Session(testbed.broker_port)) as session:
+            testbed.start_robots()
+            session.operator.wait_until_ready(len(ROBOTS), _READY_S, testbed.unexpected_exits)
+            time.sleep(idle_s)
+            session.run(session_s)
+            if problems := testbed.unexpected_exits():
+                raise PebbleError("; ".join(problems))
+            time.sleep(_LAST_S)
+        testbed.keep = False
+
+
+@contextmanager
+def _recorder(folder: Path, port: int) -> Iterator[None]:
+    folder.mkdir()
+    command = [sys.executable, "-m", "pebble.cli", "record", "--url", f"mqtt://127.0.0.1:{port}", "--into"]
+    recorder = Program("pebble record", [*command, str(folder / "recordings")], folder / "record.log")
+    try:
+        recorder.wait_until(lambda: b"Recording" in recorder.log.read_bytes(), _READY_S)  # it is connected
+        yield
+        if recorder.ended:
+            raise PebbleError(f"pebble record ended: {recorder.tail()}")
+    finally:
+        end_all([recorder], _END_S)
+
+
+class _Session:
+    """The demo's operator, and a viewer of all pictures and sound."""
+
+    def __init__(self, port: int) -> None:
+        self.operator = Operator(port, "pebble-bench-operator")
+        self.operator.connect()
+        self._viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
+        self._watching = ExitStack()
+
+    def run(self, seconds: float) -> None:
+        """Drive all robots while their pictures and sound arrive, of those that have them. Raises PebbleError."""
+        self._viewer.open()
+        robots = self.operator.discovery.all_robots()
+        receivers = [self._watch(robot.base) for robot in robots if robot.offers("video")]
+        self._wait_for_media(receivers)
+        self.operator.begin()
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            time.sleep(_POLL_S)
+            for receiver in receivers:
+                receiver.poll()
+            self.operator.completed.clear()  # nothing is assessed here
+        self._watching.close()
+
+    def _wait_for_media(self, receivers: Sequence[MediaReceiver]) -> None:
+        end = time.monotonic() + _READY_S
+        while missing := [one.name for one in receivers if not one.encoding.keys() >= {"video", "audio"}]:
+            if time.monotonic() > end:
+                raise PebbleError(f"no pictures or no sound came from {', '.join(missing)}")
+            time.sleep(_POLL_S)
+            for receiver in receivers:
+                receiver.poll()
+
+    def close(self) -> None:
+        self._watching.close()
+        self.operator.close()
+        self._viewer.close()
+
+    def _watch(self, base: str) -> MediaReceiver:
+        receiver = self._watching.enter_context(closing(MediaReceiver(self._viewer, base)))
+        receiver.wait_for_capabilities(_READY_S)
+        receiver.viewer.request("video", "json")
+        receiver.viewer.request("audio", "pcm")
+        return receiver
+
+
+# -- cells
+
+
+def cells_of(traffic: Traffic) -> list[Cell]:
+    """The lengths of each robot's outages with all of its analysis, and the bandwidths of each kind of message."""
+    return [cell for robot in traffic.robots for cell in (_outage_cell(robot), *_bandwidth_cells(robot))]
+
+
+def _outage_cell(robot: RobotTraffic) -> Cell:
+    lengths = [one.length_ms for one in robot.outages]
+    analysis = {_ANALYSIS: msgspec.json.encode(robot).decode()}
+    return Cell(variant=name_of(robot), measure="outage", unit="ms", rounds=[lengths], figures=dict(analysis))
+
+
+def _bandwidth_cells(robot: RobotTraffic) -> Iterator[Cell]:
+    for one in robot.bandwidth:
+        yield Cell(
+            variant=name_of(robot),
+            params={"messages": one.family, "time": one.time},
+            measure="bandwidth",
+            unit="kbit/s",
+            rounds=[[one.median_kbps]],
+            figures={"p95": round(one.p95_kbps, 3), "seconds": one.seconds, "count": one.messages, "bytes": one.bytes},
+        )
+
+
+def robots_of(cells: Sequence[Cell]) -> Robots:
+    """The analysis of each robot, by its name."""
+    found = {cell.variant: cell.figures[_ANALYSIS] for cell in cells if _ANALYSIS in cell.figures}
+    return {name: msgspec.json.decode(str(text), type=RobotTraffic) for name, text in found.items()}
+
+
+# -- the report
+
+
+def name_of(robot: RobotTraffic) -> str:
+    """``goob``."""
+    return robot.robot.rpartition("/")[2]
+
+
+def tables(cells: Sequence[Cell]) -> Iterator[Table]:
+    """Table 4.1 beside the paper's, and heartbeats, whose distributions the paper shows as figures."""
+    robots = robots_of(cells)
+    yield _media(robots)
+    yield _heartbeats(robots)
+
+
+def _media(robots: Robots) -> Table:
+    heads = [f"{family} {value}" for family in (VIDEO, AUDIO) for value in ("median", "p95")]
+    table = plain_table("Table 4.1: media, kbit/s of active seconds", ["robot", "", *heads], left=2)
+    for name, paper in TABLE_4_1.items():
+        table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
+        table.add_row("", "here", *_media_cells(robots.get(name)))
+    return table
+
+
+def _media_cells(robot: RobotTraffic | None) -> Iterator[str]:
+    for family in (VIDEO, AUDIO):
+        found = None if robot is None else robot.of(family)
+        yield from ("–", "–") if found is None else (f"{found.median_kbps:.2f}", f"{found.p95_kbps:.2f}")
+
+
+def _heartbeats(robots: Robots) -> Table:
+    heads = ("robot", "heartbeats", "every ms", "outages", "below 300 ms", "shared", "latency p1", "p50", "p95 ms")
+    table = plain_table("Heartbeats", heads)
+    for name, robot in robots.items():
+        usual, latency = robot.intervals, robot.latency
+        if usual is not None and latency is not None:
+            brief = sum(one.length_ms < BRIEF_MS for one in robot.outages)
+            counts = (latency.count, f"{usual.median_ms:.0f}", len(robot.outages), brief)
+            shared = sum(one.cause != "robot" for one in robot.outages)
+            times = (latency.floor_ms, latency.median_ms, latency.p95_ms)
+            table.add_row(name, *map(str, counts), str(shared), *(f"{time:.1f}" for time in times))
+    return table
+
+
+def sentences(cells: Sequence[Cell]) -> Iterator[str | Judged]:
+    """What agrees with the paper, what differs, and why."""
+    robots = robots_of(cells)
+    for about in (_sound, _video, _outages, _latencies):
+        yield from about(robots)
+
+
+def _sound(robots: Robots) -> Iterator[str | Judged]:
+    sounds = {name: one for name, robot in robots.items() if (one := robot.of(AUDIO)) is not None}
+    shown = ", ".join(f"{name} {one.median_kbps:.1f} kbit/s" for name, one in sounds.items()) or "no sound"
+    what = f"PCM, one channel at 16 kHz, takes the paper's {MONO_PCM_KBPS:.1f} kbit/s within 1 %"
+    yield Judged(what=what, outcome=_outcome(list(sounds.values())), measured=shown)
+    yield (
+        f"Goob's sound takes {TABLE_4_1['goob'][2]:.1f} kbit/s in the paper, as much as two channels: 50 packets of "
+        "1,304 bytes a second; here Goob has one channel"
+    )
+
+
+def _outcome(sounds: Sequence[Bandwidth]) -> str:
+    """Packets of a second may be received in the next one: only the median of many seconds is the rate."""
+    if sounds and min(one.seconds for one in sounds) < LEAST_SECONDS:
+        return NOT_JUDGED
+    met = bool(sounds) and all(abs(one.median_kbps / MONO_PCM_KBPS - 1) <= _SAME for one in sounds)
+    return outcome(met)
+
+
+def _video(robots: Robots) -> Iterator[str]:
+    for name, robot in robots.items():
+        found, paper = robot.of(VIDEO), TABLE_4_1.get(name)
+        if found is not None and paper is not None:
+            yield (
+                f"{name}'s video as JSON takes {found.median_kbps / paper[0]:.2f}× the paper's median: a "
+                "simulated camera shows other things, and Table 4.1 names neither encoding, size nor rate"
+            )
+
+
+def _outages(robots: Robots) -> Iterator[str]:
+    outages = [one for robot in robots.values() for one in robot.outages]
+    brief = sum(one.length_ms < BRIEF_MS for one in outages)
+    shared = sum(one.cause != "robot" for one in outages)
+    found = (
+        f"{len(outages)} outages of heartbeats, {brief} of them shorter than 300 ms (the paper: most), {shared} of "
+        "several robots at once or of the recorder, so of this machine"
+    )
+    paper = "the paper's are of archived operation, over the internet"
+    yield f"{found if outages else 'no outage of heartbeats'}; {paper}"
+
+
+def _latencies(robots: Robots) -> Iterator[str]:
+    for name, robot in robots.items():
+        latency, paper = robot.latency, _PAPER_LATENCIES.get(name)
+        if latency is not None and paper is not None:
+            whole = "its stamps are of whole seconds" if latency.whole_seconds else "its stamps are of milliseconds"
+            yield (
+                f"{name}'s heartbeats take {latency.median_ms:.1f} ms, p95 {latency.p95_ms:.1f} ms, over "
+                f"loopback; {whole} (the paper: {paper})"
+            )
+
+
+def figures(results: Results) -> list[Picture]:
+    """Figures 4.1 to 4.6 of the paper, drawn as `pebble analyse` draws them, of those robots that were analysed."""
+    from pebble.bench.plots import Picture, panels
+    from pebble.recordings.traffic.figures import draw_bandwidth, draw_latency, draw_outages
+
+    def latency(axes: Axes, robot: RobotTraffic) -> None:
+        if robot.latency is not None:
+            draw_latency(axes, robot.latency)
+
+    def bandwidth(axes: Axes, robot: RobotTraffic) -> None:
+        if shown := [one for one in robot.bandwidth if one.time in (SESSION, IDLE)]:
+            draw_bandwidth(axes, shown)
+
+    robots = robots_of(results.cells)
+    drawn = (
+        ("4.1", "goob", "outages of heartbeats", draw_outages),
+        ("4.2", "goob", "latency of heartbeats", latency),
+        ("4.3", "minilamp", "bandwidth", bandwidth),
+        ("4.4", "minilamp", "outages of heartbeats", draw_outages),
+        ("4.5", "benjr", "latency of heartbeats", latency),
+        ("4.6", "minilamp", "latency of heartbeats", latency),
+    )
+    shown = [one for one in drawn if one[1] in robots]
+
+    def make() -> Figure:
+        figure, places = panels(
+            len(shown), 2, (5.6, 3.0), "Traffic of simulated robots: the paper's Figures 4.1 to 4.6"
+        )
+        for axes, (number, name, what, draw) in zip(places, shown, strict=True):
+            draw(axes, robots[name])
+            title = f"Figure {number}: {name}, {what}"
+            axes.set_title(title, loc="left", pad=22.0, weight="bold")  # points for the legend between panel and title
+        return figure
+
+    caption = "Figures 4.1 to 4.6 of the paper, with simulated robots on this machine"
+    return [Picture("traffic-figures", caption, make)] if shown else []
+
+
+TRAFFIC = Comparison(
+    name="traffic",
+    title="Traffic of robots, as in the paper",
+    what="Section 4.1 of the paper with simulated robots: Goob and Fred, MiniLAMP and BenJr stand idle, then are "
+    "driven, and Goob and Fred send pictures as JSON and sound as PCM. `pebble record` records them at a real "
+    "broker, `pebble analyse` computes, with the same definitions as the paper: bandwidth of payloads in active "
+    "seconds, outages of heartbeats, and their latency from stamp to reception.",
+    help="""Traffic of the demo's robots as in the paper's section 4.1: bandwidth, outages and latency.
+
+    Records four simulated robots at a real broker, idle, then driven and watched, and analyses the recording as
+    pebble analyse does. Needs mosquitto and the packages of the extra "archive".
+    """,
+    full=Budget(140, idle_s=40.0, session_s=80.0),
+    quick=Budget(19, idle_s=7.0, session_s=6.0),
+    constants={"robots": list(ROBOTS)},
+    prepare=prepare,
+    measure=measure,
+    tables=(tables,),
+    assessment=(sentences,),
+    complete=bool,  # a robot without outages is no failure
+    pictures=(Drawn("pebble.bench.traffic:figures"),),
+    summary_lines=4,
+)

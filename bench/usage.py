@@ -66,18 +66,3 @@ def _memory_mb(pid: int, *fields: str) -> float:
     except ProcessLookupError:
         return 0.0
     return sum(int(line.split()[1]) for line in lines if line.startswith(fields)) / 1024
-
-
-def children(pid: int) -> list[int]:
-    """The direct children of a process; none if it has ended.
-
-    Reads the parent of every process: not every kernel has ``/proc/<pid>/task/<tid>/children``.
-    """
-    return sorted(int(one.name) for one in _PROC.iterdir() if one.name.isdecimal() and _parent(one) == pid)
-
-
-def _parent(process: Path) -> int | None:
-    try:
-        return int((process / "stat").read_text().rpartition(")")[2].split()[1])
-    except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-        return None

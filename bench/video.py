@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
-from rich import box
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
+import cv2
+import numpy as np
 
-from pebble.bench import output
+from pebble.bench.aims import Aim, single
 from pebble.bench.clips import FPS, HEIGHT, SCENES, WIDTH, Clip
-from pebble.bench.results import Cell, Stopwatch
-from pebble.bench.similarity import psnr, squared_error, ssim
+from pebble.bench.comparison import Budget, Case, Comparison, Round, seconds
+from pebble.bench.pictures import bars
+from pebble.bench.results import Cell
+from pebble.bench.tables import Grid, percentile_column, single_column
 from pebble.errors import PebbleError
 from pebble.media.decode import VideoDecoder
 from pebble.media.jpeg import Pixels
@@ -25,24 +25,12 @@ from pebble.media.video import VIDEO_ENCODINGS, JsonEncoder, VideoEncoder, make_
 TOLERANCE: Final = 0.005  # of SSIM
 QUALITY, INTERVAL = 10, 5  # the reference implementation's settings
 AIMS: Final = {"pbvz": 0.75, "h264": 0.25}
+_REFERENCE: Final = "reference"
 _EVERY: Final = 7  # one picture in so many is compared: not only key frames
 _STARTED_MS: Final = 1_700_000_000_000
 _TRIES: Final = 8
 
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One encoding on one scene."""
-
-    scene: str
-    variant: str
-    quality: float
-    n: int  # pictures
-    bytes_per_second: float
-    ssim: float
-    psnr: float
-    encode_ms: float
-    decode_ms: float
+Make = Callable[[float], VideoEncoder]
 
 
 class ReferenceJson(JsonEncoder):
@@ -51,15 +39,12 @@ class ReferenceJson(JsonEncoder):
     optimize = False
 
 
-Make = Callable[[float], VideoEncoder]
-
-
 def variants() -> dict[str, Make]:
     """The encoders that are compared; the first is the reference.
 
     h264 is there twice: with its own interval (key frames on request) and with that of the others.
     """
-    made: dict[str, Make] = {"reference": lambda quality: ReferenceJson(INTERVAL, quality)}
+    made: dict[str, Make] = {_REFERENCE: lambda quality: ReferenceJson(INTERVAL, quality)}
     for name in VIDEO_ENCODINGS:
         interval = None if name == "h264" else INTERVAL
         made[name] = lambda quality, name=name, interval=interval: make_encoder(  # type: ignore[misc]
@@ -70,9 +55,21 @@ def variants() -> dict[str, Make]:
     return made
 
 
-def measure(film: list[Pixels], scene: str, variant: str, make: Make, quality: float) -> Row:
-    """Encodes and decodes the clip."""
-    encoder, decoder = make(quality), VideoDecoder()
+@dataclass(frozen=True, slots=True)
+class Coded:
+    """One clip in one encoding of one quality."""
+
+    quality: float
+    bytes_per_second: float
+    ssim: float
+    psnr: float
+    encode_ms: float
+    decode_ms: float
+
+
+def code(film: Sequence[Pixels], variant: str, quality: float) -> Coded:
+    """Encodes and decodes the clip. Raises PebbleError if a picture cannot be decoded."""
+    encoder, decoder = variants()[variant](quality), VideoDecoder()
     sent, likeness, errors = 0, [], []
     encoding = decoding = 0.0
     for number, picture in enumerate(film):
@@ -89,118 +86,131 @@ def measure(film: list[Pixels], scene: str, variant: str, make: Make, quality: f
             likeness.append(ssim(picture, shown.picture))
             errors.append(squared_error(picture, shown.picture))
     n = len(film)
-    return Row(
-        scene, variant, quality, n, sent * FPS / n, sum(likeness) / len(likeness), psnr(sum(errors) / len(errors)),
-        encoding / n * 1000, decoding / n * 1000,
+    return Coded(
+        quality, sent * FPS / n, sum(likeness) / len(likeness), psnr(sum(errors) / len(errors)), encoding / n * 1000,
+        decoding / n * 1000,
     )  # fmt: skip
 
 
-def match(film: list[Pixels], scene: str, variant: str, make: Make, wanted: float) -> Row:
-    """The row whose SSIM is nearest to ``wanted``, found by bisection; stops within a fifth of the tolerance."""
+def match(film: Sequence[Pixels], variant: str, wanted: float) -> Coded:
+    """The one whose SSIM is nearest to ``wanted``, found by bisection; stops within a fifth of the tolerance."""
     low, high = 1.0, 100.0
     quality = float(QUALITY)
-    tried: list[Row] = []
+    tried: list[Coded] = []
     while len(tried) < _TRIES:
-        row = measure(film, scene, variant, make, quality)
-        tried.append(row)
-        if abs(row.ssim - wanted) <= TOLERANCE / 5:
+        one = code(film, variant, quality)
+        tried.append(one)
+        if abs(one.ssim - wanted) <= TOLERANCE / 5:
             break
-        low, high = (quality, high) if row.ssim < wanted else (low, quality)
+        low, high = (quality, high) if one.ssim < wanted else (low, quality)
         quality = (low * high) ** 0.5
-    return min(tried, key=lambda row: abs(row.ssim - wanted))
+    return min(tried, key=lambda one: abs(one.ssim - wanted))
 
 
-def run(
-    folder: Path = output.FOLDER, seconds: float | None = None, *, quick: bool = False, console: Console | None = None
-) -> int:
-    """Returns 0 if every encoding reached the reference's quality. The clip lasts 10 s, or 1 s with ``quick``."""
-    seconds = seconds or (1.0 if quick else 10.0)
-    console = console or Console()
-    output.check_folder(folder)
-    command = ["pebble", "bench", "video", "--seconds", f"{seconds:g}", *(["--quick"] if quick else [])]
-    watch = Stopwatch("video", command, {"seconds": seconds})
-    rows: list[Row] = []
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("coding", total=len(SCENES) * len(variants()))
-        for scene in SCENES:
+def measure(round_: Round) -> Iterator[Cell]:
+    """Bytes are the same in every run with the same programs: one sample per cell."""
+    films: dict[str, list[Pixels]] = {}
+    references: dict[str, Coded] = {}
+    count = max(_EVERY, round(round_.run["seconds"] * FPS))
+    for case in round_.cases():
+        scene = str(case.condition["scene"])
+        if scene not in films:
             clip = Clip(scene)
-            film = [clip.frame(number) for number in range(max(_EVERY, round(seconds * FPS)))]
-            for variant, make in variants().items():
-                progress.update(task, description=f"{scene}: {variant}")
-                rows.append(
-                    match(film, scene, variant, make, reference(rows, scene).ssim)
-                    if any(row.scene == scene for row in rows)
-                    else measure(film, scene, variant, make, QUALITY)
-                )
-                progress.advance(task)
-    console.print(table(rows))
-    results = watch.results([_cell(rows, row) for row in rows], assessment(rows), quick=quick)
-    output.finish(results, folder, console)
-    return int(bool(unequal(rows)))
+            films[scene] = [clip.frame(number) for number in range(count)]
+        if case.variant == _REFERENCE:
+            coded = references[scene] = code(films[scene], case.variant, QUALITY)
+        else:
+            coded = match(films[scene], case.variant, references[scene].ssim)
+        yield _cell(case, coded, references[scene], count)
 
 
-def reference(rows: list[Row], scene: str) -> Row:
-    """The first row of a scene."""
-    return next(row for row in rows if row.scene == scene)
+def _cell(case: Case, coded: Coded, reference: Coded, count: int) -> Cell:
+    return case.cell(
+        "wire", "kB/s", [coded.bytes_per_second / 1000],
+        quality=round(coded.quality, 1),
+        pictures=count,
+        ratio=round(coded.bytes_per_second / reference.bytes_per_second, 4),
+        ssim=round(coded.ssim, 4),
+        psnr_db=round(coded.psnr, 2),
+        encode_ms=round(coded.encode_ms, 3),
+        decode_ms=round(coded.decode_ms, 3),
+    )  # fmt: skip
 
 
-def ratio(rows: list[Row], row: Row) -> float:
-    return row.bytes_per_second / reference(rows, row.scene).bytes_per_second
+# -- the quality of a decoded picture: PSNR over all colours, and SSIM (Wang et al. 2004) as the mean of the channels
+
+_WINDOW, _SIGMA = (11, 11), 1.5  # the paper's Gaussian window
+_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
-def unequal(rows: list[Row]) -> list[str]:
-    """The encodings that did not reach the reference's quality, one line each."""
-    away = {f"{row.scene}, {row.variant}": row.ssim - reference(rows, row.scene).ssim for row in rows}
-    return [
-        f"{form}: SSIM differs by {far:+.4f}, quality is not equal"
-        for form, far in away.items()
-        if abs(far) > TOLERANCE
-    ]
+def squared_error(one: Pixels, other: Pixels) -> float:
+    """Mean over all pixels and channels, in levels squared."""
+    return float(cv2.norm(one, other, cv2.NORM_L2SQR)) / one.size
 
 
-def table(rows: list[Row]) -> Table:
-    title = f"Video on the wire at equal SSIM, {WIDTH}x{HEIGHT}, {FPS} fps"
-    made = Table(title=title, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for name in ("scene", "encoding"):
-        made.add_column(name, no_wrap=True)
-    for name in ("quality", "bytes/s", "ratio", "SSIM", "PSNR", "enc ms", "dec ms"):
-        made.add_column(name, justify="right", no_wrap=True)
-    for row in rows:
-        made.add_row(
-            row.scene, row.variant, f"{row.quality:.1f}", f"{row.bytes_per_second:,.0f}",
-            f"{ratio(rows, row):.3f}", f"{row.ssim:.4f}", f"{row.psnr:.2f}",
-            f"{row.encode_ms:.2f}", f"{row.decode_ms:.2f}",
-            end_section=row is rows[-1] or rows[rows.index(row) + 1].scene != row.scene,
-        )  # fmt: skip
-    return made
+def psnr(mean_squared_error: float) -> float:
+    """In dB; infinite for identical pictures."""
+    return math.inf if mean_squared_error == 0 else 10 * math.log10(255**2 / mean_squared_error)
 
 
-def assessment(rows: list[Row]) -> list[str]:
-    """The aims, for the worst scene of each encoding, and the encodings that could not be compared."""
-    worst = {name: max(ratio(rows, row) for row in rows if row.variant == name) for name in AIMS}
-    lines = [
-        f"aim: {name} takes at most {aim:.2f} of the reference's bytes at equal quality:"
-        f" {'met' if worst[name] <= aim else 'missed'} ({worst[name]:.2f})"
+def ssim(one: Pixels, other: Pixels) -> float:
+    """1 for identical pictures. BGR, of one shape. (Borders are reflected; the paper leaves them out.)"""
+    x, y = one.astype(np.float32), other.astype(np.float32)
+    mean_x, mean_y = _smooth(x), _smooth(y)
+    both, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    covariance = _smooth(x * y) - both
+    variances = _smooth(x * x + y * y) - squares
+    likeness = (2 * both + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))
+    return float(likeness.mean())
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(values, _WINDOW, _SIGMA)
+
+
+# -- the report
+
+
+def unequal(cells: Sequence[Cell]) -> Iterator[str]:
+    """The encodings that did not reach the reference's quality."""
+    likeness = single("ssim")
+    wanted = {cell.params["scene"]: likeness(cell) for cell in cells if cell.variant == _REFERENCE}
+    for cell in cells:
+        far = likeness(cell) - wanted[cell.params["scene"]]
+        if abs(far) > TOLERANCE:
+            yield f"{cell.params['scene']}, {cell.variant}: SSIM differs by {far:+.4f}, quality is not equal"
+
+
+VIDEO = Comparison(
+    name="video",
+    title="Video on the wire",
+    what="Bytes of each video encoding at equal quality (SSIM) on the same synthetic clips. Nothing is sent: this "
+    "is the encoders' output.",
+    help="Video on the wire: bytes of every encoding at equal quality, for the same film.",
+    options=(seconds("Length of the film.", least=1),),
+    full=Budget(60, seconds=10.0),
+    quick=Budget(8, seconds=1.0),
+    variants=tuple(variants()),
+    conditions=lambda _run: [{"scene": scene, "size": f"{WIDTH}x{HEIGHT}", "fps": FPS} for scene in SCENES],
+    measure_round=measure,
+    tables=(
+        Grid(
+            title=f"Video on the wire at equal SSIM, {WIDTH}x{HEIGHT}, {FPS} fps", rows=("scene", "variant"),
+            heads=("scene", "encoding"),
+            columns=(percentile_column(50, "kB/s"), *(single_column(*words) for words in (
+                ("quality", "quality", ".1f"), ("ratio", "ratio", ".3f"), ("SSIM", "ssim", ".4f"),
+                ("PSNR", "psnr_db", ".2f"), ("enc ms", "encode_ms", ".2f"), ("dec ms", "decode_ms", ".2f"),
+            ))),
+        ),
+    ),
+    assessment=(unequal, *(
+        Aim(
+            what=f"{name} takes at most {{bound:.2f}} of the reference's bytes at equal quality",
+            of=lambda cell, name=name: cell.variant == name,  # type: ignore[misc]
+            value=single("ratio"), at_most=aim, worst=True, shown="{:.2f}".format,
+        )
         for name, aim in AIMS.items()
-    ]
-    return [*lines, *unequal(rows)]
-
-
-def _cell(rows: list[Row], row: Row) -> Cell:
-    """One sample per cell: bytes are the same in every run with the same programs."""
-    return Cell(
-        variant=row.variant,
-        params={"scene": row.scene, "size": f"{WIDTH}x{HEIGHT}", "fps": FPS},
-        measure="wire",
-        unit="kB/s",
-        rounds=[[row.bytes_per_second / 1000]],
-        figures={
-            "quality": round(row.quality, 1),
-            "pictures": row.n,
-            "ratio": round(ratio(rows, row), 4),
-            "ssim": round(row.ssim, 4),
-            "psnr_db": round(row.psnr, 2),
-            "encode_ms": round(row.encode_ms, 3),
-            "decode_ms": round(row.decode_ms, 3),
-        },
-    )
+    )),
+    complete=lambda cells: not any(unequal(cells)),
+    pictures=(bars("Video at equal quality"),),
+)  # fmt: skip

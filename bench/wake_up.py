@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 from pebble.errors import PebbleError
 
 _PINGS = 60

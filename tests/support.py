@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import socket
 import statistics
@@ -15,6 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pebble.rig.broker import free_port as free_port
+from pebble.rig.broker import mosquitto_command
 from pebble.runtime.parent import tied_to_parent
 
 #: The checkout: tests that start programs of ours start them here.
@@ -55,13 +56,6 @@ def quarters(values: Sequence[float]) -> list[float]:
     ]
 
 
-def free_port() -> int:
-    """A TCP port of the loopback address that is not in use now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def gone(pid: int) -> bool:
     """Has this process ended? A zombie counts: a container without init does not reap it."""
     try:
@@ -94,13 +88,6 @@ def listening(port: int, address: str = "127.0.0.1") -> bool:
     return True
 
 
-def mosquitto_path() -> str:
-    """Where mosquitto is; Debian installs it in a folder outside users' PATH."""
-    found = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
-    assert found, "mosquitto is not installed: `make test` installs it"
-    return found
-
-
 class Broker:
     """A real mosquitto on a free loopback port. ``stop``/``kill`` then ``start`` keep port and persistence.
 
@@ -116,9 +103,7 @@ class Broker:
         autosave: bool = True,
     ) -> None:
         self.port = port or free_port()
-        lines = [f"listener {self.port} 127.0.0.1", "allow_anonymous true", *options]
-        if os.geteuid() == 0:
-            lines.append("user root")  # else it changes to a user without access to our folders
+        lines = list(options)
         self.store = folder / f"store-{self.port}"
         if persistence:
             self.store.mkdir(parents=True, exist_ok=True)
@@ -129,8 +114,7 @@ class Broker:
                 f"autosave_on_changes {str(autosave).lower()}",
                 f"autosave_interval {int(autosave)}",
             ]
-        self._config = folder / f"mosquitto-{self.port}.conf"
-        self._config.write_text("\n".join(lines) + "\n")
+        self._command = mosquitto_command(self.port, folder / f"mosquitto-{self.port}", lines)
         self._process: subprocess.Popen[bytes] | None = None
         self.start()
 
@@ -144,12 +128,8 @@ class Broker:
         return self._process is not None
 
     def start(self) -> None:
-        self._process = Child(
-            [mosquitto_path(), "-c", str(self._config)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        assert until(self._answers, 10), f"mosquitto did not start with {self._config.read_text()}"
+        self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        assert until(self._answers, 10), f"mosquitto did not start: {self._command}"
 
     def stop(self) -> None:
         """SIGTERM: persistence is written. With its security plugin it has been seen to hang then, once."""
@@ -237,7 +217,7 @@ class AmqttBroker:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "pebble.demo.broker", str(self.port)]
+        command = [sys.executable, "-m", "pebble.rig.broker", str(self.port)]
         self._process = Child(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         assert until(lambda: listening(self.port), 20), "amqtt did not start"
 

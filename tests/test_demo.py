@@ -94,7 +94,7 @@ def demos(temporary: Path) -> Iterator[list[Demo]]:
 
 
 def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None = None) -> Demo:
-    imports = "import sys; from pebble.demo.broker import BrokerKind; from pebble.demo.main import run"
+    imports = "import sys; from pebble.rig.broker import BrokerKind; from pebble.demo.main import run"
     demos.append(Demo(folder, f"{imports}; sys.exit(run({arguments}))", terminal))
     return demos[-1]
 
@@ -197,7 +197,7 @@ def test_a_robot_that_does_not_come_up_is_a_failure_with_a_place_to_look(demos: 
     code = """
 import sys
 import pebble.demo.main as main
-import pebble.demo.testbed as testbed
+import pebble.rig.testbed as testbed
 main._DISCOVERY_S = 1.0
 testbed.LinuxRobot.start = lambda self, ending: None
 sys.exit(main.run(main.SHORTEST_S))

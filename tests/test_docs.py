@@ -21,7 +21,7 @@ LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
 CODE = re.compile(
     r"`((?!(?:incoming|outgoing|flags|sensors|mcu|by|build)/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`"
 )
-OURS = ("pebble", "transports", "services", "simulation", "bench", "firmware")
+OURS = ("pebble", "transports", "services", "simulation", "bench", "rig", "firmware")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -21,9 +21,9 @@ from retired_names import identifiers, retired
 BEFORE = "456f31d"
 SMALL = 40  # lines
 #: Folders inside `pebble/` that only people's machines need; everything else runs on a robot or on its MCU.
-OFF_ROBOT = ("bench", "client", "commands", "demo", "doctor", "flash", "impair", "simulation")
+OFF_ROBOT = ("bench", "client", "commands", "demo", "doctor", "flash", "impair", "rig", "simulation")
 #: Top-level folders that are imported as parts of the package (docs/decisions/0002).
-LINKED = ("bench", "services", "simulation", "transports")
+LINKED = ("bench", "rig", "services", "simulation", "transports")
 
 
 class Tree:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from pebble.bench.impair import metrics
 from pebble.bench.impair.messages import Record, Window
-from pebble.bench.impair.network_process import Traffic
-from pebble.bench.percentiles import rounded
-from pebble.bench.results import OVER_TIME, Cell, Value
+from pebble.bench.impair.network import Traffic
+from pebble.bench.results import OVER_TIME, Cell, Value, rounded
 from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
 

@@ -24,8 +24,9 @@ from typing import Any
 import msgspec
 
 from pebble.bench.impair.conditions import Condition, Schedule, Shape
-from pebble.bench.impair.network_process import UnavailableError
+from pebble.bench.impair.network import UnavailableError
 from pebble.errors import PebbleError
+from pebble.rig import worker_end
 
 TIMED = "timed"  # the device whose packets pass through this process
 _TUN = Path("/dev/net/tun")
@@ -108,7 +109,7 @@ class NamespaceForwarder:
                     return
                 *lines, asked = (asked + received).split(b"\n")
                 for line in lines:
-                    _write_line(self._answer(line))
+                    worker_end.answer(self._answer(line))
 
     def _answer(self, line: bytes) -> dict[str, Any]:
         if line == b"count":
@@ -174,11 +175,6 @@ def _hold() -> NamespaceForwarder:
         raise PebbleError(f"new namespaces: {error.strerror}") from None
 
 
-def _write_line(answer: dict[str, Any]) -> None:
-    sys.stdout.buffer.write(msgspec.json.encode(answer) + b"\n")
-    sys.stdout.buffer.flush()
-
-
 def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with suppress(PermissionError):
@@ -186,9 +182,9 @@ def main() -> int:
     try:
         forwarder = _hold()
     except PebbleError as error:
-        _write_line({"unavailable" if isinstance(error, UnavailableError) else "error": str(error)})
+        worker_end.answer({"unavailable" if isinstance(error, UnavailableError) else "error": str(error)})
         return 1
-    _write_line({"robot": forwarder.robot, "remote": forwarder.remote})
+    worker_end.answer({"robot": forwarder.robot, "remote": forwarder.remote})
     forwarder.serve(sys.stdin.fileno())
     return 0
 

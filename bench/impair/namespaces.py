@@ -13,14 +13,11 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from functools import cache
-from types import TracebackType
-from typing import Any, Self
-
-import msgspec
+from typing import Any
 
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.forwarder import TIMED
-from pebble.bench.impair.network_process import NetworkProcess, Traffic, UnavailableError
+from pebble.bench.impair.network import ImpairedNetwork, Traffic, UnavailableError
 from pebble.errors import PebbleError
 
 WIRE = "wire"
@@ -42,17 +39,15 @@ _TABLE = """table ip impair {
 """
 
 
-class NamespaceNetwork:
-    """See pebble.bench.impair.network.ImpairedNetwork."""
+class NamespaceNetwork(ImpairedNetwork):
+    """Of two namespaces, which its process holds."""
 
     kind = "namespaces"
     broker_host = REMOTE
 
     def __init__(self, name: str = "") -> None:
-        self._forwarder = NetworkProcess(f"network {name}".strip(), "pebble.bench.impair.forwarder")
-        paths = {
-            side: f"/proc/{self._forwarder.pid}/fd/{self._forwarder.greeting[side]}" for side in ("robot", "remote")
-        }
+        super().__init__(name, "pebble.bench.impair.forwarder")
+        paths = {side: f"/proc/{self.pid}/fd/{self.greeting[side]}" for side in ("robot", "remote")}
         self._robot = _Side(paths["robot"], ROBOT, REMOTE)
         self._remote = _Side(paths["remote"], REMOTE, ROBOT)
         self._dropped_before = {self._robot: 0, self._remote: 0}
@@ -74,7 +69,7 @@ class NamespaceNetwork:
         return self._remote.inside(command)
 
     def apply(self, condition: Condition) -> None:
-        self._forwarder.ask(msgspec.json.encode(condition).decode())
+        super().apply(condition)
         device = TIMED if condition.up.timed or condition.down.timed else WIRE
         for side, shape in ((self._robot, condition.up), (self._remote, condition.down)):
             before = side.dropped()
@@ -86,7 +81,7 @@ class NamespaceNetwork:
         self._remote.send_over(device)
 
     def traffic(self) -> Traffic:
-        counts = self._forwarder.ask("count")
+        counts = self.ask("count")
         bytes_up, packets_up = _on_the_wire(counts["up"])
         bytes_down, packets_down = _on_the_wire(counts["down"])
         return Traffic(
@@ -97,15 +92,6 @@ class NamespaceNetwork:
             self._queue_drops(self._robot) + self._remote.lost() + counts["lost_up"],
             self._queue_drops(self._remote) + self._robot.lost() + counts["lost_down"],
         )
-
-    def close(self) -> None:
-        self._forwarder.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
 
     def _queue_drops(self, side: _Side) -> int:
         return self._dropped_before[side] + side.dropped()

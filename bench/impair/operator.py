@@ -1,7 +1,7 @@
 """The operator of one robot, on the broker's side of the network: drives, receives video, then audio, and plays a clip.
 
 As a process: ``python -m pebble.bench.impair.operator HOST PORT BASE``. It reports when the robot is ready, then serves
-each request on its standard input (pebble.bench.impair.messages), and ends when its standard input closes.
+each request (pebble.bench.impair.messages), and ends when its standard input closes.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from pebble.contract.payloads import Drive, SoundboardCommand
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.sound import ReceivedSound
+from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 
 CLIP = "clip.wav"  # in the folder of the robot's soundboard
@@ -264,16 +265,13 @@ def _monotonic_ns(epoch_ms: int) -> int:
 
 
 def write_report(report: OperatorReport) -> None:
-    sys.stdout.buffer.write(msgspec.json.encode(report) + b"\n")
-    sys.stdout.buffer.flush()
+    answer(msgspec.json.encode(report))
 
 
 def main(arguments: list[str]) -> int:
     host, port, base = arguments
-    ended = threading.Event()
-    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=(lines, ended), name="orders", daemon=True).start()
-    operator = TrialOperator(host, int(port), base, ended)
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+    operator = TrialOperator(host, int(port), base, serve_on_thread(lines.put, lambda: lines.put("")))
     try:
         operator.open()
         write_report(OperatorReport(ready=True))
@@ -289,20 +287,13 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _serve(operator: TrialOperator, line: bytes) -> None:
+def _serve(operator: TrialOperator, line: str) -> None:
     request = msgspec.json.decode(line, type=TrialRequest | RecoveryRequest)
     if isinstance(request, RecoveryRequest):
         operator.recover(request.quiet_s)
         write_report(OperatorReport(ready=True))
     else:
         write_report(OperatorReport(record=operator.run_trial(request)))
-
-
-def _read(lines: queue.SimpleQueue[bytes], ended: threading.Event) -> None:
-    for line in sys.stdin.buffer:
-        lines.put(line)
-    ended.set()
-    lines.put(b"")
 
 
 if __name__ == "__main__":

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pebble.bench.comparison import FOLDER
 from pebble.bench.impair.conditions import Condition, chosen, trials
 from pebble.bench.impair.messages import TrialRequest
 from pebble.bench.impair.network import KINDS
-from pebble.bench.output import FOLDER
-from pebble.bench.percentiles import LONGEST_S
+from pebble.bench.results import LONGEST_S
 from pebble.errors import PebbleError
 
 QUICK = ("base-start", "256k", "64k+5%", "base-end")

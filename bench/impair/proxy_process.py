@@ -10,7 +10,6 @@ acknowledgements and handshakes delayed.
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import os
 import signal
@@ -24,6 +23,7 @@ from typing import Any
 import msgspec
 
 from pebble.bench.impair.conditions import Condition, Schedule, Shape
+from pebble.rig import worker_end
 
 _HOST = "127.0.0.1"
 _SEGMENT = 1448  # bytes of payload sent at once, so that connections take turns
@@ -181,14 +181,9 @@ async def _serve() -> None:
     reader = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), os.fdopen(0, "rb"))
     proxy = Proxy()
-    _write_line({"proxy": True})
+    worker_end.answer({"proxy": True})
     while line := await reader.readline():
-        _write_line(proxy.answer(line.decode().strip()))
-
-
-def _write_line(answer: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(answer) + "\n")
-    sys.stdout.flush()
+        worker_end.answer(proxy.answer(line.decode().strip()))
 
 
 def main() -> int:

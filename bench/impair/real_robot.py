@@ -13,7 +13,7 @@ from typing import Final
 
 import msgspec
 
-from pebble.bench.output import check_folder
+from pebble.bench.engine import check_folder
 from pebble.client.connection import Target, connected, resolve
 from pebble.client.names import id_of
 from pebble.client.viewer import Medium, Viewer

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from rich.table import Table
 
 from pebble.bench import paper
+from pebble.bench.aims import outcome
 from pebble.bench.impair import cells as measures
 from pebble.bench.impair.conditions import trials
 from pebble.bench.impair.plan import SUBJECTS, Subject
-from pebble.bench.percentiles import percentile
 from pebble.bench.ratios import paired
-from pebble.bench.results import Cell, Results
+from pebble.bench.results import Cell, Judged, Results, percentile
 from pebble.bench.tables import figure, plain_table
 
 WIDE = 105  # columns of a terminal that the long form needs
@@ -154,7 +154,7 @@ class _Aim:
     unit: str
     least: bool = False  # else at most
 
-    def line(self, subject: str, cell: Cell) -> str:
+    def judged(self, subject: str, cell: Cell) -> Judged:
         value = self.value(cell)
         met = value >= self.limit if self.least else value <= self.limit
         shown = f"{_plain(value)} {self.unit}" if math.isfinite(value) else "too much was lost"
@@ -164,8 +164,8 @@ class _Aim:
             shown += f", by {_plain(abs(value - self.limit))} {self.unit}"
         shown += f"{'' if self.least else _lost(cell)}, window of {_number('window_s')(cell):.3g} s"
         bound = "at least" if self.least else "at most"
-        text = f"aim: {subject} at {self.trial}, {self.words} {bound} {self.limit:g} {self.unit}"
-        return f"{text}: {'met' if met else 'missed'} ({shown})"
+        what = f"{subject} at {self.trial}, {self.words} {bound} {self.limit:g} {self.unit}"
+        return Judged(what=what, outcome=outcome(met), measured=shown)
 
 
 _AIMS = (
@@ -188,20 +188,20 @@ def _lost(cell: Cell) -> str:
     return f", {_plain(100 * share)} % lost" if share > _LOSS_SHOWN else ""
 
 
-def assessment(cells: Sequence[Cell]) -> list[str]:
+def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
     """The aims for our own encodings, then comparisons."""
     ours = [one.name for one in SUBJECTS if one.form == _OURS and _trials(cells, one.name)]
-    lines = [
-        aim.line(subject, cell)
+    judged = [
+        aim.judged(subject, cell)
         for aim in _AIMS
         for subject in ours
         if (cell := _find(cells, subject, aim.measure, aim.trial)) is not None
     ]
-    lines += [line for subject in ours if (line := _media_delay_aim(cells, subject))]
-    return [*lines, *_encodings(cells), _trips(cells), *_clips(cells), *_transports(cells)]
+    judged += [one for subject in ours for one in _media_delay_aim(cells, subject)]
+    return [*judged, *_encodings(cells), _trips(cells), *_clips(cells), *_transports(cells)]
 
 
-def _media_delay_aim(cells: Sequence[Cell], subject: str) -> str:
+def _media_delay_aim(cells: Sequence[Cell], subject: str) -> Iterator[Judged]:
     """The aim that commands do not wait behind media. Trials with loss or delay are excluded: they dominate the p95."""
     steady = {one.name for one in trials() if not one.up.loss and not one.up.timed}
     waits = {
@@ -214,12 +214,13 @@ def _media_delay_aim(cells: Sequence[Cell], subject: str) -> str:
         and math.isfinite(_p95(alone))
     }
     if not waits:
-        return ""
+        return
     longest = max(waits, key=lambda name: waits[name])
     met = waits[longest] <= _DRIVE_WAITS_MS
-    words = f"aim: {subject}, drive commands wait at most one command's time ({_DRIVE_WAITS_MS:g} ms) behind media"
+    what = f"{subject}, drive commands wait at most one command's time ({_DRIVE_WAITS_MS:g} ms) behind media"
     most = f"most: {waits[longest]:+.0f} ms" if math.isfinite(waits[longest]) else "some were lost"
-    return f"{words}, p95 against the same trial without: {'met' if met else 'missed'} ({most}, {longest})"
+    what += ", p95 against the same trial without"
+    yield Judged(what=what, outcome=outcome(met), measured=f"{most}, {longest}")
 
 
 def _encodings(cells: Sequence[Cell]) -> Iterator[str]:

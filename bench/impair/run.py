@@ -11,15 +11,14 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from pebble.bench.engine import check_folder, finish
 from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.messages import RecoveryRequest
-from pebble.bench.impair.network import resolved
-from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.network import Traffic, resolved
 from pebble.bench.impair.plan import ImpairPlan, Subject
 from pebble.bench.impair.report import QUOTED, assessment, tables
 from pebble.bench.impair.robots import CLIP_S, FPS, HEIGHT, WIDTH, ImpairedRobot, TestBed
-from pebble.bench.output import check_folder, finish
 from pebble.bench.results import Results, Stopwatch, Value
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals

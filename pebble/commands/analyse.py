@@ -60,7 +60,7 @@ def analyse(
     from pebble.recordings.traffic.duck import require_packages
 
     require_packages("duckdb", "matplotlib")
-    from pebble.bench.output import check_folder
+    from pebble.bench.engine import check_folder
     from pebble.client.names import base_of
     from pebble.recordings.period import parse_period
     from pebble.recordings.traffic.analysis import analyse as analyse_traffic

@@ -1,16 +1,25 @@
-"""``pebble bench``: comparisons, side by side in one run on this machine."""
+"""``pebble bench``: comparisons, side by side in one run on this machine.
+
+The command of a comparison follows from its declaration; those that do not run on the engine yet have functions here.
+"""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from pebble.bench.output import FOLDER
-from pebble.commands import bench_control, bench_robot
-from pebble.commands.options import Output, Quick, split_names
+from pebble.bench.comparison import FOLDER, Comparison, Option
+from pebble.commands import bench_robot
+from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from typer._click.core import Command, Context
 
 _GROUP_HELP = """Comparisons, side by side in one run on this machine.
 
@@ -18,102 +27,6 @@ _GROUP_HELP = """Comparisons, side by side in one run on this machine.
     pebble bench frames
     pebble bench fleet --robots 200
 """
-
-
-def frames(
-    seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="Duration of each case in a round. [default: 0.5]")
-    ] = None,
-    rounds: Annotated[int | None, typer.Option(min=2, help="Rounds of all cases. [default: 8]")] = None,
-    size: Annotated[
-        list[str] | None, typer.Option(help="640x480; may be given several times. [default: 640x480, 1920x1080]")
-    ] = None,
-    readers: Annotated[
-        list[int] | None, typer.Option(min=1, max=16, help="May be given several times. [default: 1, 3]")
-    ] = None,
-    variants: Annotated[
-        str | None, typer.Option(help="Some of them, separated by commas. [default: all]", metavar="NAMES")
-    ] = None,
-    null: Annotated[
-        str | None,
-        typer.Option(help="Only this one, against itself and against itself slowed by a fifth.", metavar="VARIANT"),
-    ] = None,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
-    """Camera frames from one process to others: latency, CPU and memory.
-
-    BGR pictures at 30 Hz through Zenoh shared memory (without copies, and with), Zenoh without shared memory, MQTT
-    through mosquitto, and GStreamer's shared memory, compared with a bare copy. Each round measures every variant.
-
-    With --null: one variant, one size (640x480), one reader, 30 rounds of 0.4 s. The run fails if it finds a
-    difference where there is none, or misses the planted one.
-
-    \b
-        pebble bench frames
-        pebble bench frames --size 640x480 --readers 1 --variants zenoh-shm,gstreamer-shm
-        pebble bench frames --null zenoh-shm
-    """
-    from pebble.bench import frames as comparison
-    from pebble.bench import frames_null
-
-    if null is not None and variants is not None:
-        raise PebbleError("--null names the variant: leave --variants out")
-    chosen = variants if null is None else null
-    names = None if chosen is None else split_names(chosen)
-    given = {"seconds": seconds, "rounds": rounds, "sizes": size, "readers": readers, "variants": names}
-    run, plan = (comparison.run, comparison.plan) if null is None else (frames_null.run, frames_null.plan)
-    return run(plan(quick=quick, output=output, **{name: value for name, value in given.items() if value}))
-
-
-def video(
-    seconds: Annotated[float | None, typer.Option(min=1, help="Length of the film. [default: 10]")] = None,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
-    """Video on the wire: bytes of every encoding at equal quality, for the same film."""
-    from pebble.bench.video import run
-
-    return run(output, seconds, quick=quick)
-
-
-def sound(output: Output = FOLDER) -> int:
-    """Sound on the wire: bytes of every encoding, with all headers."""
-    from pebble.bench.sound import run
-
-    return run(output)
-
-
-def fleet(
-    robots: Annotated[int | None, typer.Option(min=1, help="How many robots with Wi-Fi. [default: 200]")] = None,
-    seconds: Annotated[float | None, typer.Option(min=1, help="Driving time. [default: 60]")] = None,
-    rate: Annotated[float, typer.Option(min=0.1, help="Commands a second to each robot.")] = 10.0,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
-    """Hundreds of MCU robots on one broker: heartbeats, command latency, cost.
-
-    The real firmware files on simulated pins, real TCP; one operator drives all of them. Needs mosquitto.
-
-    \b
-        pebble bench fleet
-        pebble bench fleet --robots 20 --seconds 10
-    """
-    from pebble.bench.fleet import plan, run
-
-    given = {name: value for name, value in {"robots": robots, "seconds": seconds}.items() if value}
-    return run(plan(quick=quick, rate_hz=rate, output=output, **given))
-
-
-def traffic(quick: Quick = False, output: Output = FOLDER) -> int:
-    """Traffic of the demo's robots as in the paper's section 4.1: bandwidth, outages and latency.
-
-    Records four simulated robots at a real broker, idle, then driven and watched, and analyses the recording as
-    pebble analyse does. Needs mosquitto and the packages of the extra "archive".
-    """
-    from pebble.bench.traffic import plan, run
-
-    return run(plan(quick=quick, output=output))
 
 
 def compare(
@@ -132,9 +45,24 @@ def compare(
         pebble bench frames --output after
         pebble bench compare before/frames.json after/frames.json
     """
-    from pebble.bench.compare_report import run
+    from pebble.bench.compare import run
 
     return run(a, b, threshold=threshold, everything=everything)
+
+
+def echo(
+    url: Annotated[str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", show_default=False)],
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine.
+
+    \b
+        pebble bench echo mqtt://broker.local
+    """
+    from pebble.bench.control_far import serve, settings_of
+
+    return serve(settings_of(url, password_file, ca_cert))
 
 
 def report(
@@ -158,19 +86,105 @@ def report(
         pebble bench report bench-results --only control,control-null
         pebble bench report docs/results --render
     """
+    from pebble.bench.catalogue import chosen, reported
     from pebble.bench.report import run, write
-    from pebble.bench.report_plan import chosen, needs_root
 
     if render:
         typer.echo(f"Written: {write(folder)}")
         return 0
     names = [] if only is None else split_names(only)
-    return run(chosen(names), folder, quick=quick, left_out=[] if names else needs_root())
+    left_out = [] if names else [one for one in reported() if one.needs_more_rights]
+    return run(chosen(names), folder, quick=quick, left_out=left_out)
+
+
+class Comparisons(TyperGroup):
+    """Imports the declaration of a comparison when its command is wanted."""
+
+    def list_commands(self, ctx: Context) -> list[str]:
+        from pebble.bench import catalogue
+
+        return [*catalogue.commands(), *super().list_commands(ctx)]
+
+    def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
+        from pebble.bench import catalogue
+
+        if cmd_name not in catalogue.commands():
+            return super().get_command(ctx, cmd_name)
+        about = catalogue.find(cmd_name)
+        app = typer.Typer(rich_markup_mode=None, add_completion=False)
+        app.command(cmd_name)(command_of(about))
+        return typer.main.get_command(app)
+
+
+def command_of(about: Comparison) -> Callable[..., int]:
+    """The function of a command, with the options of its comparison."""
+
+    def run(*, quick: bool = False, output: Path = FOLDER, **given: Any) -> int:
+        from pebble.bench.engine import run as run_
+
+        wanted = {option.name: _parsed(option, given[_python(option)]) for option in about.options}
+        mode = next((mode for name, mode in about.modes.items() if wanted.get(name)), about)
+        return run_(mode.run_of(quick=quick, output=output, **wanted))
+
+    parameters: dict[str, tuple[Any, Any]] = {
+        _python(option): (_annotation(about, option), None) for option in about.options
+    }
+    parameters |= {"quick": (Quick, False)} if about.has_quick else {}
+    parameters["output"] = (Output, FOLDER)
+    run.__doc__ = about.help
+    run.__annotations__ = {name: annotation for name, (annotation, _) in parameters.items()}
+    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+            for name, (annotation, default) in parameters.items()
+        ]
+    )
+    return run
+
+
+def _annotation(about: Comparison, option: Option) -> Any:
+    """The option for typer: None if it is not given."""
+    kind: Any = list[option.kind] if option.repeated else str if option.many else option.kind  # type: ignore[name-defined]
+    low, high = (None, None) if option.kind in (str, bool) or option.many else (option.least, option.most)
+    help_ = f"{option.help}{_default(about, option)}"
+    name = f"--{option.name}"
+    return Annotated[
+        kind | None, typer.Option(name, help=help_, metavar=option.metavar, show_default=False, min=low, max=high)
+    ]
+
+
+def _default(about: Comparison, option: Option) -> str:
+    full, quick = (budget.get(option.name) for budget in (about.full, about.quick))
+    if option.name == "variants":
+        return " [default: all]"
+    if full is None or option.kind is bool:
+        return ""
+    shown = [_shown(one) for one in (full, *([] if quick in (None, full) else [quick]))]
+    return f" [default: {'; quick '.join(shown) if option.many else ', quick '.join(shown)}]"
+
+
+def _shown(value: Any) -> str:
+    values = [value] if isinstance(value, (str, int, float)) else value
+    return ", ".join(one if isinstance(one, str) else f"{one:g}" for one in values)
+
+
+def _parsed(option: Option, value: Any) -> Any:
+    if option.repeated:
+        return value or None
+    if value is None or not option.many:
+        return value
+    try:
+        return [option.kind(one) for one in split_names(value)]
+    except ValueError:
+        raise PebbleError(f"--{option.name}: {value} is not a list of numbers") from None
+
+
+def _python(option: Option) -> str:
+    return option.name.replace("-", "_")
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    commands = (frames, fleet, video, sound, traffic, *bench_control.COMMANDS, *bench_robot.COMMANDS, compare, report)
-    for command in commands:
+    group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
+    for command in (*bench_robot.COMMANDS, compare, echo, report):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")

@@ -1,4 +1,4 @@
-"""``pebble bench bridge``, ``startup``, ``cost``, ``estop`` and ``page``: whole robots."""
+"""``pebble bench bridge`` and ``page``: whole robots."""
 
 from __future__ import annotations
 
@@ -7,12 +7,8 @@ from typing import Annotated
 
 import typer
 
-from pebble.bench.output import FOLDER
+from pebble.bench.comparison import FOLDER
 from pebble.commands.options import Output, Quick, split_names
-
-_Variants = Annotated[
-    str | None, typer.Option(help="mqtt or zenoh. [default: both, in turn]", metavar="NAMES", show_default=False)
-]
 
 
 def bridge(
@@ -66,75 +62,6 @@ def bridge(
     return {Mode.NULL: bridge_null.run, Mode.PROFILE: bridge_profile.run}.get(mode, run)(wanted)
 
 
-def startup(
-    rounds: Annotated[
-        int | None, typer.Option(min=1, help="Launches of each variant. [default: 10, quick 3]", show_default=False)
-    ] = None,
-    variants: _Variants = None,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
-    """How fast a robot starts: first heartbeat, all services ready, first drive command executed.
-
-    And how fast an operator or a service that connects later receives all retained messages, and how long an operator
-    waits for the first picture in each encoding. Every launch is a new simulated robot. Needs mosquitto.
-
-    \b
-        pebble bench startup
-        pebble bench startup --quick
-    """
-    from pebble.bench.startup import StartupPlan, run
-
-    return run(StartupPlan(rounds=rounds, kinds=_kinds(variants), quick=quick, output=output))
-
-
-def cost(
-    rounds: Annotated[
-        int | None, typer.Option(min=1, help="Robots of each variant. [default: 8, quick 1]", show_default=False)
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.5, help="Length of each phase. [default: 1.5, quick 0.7]", show_default=False)
-    ] = None,
-    variants: _Variants = None,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
-    """What a robot costs: memory, CPU and threads of each of its processes.
-
-    Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator in two
-    forms. Whole simulated robots; needs mosquitto.
-
-    \b
-        pebble bench cost
-        pebble bench cost --variants zenoh --seconds 10
-    """
-    from pebble.bench.cost import CostPlan, run
-
-    return run(CostPlan(rounds=rounds, seconds=seconds, kinds=_kinds(variants), quick=quick, output=output))
-
-
-def estop(
-    rounds: Annotated[
-        int | None, typer.Option(min=1, help="How often robots are started. [default: 10, quick 2]", show_default=False)
-    ] = None,
-    boards: Annotated[int, typer.Option(min=0, help="Boards with Wi-Fi that are stopped together.")] = 50,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
-    """The emergency stop: until the wheels are at rest, and until it is confirmed.
-
-    Of a Linux robot on either transport, compared with a plain zero; of two of them and 50 boards together; and a stop
-    that is held for robots which are switched on later. All robots are driven meanwhile. Needs mosquitto.
-
-    \b
-        pebble bench estop
-        pebble bench estop --quick --boards 10
-    """
-    from pebble.bench.estop import EstopPlan, run
-
-    return run(EstopPlan(rounds=rounds, boards=boards, quick=quick, output=output))
-
-
 def page(
     only: Annotated[
         str | None, typer.Option(help="Some of the cases, separated by commas. [default: all]", metavar="NAMES")
@@ -160,10 +87,4 @@ def page(
     return run(PagePlan(only=names, tries=tries, wait_s=wait, quick=quick, output=output))
 
 
-def _kinds(variants: str | None) -> list[str]:
-    from pebble.bench.bridge_robot import KINDS
-
-    return list(KINDS) if variants is None else split_names(variants)
-
-
-COMMANDS = (bridge, startup, cost, estop, page)
+COMMANDS = (bridge, page)

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from pebble.bench.output import FOLDER
+from pebble.bench.comparison import FOLDER
 from pebble.client.connection import Target
 from pebble.commands.options import CaCert, Output, PasswordFile, split_names
 from pebble.errors import PebbleError

@@ -1,4 +1,4 @@
-"""Goob follows a tag by itself; the operator takes over once and gives back. Judged by what its MCU received. Pure."""
+"""Judges how Goob followed a tag by itself, by what its MCU received and where it arrived. Pure."""
 
 from __future__ import annotations
 
@@ -6,47 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pebble.motion.arbiter import HOLD_MS
+from pebble.rig.room import Outcome
+from pebble.rig.takeover import DISTANCE_M, HOLD_S, NAME, SCRIPT, TOLERANCE_M, CompletedFollow, Wheels
 from pebble.simulation.trace import Entry
 
-NAME = "by itself"
-SCRIPT = "apriltag-follow"
-DISTANCE_M, TOLERANCE_M, BEARING_RAD = 0.9, 0.05, 0.09
-HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command
+BEARING_RAD = 0.09
 _STARTED_S = 10.0  # interpreter, OpenCV and camera on the smallest machine
 _TAKEN_OVER_S = 0.25
 _RESUMED_S = 3.5
 _PLAYED = 0.9  # share of the clip
-
-Wheels = tuple[float, float]  # left and right, -1..1
 _STOP: Wheels = (0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
-class CompletedFollow:
-    """What the operator did. Times are time.monotonic() of the operator."""
-
-    robot: str  # its id
-    started: float  # the script
-    took_over: float  # first drive command
-    wheels: Wheels  # of the operator's drive commands
-    released: float  # the zero after them
-    ended: float  # the script, by a stop command
-    clip: str
-
-    @property
-    def began(self) -> float:
-        return self.started
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The true state at the end, known to the world and the loudspeaker."""
-
-    distance_m: float  # between camera and tag
-    bearing_rad: float  # of the tag, positive to the left
-    played_s: float
-    clip_s: float
 
 
 @dataclass(frozen=True, slots=True)

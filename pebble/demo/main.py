@@ -15,25 +15,30 @@ from typing import NamedTuple
 from rich.console import Console
 
 from pebble.contract.encodings import ALL_VIDEO
-from pebble.demo import emergency, following, takeover
-from pebble.demo.broker import BrokerKind, best_kind
-from pebble.demo.emergency import CompletedStop
-from pebble.demo.following import CompletedFollow
-from pebble.demo.machine import Machine
+from pebble.demo import emergency, following
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
-from pebble.demo.operator import Operator
-from pebble.demo.page import PageServer
 from pebble.demo.results import Result, Results
-from pebble.demo.steps import ROUND_S, SCRIPT, CompletedStep, assess
-from pebble.demo.testbed import ROBOTS, Testbed
+from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
+from pebble.rig.broker import BrokerKind, best_kind
+from pebble.rig.emergency import DURATION_S as EMERGENCY_S
+from pebble.rig.emergency import NAME as EMERGENCY_STOP
+from pebble.rig.emergency import CompletedStop
+from pebble.rig.machine import Machine
+from pebble.rig.operator import Operator
+from pebble.rig.page import PageServer
+from pebble.rig.steps import ROUND_S, SCRIPT, CompletedStep
+from pebble.rig.takeover import DURATION_S as TAKEOVER_S
+from pebble.rig.takeover import NAME as BY_ITSELF
+from pebble.rig.takeover import CompletedFollow
+from pebble.rig.testbed import ROBOTS, Testbed
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT
 
-SHORTEST_S = ROUND_S + emergency.DURATION_S + takeover.DURATION_S
+SHORTEST_S = ROUND_S + EMERGENCY_S + TAKEOVER_S
 _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _POLL_S = 0.1
@@ -64,7 +69,7 @@ def run(seconds: float | None = None, *, broker: BrokerKind | None = None, conso
     kind = broker or best_kind()
     with _ending_on_signals() as ending, Testbed(ending) as testbed:
         results, media, problems, left_alone = _run_demo(testbed, kind, seconds, ending, console)
-        with_media = [robot.name for robot in testbed.robots if robot.has_media]
+        with_media = [robot.name for robot in testbed.robots.values() if robot.has_media]
         if seconds is not None:
             problems += _steps_not_done(testbed, results.all(), left_alone)
         if seconds is not None and seconds >= MEDIA_ROUND_S + _MEDIA_START_S:
@@ -94,13 +99,13 @@ def _run_demo(
     console.print("MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on simulated pins.")
     url = _start_page(testbed, ending, console)
     testbed.start_robots()
-    operator = Operator(testbed.remote_port)
+    operator = Operator(testbed.broker_port)
     operator.connect()
-    counting = [robot.name for robot in testbed.robots if robot.has_counter]
+    counting = [robot.name for robot in testbed.robots.values() if robot.has_counter]
     machine = Machine()
-    media_check = MediaCheck(testbed.remote_port, counting, partial(machine.overloaded, on_average=True))
+    media_check = MediaCheck(testbed.broker_port, counting, partial(machine.overloaded, on_average=True))
     try:
-        with View(console, operator, media_check, testbed.robots, ending, url) as view:
+        with View(console, operator, media_check, list(testbed.robots.values()), ending, url) as view:
             if not _discovered(operator, view, ending):
                 problems = [] if ending.is_set() else [*_not_ready(operator), *testbed.unexpected_exits()]
                 return _Observed(Results(), [], problems, set())
@@ -115,7 +120,7 @@ def _run_demo(
         return _Observed(results, list(media_check.results), problems, operator.left_alone)
     finally:
         media_check.end()
-        operator.end()
+        operator.close()
 
 
 def _start_page(testbed: Testbed, ending: threading.Event, console: Console) -> str:
@@ -159,7 +164,7 @@ def _not_ready(operator: Operator) -> list[str]:
 
 def _without_imu(testbed: Testbed, operator: Operator) -> list[str]:
     received = {seen.name for seen in operator.discovery.all_robots() if seen.attitude is not None}
-    wanted = [robot.name for robot in testbed.robots if robot.has_imu]
+    wanted = [robot.name for robot in testbed.robots.values() if robot.has_imu]
     return [f"{name}: its inertial sensor published nothing" for name in wanted if name not in received]
 
 
@@ -177,7 +182,7 @@ def _watch(
         machine.sample()
         view.update()
         _assess_completed(testbed, operator, machine, results, now - _REPORTED_S)
-    operator.end()
+    operator.close()
     time.sleep(_REPORTED_S)
     _assess_completed(testbed, operator, machine, results, math.inf)
     return results
@@ -196,7 +201,7 @@ def _assess_completed(testbed: Testbed, operator: Operator, machine: Machine, re
 
 
 def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | CompletedStop | CompletedFollow) -> Result:
-    robot = next(robot for robot in testbed.robots if robot.name == completed.robot)
+    robot = testbed.robots[completed.robot]
     if isinstance(completed, CompletedStop):
         return emergency.assess(completed, robot.entries())
     if isinstance(completed, CompletedFollow):
@@ -209,9 +214,9 @@ def _assess(testbed: Testbed, operator: Operator, completed: CompletedStep | Com
 def _steps_not_done(testbed: Testbed, results: list[Result], left_alone: set[str]) -> list[str]:
     """Of robots that nobody took from the operator."""
     driven = {(result.robot, result.step) for result in results}
-    steps = [*(step.name for step in SCRIPT), emergency.NAME]
+    steps = [*(step.name for step in SCRIPT), EMERGENCY_STOP]
     wanted = [(name, step) for name in ROBOTS for step in steps]
-    wanted += [(robot.name, following.NAME) for robot in testbed.robots if robot.has_scripts]
+    wanted += [(robot.name, BY_ITSELF) for robot in testbed.robots.values() if robot.has_scripts]
     return [
         f"{name}, {step}: not done" for name, step in wanted if (name, step) not in driven and name not in left_alone
     ]

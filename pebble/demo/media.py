@@ -27,13 +27,13 @@ from pebble.demo.media_assessment import (
     assess_sound,
     watched,
 )
-from pebble.demo.testbed import CAMERA_FPS
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.scene import read_counter
 from pebble.media.sound import ReceivedSound
 from pebble.media.speech import PERIOD_S as SPEECH_PERIOD_S
 from pebble.media.speech import Speech
+from pebble.rig.testbed import CAMERA_FPS
 from pebble.transports import Message, MqttSettings, Transport, create
 
 VIDEO_TURN_S = 4.0  # for each encoding of the pictures

@@ -1,4 +1,4 @@
-"""The steps that the demo drives, and the assessment of each by what the MCU measured, not by telemetry. Pure."""
+"""Judges each step that the demo has driven by what the MCU measured, not by telemetry. Pure."""
 
 from __future__ import annotations
 
@@ -7,47 +7,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from pebble.contract.payloads import Drive, LightsFlash, LightsSolid
+from pebble.rig.steps import CompletedStep
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from pebble.simulation.trace import Entry
 
-COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
 REACTION_S = 1.0  # from the first command until the wheels turn
 _TURNING_MM_S = 20.0
 _ENOUGH = 0.4  # of the ideal distance: motors lag, Fred's are trimmed
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """Repeat ``drive`` for ``drive_s``, then send a stop or simply nothing more, and observe for ``rest_s``."""
-
-    name: str
-    drive: Drive
-    drive_s: float
-    sends_stop: bool
-    rest_s: float
-    lights: LightsSolid | LightsFlash
-
-
-@dataclass(frozen=True, slots=True)
-class CompletedStep:
-    """A step that was sent to one robot. Times are time.monotonic() of the operator."""
-
-    robot: str  # its id
-    step: Step
-    began: float
-    released: float  # the last moving command, or the stop command if the step sends one
-    ended: float
-
-
-SCRIPT = (
-    Step("forward, stop", Drive(z=0.6), 1.2, True, 1.4, LightsSolid(g=1.0)),
-    Step("turn right, stop", Drive(x=0.35), 0.8, True, 1.4, LightsFlash(b=1.0, period=0.5)),
-    Step("forward, let go", Drive(z=0.6), 0.8, False, 1.4, LightsSolid(r=1.0)),
-    Step("back, stop", Drive(z=-0.5), 0.8, True, 1.4, LightsSolid(b=0.3, g=0.3, r=0.3)),
-)
-ROUND_S = sum(step.drive_s + step.rest_s for step in SCRIPT)
 
 
 @dataclass(frozen=True, slots=True)

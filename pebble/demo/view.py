@@ -20,10 +20,10 @@ from pebble.demo.emergency import StopResult
 from pebble.demo.following import FollowResult
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
-from pebble.demo.operator import Operator
 from pebble.demo.results import Result
 from pebble.demo.steps import StepResult
-from pebble.demo.testbed import SimulatedRobot
+from pebble.rig.operator import Operator
+from pebble.rig.testbed import SimulatedRobot
 
 _LINE_PERIOD_S = 1.0
 _COLUMN_WIDTH = 26  # characters, of the longest usual cell: keeps the layout stable

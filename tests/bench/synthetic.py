@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pebble.bench.results import Cell, Results
-from pebble.bench.traffic_report import cells_of
+from pebble.bench.results import Cell, Judged, Results
+from pebble.bench.traffic import cells_of
 from pebble.recordings.traffic.results import (
     Bandwidth,
     Histogram,
@@ -40,7 +40,7 @@ def latencies(middle: float, count: int = 300, rounds: int = 10, spread: float =
     ]
 
 
-def _results(bench: str, cells: list[Cell], assessment: list[str], **more: object) -> Results:
+def _results(bench: str, cells: list[Cell], lines: list[str | Judged], **more: object) -> Results:
     machine = {"cpu": "Some CPU @ 2.40GHz", "cores": 2, "kernel": "6.1.0", "python": "3.11.2", "mosquitto": "2.0.11"}
     return Results(
         bench=bench,
@@ -49,9 +49,14 @@ def _results(bench: str, cells: list[Cell], assessment: list[str], **more: objec
         began="2026-11-20T14:00:00Z",
         took_s=61.0,
         cells=cells,
-        assessment=assessment,
+        assessment=[line for line in lines if isinstance(line, str)],
+        aims=[line for line in lines if isinstance(line, Judged)],
         **more,  # type: ignore[arg-type]
     )
+
+
+def _aim(what: str, outcome: str, measured: str) -> Judged:
+    return Judged(what=what, outcome=outcome, measured=measured)
 
 
 def control(small: bool = False) -> Results:
@@ -79,8 +84,8 @@ def control(small: bool = False) -> Results:
         cells,
         [
             "zenoh-p2p takes 0.43× the time of mqtt-nodelay (99 % interval 0.41–0.45)",
-            "aim: Zenoh peer to peer, p50 at most 0.70 of the better MQTT variant's: met (0.43, at most 0.45)",
-            "aim: with media, p99 at 200 Hz at most 0.35 of it: missed (0.41, at most 0.52)",
+            _aim("Zenoh peer to peer, p50 at most 0.70 of the better MQTT variant's", "met", "0.43, at most 0.45"),
+            _aim("with media, p99 at 200 Hz at most 0.35 of it", "missed", "0.41, at most 0.52"),
         ],
     )
 
@@ -92,7 +97,7 @@ def null_test(bench: str, variant: str) -> Results:
              rounds=latencies(200 * factor))
         for role, factor in roles.items()
     ]  # fmt: skip
-    return _results(f"{bench}-null", cells, ["aim: the same against itself is equal: met (1.01)"])
+    return _results(f"{bench}-null", cells, [_aim("the same against itself is equal", "met", "1.01")])
 
 
 def bridge() -> Results:
@@ -104,7 +109,7 @@ def bridge() -> Results:
         for variant, middle in {"mqtt": 0.9, "zenoh": 0.6, "one hop": 0.25}.items()
         if variant != "one hop" or measure == "down"
     ]  # fmt: skip
-    return _results("bridge", cells, ["aim: mqtt, p50 at most 0.7 ms: missed (0.9 ms)"])
+    return _results("bridge", cells, [_aim("mqtt, p50 at most 0.7 ms", "missed", "0.9 ms")])
 
 
 def startup() -> Results:
@@ -196,7 +201,7 @@ def impair(trials: tuple[str, ...] = TRIALS) -> Results:
             times = latencies(middle, 1500, 1)[0]
             cells.append(Cell(variant=subject, measure=f"{what} over time", unit="ms", rounds=[seconds, times]))
     marks = ";".join(f"{trial}@{2 + 24 * number}" for number, trial in enumerate(trials))
-    aims = ["aim: mqtt h264 opus at 256k, audio at least 99 %: met (99.0 %)"]
+    aims = [_aim("mqtt h264 opus at 256k, audio at least 99 %", "met", "99.0 %")]
     link = {"link": "proxy", "link_words": "a userspace proxy, loss modelled; robot's uplink impaired"}
     return _results("impair", cells, aims, options={**link, "window_s": 8.0, "marks": marks})
 
@@ -214,7 +219,7 @@ def broken() -> Results:
 
 
 def traffic() -> Results:
-    return _results("traffic", cells_of(analysed()), ["aim: PCM: met (fred 265.6 kbit/s)"])
+    return _results("traffic", cells_of(analysed()), [_aim("PCM", "met", "fred 265.6 kbit/s")])
 
 
 def analysed() -> Traffic:

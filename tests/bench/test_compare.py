@@ -10,8 +10,7 @@ from rich.console import Console
 
 from pebble import cli
 from pebble.bench import ratios
-from pebble.bench.compare import CHANCE, Kind, certainty, compare, differences, summary
-from pebble.bench.compare_report import run
+from pebble.bench.compare import CHANCE, Kind, certainty, compare, differences, run, summary
 from pebble.bench.results import Cell, Results
 from pebble.errors import PebbleError
 

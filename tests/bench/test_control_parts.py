@@ -2,30 +2,40 @@
 
 import io
 import socket
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, control_load, null, output
-from pebble.bench.control_ends import REPLIES, REQUESTS, Echo, Handler, Sender, SliceSpec
-from pebble.bench.control_participants import Slice
-from pebble.bench.control_plan import Condition, ControlPlan
+from pebble.bench import control, control_load, engine, null
+from pebble.bench.comparison import Case, Comparison
+from pebble.bench.control import CONTROL, CONTROL_NULL
+from pebble.bench.control_ends import (
+    REPLIES,
+    REQUESTS,
+    Echo,
+    Handler,
+    Sender,
+    SliceSpec,
+    parse,
+    rate_name,
+    request,
+    size_name,
+    stamped,
+)
+from pebble.bench.control_participants import VARIANTS, Slice
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, tables
-from pebble.bench.control_variants import VARIANTS
-from pebble.bench.control_wire import parse, request, stamped
 from pebble.bench.control_worker import Answer
 from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
-from pebble.demo import broker as demo_broker
-from pebble.demo.broker import Broker, BrokerKind
-from pebble.demo.programs import end_all
 from pebble.errors import PebbleError
+from pebble.rig import broker as rig_broker
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import end_all
 from pebble.runtime.inbox import Inbox
 from tests.support import until
 
@@ -58,6 +68,10 @@ class Loop:
 
     def close(self) -> None:
         """Nothing is open."""
+
+
+def lines_of(cells: list[Cell]) -> list[str]:
+    return [str(one) for one in assessment(cells)]
 
 
 def run(loop: Loop, spec: SliceSpec) -> tuple[int, int, int]:
@@ -99,27 +113,37 @@ def test_a_foreign_request_is_not_echoed() -> None:
 
 
 def test_the_default_has_sixty_cells_and_the_quick_one_twelve() -> None:
-    assert len(ControlPlan.of().conditions) * len(ControlPlan.of().roles) == 60
-    quick = ControlPlan.of(quick=True)
-    assert len(quick.conditions) * len(quick.roles) == 12
-    assert {condition.load for condition in quick.conditions} == {"none", "media"}
+    run = CONTROL.run_of()
+    assert len(control.conditions(run)) * len(run["variants"]) == 60
+    run = CONTROL.run_of(quick=True)
+    assert len(control.conditions(run)) * len(run["variants"]) == 12
+    assert {one["load"] for one in control.conditions(run)} == {"none", "media"}
 
 
 def test_what_is_asked_for_is_what_is_run_and_remembered() -> None:
-    plan = ControlPlan.of(variants=["mqtt"], sizes=[40], rates=[20.0], loads=["none", "hog"], seconds=0.5, rounds=2)
-    assert plan.conditions == (Condition(40, 20.0, "none"), Condition(40, 20.0, "hog"))
-    assert plan.command == [
+    given: dict[str, Any] = {"variants": ["mqtt"], "sizes": [40], "rates": [20.0], "loads": ["none", "hog"]}
+    run = CONTROL.run_of(**given, seconds=0.5, rounds=2)
+    assert control.conditions(run) == [{"size": "40 B", "rate": "20 Hz", "load": load} for load in ("none", "hog")]
+    assert run.command == [
         *("pebble", "bench", "control", "--variants", "mqtt", "--sizes", "40", "--rates", "20"),
         *("--loads", "none,hog", "--seconds", "0.5", "--rounds", "2"),
     ]
-    assert ControlPlan.of(loads=["media"]).conditions == tuple(Condition(40, rate, "media") for rate in (20.0, 200.0))
+    loaded = control.conditions(CONTROL.run_of(loads=["media"]))
+    assert loaded == [{"size": "40 B", "rate": rate, "load": "media"} for rate in ("20 Hz", "200 Hz")]
+
+
+@pytest.mark.parametrize(("size", "rate"), [(40, 200.0), (1024, 0.5), (1536, 1000.0)])
+def test_a_condition_is_the_slice_that_it_names(size: int, rate: float) -> None:
+    condition = {"size": size_name(size), "rate": rate_name(rate)}
+    case = Case(run=CONTROL.run_of(), number=0, variant="mqtt", role="mqtt", condition=condition)
+    assert SliceSpec.of(case) == SliceSpec(size=size, rate=rate, seconds=0.35)
 
 
 def test_the_null_test_runs_one_variant_in_three_roles() -> None:
-    plan = ControlPlan.of(null=True, quick=True, variants=["mqtt"])
-    assert plan.roles == null.roles("mqtt")
-    assert plan.bench == "control-null"
-    assert ControlPlan.of(null=True).rounds >= 8
+    run = CONTROL_NULL.run_of(quick=True, variants=["mqtt"])
+    assert engine.roles_of(run) == null.roles("mqtt")
+    assert " ".join(run.command).endswith("--rounds 4 --null --quick")
+    assert CONTROL_NULL.run_of().rounds >= 8
 
 
 @pytest.mark.parametrize(
@@ -136,9 +160,17 @@ def test_the_null_test_runs_one_variant_in_three_roles() -> None:
         {"rounds": 0},
     ],
 )
-def test_invalid_options_are_refused_before_anything_starts(nonsense: dict[str, object]) -> None:
+def test_invalid_options_are_refused_before_anything_starts(nonsense: dict[str, object], tmp_path: Path) -> None:
+    about = CONTROL_NULL if "null" in nonsense else CONTROL
     with pytest.raises(PebbleError):
-        ControlPlan.of(**nonsense)  # type: ignore[arg-type]
+        engine.run(about.run_of(**nonsense, output=tmp_path))  # type: ignore[arg-type]
+
+
+def ran(folder: Path, about: Comparison = CONTROL, **given: Any) -> tuple[int, str]:
+    """The exit code and what was printed."""
+    printed = io.StringIO()
+    code = engine.run(about.run_of(output=folder, console=Console(file=printed, width=80), **given))
+    return code, printed.getvalue()
 
 
 class FakeParticipants:
@@ -171,7 +203,7 @@ class FakeParticipants:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeParticipants]:
     monkeypatch.setattr(control, "Participants", FakeParticipants)
-    monkeypatch.setattr(output, "find_spec", lambda _name: None)  # no plots
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
     monkeypatch.setattr(FakeParticipants, "calls", [])
     monkeypatch.setattr(FakeParticipants, "started", [])
     return FakeParticipants
@@ -180,52 +212,47 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeParticipants]:
 def test_every_other_round_goes_backwards_and_one_that_fails_is_left_out_for_all(
     fake: type[FakeParticipants], tmp_path: Path
 ) -> None:
-    printed = io.StringIO()
-    plan = ControlPlan.of(variants=["mqtt", "zenoh-p2p"], sizes=[40], rates=[200.0], loads=["none", "hog"], rounds=4,
-                   output=tmp_path)  # fmt: skip
-    assert (
-        control.run(plan, Console(file=printed, width=80)) == 0
-    )  # fewer rounds were requested than are needed to judge
+    given: dict[str, Any] = {"variants": ["mqtt", "zenoh-p2p"], "sizes": [40], "rates": [200.0]}
+    code, printed = ran(tmp_path, **given, loads=["none", "hog"], rounds=4)
+    assert code == 0  # fewer rounds were requested than are needed to judge
     there = [("mqtt", "none"), ("zenoh-p2p", "none"), ("mqtt", "hog"), ("zenoh-p2p", "hog")]
     expected = [*there, *there[::-1]] * 2 + [*there[::-1], *there]
     assert [(role, load) for role, _, load in fake.calls] == expected
-    assert "mqtt: echo said nothing" in printed.getvalue()
+    assert "mqtt: echo said nothing" in printed
     results = load(tmp_path / "control.json")
     assert all(len(cell.rounds) == 3 for cell in results.cells)
-    assert results.assessment[0] == "1 of 4 rounds failed and were left out: mqtt: echo said nothing"
+    assert results.assessment[0] == "1 of 4 rounds failed and were left out; round 2: mqtt: echo said nothing"
     assert {cell.lost for cell in results.cells} == {0}
-    assert "50.0 70.0 30.0 7.00 3.50" in " ".join(printed.getvalue().split())
+    assert "50.0 70.0 30.0 7.00 3.50" in " ".join(printed.split())
     assert "10.5 with mqtt and 10.5 with zenoh-p2p such wake-ups" in results.assessment[1]
 
 
 @pytest.mark.usefixtures("fake")
 @pytest.mark.parametrize(("rounds", "code"), [(8, 1), (9, 0)])
 def test_too_few_rounds_that_are_left_are_an_error(rounds: int, code: int, tmp_path: Path) -> None:
-    plan = ControlPlan.of(variants=["mqtt"], sizes=[40], rates=[200.0], loads=["none"], rounds=rounds, output=tmp_path)
-    assert control.run(plan, Console(file=io.StringIO(), width=80)) == code
+    given: dict[str, Any] = {"variants": ["mqtt"], "sizes": [40], "rates": [200.0], "loads": ["none"]}
+    assert ran(tmp_path, **given, rounds=rounds)[0] == code
 
 
 @pytest.mark.usefixtures("fake")
 def test_a_round_of_several_passes_has_the_samples_of_all(tmp_path: Path) -> None:
-    plan = ControlPlan.of(null=True, rounds=1, output=tmp_path)
-    assert control.run(plan, Console(file=io.StringIO(), width=80)) == 0
+    assert ran(tmp_path, CONTROL_NULL, rounds=1)[0] == 0
     for one in load(tmp_path / "control-null.json").cells:
-        assert [len(samples) for samples in one.rounds] == [10 * plan.passes]
+        assert [len(samples) for samples in one.rounds] == [10 * CONTROL_NULL.full["passes"]]
         assert one.lost == 0
 
 
 def test_all_roles_work_for_a_fifth_of_the_pilot_s_median_and_the_slowed_one_when_the_time_runs(
     fake: type[FakeParticipants], tmp_path: Path
 ) -> None:
-    plan = ControlPlan.of(null=True, rounds=10, variants=["mqtt"], output=tmp_path)
-    assert control.run(plan, Console(file=io.StringIO(), width=80)) == 0
+    assert ran(tmp_path, CONTROL_NULL, rounds=10, variants=["mqtt"])[0] == 0
     pilot, *measured = [(role, spec) for role, spec, _ in fake.calls]
-    assert pilot == ("mqtt", SliceSpec(size=40, rate=200.0, seconds=plan.seconds))
+    assert pilot == ("mqtt", SliceSpec(size=40, rate=200.0, seconds=CONTROL_NULL.full["seconds"]))
     assert [spec.work_us for _, spec in measured] == pytest.approx([0.2 * 104.0] * len(measured))
     assert all(spec.slowed == null.is_slowed(role) for role, spec in measured)
     results = load(tmp_path / "control-null.json")
     assert {cell.measure for cell in results.cells} == {ONE_WAY}
-    assert ": met (" in results.assessment[-1]
+    assert [aim.outcome for aim in results.aims] == ["met"]
 
 
 def cell(
@@ -269,7 +296,7 @@ def some(p2p: float) -> list[Cell]:
 
 
 def test_the_assessment_compares_with_the_better_mqtt_variant_and_names_the_aims() -> None:
-    printed = assessment(some(450.0))
+    printed = lines_of(some(450.0))
     assert any("zenoh-p2p takes 0.50× the time of mqtt-nodelay (the better MQTT variant)" in line for line in printed)
     assert any(line.startswith("aim: ") and "at most 0.70: met (0.5" in line for line in printed)
     assert any(line.startswith("aim: ") and "at most 0.35: missed (0.5" in line for line in printed)
@@ -277,25 +304,25 @@ def test_the_assessment_compares_with_the_better_mqtt_variant_and_names_the_aims
 
 
 def test_the_assessment_reports_equal_variants_as_equal() -> None:
-    printed = assessment(some(900.0))
+    printed = lines_of(some(900.0))
     assert any("equal within noise: 1.00×" in line for line in printed)
     assert [line for line in printed if line.startswith("aim: ") and "met (" in line] == []
 
 
 def test_the_assessment_covers_only_what_was_measured() -> None:
-    assert assessment([cell("mqtt", "hog", 900.0)]) == []
-    assert assessment([]) == ["A 99 % interval needs 8 rounds."]
+    assert lines_of([cell("mqtt", "hog", 900.0)]) == []
+    assert lines_of([]) == ["A 99 % interval needs 8 rounds."]
 
 
 def test_a_rate_that_was_not_reached_is_reported() -> None:
-    assert assessment([cell("mqtt", "hog", 900.0, late=600)]) == [
+    assert lines_of([cell("mqtt", "hog", 900.0, late=600)]) == [
         "At 200 Hz 60% of the messages were sent late: this machine cannot keep that rate."
     ]
 
 
 def test_too_few_rounds_are_not_judged_and_have_no_interval() -> None:
     few = [cell(name, "media", p50, count=7) for name, p50 in (("mqtt", 900.0), ("zenoh-p2p", 900.0))]
-    assert "at most 0.35: not judged (1.00 of 7 rounds)" in assessment(few)[-1]
+    assert "at most 0.35: not judged (1.00 of 7 rounds)" in lines_of(few)[-1]
     printed = io.StringIO()
     Console(file=printed, width=80).print(tables(few)[-1])
     assert "–" not in printed.getvalue()
@@ -303,7 +330,7 @@ def test_too_few_rounds_are_not_judged_and_have_no_interval() -> None:
 
 @pytest.mark.parametrize(("lost", "outcome"), [(0, "met (0.20"), (1, "met (0.20"), (2, "missed (∞")])
 def test_lost_messages_are_reported_and_fail_an_aim(lost: int, outcome: str) -> None:
-    printed = assessment([cell("mqtt", "media", 5000.0), cell("zenoh-p2p", "media", 1000.0, lost=lost)])
+    printed = lines_of([cell("mqtt", "media", 5000.0), cell("zenoh-p2p", "media", 1000.0, lost=lost)])
     assert f"at most 0.35: {outcome}" in printed[-1]
     assert any(f"At 200 Hz messages were lost: {lost}.0% of zenoh-p2p." in line for line in printed) == bool(lost)
 
@@ -311,12 +338,12 @@ def test_lost_messages_are_reported_and_fail_an_aim(lost: int, outcome: str) -> 
 def test_too_much_lost_in_few_rounds_fails_an_aim() -> None:
     ours = cell("zenoh-p2p", "media", 1000.0)
     ours.rounds[0] = ours.rounds[0][:80]
-    assert "at most 0.35: missed (0.20" in assessment([cell("mqtt", "media", 5000.0), ours])[-1]
+    assert "at most 0.35: missed (0.20" in lines_of([cell("mqtt", "media", 5000.0), ours])[-1]
 
 
 def test_concurrent_pictures_are_reported_and_too_few_are_marked() -> None:
     cells = [cell("mqtt", "media", 900.0, pictures=29.9), cell("zenoh-p2p", "media", 300.0, pictures=20.0)]
-    printed = assessment(cells)
+    printed = lines_of(cells)
     assert any(line.endswith("of 30: mqtt 29.9, zenoh-p2p 20.0") for line in printed)
     assert any("zenoh-p2p: fewer than 27 pictures per second" in line for line in printed)
     assert not any("mqtt: fewer" in line or "mqtt, zenoh-p2p: fewer" in line for line in printed)
@@ -335,16 +362,16 @@ def test_the_broker_gets_the_lines_of_its_variant(tmp_path: Path) -> None:
     try:
         assert "set_tcp_nodelay true" in (tmp_path / "broker.conf").read_text().splitlines()
     finally:
-        end_all([broker.program], 5.0)
+        end_all([broker], 5.0)
 
 
 def test_another_server_on_the_broker_s_port_is_not_the_broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as stranger:
-        monkeypatch.setattr(demo_broker, "free_port", lambda: stranger.getsockname()[1])
+        monkeypatch.setattr(rig_broker, "free_port", lambda: stranger.getsockname()[1])
         broker = Broker("broker", BrokerKind.MOSQUITTO, tmp_path)
-        assert until(lambda: broker.program.ended)
+        assert until(lambda: broker.ended)
         with pytest.raises(PebbleError, match="broker ended at once"):
-            broker.wait(threading.Event())
+            broker.wait()
 
 
 class Idle:
@@ -366,11 +393,11 @@ class Idle:
 def test_a_reader_that_is_off_still_runs_its_network_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broker, looped = Broker("broker", BrokerKind.MOSQUITTO, tmp_path), []
     try:
-        broker.wait(threading.Event())
+        broker.wait()
         reader = MqttReader(broker.port)
         loop = reader._client.loop
         monkeypatch.setattr(reader._client, "loop", lambda timeout: (looped.append(timeout), loop(timeout)))
         control_load._read(reader, Idle())  # type: ignore[arg-type]
     finally:
-        end_all([broker.program], 5.0)
+        end_all([broker], 5.0)
     assert len(looped) >= 3

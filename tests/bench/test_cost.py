@@ -7,9 +7,10 @@ import sys
 import pytest
 from rich.console import Console
 
-from pebble.bench.cost_cells import cells_of
-from pebble.bench.cost_report import assessment, legend, table
-from pebble.bench.cost_robot import IDLE, Reading
+from pebble.bench import cost
+from pebble.bench.comparison import Case
+from pebble.bench.cost import COST, IDLE, Reading, legend
+from pebble.bench.engine import Collected
 from pebble.bench.results import Cell
 from pebble.bench.robot_subscriber import encoding_of
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
@@ -28,6 +29,15 @@ def reading(phase: str, scale: float, broker: str, pictures_per_s: float | None 
 
 def robot(scale: float, broker: str) -> list[Reading]:
     return [reading(IDLE, scale, broker), reading("json+pcm", 2 * scale, broker, 15.0)]
+
+
+def cells_of(rounds: dict[str, list[list[Reading]]]) -> list[Cell]:
+    collected, run = Collected(COST, list(rounds)), COST.run_of()
+    for number in range(max(map(len, rounds.values()))):
+        for kind, robots in rounds.items():
+            case = Case(run=run, number=number, variant=kind, role=kind, condition={})
+            collected.add(cell for reading in robots[number] for cell in cost.cells_of(case, reading))
+    return collected.cells()
 
 
 @pytest.fixture
@@ -66,14 +76,14 @@ def test_without_pictures_there_is_no_cpu_per_picture() -> None:
 
 def test_the_table_has_the_processes_of_both_within_100_columns(cells: list[Cell]) -> None:
     out = io.StringIO()
-    Console(file=out, width=100).print(table(cells))
+    Console(file=out, width=100).print(*COST.shown(cells))
     shown = out.getvalue()
     assert all(name in shown for name in ("idle", "json+pcm", "launcher", "mosquitto", "zenoh_hub", "all"))
     assert "…" not in shown
 
 
 def test_the_assessment_is_about_sums(cells: list[Cell]) -> None:
-    printed = "\n".join(assessment(cells))
+    printed = "\n".join(map(str, COST.assessed(cells)))
     assert "idle, memory: mqtt 31.5 (30.0 to 33.0) MB, zenoh 60.0 (60.0 to 60.0) MB\n" in printed
     assert "json+pcm, CPU per delivered picture: mqtt 4.20" in printed
     assert "needs 8" in printed
@@ -92,5 +102,6 @@ def test_encodings_are_distinguished() -> None:
 
 def test_the_measuring_process_does_not_import_large_libraries() -> None:
     """Otherwise part of a robot's memory would be counted as the measuring process's."""
-    code = "import sys, pebble.bench.cost; print({'numpy', 'cv2', 'av', 'zenoh'} & set(sys.modules))"
+    modules = "pebble.bench.cost, pebble.bench.engine, pebble.commands.bench"
+    code = f"import sys, {modules}; print({{'numpy', 'cv2', 'av', 'zenoh'}} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

@@ -4,31 +4,33 @@ import io
 import json
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import estop
-from pebble.bench.estop import EstopPlan, run
-from pebble.bench.estop_report import (
+from pebble.bench import engine
+from pebble.bench.engine import Collected, run
+from pebble.bench.estop import (
     ALL,
     CONFIRMED,
     ESTOP,
     HOLD,
     REST,
+    STOP,
     WIRE,
     ZERO,
-    Samples,
-    assessment,
-    cells_of,
-    show,
+    Rest,
+    is_moving,
+    rest,
+    sample,
 )
-from pebble.bench.estop_robots import Rest, is_moving, rest
 from pebble.bench.plots import pictures
 from pebble.bench.results import Cell, Results, load
-from pebble.bench.worker import Worker, end_workers
 from pebble.errors import PebbleError
+from pebble.rig.worker import Worker, end_workers
 from pebble.simulation.fleet import Moved
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.support import Broker, until
@@ -63,28 +65,33 @@ def test_a_robot_moves_after_its_last_change() -> None:
 # -- cells and assessment
 
 
-def one_round(stop_ms: float, *, again: bool = False, lost: bool = False) -> Samples:
-    samples = Samples()
-    for variant, ms in ((ESTOP, stop_ms), (ZERO, 1.0)):
+def one_round(stop_ms: float, *, again: bool = False, lost: bool = False) -> Iterator[Cell]:
+    for variant, ms in ((STOP, stop_ms), (ZERO, 1.0)):
         for _ in range(2):
-            samples.add(REST, "mqtt", variant, 5 * MS, round((5 + ms) * MS), again=again and variant == ESTOP)
-    samples.add(REST, ALL, ESTOP, 0, None if lost else round(100 * MS))
-    samples.add(CONFIRMED, "mqtt", ESTOP, 0, 600 * MS)
-    samples.add(HOLD, "mqtt", ESTOP, 0, 3 * MS)
-    samples.add(WIRE, "mqtt", "pebble estop", 0, 180 * MS)
-    return samples
+            yield sample(REST, "mqtt", variant, 5 * MS, round((5 + ms) * MS), again=again and variant == STOP)
+    yield sample(REST, ALL, STOP, 0, None if lost else round(100 * MS))
+    yield sample(CONFIRMED, "mqtt", STOP, 0, 600 * MS)
+    yield sample(HOLD, "mqtt", STOP, 0, 3 * MS)
+    yield sample(WIRE, "mqtt", "pebble estop", 0, 180 * MS)
 
 
-def cells(*rounds: Samples) -> list[Cell]:
-    return cells_of([samples.all for samples in rounds])
+def cells(*rounds: Iterator[Cell]) -> list[Cell]:
+    collected = Collected(ESTOP, [""])
+    for one in rounds:
+        collected.add(one)
+    return collected.cells()
+
+
+def assessment(found: list[Cell]) -> list[str]:
+    return [str(line) for line in ESTOP.assessed(found)]
 
 
 def test_a_cell_has_the_samples_of_each_round() -> None:
     first, second = one_round(2.0), one_round(4.0, lost=True)
     found = {(cell.measure, cell.variant, cell.conditions()): cell for cell in cells(first, second)}
-    assert found[REST, ESTOP, "mqtt"].rounds == [[2.0, 2.0], [4.0, 4.0]]
-    assert found[REST, ESTOP, ALL].lost == 1
-    assert next(iter(found)) == (REST, ESTOP, "mqtt")
+    assert found[REST, STOP, "mqtt"].rounds == [[2.0, 2.0], [4.0, 4.0]]
+    assert found[REST, STOP, ALL].lost == 1
+    assert next(iter(found)) == (REST, STOP, "mqtt")
 
 
 def test_aims_are_judged_from_enough_samples() -> None:
@@ -111,7 +118,7 @@ def test_a_stop_that_did_not_happen_misses_its_aim() -> None:
 
 def test_the_table_names_every_measure_within_130_columns() -> None:
     out = io.StringIO()
-    show(cells(one_round(2.0)), Console(file=out, width=130))
+    Console(file=out, width=130).print(*ESTOP.shown(cells(one_round(2.0))))
     assert all(measure in out.getvalue() for measure in (REST, CONFIRMED, HOLD, WIRE))
     assert "…" not in out.getvalue()
 
@@ -121,21 +128,22 @@ def test_measures_with_enough_samples_have_pictures() -> None:
     assert [picture.name for picture in pictures(results)] == ["estop-wheels-at-rest"]
 
 
-def test_a_plan_repeats_itself() -> None:
-    assert " ".join(EstopPlan(quick=True, boards=8).command()) == "pebble bench estop --rounds 2 --boards 8 --quick"
-    assert EstopPlan().count * EstopPlan().stops >= 100
-    assert EstopPlan().count * EstopPlan().all_stops >= 20
-    assert EstopPlan().count >= 10
-    with pytest.raises(PebbleError, match="boards must be"):
-        EstopPlan(boards=-1).check()
+def test_a_run_repeats_itself() -> None:
+    quick, full = ESTOP.run_of(quick=True, boards=8), ESTOP.run_of()
+    assert " ".join(quick.command) == "pebble bench estop --rounds 2 --boards 8 --quick"
+    assert full.rounds * full["stops"] >= 100
+    assert full.rounds * full["all_stops"] >= 20
+    assert full.rounds >= 10
+    with pytest.raises(PebbleError, match="--boards -1: must be at least 0"):
+        ESTOP.run_of(boards=-1)
 
 
 def test_results_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     swept: list[bool] = []
-    monkeypatch.setattr(estop, "_round", lambda _plan, _show: one_round(2.0))
-    monkeypatch.setattr(estop, "sweep", lambda: swept.append(True))
+    measured = replace(ESTOP, environment=lambda _run: nullcontext(), measure_round=lambda _round: one_round(2.0))
+    monkeypatch.setattr(engine, "sweep", lambda: swept.append(True))
     out = io.StringIO()
-    assert run(EstopPlan(rounds=2, output=tmp_path), Console(file=out, width=130)) == 0
+    assert run(measured.run_of(rounds=2, output=tmp_path, console=Console(file=out, width=130))) == 0
     assert swept == [True]
     assert load(tmp_path / "estop.json").assessment[-1].startswith("Load of the machine before the run: ")
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pebble.bench.percentiles import percentile, rounded
+from pebble.bench.results import percentile, rounded
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,8 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from pebble.bench.plots import draw, pictures
-from pebble.bench.plots_style import place, save, styles
-from pebble.bench.plots_time import marks
+from pebble.bench.impair.pictures import marks
+from pebble.bench.plots import draw, pictures, place, save, styles
 from pebble.bench.results import Cell, Results
 from pebble.errors import PebbleError
 from tests.bench import synthetic

@@ -1,13 +1,25 @@
 """Results are loaded as they were saved; other files are refused with one line."""
 
 import math
+import random
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from pebble.bench.output import check_folder
-from pebble.bench.results import FORMAT, Cell, Results, Stopwatch, load, machine
+from pebble.bench.compare import compare
+from pebble.bench.engine import check_folder
+from pebble.bench.results import (
+    FORMAT,
+    OVER_TIME,
+    Cell,
+    Results,
+    Stopwatch,
+    load,
+    machine,
+    pack,
+    percentile,
+)
 from pebble.errors import PebbleError
 
 
@@ -115,3 +127,55 @@ def test_percentiles_are_of_all_rounds() -> None:
 def test_conditions_are_words() -> None:
     assert a_cell().conditions() == "40 B, 3"
     assert a_cell(params={}).conditions() == ""
+
+
+# -- thinned
+
+
+def test_percentiles_of_a_thinned_round_are_those_of_all_samples(tmp_path: Path) -> None:
+    noise = random.Random(1)
+    rounds = [[round(noise.lognormvariate(5, 1), 3) for _ in range(count)] for count in (5000, 777, 30, 0)]
+    whole = a_cell(rounds=rounds, figures={"sent": 6000})
+    (tmp_path / "foreign.json").write_text("[]")
+    Results(bench="control", cells=[whole]).save(tmp_path / "control.json")
+    pack(tmp_path)
+    assert (tmp_path / "control.json").stat().st_size + (tmp_path / "samples.json.xz").stat().st_size < 6000
+    (cell,) = load(tmp_path / "control.json").cells
+    for percent in (50, 95, 99, 100):
+        assert [percentile(one, percent) for one in cell.rounds[:3]] == [percentile(one, percent) for one in rounds[:3]]
+        assert cell.percentile(percent) == whole.percentile(percent)
+    assert (cell.lost, cell.sizes) == (whole.lost, [5000, 777, 30, 0])
+    assert len(cell.samples) <= 2000
+    assert cell.rounds[2] == sorted(rounds[2])
+    before = load(tmp_path / "control.json")
+    pack(tmp_path)  # after the next report
+    assert load(tmp_path / "control.json") == before
+
+
+def test_a_curve_keeps_its_order(tmp_path: Path) -> None:
+    cell = a_cell(
+        measure=f"audio{OVER_TIME}", rounds=[[float(n) for n in range(3000)], [float(-n) for n in range(3000)]]
+    )
+    seconds, values = cell.thinned().rounds
+    assert values == [-one for one in seconds]
+    assert len(seconds) == 1000
+
+
+def test_two_thinned_runs_are_compared_as_the_whole_ones(tmp_path: Path) -> None:
+    noise = random.Random(2)
+    whole = [
+        Results(
+            bench="x", cells=[a_cell(rounds=[[factor * noise.gauss(100, 5) for _ in range(400)] for _ in range(9)])]
+        )
+        for factor in (1.0, 1.3)
+    ]
+    thinned = [Results(bench="x", cells=[cell.thinned() for cell in one.cells]) for one in whole]
+    assert [(f.kind, f.percent) for f in compare(*thinned)] == [(f.kind, f.percent) for f in compare(*whole)]
+
+
+def test_samples_that_are_missing_are_named(tmp_path: Path) -> None:
+    Results(bench="control", cells=[a_cell()]).save(tmp_path / "control.json")
+    pack(tmp_path)
+    (tmp_path / "samples.json.xz").unlink()
+    with pytest.raises(PebbleError, match=r"samples\.json\.xz does not hold the samples of control"):
+        load(tmp_path / "control.json")

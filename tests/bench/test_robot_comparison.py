@@ -2,10 +2,10 @@
 
 import pytest
 
-from pebble.bench.measured_robot import check_kinds
 from pebble.bench.results import Cell
-from pebble.bench.robot_comparison import against, caveat, sentence, spread
+from pebble.bench.tables import against, caveat, sentence, spread
 from pebble.errors import PebbleError
+from pebble.rig.robot import check_kinds
 
 
 def cells(mqtt: list[float], zenoh: list[float]) -> list[Cell]:

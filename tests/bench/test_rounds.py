@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, cost, output, startup
+from pebble.bench import bridge, cost, startup
 from pebble.bench.bridge_drive import Arrived, DriveSegment
 from pebble.bench.bridge_plan import BridgePlan
-from pebble.bench.cost_robot import IDLE, Reading
+from pebble.bench.comparison import Case
+from pebble.bench.cost import COST, IDLE, Reading
+from pebble.bench.engine import Rounds, run
 from pebble.bench.results import Cell, load
-from pebble.bench.rounds import Rounds
 from pebble.errors import PebbleError
 
 FULL = [Cell(variant="mqtt", measure="m", unit="ms", rounds=[[1.0]])]
@@ -59,26 +61,23 @@ def test_two_failures_at_the_start_end_the_run(outcomes: str) -> None:
 
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output, "find_spec", lambda _name: None)
-
-
-_MEASURED = ("first heartbeat", "picture, json, at rest")
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)
 
 
 def test_startup_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     launches = iter([1.0, 2.0, None, 3.0, 4.0])
 
-    def launch(kind: str, joins: int) -> startup.Launch:
+    def launch(case: Case) -> Iterator[Cell]:
         if (s := next(launches)) is None:
-            raise PebbleError(f"{kind}: no heartbeat")
-        return startup.Launch(
-            heartbeat_s=s, ready_s=s, obeyed_s=s, operator_ms=[s], stock_operator_ms=[s], service_ms=joins * [s]
-        )
+            raise PebbleError(f"{case.variant}: no heartbeat")
+        yield case.cell("first heartbeat", "s", [s])
+
+    def first_pictures(case: Case) -> Iterator[Cell]:
+        yield case.cell("picture, json, at rest", "ms", [500.0])
 
     monkeypatch.setattr(startup, "launch", launch)
-    monkeypatch.setattr(startup.first_picture, "measure", lambda _kind: {("json", "at rest"): 500.0})
-    monkeypatch.setattr(startup, "MEASURES", [one for one in startup.MEASURES if one.name in _MEASURED])
-    assert startup.run(startup.StartupPlan(rounds=3, output=tmp_path), Console(file=io.StringIO())) == 0
+    monkeypatch.setattr(startup, "first_pictures", first_pictures)
+    assert run(startup.STARTUP.run_of(rounds=3, output=tmp_path, console=Console(file=io.StringIO()))) == 0
     results = load(tmp_path / "startup.json")
     assert {cell.variant: cell.rounds for cell in results.cells if cell.measure == "first heartbeat"} == {
         "mqtt": [[1.0], [3.0]],
@@ -92,14 +91,13 @@ def test_startup_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_cost_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robots = iter([1.0, None, 3.0])
 
-    def measure(kind: str, _seconds: float, _streams: object) -> list[Reading]:
+    def read(kind: str, _seconds: float) -> Iterator[Reading]:
         if (mb := next(robots)) is None:
             raise PebbleError(f"{kind}: a process ended")
-        return [Reading(phase=IDLE, memory={"launcher": mb}, cpu={"launcher": mb}, threads={"launcher": 1})]
+        yield Reading(phase=IDLE, memory={"launcher": mb}, cpu={"launcher": mb}, threads={"launcher": 1})
 
-    monkeypatch.setattr(cost, "measure", measure)
-    plan = cost.CostPlan(rounds=3, kinds=["mqtt"], output=tmp_path)
-    assert cost.run(plan, Console(file=io.StringIO())) == 0
+    monkeypatch.setattr(cost, "read", read)
+    assert run(COST.run_of(rounds=3, variants=["mqtt"], output=tmp_path, console=Console(file=io.StringIO()))) == 0
     results = load(tmp_path / "cost.json")
     assert results.cells[0].rounds == [[1.0], [3.0]]
     assert results.assessment[0] == "1 of 3 rounds failed and were left out; round 2: mqtt: a process ended"

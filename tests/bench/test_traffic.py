@@ -10,11 +10,12 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import traffic as comparison
+from pebble.bench.catalogue import chosen
+from pebble.bench.engine import run
 from pebble.bench.paper import TABLE_4_1
 from pebble.bench.plots import pictures
-from pebble.bench.report_plan import chosen
 from pebble.bench.results import load
-from pebble.bench.traffic_report import assess, cells_of, robots_of, tables
+from pebble.bench.traffic import TRAFFIC, cells_of, robots_of, sentences, tables
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.analysis import analyse
@@ -26,7 +27,7 @@ from tests.recordings.demo_robots import DRIVE, FRED, MEDIA, messages
 
 def printed(traffic: Traffic) -> str:
     console = Console(record=True, width=120, file=io.StringIO())
-    for table in tables(traffic):
+    for table in tables(cells_of(traffic)):
         console.print(table)
     return console.export_text()
 
@@ -57,9 +58,9 @@ def test_table_4_1_stands_beside_the_paper_s(recorded: Traffic) -> None:
 
 
 def test_sentences_name_what_differs(recorded: Traffic) -> None:
-    sentences = assess(recorded)
-    assert any("goob's heartbeats take" in one and "20 to 40 ms" in one for one in sentences)
-    assert any(one.startswith("fred's video as JSON takes") for one in sentences)
+    found = [str(one) for one in sentences(cells_of(recorded))]
+    assert any("goob's heartbeats take" in one and "20 to 40 ms" in one for one in found)
+    assert any(one.startswith("fred's video as JSON takes") for one in found)
 
 
 @pytest.mark.parametrize(
@@ -69,14 +70,14 @@ def test_the_bandwidth_of_sound_is_judged_over_many_seconds(seconds: int, kbps: 
     traffic = synthetic.analysed()
     for robot in traffic.robots:
         robot.bandwidth = [Bandwidth(AUDIO, ALL, seconds, kbps, kbps, 50 * seconds, 664 * 50 * seconds)]
-    assert f"within 1 %: {expected} (goob {kbps:.1f} kbit/s" in assess(traffic)[0]
+    assert f"within 1 %: {expected} (goob {kbps:.1f} kbit/s" in str(next(iter(sentences(cells_of(traffic)))))
 
 
 def test_the_whole_analysis_is_in_the_results(recorded: Traffic, tmp_path: Path) -> None:
     results = synthetic.traffic()
     results.cells = cells_of(recorded)
     results.save(tmp_path / "traffic.json")
-    robots = robots_of(load(tmp_path / "traffic.json"))
+    robots = robots_of(load(tmp_path / "traffic.json").cells)
     assert robots == {robot.robot.rpartition("/")[2]: robot for robot in recorded.robots}
 
 
@@ -97,16 +98,16 @@ def test_without_duckdb_it_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path
     found = importlib.util.find_spec
     monkeypatch.setattr(comparison, "find_spec", lambda name: None if name == "duckdb" else found(name))
     with pytest.raises(PebbleError, match=r'left out: .* needs DuckDB: pip install "pebble-robot\[archive\]"'):
-        comparison.run(comparison.plan(quick=True, output=tmp_path))
+        run(TRAFFIC.run_of(quick=True, output=tmp_path))
 
 
 @pytest.mark.alone
 def test_the_robots_are_recorded_at_a_broker(tmp_path: Path) -> None:
     pytest.importorskip("duckdb")
-    plan = comparison.Plan(idle_s=8, session_s=6, quick=True, output=tmp_path)
-    assert comparison.run(plan, Console(quiet=True)) == 0
+    short = TRAFFIC.run_of(idle_s=8, session_s=6, quick=True, output=tmp_path, console=Console(quiet=True))
+    assert run(short) == 0
     results = load(tmp_path / "traffic.json")
-    robots = robots_of(results)
+    robots = robots_of(results.cells)
     assert set(robots) == {"goob", "fred", "minilamp", "benjr"}
     for name in ("goob", "fred"):
         assert robots[name].of(VIDEO) is not None

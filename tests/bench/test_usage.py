@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from pebble.bench import usage
-from pebble.bench.usage import children, cpu_s, own_mb, pss_mb, wake_ups
+from pebble.bench.usage import cpu_s, own_mb, pss_mb, wake_ups
 from pebble.bench.wake_up import wake_up_us
-from pebble.bench.worker import Worker
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
+from pebble.rig.worker import Worker
 from tests.support import Child, until
 
 GONE = 1 << 22  # above the largest pid
@@ -87,4 +88,4 @@ def test_a_worker_that_has_ended_is_reported_when_asked(tmp_path: Path) -> None:
     with pytest.raises(PebbleError, match="no broker"):
         worker.answer(20)
     worker.send("1")
-    worker.close_input()
+    worker.ask_to_end()

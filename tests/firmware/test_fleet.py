@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Self
@@ -14,7 +16,9 @@ import pytest
 from rich.console import Console
 
 from pebble import cli
-from pebble.bench.fleet import FleetMetrics, FleetPlan, latencies_ms, longest_gap_s, measure, plan, run
+from pebble.bench import engine
+from pebble.bench.comparison import Case
+from pebble.bench.fleet import FLEET, cell_of, latencies_ms, longest_gap_s, measure
 from pebble.bench.fleet_operator import STEPS
 from pebble.bench.results import load
 from pebble.errors import ConfigError, PebbleError
@@ -85,47 +89,46 @@ def test_a_robot_that_falls_silent_is_missed_until_the_end() -> None:
 
 
 def test_a_quick_fleet_is_small_and_its_command_shows_it() -> None:
-    quick = plan(quick=True, seconds=2.0)
-    assert (quick.robots, quick.seconds) == (30, 2.0)
-    assert " ".join(quick.command()) == "pebble bench fleet --robots 30 --seconds 2 --rate 10 --quick"
-    assert plan() == FleetPlan()
+    quick, full = FLEET.run_of(quick=True, seconds=2.0), FLEET.run_of()
+    assert (quick["robots"], quick["seconds"]) == (30, 2.0)
+    assert " ".join(quick.command) == "pebble bench fleet --robots 30 --seconds 2 --rate 10 --quick"
+    assert (full["robots"], full["seconds"]) == (200, 60.0)
+
+
+def case_of(**given: object) -> Case:
+    return Case(run=FLEET.run_of(**given), number=0, variant="mqtt", role="mqtt", condition={})
 
 
 def test_a_small_fleet_is_measured() -> None:
     """Whole: a broker, ten robots, an operator; with bounds that hold on a busy machine too."""
-    metrics = measure(FleetPlan(robots=10, seconds=5.0))
-    assert metrics.online == 10
-    assert metrics.sent == 500
-    assert metrics.lost <= 0.8 * metrics.sent  # overtaken, where a busy machine let several wait
-    assert len(metrics.heartbeats_hz) == 10
-    assert all(rate == pytest.approx(4.0, rel=0.25) for rate in metrics.heartbeats_hz)
-    cell = metrics.cell(10.0)
+    (cell,) = measure(case_of(robots=10, seconds=5.0))
+    assert cell.figures["online"] == 10
+    assert cell.figures["sent"] == 500
+    assert cell.lost is not None
+    assert cell.lost <= 0.8 * 500  # overtaken, where a busy machine let several wait
+    for name in ("min", "median", "max"):
+        assert cell.figures[f"beats_{name}_hz"] == pytest.approx(4.0, rel=0.25)
     assert cell.percentile(50) < 200
-    assert cell.lost == metrics.lost
-    assert set(metrics.cpu) == {"broker", "fleet", "operator"}
+    assert {"cpu_broker", "cpu_fleet", "cpu_operator"} <= cell.figures.keys()
     assert 0 < cell.figures["mb_per_robot"] < 20
 
 
 def test_what_cannot_be_measured_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for bad in (
-        FleetPlan(robots=MOST + 1),
-        FleetPlan(seconds=0.0),
-        FleetPlan(rate_hz=100.0),
-        FleetPlan(output=tmp_path / "file" / "no"),
-    ):
+    for bad in ({"robots": MOST + 1}, {"seconds": 0.0}, {"rate": 100.0}, {"output": tmp_path / "file" / "no"}):
         with pytest.raises(PebbleError):
-            run(bad)
+            engine.run(FLEET.run_of(**bad))
 
 
-def test_figures_are_shown_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    metrics = FleetMetrics(
-        robots=2, seconds=1.0, online=2, sent=3, late=0, latencies_ms=[1.0, 9.0], heartbeats_hz=[4.0, 4.1]
-    )
-    monkeypatch.setattr("pebble.bench.fleet.measure", lambda *_: metrics)
+def test_figures_are_shown_and_written(tmp_path: Path) -> None:
+    second = 1_000_000_000
+    heartbeats = [[number * second // 4 for number in range(5)], [number * second // 4 for number in range(9)]]
+    answer = {"sent": [[0, second], [0]], "late": 0, "heartbeats": heartbeats, "began": 0, "ended": 2 * second}
+    moves = {name: [Moved(ms * 1_000_000, name, (1.0, 1.0))] for name, ms in (("minilamp-001", 1), ("benjr-001", 9))}
+    measured = replace(FLEET, measure=lambda case: [cell_of(case, 2, answer, moves, {"fleet": 1.0}, 8.0)])
     out = StringIO()
-    assert run(FleetPlan(robots=2, output=tmp_path), Console(file=out, width=100)) == 0
-    assert "3 / 2 / 1" in out.getvalue()  # sent, obeyed, lost
+    assert engine.run(measured.run_of(robots=2, output=tmp_path, console=Console(file=out, width=100))) == 0
+    assert re.search(r"2 +10 Hz +1.00 +9.00 +9.00 +9.00 +2 +3 +0", out.getvalue())  # p50 … max, n, sent, late
     results = load(tmp_path / "fleet.json")
     assert results.cells[0].rounds == [[1.0, 9.0]]
     assert results.assessment[0] == "2 of 2 robots were online; of 3 commands 1 were overtaken or lost"

@@ -20,10 +20,10 @@ from pebble.bench.usage import cpu_s, own_mb
 from pebble.client.viewer import Viewer
 from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
-from pebble.demo.stage import Stage
-from pebble.demo.testbed import ROBOTS
 from pebble.errors import PebbleError
 from pebble.recordings.library import files, merged
+from pebble.rig.stage import Stage
+from pebble.rig.testbed import ROBOTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.support import quarters, until
 

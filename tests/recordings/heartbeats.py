@@ -19,10 +19,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 from pebble.contract import ONLINE
-from pebble.demo.stage import Stage
-from pebble.demo.testbed import ROBOTS
+from pebble.rig.stage import Stage
+from pebble.rig.testbed import ROBOTS
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.recordings.endurance import Operator
 from tests.support import until

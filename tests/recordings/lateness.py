@@ -8,7 +8,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 from pebble.recordings.replay.player import Player
 from pebble.recordings.replay.robots import ReplayedRobots
 from pebble.recordings.replay.rules import Options, Rules

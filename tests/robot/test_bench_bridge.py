@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, bridge_null, bridge_profile, output
+from pebble.bench import bridge, bridge_null, bridge_profile
 from pebble.bench.bridge_media import FLOWS
 from pebble.bench.bridge_plan import Mode, plan
-from pebble.bench.bridge_robot import KINDS
 from pebble.bench.results import Cell, load
-from pebble.bench.usage import children
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
+from pebble.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
 from tests.support import until
 
@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.thorough]
 
 @pytest.fixture(autouse=True)
 def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output, "find_spec", lambda _name: None)  # pictures have tests of their own
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # pictures have tests of their own
     monkeypatch.setattr(bridge, "_STARTUP_S", 0.2)
     monkeypatch.setattr(bridge, "_MEDIA_STARTUP_S", 0.0)
     monkeypatch.setattr(bridge_null, "_STARTUP_S", 0.5)  # the serial port is open, and the pilot quick
@@ -45,7 +45,7 @@ def test_both_robots_are_driven_also_with_media_and_leave_nothing(tmp_path: Path
     assert all(cell.figures[f"{flow}_per_s"] for cell in results.cells if _name(cell)[1] == "media" for flow in FLOWS)
     assert (results.quick, results.command[:3]) == (True, ["pebble", "bench", "bridge"])
     assert "zenoh" in printed.getvalue()
-    assert any(line.startswith("aim: ") for line in results.assessment)
+    assert results.aims
     assert children(os.getpid()) == []
 
 

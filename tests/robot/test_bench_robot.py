@@ -11,12 +11,14 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, cost, cost_robot, startup
+from pebble.bench import bridge, cost, startup
+from pebble.bench.bridge_driven_robot import STAND_IN
 from pebble.bench.bridge_plan import Mode, plan
-from pebble.bench.bridge_robot import KINDS, STAND_IN
 from pebble.bench.bridge_tally import DOWN, UNLOADED, UP
+from pebble.bench.engine import run
 from pebble.bench.results import load
-from pebble.bench.usage import children
+from pebble.rig.programs import children
+from pebble.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, Child, until
 
@@ -31,33 +33,32 @@ def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_startup_of_both_kinds(tmp_path: Path) -> None:
     printed = io.StringIO()
-    assert (
-        startup.run(startup.StartupPlan(rounds=1, quick=True, output=tmp_path), Console(file=printed, width=100)) == 0
-    )
+    short = startup.STARTUP.run_of(rounds=1, quick=True, output=tmp_path, console=Console(file=printed, width=100))
+    assert run(short) == 0
     results = load(tmp_path / "startup.json")
     assert (results.bench, results.quick) == ("startup", True)
     assert results.command == ["pebble", "bench", "startup", "--rounds", "1", "--quick"]
     assert {(cell.measure, cell.variant) for cell in results.cells} == {
-        (measure.name, kind) for measure in startup.MEASURES for kind in KINDS
+        (measure, kind) for measure in startup.MEASURES for kind in KINDS
     }
     for kind in KINDS:
         heartbeat, ready, obeyed, operator, paho, service, *pictures = (
-            cell for measure in startup.MEASURES if (cell := results.find(kind, measure.name)) is not None
+            cell for measure in startup.MEASURES if (cell := results.find(kind, measure)) is not None
         )
         assert all(0 < cell.samples[0] < 60_000 for cell in pictures)
         assert len(pictures) == len(startup.PICTURES)
         assert all(0 < cell.samples[0] < 60 for cell in (heartbeat, ready, obeyed))
-        assert all(len(cell.samples) == startup.QUICK_JOINS for cell in (operator, paho, service))
+        assert all(len(cell.samples) == short["joins"] for cell in (operator, paho, service))
         assert all(cell.figures["topics"] for cell in (operator, paho, service))
     assert "first drive obeyed" in printed.getvalue()
     assert children(os.getpid()) == []
 
 
 def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost_robot, "_STARTUP_S", 0.0)
+    monkeypatch.setattr(cost, "_STARTUP_S", 0.0)
     printed = io.StringIO()
-    plan = cost.CostPlan(rounds=1, seconds=0.4, quick=True, output=tmp_path)
-    assert cost.run(plan, Console(file=printed, width=100)) == 0
+    console = Console(file=printed, width=100)
+    assert run(cost.COST.run_of(rounds=1, seconds=0.4, quick=True, output=tmp_path, console=console)) == 0
     results = load(tmp_path / "cost.json")
     assert results.command == ["pebble", "bench", "cost", "--rounds", "1", "--seconds", "0.4", "--quick"]
     for kind, own in (("mqtt", "mosquitto"), ("zenoh", "zenoh_hub")):

@@ -18,7 +18,7 @@ from pebble.bench.impair.network import why_no_namespaces
 from pebble.bench.impair.plan import ImpairPlan
 from pebble.bench.impair.run import run
 from pebble.bench.results import load
-from pebble.bench.usage import children
+from pebble.rig.programs import children
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, until
 
@@ -44,7 +44,7 @@ def permitted(kind: str) -> None:
 def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     kind: str, subject: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pebble.bench.output.find_spec", lambda _name: None)  # no plots
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
     monkeypatch.setattr("pebble.bench.impair.run._QUIET_QUICK_S", 0.1)
     monkeypatch.setattr(
         ImpairPlan, "request", lambda _plan, one: TrialRequest(video=one.video, audio=one.audio, **SHORT)

@@ -19,9 +19,9 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from pebble.demo.media_assessment import best_match, envelope
-from pebble.demo.testbed import LinuxRobot
 from pebble.media.pcm import Resampler
 from pebble.media.speech import PERIOD_S, Speech
+from pebble.rig.testbed import LinuxRobot
 from pebble.simulation.loudspeaker import playbacks
 from tests.web.browser import Tab
 from tests.web.sound_robot import REF

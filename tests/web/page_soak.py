@@ -20,7 +20,7 @@ from rich.table import Table
 
 from pebble.bench import chromium as program
 from pebble.bench.usage import pss_mb
-from pebble.demo.testbed import ROBOTS
+from pebble.rig.testbed import ROBOTS
 from tests.support import quarters
 from tests.web.browser import Tab
 from tests.web.console import Console, console
@@ -52,7 +52,7 @@ def pages() -> Iterator[tuple[Stage, CDPSession, list[Console]]]:
 
 def measure(stage: Stage, browser: CDPSession, opened: list[Console], samples: Samples) -> None:
     """Append the memory of now."""
-    samples.setdefault("server", []).append(pss_mb(stage.server.program.pid))
+    samples.setdefault("server", []).append(pss_mb(stage.server.pid))
     for one in opened:
         for what, value in memory(one.tab).items():
             samples.setdefault(f"{one.name}: {what}", []).append(value)

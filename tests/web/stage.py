@@ -5,6 +5,6 @@
 
 from __future__ import annotations
 
-from pebble.demo.stage import Stage
+from pebble.rig.stage import Stage
 
 __all__ = ["Stage"]

@@ -9,7 +9,6 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -96,7 +95,7 @@ def test_a_clip_is_played_and_stopped(goob: Console, stage: Stage, reports: Repo
     name = "signals/two-tone.wav"
 
     def played() -> list[Playback]:
-        return [one for one in playbacks(Path(stage.folder_of_logs) / "goob" / "played") if one.file.endswith(name)]
+        return [one for one in playbacks(stage.folder / "goob" / "played") if one.file.endswith(name)]
 
     before = len(played())
     goob.uncover("clip")

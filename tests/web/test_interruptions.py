@@ -63,16 +63,20 @@ INTERRUPTIONS = {
     ),
     "the page's main thread is busy": Interruption(_busy, SILENCE_S, lasts_s=1.8),
     "the server is suspended": Interruption(
-        lambda robot: robot.stage.freeze_server(), VALID_S, lambda robot: robot.stage.thaw_server(), 1.5
+        lambda robot: robot.stage.server.freeze(), VALID_S, lambda robot: robot.stage.server.thaw(), 1.5
     ),
     "the server is killed": Interruption(
-        lambda robot: robot.stage.kill_server(), VALID_S, lambda robot: robot.stage.restart_server(), 1.0
+        lambda robot: robot.stage.server.kill(), VALID_S, lambda robot: robot.stage.restart_server(), 1.0
     ),
     "the broker is killed": Interruption(
-        lambda robot: robot.stage.kill_broker(), CONNECTION_S, lambda robot: robot.stage.restart_broker(), 1.0
+        lambda robot: robot.stage.remote_broker.kill(), CONNECTION_S, lambda robot: robot.stage.restart_broker(), 1.0
     ),
     "the broker is suspended": Interruption(
-        lambda robot: robot.stage.freeze_broker(), VALID_S, lambda robot: robot.stage.thaw_broker(), 1.5, late_s=0.1
+        lambda robot: robot.stage.remote_broker.freeze(),
+        VALID_S,
+        lambda robot: robot.stage.remote_broker.thaw(),
+        1.5,
+        late_s=0.1,
     ),
 }
 

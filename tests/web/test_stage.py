@@ -44,12 +44,12 @@ def test_the_traces_show_what_a_robot_is_commanded(lamp: Stage) -> None:
 
 def test_the_server_can_be_frozen_killed_and_started_again_at_its_address(lamp: Stage) -> None:
     url = lamp.url
-    lamp.freeze_server()
+    lamp.server.freeze()
     with pytest.raises(TimeoutError):
         urllib.request.urlopen(url, timeout=0.3)
-    lamp.thaw_server()
+    lamp.server.thaw()
     assert status(url) == 200
-    lamp.kill_server()
+    lamp.server.kill()
     lamp.restart_server()
     assert lamp.url == url
     assert status(url) == 200
@@ -71,7 +71,7 @@ def test_a_browser_opens_the_page_and_keeps_its_complaints(lamp: Stage, browser:
 
 def test_nothing_outlives_a_stage() -> None:
     with Stage("minilamp") as stage:
-        pids = [stage.server.program.pid, *(program.pid for program in stage.robots["minilamp"].programs)]
+        pids = [stage.server.pid, *(program.pid for program in stage.robots["minilamp"].programs)]
         alive: Callable[[], list[int]] = lambda: [pid for pid in pids if not gone(pid)]
         assert alive() == pids
     assert alive() == []

@@ -12,7 +12,7 @@ from rich.console import Console
 from pebble.bench.impair import cells, metrics
 from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.messages import ClipCommand, Command, Heartbeat, Picture, Record, Sound, Window
-from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.plan import NAMES, QUICK, ImpairPlan
 from pebble.bench.impair.report import assessment, tables
 from pebble.bench.results import Cell, Results
@@ -22,6 +22,10 @@ from pebble.simulation.trace import Entry, motors_entry
 
 S, MS = 1_000_000_000, 1_000_000
 WINDOW = Window(10 * S, 20 * S, first_s=0.5)
+
+
+def lines_of(cells: list[Cell]) -> list[str]:
+    return [str(one) for one in assessment(cells)]
 
 
 def packet(number: int, late_ms: float = 50, at_ms: float | None = None) -> Sound:
@@ -231,7 +235,7 @@ def test_a_clip_is_timed_from_its_command_to_its_first_sample() -> None:
     (silent,) = (cell for cell in found if cell.measure == cells.CLIP and cell.params["trial"] == "64k")
     assert (silent.samples, silent.lost, silent.figures["status_ms"]) == ([], 1, None)
     line = "Clips that the loudspeaker played when commanded: zenoh h264 opus 1 of 2 (p50 70.0 ms, longest 70.0 ms)."
-    assert line in assessment(found)
+    assert line in lines_of(found)
 
 
 def test_a_trial_in_which_nothing_arrived_has_metrics_too() -> None:
@@ -241,7 +245,7 @@ def test_a_trial_in_which_nothing_arrived_has_metrics_too() -> None:
     assert math.isnan(of(found, cells.SOUND).percentile(95))
     assert of(found, cells.PICTURES).figures["frozen_s"] == 7
     assert of(found, cells.HEARTBEAT_GAP).figures["longest_gap_s"] == 20
-    assert any("nothing arrived" in sentence and "missed" in sentence for sentence in assessment(found))
+    assert any("nothing arrived" in sentence and "missed" in sentence for sentence in lines_of(found))
 
 
 def test_series_over_time_are_ordered_and_begin_with_the_run() -> None:
@@ -255,7 +259,7 @@ def test_series_over_time_are_ordered_and_begin_with_the_run() -> None:
 
 def test_the_aims_are_met_or_missed_by_so_much() -> None:
     good, bad = trial("mqtt h264 opus"), trial("zenoh h264 opus", late_ms=500)
-    lines = assessment(cells_of([good, bad], fps=10))
+    lines = lines_of(cells_of([good, bad], fps=10))
     aim, window = "h264 opus at 256k, sound p95 at most 400 ms", "window of 10 s"
     assert f"aim: mqtt {aim}: met (50.0 ms, {window})" in lines
     assert f"aim: zenoh {aim}: missed (500 ms, by 100 ms, {window})" in lines
@@ -263,15 +267,15 @@ def test_the_aims_are_met_or_missed_by_so_much() -> None:
 
 
 def test_lost_messages_are_infinitely_late() -> None:
-    few = assessment(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 50])], fps=10))
-    many = assessment(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 10])], fps=10))
+    few = lines_of(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 50])], fps=10))
+    many = lines_of(cells_of([trial(sounds=[packet(number) for number in range(250) if number % 10])], fps=10))
     aim = "aim: zenoh h264 opus at 256k, sound p95 at most 400 ms"
     assert f"{aim}: met (50.0 ms, 2.00 % lost, window of 10 s)" in few
     assert f"{aim}: missed (too much was lost, 10.0 % lost, window of 10 s)" in many
 
 
 def test_commands_that_were_overtaken_or_lost_count_for_the_aim() -> None:
-    lines = assessment(
+    lines = lines_of(
         cells_of([trial(name="64k+5%", reached=one) for one in (slice(None, None, 10),)], fps=10)
         + cells_of([trial("mqtt h264 opus", "64k+5%", reached=slice(100))], fps=10)
     )
@@ -281,16 +285,16 @@ def test_commands_that_were_overtaken_or_lost_count_for_the_aim() -> None:
 
 
 def test_rest_times_show_a_robot_that_nothing_reached() -> None:
-    (line,) = (line for line in assessment(cells_of([trial(reached=slice(0))], fps=10)) if line.startswith("Stops"))
+    (line,) = (line for line in lines_of(cells_of([trial(reached=slice(0))], fps=10)) if line.startswith("Stops"))
     assert "zenoh h264 opus 0 (wheels at rest for 19.9 of 20.0 s)" in line
 
 
 def test_transports_are_compared_where_both_were_tried() -> None:
     both = [trial(f"{kind} original", name, late_ms=50) for name in QUICK for kind in ("mqtt", "zenoh")]
-    lines = assessment(cells_of(both, fps=10))
+    lines = lines_of(cells_of(both, fps=10))
     assert any("original, sound p50 over 4 trials: zenoh / mqtt = 1.00" in sentence for sentence in lines)
     assert not any(sentence.startswith("aim:") for sentence in lines)
-    assert not any("zenoh and mqtt" in sentence for sentence in assessment(cells_of(both[::2], fps=10)))
+    assert not any("zenoh and mqtt" in sentence for sentence in lines_of(cells_of(both[::2], fps=10)))
 
 
 @pytest.mark.parametrize(("width", "number"), [(80, 4), (105, 6), (120, 6)])

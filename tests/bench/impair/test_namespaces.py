@@ -95,5 +95,5 @@ def test_a_user_without_permission_gets_the_reason() -> None:
 
 
 def test_a_port_is_found_without_a_loopback_device() -> None:
-    asked = [sys.executable, "-c", "from pebble.demo.broker import free_port; print(free_port())"]
+    asked = [sys.executable, "-c", "from pebble.rig.broker import free_port; print(free_port())"]
     assert int(subprocess.check_output(["unshare", "--net", *asked], cwd=ROOT)) > 0

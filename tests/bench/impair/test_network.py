@@ -9,8 +9,8 @@ import pytest
 
 from pebble.bench.impair.conditions import Condition, Shape, chosen
 from pebble.bench.impair.network import ImpairedNetwork, open_network
-from pebble.bench.usage import children
 from pebble.errors import PebbleError
+from pebble.rig.programs import children
 from tests.bench.impair.peers import ProbeConnection
 from tests.support import ROOT, Child, gone, until
 

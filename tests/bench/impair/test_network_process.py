@@ -5,10 +5,10 @@ import signal
 
 import pytest
 
-from pebble.bench import worker
-from pebble.bench.impair import network_process as module
-from pebble.bench.impair.network_process import NetworkProcess
+from pebble.bench.impair import network as module
+from pebble.bench.impair.network import NetworkProcess
 from pebble.errors import PebbleError
+from pebble.rig import worker
 
 
 def test_a_late_answer_is_not_taken_for_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:

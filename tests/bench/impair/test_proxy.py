@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from pebble.bench.impair.conditions import Condition, Shape
-from pebble.bench.impair.proxy import ProxyNetwork
+from pebble.bench.impair.network import ProxyNetwork
 from pebble.bench.impair.proxy_process import _HEADERS, _SEGMENT, Direction
 from tests.support import free_port, until
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from pebble.bench.impair import run as module
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.messages import ClipCommand, OperatorReport, Record, RecoveryRequest, TrialRequest, Window
-from pebble.bench.impair.network_process import Traffic
+from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.plan import ImpairPlan, Subject
 from pebble.bench.impair.run import run
 from pebble.bench.results import load
@@ -107,7 +107,7 @@ def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int, network: str 
     log: list[str] = []
     printed = io.StringIO()
     monkeypatch.setattr(module, "TestBed", FakeTestBed(log, trials))
-    monkeypatch.setattr("pebble.bench.output.find_spec", lambda _name: None)  # no plots
+    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
     plan = ImpairPlan(trials=PLAN.trials, subjects=PLAN.subjects, network=network, output=folder)
     try:
         run(plan, Console(file=printed, width=120))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 from pebble.recordings.files.finish import finish
 from pebble.recordings.replay import robots as replayed_robots
 from pebble.transports import Message, MqttSettings, QoS, create

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pebble.bench.percentiles import percentile
+from pebble.bench.results import percentile
 from pebble.bench.usage import pss_mb
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.segment import segment

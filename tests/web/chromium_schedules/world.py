@@ -66,7 +66,7 @@ class World:
             self._opened = opened.pop_all()
 
     def close(self) -> None:
-        self.stage.thaw_server()
+        self.stage.server.thaw()
         self._proxy.resume()
         self._opened.close()
 
@@ -257,17 +257,17 @@ class World:
 
     def _suspend_server(self, step: Step) -> None:
         self._server_away = True
-        self.stage.freeze_server()
+        self.stage.server.freeze()
         for tab in self.tabs:
             self._fails(tab, VALID_S, "the server stands still", step)
 
     def _suspend_server_ends(self, _: Step) -> None:
-        self.stage.thaw_server()
+        self.stage.server.thaw()
         self._server_away = False
         self._acknowledge()
 
     def _kill_server(self, _: Step) -> None:
-        self.stage.kill_server()
+        self.stage.server.kill()
         self._holder = None
         for press in [*self._alive(1), *self._alive(2)]:
             press.end(time.monotonic(), VALID_S, "the server was killed")

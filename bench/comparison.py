@@ -1,0 +1,280 @@
+"""What a comparison is: a declaration from which its command, its run, its pictures and its part of the report follow.
+
+The module of a declaration is imported for the help of its command, too, and by the process that measures: what is
+large (numpy is not needed: see :mod:`pebble.bench.ratios`) is imported where it is used.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from rich.console import Console
+from rich.table import Table
+
+from pebble.bench.results import LONGEST_S, Cell, Judged, Results, Value
+from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from pebble.bench.plots import Picture
+
+FOLDER: Final = Path("bench-results")
+
+Combine = Callable[[Sequence[Any]], Value]  # the values of all rounds into one
+Tables = Callable[[Sequence[Cell]], Iterable[Table]]
+Assess = Callable[[Sequence[Cell]], Iterable[str | Judged]]
+
+
+def of_known(how: Callable[[Sequence[float]], float], digits: int) -> Combine:
+    """Joins the values of the rounds that have one; None without any."""
+
+    def combine(values: Sequence[float | None]) -> float | None:
+        known = [one for one in values if one is not None]
+        return round(how(known), digits) if known else None
+
+    return combine
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Option:
+    """One option of the command line. Its defaults are values of the budgets, under the same name."""
+
+    name: str
+    help: str
+    kind: type[Any] = str  # of one value; bool: a flag
+    many: bool = False  # several values, separated by commas
+    repeated: bool = False  # or each in an option of its own
+    known: Sequence[str] = ()  # the values that there are
+    least: float | None = None
+    most: float | None = None
+    metavar: str | None = None
+    recorded: bool = True  # among the options of the results
+    private: bool = False  # results name no hosts and files: neither recorded nor, with its value, in their command
+
+    def check(self, value: Any) -> None:
+        """Raises PebbleError for an invalid value."""
+        values = list(value) if self.many else [value]
+        if unknown := [one for one in values if self.known and one not in self.known]:
+            raise PebbleError(f"--{self.name}: unknown {', '.join(unknown)}: there are {', '.join(self.known)}")
+        if not values or len(set(values)) < len(values):
+            raise PebbleError(f"--{self.name}: name {'each one once' if values else 'at least one'}")
+        for one in values:
+            if (self.least is not None and not one >= self.least) or (self.most is not None and not one <= self.most):
+                limits = (("at least", self.least), ("at most", self.most))
+                words = " and ".join(f"{word} {limit:g}" for word, limit in limits if limit is not None)
+                raise PebbleError(f"--{self.name} {one}: must be {words}")
+
+    def words(self, value: Any, default: Any) -> list[str]:
+        """As on the command line; names only if they are not the default ones."""
+        if self.kind is bool:
+            return [f"--{self.name}"] if value else []
+        if value is None or (self.many and list(value) == list(default or ())):
+            return []
+        if self.private:
+            return [f"--{self.name}", self.metavar or self.name.upper()]
+        if self.repeated:
+            return [word for one in value for word in (f"--{self.name}", _word(one))]
+        return [f"--{self.name}", ",".join(map(_word, value if self.many else [value]))]
+
+
+def _word(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def rounds(help_: str, *, least: int = 1) -> Option:
+    return Option(name="rounds", kind=int, least=least, most=10_000, help=help_)
+
+
+def seconds(help_: str, *, least: float = 0.1) -> Option:
+    return Option(name="seconds", kind=float, least=least, most=LONGEST_S, help=help_)
+
+
+def variants(known: Sequence[str], help_: str = "Some of them, separated by commas.") -> Option:
+    return Option(name="variants", many=True, known=known, metavar="NAMES", help=help_, recorded=False)
+
+
+class Budget(dict[str, Any]):
+    """The defaults of the options and of what else grows with the time spent; ``takes_s`` is the expected duration."""
+
+    def __init__(self, takes_s: int, **values: Any) -> None:
+        super().__init__(values)
+        self.takes_s = takes_s
+
+
+class Drawing(Protocol):
+    """One of the kinds of pictures in :mod:`pebble.bench.pictures`."""
+
+    def pictures(self, results: Results) -> list[Picture]: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """The engine calls ``measure`` for each case, or ``measure_round`` for each round, which calls :meth:`Round.cases`.
+
+    Both return the cells of one round; cells of the same variant, conditions and measure are joined over the rounds.
+    ``environment`` is entered before a round, and after every ``fresh_every``-th one again.
+    """
+
+    name: str
+    title: str
+    what: str  # what is measured, and how to read it: for the report
+    help: str = ""  # of the command line
+    full: Budget
+    quick: Budget
+    options: Sequence[Option] = ()
+    constants: Mapping[str, Value | list[Value]] = field(default_factory=dict)  # recorded with the options
+
+    variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
+    conditions: Callable[[Run], Sequence[Mapping[str, Value]]] = lambda _run: ({},)
+    prepare: Callable[[Run], None] = lambda _run: None  # checks what is needed, and notes; raises PebbleError
+    missing: Callable[[str], str | None] = lambda _variant: None  # why a variant is left out
+    environment: Callable[[Run], AbstractContextManager[Any]] = lambda _run: nullcontext()
+    measure: Callable[[Case], Iterable[Cell]] | None = None
+    measure_round: Callable[[Round], Iterable[Cell]] | None = None
+    alone: bool = False  # a case that fails leaves an empty round of its own cells, not of all
+    measures: Sequence[str] = ()  # the order of the cells; else as they were measured
+    figures: Mapping[str, Combine] = field(default_factory=dict)  # how single values are joined; else the last one
+
+    derived: Callable[[list[Cell]], list[Cell]] = lambda cells: cells  # what all rounds together make of the cells
+    tables: Sequence[Tables] = ()  # see pebble.bench.tables
+    legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
+    assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
+    complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
+    pictures: Sequence[Drawing] = ()
+
+    is_null: bool = False  # one variant in three roles: see pebble.bench.null
+    modes: Mapping[str, Comparison] = field(default_factory=dict)  # what is run instead if this option is given
+    words: Sequence[str] = ()  # what starts its command line after ``pebble``; by default ``bench NAME``
+    reported: Sequence[str] | None = ()  # options in a report; None: it is not part of the report
+    reported_full: Sequence[str] = ()  # more of them, of the full run
+    summary_lines: int = 0  # of the sentences in the report's summary; the most important come first
+    root: bool = False  # needs root
+
+    def arguments(self, quick: bool) -> list[str]:
+        """The command line in a report, without ``pebble``."""
+        words = [*(self.words or ("bench", self.name)), *(self.reported or ())]
+        return [*words, *((["--quick"] if self.has_quick else []) if quick else self.reported_full)]
+
+    @property
+    def has_quick(self) -> bool:
+        return self.quick is not self.full
+
+    def shown(self, cells: Sequence[Cell]) -> list[Table]:
+        return [table for tables in self.tables for table in tables(cells)]
+
+    def assessed(self, cells: Sequence[Cell]) -> list[str | Judged]:
+        return [line for assess in self.assessment for line in assess(cells)]
+
+    def expected_s(self, quick: bool) -> int:
+        return (self.quick if quick else self.full).takes_s
+
+    @property
+    def needs_more_rights(self) -> bool:
+        """Whether this user may not run it."""
+        return self.root and os.geteuid() != 0
+
+    def run_of(
+        self, *, quick: bool = False, output: Path = FOLDER, console: Console | None = None, **given: Any
+    ) -> Run:
+        """A run with the defaults, and the ``given`` options unless they are None. Raises PebbleError."""
+        values = {**self.full, **(self.quick if quick else {})}
+        if self.variants:
+            values.setdefault("variants", list(self.variants))
+        values |= {name: value for name, value in given.items() if value is not None}
+        run = Run(self, values, quick, output)
+        run.console = console or Console()
+        for option in self.options:
+            if run.options.get(option.name) is not None:
+                option.check(run.options[option.name])
+        return run
+
+
+@dataclass
+class Run:
+    """One run of a comparison; its options are looked up as ``run["seconds"]``."""
+
+    comparison: Comparison
+    options: dict[str, Any]
+    quick: bool = False
+    output: Path = FOLDER
+    notes: list[str] = field(default_factory=list)  # sentences at the end of the assessment
+    recorded: dict[str, Value | list[Value]] = field(default_factory=dict)  # more options of the results
+    problem: PebbleError | None = None  # ended the run early, and is raised when the results are written
+
+    def __post_init__(self) -> None:
+        self.console = Console()
+        self.show: Callable[[str], None] = lambda _text: None  # what is being done
+
+    def __getitem__(self, name: str) -> Any:
+        return self.options[name]
+
+    @property
+    def rounds(self) -> int:
+        return int(self.options.get("rounds", 1))
+
+    @property
+    def command(self) -> list[str]:
+        """The command line that repeats the run."""
+        about, defaults = self.comparison, {**self.comparison.full, "variants": self.comparison.variants}
+        words = ["pebble", *(about.words or ("bench", about.name))]
+        for option in about.options:
+            words += option.words(self.options.get(option.name), defaults.get(option.name, ()))
+        return [*words, *(["--quick"] if self.quick and about.has_quick else [])]
+
+    def records(self) -> dict[str, Value | list[Value]]:
+        """All options that affect the results."""
+        unrecorded = {"variants"} | {one.name for one in self.comparison.options if one.private or not one.recorded}
+        values = {name: value for name, value in self.options.items() if name not in unrecorded}
+        return {**values, **self.comparison.constants, **self.recorded}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One variant under one condition in one round."""
+
+    run: Run
+    number: int  # of the round, from 0
+    variant: str
+    role: str  # the variant of its cells: another one in a null test
+    condition: Mapping[str, Value]
+    planted_us: float = 0.0  # of work for each message in a null test: before its time stamp,
+    slowed: bool = False  # or after it
+    env: Any = None
+
+    def __str__(self) -> str:
+        return ", ".join(filter(None, (self.role, *map(str, self.condition.values()))))
+
+    def cell(
+        self,
+        measure: str,
+        unit: str,
+        samples: Iterable[float],
+        params: Mapping[str, Value] | None = None,
+        **figures: Value,
+    ) -> Cell:
+        """The cell of this round."""
+        return Cell(
+            variant=self.role,
+            params={**self.condition, **(params or {})},
+            measure=measure,
+            unit=unit,
+            rounds=[list(samples)],
+            figures=figures,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Round:
+    """One round: all cases, in reverse order in every other round and pass."""
+
+    run: Run
+    number: int  # from 0
+    env: Any
+    plan: Callable[[Round], Iterator[Case]]
+
+    def cases(self) -> Iterator[Case]:
+        return self.plan(self)

@@ -1,0 +1,287 @@
+"""Runs a comparison: rounds in turn, failed ones left out, cells joined, aims judged, results printed and written."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from pebble.bench import null
+from pebble.bench.comparison import Case, Combine, Comparison, Round, Run
+from pebble.bench.ratios import LEAST_ROUNDS
+from pebble.bench.results import Cell, Results, Stopwatch, Value, percentile
+from pebble.errors import PebbleError
+from pebble.runtime.signals import interrupted_by_signals
+from pebble.transports.segments import sweep
+
+_GIVEN_UP: Final = 2  # failures before the first success until the run is given up
+_IN_US: Final = {"us": 1.0, "ms": 1e3, "s": 1e6}
+_JOINED: Final[Mapping[str, Combine]] = {"sent": sum}
+
+
+def run(run: Run) -> int:
+    """Measures, prints and writes; returns 0 if everything has results of enough rounds. Raises PebbleError."""
+    about, console = run.comparison, run.console
+    check_folder(run.output)
+    about.prepare(run)
+    _leave_out_missing(run)
+    watch = Stopwatch(about.name, run.command, {})
+    collected, rounds = Collected(about, roles_of(run), about.conditions(run)), Rounds(run.rounds, console)
+    with interrupted_by_signals():
+        try:
+            _measure(run, collected, rounds)
+        finally:
+            sweep()  # Zenoh leaves files behind even after a regular end
+    cells = about.derived(collected.cells())
+    for table in about.shown(cells):
+        console.print(table)
+    for line in about.legend(cells):
+        console.print(line, style="dim", highlight=False, soft_wrap=True)
+    lines = [*rounds.notes(), *about.assessed(cells), *run.notes]
+    results = watch.results(cells, lines, quick=run.quick)
+    results.options = run.records()
+    finish(results, run.output, console)
+    if run.problem is not None:
+        raise run.problem
+    return int(not (rounds.enough and about.complete(cells)))
+
+
+def _leave_out_missing(run: Run) -> None:
+    """Prints why a variant cannot be measured on this machine. Raises PebbleError if none can."""
+    reasons = {name: run.comparison.missing(name) for name in _named(run)}
+    for name, reason in reasons.items():
+        if reason is not None:
+            run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
+    left = [name for name, reason in reasons.items() if reason is None]
+    if reasons and not left:
+        raise PebbleError("no variant can be measured on this machine")
+    if len(left) < len(reasons):
+        run.options["variants"] = left
+
+
+def _named(run: Run) -> Sequence[str]:
+    """The variants that were asked for; a null test may have an option for its only one."""
+    null_of = run.options.get("null")
+    return [null_of] if isinstance(null_of, str) and run.comparison.is_null else run.options.get("variants") or ()
+
+
+def roles_of(run: Run) -> Sequence[str]:
+    """The variants, or the roles of the only one in a null test. Raises PebbleError if several are named."""
+    names = _named(run) or [""]
+    if not run.comparison.is_null:
+        return names
+    if len(names) != 1 or len(run.comparison.conditions(run)) != 1:
+        raise PebbleError("--null takes one variant, one size and one of everything else")
+    return null.roles(names[0])
+
+
+def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
+    about = run.comparison
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=run.console, transient=True) as progress, ExitStack() as stack:
+        cases = len(collected.roles) * len(about.conditions(run)) * run.options.get("passes", 1)
+        bar = progress.add_task("", total=run.rounds * cases)
+        environment = stack.enter_context(_Environment(run))
+        for number in range(run.rounds):
+
+            def show(text: str, number: int = number) -> None:
+                progress.update(bar, description=f"round {number + 1} of {run.rounds}: {text}")
+
+            def plan(round_: Round, number: int = number) -> Iterator[Case]:
+                for done, case in enumerate(_cases(round_, collected)):
+                    progress.update(bar, completed=number * cases + done)
+                    run.show(str(case))
+                    yield case
+
+            run.show = show
+            with rounds.attempt(number), environment.of(number) as env:
+                round_ = Round(run=run, number=number, env=env, plan=plan)
+                if about.is_null and about.measure is not None and not collected.pilot:
+                    collected.pilot = list(about.measure(next(round_.cases())))
+                collected.add(_round(round_))
+
+
+def _round(round_: Round) -> Iterator[Cell]:
+    about = round_.run.comparison
+    if about.measure_round is not None:
+        yield from about.measure_round(round_)
+    elif about.measure is not None:
+        for case in round_.cases():
+            try:
+                yield from about.measure(case)
+            except PebbleError as error:
+                if not about.alone:
+                    raise
+                round_.run.console.print(f"{case}: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
+                yield from (case.cell(measure, "", []) for measure in about.measures)
+
+
+def _cases(round_: Round, collected: Collected) -> Iterator[Case]:
+    """Roles of each condition one after another, so that a temporary disturbance affects all of them."""
+    run, number = round_.run, round_.number
+    conditions = list(run.comparison.conditions(run))
+    for pass_ in range(run.options.get("passes", 1)):
+        step = -1 if (number + pass_) % 2 else 1
+        for condition in conditions[::step]:
+            for role in collected.roles[::step]:
+                yield Case(
+                    run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
+                    slowed=null.is_slowed(role), planted_us=collected.planted_us(condition), env=round_.env,
+                )  # fmt: skip
+
+
+class _Environment:
+    """What the rounds share: a new one every ``fresh_every`` rounds, and after a round that failed."""
+
+    def __init__(self, run: Run) -> None:
+        self._run, self._stack = run, ExitStack()
+        self._open = False
+        self._env: Any = None
+
+    def __enter__(self) -> _Environment:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open = False
+        self._stack.close()
+
+    @contextmanager
+    def of(self, number: int) -> Iterator[Any]:
+        if number % self._run.options.get("fresh_every", 1) == 0:
+            self.__exit__()
+        if not self._open:
+            self._env = self._stack.enter_context(self._run.comparison.environment(self._run))
+            self._open = True
+        try:
+            yield self._env
+        except BaseException:
+            self.__exit__()
+            raise
+
+
+class Collected:
+    """Joins the cells of the rounds by variant, conditions and measure."""
+
+    def __init__(
+        self, comparison: Comparison, roles: Sequence[str], conditions: Sequence[Mapping[str, Value]] = ()
+    ) -> None:
+        self.roles, self._conditions = roles, conditions
+        self._about = comparison
+        self._cells: dict[Hashable, Cell] = {}
+        self._figures: dict[tuple[Hashable, str], list[Value]] = {}
+        self.pilot: list[Cell] = []  # of a null test, before the first round
+
+    def add(self, cells: Iterable[Cell]) -> None:
+        """Adds a round: all of it, or nothing if an error is raised meanwhile. Passes of a round are one."""
+        found: dict[Hashable, list[Cell]] = {}
+        for cell in cells:
+            found.setdefault(_key(cell), []).append(cell)
+        for key, parts in sorted(found.items(), key=lambda one: self._place(one[1][0])):
+            cell = self._cells.setdefault(key, msgspec.structs.replace(parts[0], rounds=[], figures={}))
+            cell.unit = cell.unit or parts[0].unit  # a case that failed has none
+            cell.rounds.append([sample for part in parts for sample in part.samples])
+            for part in parts:
+                for name, value in part.figures.items():
+                    self._figures.setdefault((key, name), []).append(value)
+
+    def _place(self, cell: Cell) -> tuple[int, int]:
+        """The order of the cases, of which every other round has the reverse."""
+        of = (at for at, one in enumerate(self._conditions) if one.items() <= cell.params.items())
+        return next(of, -1), self.roles.index(cell.variant) if cell.variant in self.roles else -1
+
+    def cells(self) -> list[Cell]:
+        """In the order of the declared measures, if there is one."""
+        combine = {**_JOINED, **self._about.figures}
+        for key, cell in self._cells.items():
+            known = {name: values for (whose, name), values in self._figures.items() if whose == key}
+            cell.figures = {name: combine.get(name, _last)(values) for name, values in known.items()}
+        order = {measure: at for at, measure in enumerate(self._about.measures)}
+        return sorted(self._cells.values(), key=lambda cell: order.get(cell.measure, 0))
+
+    def planted_us(self, condition: Mapping[str, Value]) -> float:
+        """A fifth of the usual latency so far in a null test; the first measure is the one that is tested."""
+        if not self._about.is_null:
+            return 0.0
+        usual = [
+            _IN_US[cell.unit] * percentile(cell.samples, 50)
+            for cell in [*self._cells.values()] or self.pilot
+            if not null.is_slowed(cell.variant) and cell.samples and condition.items() <= cell.params.items()
+        ]
+        return null.SLOWDOWN * percentile(usual, 50) if usual else 0.0
+
+
+def _key(cell: Cell) -> Hashable:
+    return cell.variant, tuple(cell.params.items()), cell.measure
+
+
+def _last(values: Sequence[Value]) -> Value:
+    return values[-1]
+
+
+class Rounds:
+    """Counts successful and failed rounds of ``asked``: a failed one is left out and noted, the others still count."""
+
+    def __init__(self, asked: int, console: Console) -> None:
+        self._asked, self._console = asked, console
+        self._done = 0
+        self._failed: list[str] = []
+
+    @contextmanager
+    def attempt(self, number: int) -> Iterator[None]:
+        """Runs round ``number``, from 0. Raises PebbleError if the first rounds fail, since all would."""
+        try:
+            yield
+        except PebbleError as error:
+            self._failed.append(f"round {number + 1}: {error}")
+            if not self._done and len(self._failed) == min(_GIVEN_UP, self._asked):
+                raise
+            self._console.print(self._failed[-1], style="red", highlight=False, markup=False)
+        else:
+            self._done += 1
+
+    def notes(self) -> list[str]:
+        """A sentence for the assessment: how many rounds failed, and why the first of them did."""
+        if not self._failed:
+            return []
+        why = self._failed[0].splitlines()[0]
+        return [f"{len(self._failed)} of {self._asked} rounds failed and were left out; {why}"]
+
+    @property
+    def enough(self) -> bool:
+        """Whether enough rounds to judge are left, if so many were requested."""
+        return self._done >= LEAST_ROUNDS or self._asked < LEAST_ROUNDS
+
+    def code(self, cells: Sequence[Cell]) -> int:
+        """The exit code: 1 if a cell has no samples, or too few of enough requested rounds are left."""
+        return int(not (self.enough and all(cell.samples for cell in cells)))
+
+
+def check_folder(folder: Path) -> None:
+    """Raises PebbleError if the folder cannot be written: before an hour of measuring, not after it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise PebbleError(f"{folder}: {error.strerror}") from None
+
+
+def finish(results: Results, folder: Path, console: Console) -> None:
+    """Prints the assessment, writes ``<bench>.json`` and, if matplotlib is installed, the plots."""
+    for line in (*results.assessment, *results.aims):
+        console.print(str(line), highlight=False, soft_wrap=True)
+    written = [folder / f"{results.bench}.json"]
+    results.save(written[0])
+    if find_spec("matplotlib") is None:
+        console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
+    else:
+        from pebble.bench.plots import draw
+
+        written += draw(results, folder)
+    console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)

@@ -1,0 +1,231 @@
+"""Pictures of robots on impaired networks: over the trials, as in the paper's Figures 4.7 and 4.8, and over time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from pebble.bench import paper
+from pebble.bench.plots import Picture, around, finite, guide, legend, log_axis, panels, short, styles, unique
+from pebble.bench.results import OVER_TIME, Cell, Results, percentile
+
+_QUOTED = Line2D([], [], color="#1a1a1a", marker="x", linestyle="", markersize=7, markeredgewidth=2,
+                 label="the original program itself, measured once elsewhere")  # fmt: skip
+_NARROW, _WORST = f"aim\nat {paper.NARROW}", f"aim at\n{paper.WORST}"
+_BANDS = ("#f3f0e7", "#ffffff")
+
+Value = Callable[[Cell], float]
+
+
+def single(name: str) -> Value:
+    def value(cell: Cell) -> float:
+        found = cell.figures.get(name)
+        return float(found) if isinstance(found, int | float) else math.nan
+
+    return value
+
+
+def p(percent: float, *, lost: bool = False) -> Value:
+    """Percentile of what arrived, or with lost messages as infinitely late; not drawn if that is infinite."""
+
+    def value(cell: Cell) -> float:
+        never = [math.inf] * max(0, cell.lost or 0) if lost else []
+        found = percentile([*finite(cell.samples), *never], percent)
+        return found if math.isfinite(found) else math.nan
+
+    return value
+
+
+def _original(value: Callable[[paper.Original], float | None], factor: float = 1.0) -> dict[str, float]:
+    """The original's values by trial, as far as they were measured."""
+    return {trial: factor * known for trial, one in paper.ORIGINAL.items() if (known := value(one)) is not None}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Panel:
+    """A line for each subject over the trials: a value of the cells whose measures begin with ``measures``."""
+
+    label: str
+    measures: tuple[str, ...]
+    value: Value
+    log: bool = False
+    ends: tuple[float, float] | None = None  # of a linear axis; None: from 0 to the largest value
+    least_top: float = 1.0  # of a linear axis from 0
+    aim: float | None = None  # drawn as a guide
+    aim_text: str = ""
+    crosses: Mapping[str, float] = field(default_factory=dict)  # the original's values by trial
+    words: Mapping[str, str] = field(default_factory=dict)  # the paper's, by trial
+
+
+def _drive(what: str) -> Panel:
+    label = f"drive p95\n{what.replace('during', 'with')}, ms"
+    return Panel(label=label, measures=(f"drive {what}",), value=p(95, lost=True), log=True,
+                 aim=paper.WORST_DRIVE_P95_MS, aim_text=_WORST)  # fmt: skip
+
+
+_FIGURE_4_8: Final = "Latency of the audio that arrived, over the trials, in the form of the paper's Figure 4.8"
+_FRAMES: Final = ("video", "picture")
+#: By name: the caption, the height of a panel in inches, and the panels.
+_OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
+    "audio-delivery": ("Audio delivery over the trials, in the form of the paper's Figure 4.7", 3.5, (
+        Panel(label="audio that arrived, %", measures=("audio",), value=single("delivered_percent"), ends=(-4, 106),
+              crosses=_original(lambda one: one.delivered_percent), aim=paper.PAPER_BEST_PERCENT,
+              aim_text=f"paper:\nat best\n~{paper.PAPER_BEST_PERCENT:g} %", words=paper.PAPER_WORDS),
+        Panel(label="audio within 1 s, %", measures=("audio",), value=single("on_time_percent"), ends=(-4, 106),
+              crosses=_original(lambda one: one.on_time_percent)),
+    )),
+    "audio-latency": (_FIGURE_4_8, 3.3, (
+        Panel(label="audio latency p50, ms", measures=("audio latency",), value=p(50), log=True),
+        Panel(label="audio latency p95, ms", measures=("audio latency",), value=p(95), log=True,
+              crosses=_original(lambda one: one.p95_s, 1000.0), aim=paper.NARROW_SOUND_P95_MS, aim_text=_NARROW),
+    )),
+    "video": ("Video over the trials: frame rate, and how long it froze", 2.7, (
+        Panel(label="pictures per second", measures=_FRAMES, value=single("fps"),
+              crosses=_original(lambda one: one.fps)),
+        Panel(label="frozen, s\n(gaps over 1 s)", measures=_FRAMES, value=single("frozen_s")),
+        Panel(label="longest gap, s", measures=_FRAMES, value=single("longest_gap_s"), log=True,
+              aim=paper.NARROW_PICTURE_GAP_S, aim_text=_NARROW),
+    )),
+    "drive": ("Drive commands and heartbeat over the trials (no point: more than 5 % of the commands were lost)", 2.3, (
+        _drive("alone"), _drive("during video"), _drive("during audio"),
+        Panel(label="robot seen offline,\nlongest, s", measures=("heartbeat",), value=single("longest_offline_s"),
+              least_top=paper.WORST_OFFLINE_S, aim=paper.WORST_OFFLINE_S, aim_text=_WORST),
+    )),
+}  # fmt: skip
+
+
+def over_trials(results: Results) -> list[Picture]:
+    """Audio, video and commands over the trials."""
+    cells = [cell for cell in results.cells if "trial" in cell.params and not cell.measure.endswith(OVER_TIME)]
+    if not cells:
+        return []
+    options = results.options
+    window = f"; windows of {options['window_s']:g} s" if "window_s" in options else ""
+    link = f", over {options['link_words']}" if "link_words" in options else ""
+    run = f"{window}{link}. “original”: this program with the original's encodings"
+    return [
+        Picture(f"{results.bench}-{name}", caption + run, partial(_trials, cells, caption + run, height, shown))
+        for name, (caption, height, shown) in _OVER_TRIALS.items()
+    ]
+
+
+def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Panel]) -> Figure:
+    figure, every = panels(len(shown), 1, (10.5, height), title)
+    trials, subjects = (unique([str(one) for one in found]) for found in zip(
+        *((cell.params["trial"], cell.variant) for cell in cells), strict=True
+    ))  # fmt: skip
+    seen = [_lines(axes, cells, trials, subjects, panel) for axes, panel in zip(every, shown, strict=True)]
+    for axes, panel, values in zip(every, shown, seen, strict=True):
+        if panel.log:  # panels with the same aim have one scale, to show waiting behind media
+            same = [one for other, found in zip(shown, seen, strict=True) for one in found if other.aim == panel.aim]
+            log_axis(axes, "y", panel.label, *around([*(same if panel.aim else values), panel.aim]))
+        else:
+            top = 1.15 * max(finite([*values, panel.least_top]))
+            axes.set_ylim(*(panel.ends or (-0.1, top)))
+            axes.set_ylabel(panel.label)
+        if panel.aim is not None:
+            guide(axes, panel.aim, panel.aim_text)
+        for trial, word in panel.words.items():
+            if trial in trials:
+                at = trials.index(trial)
+                axes.axvspan(at - 0.5, at + 0.5, color="#f2efe6", zorder=0)
+                axes.annotate(
+                    f"paper:\n{word}", (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555",
+                    ha="center", va="bottom",
+                )  # fmt: skip
+        axes.set_xlim(-0.6, len(trials) - 0.4)
+        axes.set_xticks(range(len(trials)), trials if axes is every[-1] else [""] * len(trials))
+    every[-1].tick_params(axis="x", labelrotation=40)
+    for label in every[-1].get_xticklabels():
+        label.set_horizontalalignment("right")
+        label.set_rotation_mode("anchor")
+    every[-1].set_xlabel("trial: condition of the network, in the order of the run")
+    legend(figure, styles(subjects), more=[_QUOTED] if any(panel.crosses for panel in shown) else [])
+    return figure
+
+
+def _lines(
+    axes: Axes, cells: Sequence[Cell], trials: Sequence[str], subjects: Sequence[str], panel: Panel
+) -> list[float]:
+    """Draws one line per subject; returns all values."""
+    ours = [cell for cell in cells if cell.measure.startswith(panel.measures)]
+    style_of, seen = styles(subjects), list[float]()
+    for number, (subject, style) in enumerate(style_of.items()):
+        beside = 0.06 * (number - (len(style_of) - 1) / 2)  # keeps equal values visible
+        heights = []
+        for trial in trials:
+            found = (panel.value(one) for one in ours if (one.variant, one.params["trial"]) == (subject, trial))
+            heights.append(next(filter(math.isfinite, found), math.nan))
+        seen += heights
+        axes.plot(
+            np.arange(len(trials)) + beside, heights, color=style.colour, linestyle=style.dash, marker=style.marker,
+            markersize=5, linewidth=1.2, markerfacecolor="white" if style.hollow else style.colour,
+        )  # fmt: skip
+    for trial, height in panel.crosses.items():
+        if trial in trials:
+            seen.append(height)
+            axes.plot(trials.index(trial), height, "x", color="#1a1a1a", markersize=7, markeredgewidth=2, zorder=5)
+    return seen
+
+
+# -- over time
+
+
+def over_time(results: Results) -> list[Picture]:
+    """One picture for each measure ``… over time``, whose cells hold two rounds: seconds, and milliseconds."""
+    found = []
+    cells = [cell for cell in results.cells if len(cell.rounds) == 2 and finite(cell.rounds[0])]
+    for measure in unique([cell.measure for cell in cells if cell.measure.endswith(OVER_TIME)]):
+        what = measure.removesuffix(OVER_TIME)
+        caption = f"Latency of {what} over time, with the trials marked: a dot for each message that arrived"
+        shown = [cell for cell in cells if cell.measure == measure]
+        found.append(Picture(f"{results.bench}-{what}-over-time", caption, partial(_series, shown, results, caption)))
+    return found
+
+
+def marks(text: str) -> list[tuple[str, float]]:
+    """Parses ``256k@37.2;512k@60`` into names and seconds; skips invalid parts."""
+    found = []
+    for part in text.split(";"):
+        name, _, second = part.rpartition("@")
+        try:
+            found.append((name.strip(), float(second)))
+        except ValueError:
+            continue
+    return sorted(found, key=lambda mark: mark[1])
+
+
+def _series(cells: Sequence[Cell], results: Results, title: str) -> Figure:
+    figure, every = panels(len(cells), 1, (12.0, 2.1), title)
+    style_of = styles([cell.variant for cell in cells])
+    begun = marks(str(results.options.get("marks", "")))
+    ends = around([latency for cell in cells for latency in cell.rounds[1]])
+    last = max(second for cell in cells for second in finite(cell.rounds[0]))
+    for axes, cell in zip(every, cells, strict=True):
+        seconds, latencies = cell.rounds[0], cell.rounds[1]
+        _bands(axes, begun, last, named=axes is every[0])
+        axes.plot(seconds, latencies, ".", color=style_of[cell.variant].colour, markersize=2.2, antialiased=False)
+        log_axis(axes, "y", f"{short(cell.variant, 18)}\nlatency, ms", *ends)
+    every[-1].set_xlabel("seconds since the run began")
+    return figure
+
+
+def _bands(axes: Axes, found: Sequence[tuple[str, float]], end: float, *, named: bool) -> None:
+    ends = [second for _, second in found[1:]] + [end]
+    for number, ((name, begin), until) in enumerate(zip(found, ends, strict=False)):
+        axes.axvspan(begin, max(begin, until), color=_BANDS[number % 2], zorder=0)
+        axes.axvline(begin, color="#999", linewidth=0.6, zorder=1)
+        if named:
+            axes.annotate(
+                name, ((begin + until) / 2, 1.02), xycoords=("data", "axes fraction"), fontsize=8, color="#333",
+                ha="left", va="bottom", rotation=40, rotation_mode="anchor",
+            )  # fmt: skip
+    axes.set_xlim(-0.01 * end, 1.01 * end)

@@ -1,0 +1,101 @@
+"""The processes of a measurement or a demonstration, in a temporary folder, which end in order."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar
+
+from pebble.rig.broker import Broker, BrokerKind
+from pebble.rig.programs import Program, Wrap, end_all, unchanged
+from pebble.rig.worker import Worker
+
+#: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
+OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
+
+P = TypeVar("P", bound=Program)
+
+
+class Processes:
+    """Ends all of them with its ``with`` block, those of a kind at the same time; then deletes the folder.
+
+    A subclass starts what it consists of in :meth:`start`; what is to be closed before all processes goes to
+    ``closing``. The block does not begin if that fails.
+    """
+
+    ends_s: ClassVar[tuple[float, ...]] = (4.0, 6.0, 2.0, 2.0)  # what is left of each kind after that is killed
+    keep = False  # the folder
+
+    def __init__(self, prefix: str = "pbl-", into: str | None = None) -> None:
+        """The folder's name begins with ``prefix``; it is in the usual place for temporary ones unless ``into``."""
+        self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=into))
+        self.closing = ExitStack()
+        self.workers: list[Worker] = []
+        self._programs: tuple[list[Program], ...] = ([], [], [], [])
+
+    def __enter__(self) -> Self:
+        try:
+            self.start()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def start(self) -> None:
+        """Called as the ``with`` block begins."""
+
+    def __exit__(self, *_: object) -> None:
+        self.closing.close()
+        for programs, within_s in zip(self._programs, self.ends_s, strict=True):
+            end_all(programs, within_s)
+        if not self.keep:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def add(self, program: P, kind: int) -> P:
+        self._programs[kind].append(program)
+        return program
+
+    def end(self, program: Program) -> None:
+        """End one of them before the others."""
+        for programs, within_s in zip(self._programs, self.ends_s, strict=True):
+            if program in programs:
+                programs.remove(program)
+                end_all([program], within_s)
+
+    def unexpected_exits(self) -> list[str]:
+        """The processes that should still run and do not."""
+        programs = [program for kind in reversed(self._programs) for program in kind]
+        return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
+
+    def worker(self, name: str, module: str, *arguments: object, wrap: Wrap = unchanged) -> Worker:
+        """``python -m module``."""
+        return self.command(name, wrap(python(module, *arguments)))
+
+    def command(self, name: str, command: Sequence[str]) -> Worker:
+        """Another command that is a worker."""
+        self.workers.append(self.add(Worker(name, command, self.folder / f"{name}.log"), OPERATORS))
+        return self.workers[-1]
+
+    def robot(self, name: str, module: str, *arguments: object) -> Program:
+        """``python -m module``, one or more robots."""
+        return self.add(Program(name, python(module, *arguments), self.folder / f"{name}.log"), ROBOTS)
+
+    def broker(
+        self,
+        name: str = "broker",
+        kind: BrokerKind = BrokerKind.MOSQUITTO,
+        *,
+        folder: Path | None = None,
+        **options: Any,
+    ) -> Broker:
+        """A broker that is starting: wait for it."""
+        return self.add(Broker(name, kind, folder or self.folder, **options), BROKERS)
+
+
+def python(module: str, *arguments: object) -> list[str]:
+    """The command that runs a module."""
+    return [sys.executable, "-m", module, *map(str, arguments)]

@@ -1,0 +1,42 @@
+"""The other end of a worker (pebble.rig.worker): lines from standard input, answers in JSON lines.
+
+It needs only the standard library: the system's Python, which has GStreamer, imports it as a plain file.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+
+def answer(what: bytes | dict[str, Any]) -> None:
+    """Write one answer; bytes are JSON already."""
+    sys.stdout.buffer.write((what if isinstance(what, bytes) else json.dumps(what).encode()) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def serve(handle: Callable[[str], bytes | dict[str, Any] | None]) -> None:
+    """Pass each line to ``handle`` and write what it answers, if anything, until standard input closes."""
+    for line in sys.stdin:
+        reply = handle(line.strip())
+        if reply is not None:
+            answer(reply)
+
+
+def serve_on_thread(
+    handle: Callable[[str], bytes | dict[str, Any] | None], end: Callable[[], object] | None = None
+) -> threading.Event:
+    """The same on a thread of its own; the event is set, and ``end`` is called, when standard input has closed."""
+    ended = threading.Event()
+
+    def run() -> None:
+        serve(handle)
+        ended.set()
+        if end is not None:
+            end()
+
+    threading.Thread(target=run, name="lines", daemon=True).start()
+    return ended

@@ -1,0 +1,129 @@
+"""The scripted operator beside people at the operator page."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.contract import CAPABILITIES, DRIVE, DRIVING, ESTOP_STATE, ONLINE, codec
+from pebble.contract.payloads import Capabilities, Drive, Driver, Driving, EstopState, Heartbeat
+from pebble.rig.operator import Operator
+from pebble.transports import Message, MqttSettings, QoS, Transport, create
+from tests.support import Broker, until
+
+BASE = "pebble/robots/goob"
+START_S = 5.0
+
+
+class Robot:
+    """Capabilities and heartbeats of a robot that drives, and every drive command that it receives."""
+
+    def __init__(self, port: int) -> None:
+        self.transport: Transport = create("mqtt", "goob", MqttSettings(host="127.0.0.1", port=port))
+        self.transport.open()
+        self.drives: list[tuple[float, Drive]] = []
+        self.transport.subscribe(DRIVE.topic(BASE), self._receive)
+        value = {
+            "drive": {"available": True, "topic": DRIVE.topic(BASE)},
+            "estop": {"available": True, "owners": ["m"]},
+        }
+        payload = codec.encode(CAPABILITIES, Capabilities(t=1, value=value))
+        self.transport.publish(CAPABILITIES.topic(BASE), payload, retain=True, qos=QoS.DELIVERED)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._send_heartbeats, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.transport.close()
+
+    def driven_since(self, at: float) -> bool:
+        return any(received > at for received, _ in list(self.drives))
+
+    def announce(self, *robots: str) -> None:
+        driven = {base: Driver(by="anna", device="phone", since=1) for base in robots}
+        payload = codec.encode(DRIVING, Driving(t=1, robots=driven))
+        self.transport.publish(DRIVING.topic("pebble/servers/hall"), payload, qos=QoS.DELIVERED)
+
+    def show_stop(self, *, by: str, latched: bool = True) -> None:
+        state = EstopState(
+            latched=latched, boot="b", count=1, recent=[], by=by, why="", since=1, reset_refused=None, persisted=None
+        )
+        topic = ESTOP_STATE.topic(BASE, owner="m")
+        self.transport.publish(topic, codec.encode(ESTOP_STATE, state), retain=True, qos=QoS.DELIVERED)
+
+    def _send_heartbeats(self) -> None:
+        while not self._ended.wait(0.1):
+            payload = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time())))
+            self.transport.publish(ONLINE.topic(BASE), payload)
+
+    def _receive(self, message: Message) -> None:
+        self.drives.append((time.monotonic(), codec.decode(DRIVE, message.payload)))
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    running = Broker(tmp_path)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[Robot]:
+    running = Robot(broker.port)
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def operator(broker: Broker, robot: Robot) -> Iterator[Operator]:
+    running = Operator(broker.port)
+    running.connect()
+    assert until(lambda: running.ready(1), START_S)
+    yield running
+    running.close()
+
+
+def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(robot: Robot, operator: Operator) -> None:
+    operator.begin()
+    assert until(lambda: robot.driven_since(0.0))
+    robot.announce(BASE)
+    assert until(lambda: operator.activity.endswith("; goob is driven by anna on phone"))
+    taken = time.monotonic()
+    assert not until(lambda: robot.driven_since(taken + 0.1), 1.0)
+    robot.announce()
+    assert until(lambda: "goob" not in operator.activity)
+    assert until(lambda: robot.driven_since(taken + 0.1), START_S)
+    assert operator.left_alone == {"goob"}
+    assert [one for one in operator.completed if one.ended > taken > one.began] == []
+
+
+def test_what_may_be_due_to_the_machine_is_repeated_but_not_for_ever(broker: Broker) -> None:
+    operator, times = Operator(broker.port), []
+    operator._until_right("x", lambda: times.append(1))
+    assert len(times) == 1
+    operator.again = frozenset({"x"})
+    operator._until_right("x", lambda: times.append(2))
+    assert times == [1, 2, 2, 2]
+
+    def is_right() -> None:
+        times.append(3)
+        operator.again = frozenset()
+
+    operator._until_right("x", is_right)
+    assert times == [1, 2, 2, 2, 3]
+    operator.close()
+
+
+def test_a_persons_stop_is_left_to_the_person(robot: Robot, operator: Operator) -> None:
+    robot.show_stop(by="anna")
+    assert until(lambda: operator.activity.endswith("; goob is stopped by anna"))
+    operator.begin()
+    assert not until(lambda: robot.drives, 1.0)
+    robot.show_stop(by="anna", latched=False)
+    assert until(lambda: robot.drives, START_S)
