@@ -49,6 +49,7 @@ class Aim:
     least_rounds: int = 1
     never: str = "not at all"  # in place of an infinite value
     shown: Callable[[float], str] = figure
+    beside: Callable[[Cell], str] = lambda _cell: ""  # more that was measured, after the value
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Judged]:
         found = [cell for cell in cells if self.of(cell)]
@@ -67,5 +68,10 @@ class Aim:
         return Judged(
             what=self.what.format(variant=cell.variant, measure=cell.measure, bound=bound, **cell.params),
             outcome=outcome(self._beyond(cell) <= 0, judged=enough),
-            measured=self.never if math.isinf(value) else f"{self.shown(value)} {self.unit}".strip(),
+            measured=f"{self._words(value)}{self.beside(cell)}",
         )
+
+    def _words(self, value: float) -> str:
+        if math.isfinite(value):
+            return f"{self.shown(value)} {self.unit}".strip()
+        return "nothing arrived" if math.isnan(value) else self.never

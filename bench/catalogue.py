@@ -24,7 +24,7 @@ MODULES: Final = {
     "estop": "estop",
     "fleet": "fleet",
     "traffic": "traffic",
-    "impair": "unported",
+    "impair": "impair.trials",
 }
 
 

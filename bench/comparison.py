@@ -45,6 +45,7 @@ class Option:
 
     name: str
     help: str
+    sets: str = ""  # the value that it sets, if that has another name
     kind: type[Any] = str  # of one value; bool: a flag
     many: bool = False  # several values, separated by commas
     repeated: bool = False  # or each in an option of its own
@@ -54,6 +55,11 @@ class Option:
     metavar: str | None = None
     recorded: bool = True  # among the options of the results
     private: bool = False  # results name no hosts and files: neither recorded nor, with its value, in their command
+
+    @property
+    def key(self) -> str:
+        """The name of its value in budgets and runs."""
+        return self.sets or self.name
 
     def check(self, value: Any) -> None:
         """Raises PebbleError for an invalid value."""
@@ -77,11 +83,12 @@ class Option:
         if self.private:
             return [f"--{self.name}", self.metavar or self.name.upper()]
         if self.repeated:
-            return [word for one in value for word in (f"--{self.name}", _word(one))]
-        return [f"--{self.name}", ",".join(map(_word, value if self.many else [value]))]
+            return [word for one in value for word in (f"--{self.name}", as_word(one))]
+        return [f"--{self.name}", ",".join(map(as_word, value if self.many else [value]))]
 
 
-def _word(value: Any) -> str:
+def as_word(value: Any) -> str:
+    """A value as on the command line."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -141,6 +148,7 @@ class Comparison:
 
     derived: Callable[[list[Cell]], list[Cell]] = lambda cells: cells  # what all rounds together make of the cells
     tables: Sequence[Tables] = ()  # see pebble.bench.tables
+    title_suffix: str = ""  # of all tables; may name recorded options and {quick}: ", over {link}"
     legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
@@ -188,8 +196,8 @@ class Comparison:
         run = Run(self, values, quick, output)
         run.console = console or Console()
         for option in self.options:
-            if run.options.get(option.name) is not None:
-                option.check(run.options[option.name])
+            if run.options.get(option.key) is not None:
+                option.check(run.options[option.key])
         return run
 
 
@@ -222,12 +230,12 @@ class Run:
         about, defaults = self.comparison, {**self.comparison.full, "variants": self.comparison.variants}
         words = ["pebble", *(about.words or ("bench", about.name))]
         for option in about.options:
-            words += option.words(self.options.get(option.name), defaults.get(option.name, ()))
+            words += option.words(self.options.get(option.key), defaults.get(option.key, ()))
         return [*words, *(["--quick"] if self.quick and about.has_quick else [])]
 
     def records(self) -> dict[str, Value | list[Value]]:
         """All options that affect the results."""
-        unrecorded = {"variants"} | {one.name for one in self.comparison.options if one.private or not one.recorded}
+        unrecorded = {"variants"} | {one.key for one in self.comparison.options if one.private or not one.recorded}
         values = {name: value for name, value in self.options.items() if name not in unrecorded}
         return {**values, **self.comparison.constants, **self.recorded}
 

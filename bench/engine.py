@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from pebble.bench import null
 from pebble.bench.comparison import Case, Combine, Comparison, Round, Run
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Results, Stopwatch, Value, percentile
+from pebble.bench.results import OVER_TIME, Cell, Results, Stopwatch, Value, percentile
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
@@ -41,16 +41,26 @@ def run(run: Run) -> int:
             sweep()  # Zenoh leaves files behind even after a regular end
     cells = about.derived(collected.cells())
     for table in about.shown(cells):
+        suffix = about.title_suffix.format(**run.records(), quick=", quick" if run.quick else "")
+        table.title = f"{table.title}{suffix}"
         console.print(table)
     for line in about.legend(cells):
         console.print(line, style="dim", highlight=False, soft_wrap=True)
-    lines = [*rounds.notes(), *about.assessed(cells), *run.notes]
+    lines = [*_early(run), *rounds.notes(), *about.assessed(cells), *run.notes]
     results = watch.results(cells, lines, quick=run.quick)
     results.options = run.records()
     finish(results, run.output, console)
     if run.problem is not None:
         raise run.problem
     return int(not (rounds.enough and about.complete(cells)))
+
+
+def _early(run: Run) -> list[str]:
+    """A sentence for the assessment: why the run ended early, if it did."""
+    if run.problem is None:
+        return []
+    why = str(run.problem).splitlines()[0]
+    return [f"{why[0].upper()}{why[1:]}"]
 
 
 def _leave_out_missing(run: Run) -> None:
@@ -186,7 +196,10 @@ class Collected:
         for key, parts in sorted(found.items(), key=lambda one: self._place(one[1][0])):
             cell = self._cells.setdefault(key, msgspec.structs.replace(parts[0], rounds=[], figures={}))
             cell.unit = cell.unit or parts[0].unit  # a case that failed has none
-            cell.rounds.append([sample for part in parts for sample in part.samples])
+            if cell.measure.endswith(OVER_TIME):
+                cell.rounds += parts[0].rounds  # times, then values
+            else:
+                cell.rounds.append([sample for part in parts for sample in part.samples])
             for part in parts:
                 for name, value in part.figures.items():
                     self._figures.setdefault((key, name), []).append(value)

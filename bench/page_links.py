@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from pebble.bench.impair.conditions import Condition, Shape
-from pebble.bench.impair.namespaces import ROBOT as SERVER
-from pebble.bench.impair.namespaces import NamespaceNetwork, obstacle
+from pebble.bench.impair.network import ROBOT_HOST as SERVER
+from pebble.bench.impair.network import NamespaceNetwork, why_no_namespaces
 from pebble.bench.page_cases import KEY, ROBOT, Samples, driven_by_others, reset
 from pebble.bench.page_rig import Rig, monotonic, rig
 from pebble.contract import CAMERA, CAPABILITIES, MQTT_VIDEO, ONLINE, VIDEO_CONTROL, codec
@@ -41,7 +41,7 @@ def linked(condition: Condition, *names: str, wide: bool = False, flags: tuple[s
 
     ``wide``: with a robot whose pictures are larger than the network carries. ``flags``: further ones of the browser.
     """
-    problem = obstacle()
+    problem = why_no_namespaces()
     if problem is not None:
         raise PebbleError(f"no network namespaces: {problem}")
     with ExitStack() as stack:

@@ -6,7 +6,7 @@ Their command lines are in pebble.commands, and their runs in modules of their o
 from __future__ import annotations
 
 from pebble.bench.comparison import Budget, Comparison
-from pebble.bench.pictures import Drawn, ecdf, null_ratios, ratios
+from pebble.bench.pictures import ecdf, null_ratios, ratios
 
 BRIDGE = Comparison(
     name="bridge",
@@ -42,16 +42,4 @@ BRIDGE_NULL = Comparison(
     words=("bench", "bridge"),
     reported=("--null",),
     pictures=(null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
-)
-IMPAIR = Comparison(
-    name="impair",
-    title="On an impaired network",
-    what="Whole robots whose uplink is limited and loses packets, trial after trial, as in section 4.2 of the "
-    "paper: heartbeat, driving, video, then audio in each. “original” is this Pebble with the original's encodings "
-    "(JSON video, PCM audio); “h264 opus” are the encodings with rate control.",
-    full=Budget(1300),
-    quick=Budget(85),
-    summary_lines=9,
-    words=("impair",),
-    pictures=(Drawn("pebble.bench.impair.pictures:over_trials"), Drawn("pebble.bench.impair.pictures:over_time")),
 )

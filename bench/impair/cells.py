@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from pebble.bench.impair import metrics
-from pebble.bench.impair.messages import Record, Window
+from pebble.bench.impair.metrics import Record, Window
 from pebble.bench.impair.network import Traffic
 from pebble.bench.results import OVER_TIME, Cell, Value, rounded
 from pebble.simulation.loudspeaker import Playback

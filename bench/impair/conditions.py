@@ -89,21 +89,13 @@ _PROFILES = (
     Condition("starlink", _SATELLITE, _SATELLITE),
     Condition("wifi-power-save", _AIR, replace(_AIR, beacon_ms=102.4)),
 )
+TRIALS = (*_PAPER, *(profile.name for profile in _PROFILES))
 
 
-def trials(both_ways: bool = False) -> list[Condition]:
-    """All conditions in order. ``both_ways`` shapes the downlink like the uplink; the profiles have their own."""
+def chosen(names: Sequence[str] = TRIALS, both_ways: bool = False) -> list[Condition]:
+    """The conditions of these trials, in order. ``both_ways`` shapes the downlink alike, except in the profiles."""
     shaped = [Condition(name, shape, shape if both_ways else Shape()) for name, shape in _PAPER.items()]
-    return [*shaped, *_PROFILES]
-
-
-def chosen(names: Sequence[str], both_ways: bool = False) -> list[Condition]:
-    """The trials of these names, in the order of `trials`. Raises PebbleError for an unknown name."""
-    known = trials(both_ways)
-    unknown = set(names) - {condition.name for condition in known}
-    if unknown:
-        raise PebbleError(f"no trial {min(unknown)!r}: choose from {', '.join(each.name for each in known)}")
-    return [condition for condition in known if condition.name in names]
+    return [condition for condition in (*shaped, *_PROFILES) if condition.name in names]
 
 
 class Schedule:

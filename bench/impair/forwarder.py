@@ -24,8 +24,6 @@ from typing import Any
 import msgspec
 
 from pebble.bench.impair.conditions import Condition, Schedule, Shape
-from pebble.bench.impair.network import UnavailableError
-from pebble.errors import PebbleError
 from pebble.rig import worker_end
 
 TIMED = "timed"  # the device whose packets pass through this process
@@ -161,28 +159,25 @@ def _make_tun_node() -> None:
             os.mknod(_TUN, stat.S_IFCHR | 0o600, os.makedev(10, 200))
 
 
-def _hold() -> NamespaceForwarder:
-    """Raises UnavailableError without permission for namespaces or without TUN, PebbleError for other errors."""
-    _make_tun_node()
-    try:
-        return NamespaceForwarder()
-    except PermissionError as error:
+def _refusal(error: OSError) -> dict[str, str]:
+    """The answer if there are no namespaces: unavailable without permission or without TUN, else an error."""
+    if isinstance(error, PermissionError):
         what = error.filename or "new namespaces"
-        raise UnavailableError(f"{what}: not permitted: run it as root, or in `unshare --map-root-user`") from None
-    except OSError as error:
-        if error.filename == str(_TUN):
-            raise UnavailableError(f"{_TUN}: {error.strerror}: the kernel has no TUN") from None
-        raise PebbleError(f"new namespaces: {error.strerror}") from None
+        return {"unavailable": f"{what}: not permitted: run it as root, or in `unshare --map-root-user`"}
+    if error.filename == str(_TUN):
+        return {"unavailable": f"{_TUN}: {error.strerror}: the kernel has no TUN"}
+    return {"error": f"new namespaces: {error.strerror}"}
 
 
 def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+    _make_tun_node()
     try:
-        forwarder = _hold()
-    except PebbleError as error:
-        worker_end.answer({"unavailable" if isinstance(error, UnavailableError) else "error": str(error)})
+        forwarder = NamespaceForwarder()
+    except OSError as error:
+        worker_end.answer(_refusal(error))
         return 1
     worker_end.answer({"robot": forwarder.robot, "remote": forwarder.remote})
     forwarder.serve(sys.stdin.fileno())

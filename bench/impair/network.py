@@ -1,24 +1,52 @@
-"""A network between a robot and its broker that can be impaired and restored while both use it."""
+"""Networks between a robot and its broker that can be impaired and restored while both use them.
+
+Of two network namespaces: rate by TBF and loss by nftables, in the kernel; delay by the forwarder. Two pairs of devices
+join the namespaces. Without delay, a veth pair carries everything, entirely in the kernel. With delay, the route uses
+TUN devices and the forwarder. The addresses stay the same, so connections survive. Or a proxy on loopback.
+"""
 
 from __future__ import annotations
 
+import errno
+import json
 import os
+import shutil
+import subprocess
 import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
 import msgspec
 
-from pebble.bench.impair.conditions import Condition
+from pebble.bench.impair.conditions import Condition, Shape
+from pebble.bench.impair.forwarder import TIMED
 from pebble.errors import PebbleError
 from pebble.rig.worker import Worker, end_workers
 
 KINDS = ("auto", "namespaces", "proxy")
 LOOPBACK = "127.0.0.1"
+WIRE = "wire"
+ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
+_PREFIX = 30
+_MTU = 1500
+_ETHERNET = 14  # bytes of header that packets of a TUN device lack, but would have on a wire
+_BURST = 1600  # bytes: one packet, so that the rate also holds over short times
+_QUEUE_S = 0.3  # the queue of a home router's modem, with tail drop
+_QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
+_COMMAND_S = 10.0
+_SBIN = "/usr/local/sbin:/usr/sbin:/sbin"
+_PACKAGES = {"nsenter": "util-linux", "ip": "iproute2", "tc": "iproute2", "nft": "nftables"}
+
+_TABLE = """table ip impair {
+    counter lost { }
+    chain arriving { type filter hook prerouting priority raw; }
+}
+"""
 _ANSWER_S = 10.0
 
 
@@ -41,19 +69,45 @@ class UnavailableError(PebbleError):
     """This machine or user does not permit such a network."""
 
 
-class NetworkProcess:
-    """Starts ``python -m module`` and waits for its first answer (`greeting`); thread-safe."""
+class ImpairedNetwork(ABC):
+    """One robot's network, and ``python -m module``, the process that impairs it; thread-safe.
+
+    Several may be open at the same time, independent. Raises UnavailableError if the process cannot make one.
+    """
+
+    kind: str  # "namespaces" or "proxy"
+    broker_host: str  # the address on which the broker must listen
 
     def __init__(self, name: str, module: str) -> None:
         self._log = os.memfd_create("link")  # the log is an unnamed file: nothing is left behind if we are killed
         self._lock = threading.Lock()
-        self._worker = Worker(name, [sys.executable, "-m", module], Path(f"/proc/self/fd/{self._log}"))
+        log = Path(f"/proc/self/fd/{self._log}")
+        self._worker = Worker(f"network {name}".strip(), [sys.executable, "-m", module], log)
         self._open = True
         try:
             self.greeting = self._greeting()
         except BaseException:
             self.close()
             raise
+
+    @abstractmethod
+    def broker_address(self, port: int) -> tuple[str, int]:
+        """The robot's address for a broker that listens on ``broker_host:port``."""
+
+    @abstractmethod
+    def traffic(self) -> Traffic: ...
+
+    def on_robot(self, command: Sequence[str]) -> list[str]:
+        """Wraps a command so that it runs on the robot's side. The process is replaced: pid and signals stay."""
+        return list(command)
+
+    def on_remote(self, command: Sequence[str]) -> list[str]:
+        """Wraps a command so that it runs on the broker's side."""
+        return list(command)
+
+    def apply(self, condition: Condition) -> None:
+        """Applies a condition. Connections stay; the condition's time starts at 0."""
+        self.ask(msgspec.json.encode(condition).decode())
 
     @property
     def pid(self) -> int:
@@ -90,35 +144,6 @@ class NetworkProcess:
             raise PebbleError(str(answer["error"]))
         return answer
 
-
-class ImpairedNetwork(NetworkProcess, ABC):
-    """One robot's network, and the process that impairs it. Several may be open at the same time, independent."""
-
-    kind: str  # "namespaces" or "proxy"
-    broker_host: str  # the address on which the broker must listen
-
-    def __init__(self, name: str, module: str) -> None:
-        super().__init__(f"network {name}".strip(), module)
-
-    @abstractmethod
-    def broker_address(self, port: int) -> tuple[str, int]:
-        """The robot's address for a broker that listens on ``broker_host:port``."""
-
-    def on_robot(self, command: Sequence[str]) -> list[str]:
-        """Wraps a command so that it runs on the robot's side. The process is replaced: pid and signals stay."""
-        return list(command)
-
-    def on_remote(self, command: Sequence[str]) -> list[str]:
-        """Wraps a command so that it runs on the broker's side."""
-        return list(command)
-
-    def apply(self, condition: Condition) -> None:
-        """Applies a condition. Connections stay; the condition's time starts at 0."""
-        self.ask(msgspec.json.encode(condition).decode())
-
-    @abstractmethod
-    def traffic(self) -> Traffic: ...
-
     def __enter__(self) -> Self:
         return self
 
@@ -145,10 +170,164 @@ class ProxyNetwork(ImpairedNetwork):
         return msgspec.convert(self.ask("count"), Traffic)
 
 
+class NamespaceNetwork(ImpairedNetwork):
+    """Of two namespaces, which its process holds."""
+
+    kind = "namespaces"
+    broker_host = REMOTE_HOST
+
+    def __init__(self, name: str = "") -> None:
+        super().__init__(name, "pebble.bench.impair.forwarder")
+        paths = {side: f"/proc/{self.pid}/fd/{self.greeting[side]}" for side in ("robot", "remote")}
+        self._robot = _Side(paths["robot"], ROBOT_HOST, REMOTE_HOST)
+        self._remote = _Side(paths["remote"], REMOTE_HOST, ROBOT_HOST)
+        self._dropped_before = {self._robot: 0, self._remote: 0}
+        try:
+            self._robot.ip(f"link add {WIRE} type veth peer name {WIRE} netns {paths['remote']}")
+            self._robot.set_up()
+            self._remote.set_up()
+        except BaseException:
+            self.close()
+            raise
+
+    def broker_address(self, port: int) -> tuple[str, int]:
+        return REMOTE_HOST, port
+
+    def on_robot(self, command: Sequence[str]) -> list[str]:
+        return self._robot.inside(command)
+
+    def on_remote(self, command: Sequence[str]) -> list[str]:
+        return self._remote.inside(command)
+
+    def apply(self, condition: Condition) -> None:
+        super().apply(condition)
+        device = TIMED if condition.up.timed or condition.down.timed else WIRE
+        for side, shape in ((self._robot, condition.up), (self._remote, condition.down)):
+            before = side.dropped()
+            side.limit(shape.kbit)
+            self._dropped_before[side] += before - side.dropped()  # a new queue counts from 0
+        self._remote.lose(condition.up.loss)
+        self._robot.lose(condition.down.loss)
+        self._robot.send_over(device)
+        self._remote.send_over(device)
+
+    def traffic(self) -> Traffic:
+        counts = self.ask("count")
+        bytes_up, packets_up = _on_the_wire(counts["up"])
+        bytes_down, packets_down = _on_the_wire(counts["down"])
+        return Traffic(
+            bytes_up,
+            bytes_down,
+            packets_up,
+            packets_down,
+            self._queue_drops(self._robot) + self._remote.lost() + counts["lost_up"],
+            self._queue_drops(self._remote) + self._robot.lost() + counts["lost_down"],
+        )
+
+    def _queue_drops(self, side: _Side) -> int:
+        return self._dropped_before[side] + side.dropped()
+
+
+class _Side:
+    """One of the namespaces, configured with the system's tools."""
+
+    def __init__(self, path: str, address: str, peer: str) -> None:
+        self._path, self._address, self._peer = path, address, peer
+
+    def inside(self, command: Sequence[str]) -> list[str]:
+        return [_program("nsenter"), f"--net={self._path}", "--", *command]
+
+    def set_up(self) -> None:
+        devices = [
+            line
+            for device in (WIRE, TIMED)
+            for line in (
+                f"link set {device} mtu {_MTU} addrgenmode none",  # no IPv6 traffic of its own
+                f"link set {device} gso_max_segs 1",  # otherwise packets of 64 KB are limited and dropped as one
+                f"link set {device} up",
+            )
+        ]
+        self.ip("link set lo up", f"address add {self._address}/{_PREFIX} dev {WIRE}", *devices)
+        self.send_over(WIRE)
+        self._run("nft", "-f", "-", stdin=_TABLE)
+
+    def send_over(self, device: str) -> None:
+        self.ip(f"route replace {self._peer}/32 dev {device} src {self._address}")
+
+    def limit(self, kbit: float | None) -> None:
+        """Limits the rate of outgoing packets on both devices: only one of them is in use."""
+        rule = {device: _queue(kbit, device) for device in (WIRE, TIMED)}
+        self._run("tc", "-batch", "-", stdin="".join(f"qdisc replace dev {d} root {q}\n" for d, q in rule.items()))
+
+    def lose(self, share: float) -> None:
+        """Drops a share of incoming packets."""
+        rule = f'iifname != "lo" numgen random mod 10000 < {round(share * 10000)} counter name lost drop'
+        add = f"add rule ip impair arriving {rule}\n" if share else ""
+        self._run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
+
+    def dropped(self) -> int:
+        """Packets dropped by the queues of this side since they were created."""
+        return sum(int(queue["drops"]) for queue in self._json("tc", "-s", "-j", "qdisc", "show"))
+
+    def lost(self) -> int:
+        listed = self._json("nft", "-j", "list", "counter", "ip", "impair", "lost")["nftables"]
+        return sum(int(entry["counter"]["packets"]) for entry in listed if "counter" in entry)
+
+    def ip(self, *lines: str) -> None:
+        self._run("ip", "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
+
+    def _json(self, *command: str) -> Any:
+        return json.loads(self._run(*command))
+
+    def _run(self, program: str, *arguments: str, stdin: str = "") -> str:
+        command = self.inside([_program(program), *arguments])
+        try:
+            done = subprocess.run(
+                command,
+                input=stdin,
+                capture_output=True,
+                text=True,
+                timeout=_COMMAND_S,
+                check=False,
+                env={**os.environ, "LC_ALL": "C"},  # `_not_permitted` parses its messages
+            )
+        except subprocess.TimeoutExpired:
+            raise PebbleError(f"{program} did not end within {_COMMAND_S:.0f} s") from None
+        if done.returncode:
+            answer = done.stderr.strip().splitlines() or [f"code {done.returncode}"]
+            problem = f"{program} {' '.join(arguments)}: {answer[0]}"
+            raise UnavailableError(problem) if _not_permitted(answer[0]) else PebbleError(problem)
+        return done.stdout
+
+
+def _queue(kbit: float | None, device: str) -> str:
+    """The queueing discipline in tc's syntax; without a limit the device's default."""
+    if kbit is None:
+        return "noqueue" if device == WIRE else "pfifo limit 1000"
+    rate = kbit * 1000 / 8
+    limit = max(rate * _QUEUE_S, _QUEUE_PACKETS * (_MTU + _ETHERNET))
+    return f"tbf rate {round(kbit * 1000)}bit burst {round(max(_BURST, rate * 0.005))} limit {round(limit)}"
+
+
+def _on_the_wire(devices: dict[str, tuple[int, int]]) -> tuple[int, int]:
+    (wire_bytes, wire_packets), (timed_bytes, timed_packets) = devices[WIRE], devices[TIMED]
+    return wire_bytes + timed_bytes + timed_packets * _ETHERNET, wire_packets + timed_packets
+
+
+def _program(name: str) -> str:
+    """The path of a program; users' PATH lacks the folders in which Debian installs these."""
+    found = shutil.which(name) or shutil.which(name, path=_SBIN)
+    if found is None:
+        raise UnavailableError(f"{name} is not installed: apt-get install {_PACKAGES[name]}")
+    return found
+
+
+def _not_permitted(answer: str) -> bool:
+    return any(os.strerror(number) in answer for number in (errno.EPERM, errno.EACCES))
+
+
 def open_network(kind: str = "auto", *, name: str = "") -> ImpairedNetwork:
     """Opens a network of a kind as in `resolved`; ``name`` is for messages. Raises PebbleError if it is unavailable."""
-    from pebble.bench.impair.namespaces import NamespaceNetwork
-
     kind, _ = resolved(kind)
     return ProxyNetwork(name) if kind == "proxy" else NamespaceNetwork(name)
 
@@ -166,8 +345,19 @@ def resolved(kind: str) -> tuple[str, str | None]:
     return "proxy" if kind == "proxy" or obstacle else "namespaces", obstacle
 
 
+@cache
 def why_no_namespaces() -> str | None:
-    """What prevents networks of kind ``namespaces``; None: nothing. Raises PebbleError if they fail."""
-    from pebble.bench.impair import namespaces
+    """What prevents networks of kind ``namespaces``; None: nothing. Tested with every feature a condition may use.
 
-    return namespaces.obstacle()
+    Raises PebbleError if namespaces are permitted, but fail.
+    """
+    everything = Shape(kbit=1000, loss=0.01, delay_ms=1)
+    try:
+        with NamespaceNetwork("on trial") as network:
+            network.apply(Condition("trial", everything, everything))
+            network.traffic()
+    except UnavailableError as error:
+        return str(error)
+    except PebbleError as error:
+        raise PebbleError(f"network namespaces do not work here: {error}; or choose the proxy") from None
+    return None

@@ -1,7 +1,7 @@
 """The operator of one robot, on the broker's side of the network: drives, receives video, then audio, and plays a clip.
 
 As a process: ``python -m pebble.bench.impair.operator HOST PORT BASE``. It reports when the robot is ready, then serves
-each request (pebble.bench.impair.messages), and ends when its standard input closes.
+each request (pebble.bench.impair.metrics), and ends when its standard input closes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable
 import msgspec
 
 from pebble.bench.bridge_operator import wheels
-from pebble.bench.impair.messages import (
+from pebble.bench.impair.metrics import (
     ClipCommand,
     Command,
     Heartbeat,

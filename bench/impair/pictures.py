@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from pebble.bench import paper
+from pebble.bench.aims import single
 from pebble.bench.plots import Picture, around, finite, guide, legend, log_axis, panels, short, styles, unique
 from pebble.bench.results import OVER_TIME, Cell, Results, percentile
 
@@ -23,14 +24,6 @@ _NARROW, _WORST = f"aim\nat {paper.NARROW}", f"aim at\n{paper.WORST}"
 _BANDS = ("#f3f0e7", "#ffffff")
 
 Value = Callable[[Cell], float]
-
-
-def single(name: str) -> Value:
-    def value(cell: Cell) -> float:
-        found = cell.figures.get(name)
-        return float(found) if isinstance(found, int | float) else math.nan
-
-    return value
 
 
 def p(percent: float, *, lost: bool = False) -> Value:
@@ -214,7 +207,7 @@ def _series(cells: Sequence[Cell], results: Results, title: str) -> Figure:
         _bands(axes, begun, last, named=axes is every[0])
         axes.plot(seconds, latencies, ".", color=style_of[cell.variant].colour, markersize=2.2, antialiased=False)
         log_axis(axes, "y", f"{short(cell.variant, 18)}\nlatency, ms", *ends)
-    every[-1].set_xlabel("seconds since the run began")
+    every[-1].set_xlabel("seconds since the first trial began")
     return figure
 
 

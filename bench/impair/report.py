@@ -1,23 +1,18 @@
-"""The tables and the assessment of the trials. Pure."""
+"""The tables, the aims and the sentences of the trials. Pure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-
-from rich.table import Table
 
 from pebble.bench import paper
-from pebble.bench.aims import outcome
+from pebble.bench.aims import Aim, outcome, single, with_lost
 from pebble.bench.impair import cells as measures
-from pebble.bench.impair.conditions import trials
-from pebble.bench.impair.plan import SUBJECTS, Subject
+from pebble.bench.impair.conditions import chosen
 from pebble.bench.ratios import paired
-from pebble.bench.results import Cell, Judged, Results, percentile
-from pebble.bench.tables import figure, plain_table
+from pebble.bench.results import Cell, Judged, percentile
+from pebble.bench.tables import Column, Grid, figure
 
-WIDE = 105  # columns of a terminal that the long form needs
 QUOTED = (
     *paper.QUOTED,
     '"original" above is this program with the original\'s encodings, JSON pictures and PCM; it drops outdated media, '
@@ -27,240 +22,175 @@ _LOSS_SHOWN = 0.005  # share of what was sent
 _DRIVE_WAITS_MS = 100.0  # one command's time at 10 Hz
 _OURS = "h264 opus"
 
-
-# -- the table
-
-
-def tables(results: Results, width: int) -> Iterator[Table]:
-    """One table per form with the transports side by side, and one of details; fewer columns if ``width`` is small."""
-    forms = dict.fromkeys(subject.form for subject in SUBJECTS)
-    for form in forms:
-        subjects = [one for one in SUBJECTS if one.form == form and _trials(results.cells, one.name)]
-        if subjects:
-            yield _table(results, form, subjects, width >= WIDE)
-        if subjects and width >= WIDE:
-            yield _by_transport(f"details of {_title(results, form)}", _DETAILS, results, subjects)
-        if subjects:
-            title = f"a clip, and {results.options.get('off_s')} s without media, of {_title(results, form)}"
-            yield _by_transport(title, _AFTERWARDS, results, subjects)
+_Value = Callable[[Cell], float]
+_p95 = with_lost(95)
 
 
-def _table(results: Results, form: str, subjects: Sequence[Subject], wide: bool) -> Table:
-    columns = [column for column in _COLUMNS if wide or column.always]
-    heads = [
-        f"{subject.transport if number == 0 else ''}\n{column.name}"
-        for subject in subjects
-        for number, column in enumerate(columns)
-    ]
-    table = plain_table(_title(results, form), ["trial", *heads])
-    for trial in _all_trials(results.cells):
-        table.add_row(trial, *(column.of(results, one.name, trial) for one in subjects for column in columns))
-    return table
+# -- the tables
 
 
-def _by_transport(title: str, shown: Sequence[_Column], results: Results, subjects: Sequence[Subject]) -> Table:
-    """A row for each transport in each trial."""
-    table = plain_table(title, ["trial", "inside", *(column.name for column in shown)], left=2)
-    for trial in _all_trials(results.cells):
-        for number, one in enumerate(subjects):
-            figures = [column.of(results, one.name, trial) for column in shown]
-            table.add_row("" if number else trial, one.transport, *figures)
-    return table
-
-
-def _title(results: Results, form: str) -> str:
-    options = results.options
-    words, window = options.get("link_words", options.get("link")), options.get("window_s")
-    return f"{form}, over {words}, windows of {window} s{', quick' if results.quick else ''}"
-
-
-@dataclass(frozen=True, slots=True)
-class _Column:
-    name: str
-    measure: str
-    value: Callable[[Cell], float]
-    always: bool = True  # also in the short form
-    whole: bool = False
-
-    def of(self, results: Results, subject: str, trial: str) -> str:
-        cell = results.find(subject, self.measure, trial=trial)
-        value = math.nan if cell is None else self.value(cell)
-        if value == math.inf:
-            return "never"
-        return f"{value:.0f}" if self.whole and not math.isnan(value) else figure(value)
-
-
-def _number(name: str) -> Callable[[Cell], float]:
-    def of(cell: Cell) -> float:
-        value = cell.figures.get(name)
-        return float(value) if isinstance(value, int | float) else math.nan
-
-    return of
-
-
-def _percentile(percent: float) -> Callable[[Cell], float]:
-    """A percentile in which lost messages are infinitely late."""
-    return lambda cell: percentile([*cell.samples, *[math.inf] * (cell.lost or 0)], percent)
-
-
-_p95 = _percentile(95)
-
-
-def _arrived(percent: float) -> Callable[[Cell], float]:
+def _arrived(percent: float) -> _Value:
     """A percentile of what arrived; the share that arrived is in another column."""
     return lambda cell: cell.percentile(percent)
 
 
-_COLUMNS = (
-    _Column("audio\n%", measures.SOUND, _number("delivered_percent")),
-    _Column("p95\nms", measures.SOUND, _arrived(95)),
-    _Column("video\nfps", measures.PICTURES, _number("fps")),
-    _Column("frozen\ns", measures.PICTURES, _number("frozen_s"), always=False),
-    _Column("drive\np95 ms", measures.DRIVE, _p95),
-    _Column("heartbeat\ngap s", measures.HEARTBEAT_GAP, _number("longest_gap_s"), always=False),
+def _column(head: str, measure: str, value: _Value, *, whole: bool = False) -> Column:
+    def shown(cell: Cell) -> str:
+        found = value(cell)
+        if math.isinf(found):
+            return "never"
+        return f"{found:.0f}" if whole and not math.isnan(found) else figure(found)
+
+    return Column(head, shown, measure)
+
+
+def _grid(title: str, *columns: Column) -> Grid:
+    of_trials: Callable[[Cell], bool] = lambda cell: "trial" in cell.params  # noqa: E731
+    return Grid(title=title, rows=("trial", "variant"), heads=("trial", "subject"), columns=columns, of=of_trials)
+
+
+def _after(measure: str, what: str) -> tuple[Column, ...]:
+    return (
+        _column(f"no {what}\nbytes", measure, single("bytes_up"), whole=True),
+        _column("beats", measure, single("heartbeats"), whole=True),
+        _column("gap\ns", measure, single("longest_gap_s")),
+    )
+
+
+TABLES = (
+    _grid(
+        "trials",
+        _column("audio\n%", measures.SOUND, single("delivered_percent")),
+        _column("p95\nms", measures.SOUND, _arrived(95)),
+        _column("video\nfps", measures.PICTURES, single("fps")),
+        _column("frozen\ns", measures.PICTURES, single("frozen_s")),
+        _column("drive\np95 ms", measures.DRIVE, _p95),
+        _column("heart-\nbeat\ngap s", measures.HEARTBEAT_GAP, single("longest_gap_s")),
+    ),
+    _grid(
+        "details of media",
+        _column("video\nkbit/s", measures.PICTURES, single("kbit_up")),
+        _column("audio\nkbit/s", measures.SOUND, single("kbit_up")),
+        _column("video\ndrops", measures.PICTURES, single("dropped_up"), whole=True),
+        _column("audio\ndrops", measures.SOUND, single("dropped_up"), whole=True),
+        _column("audio\np50 ms", measures.SOUND, _arrived(50)),
+    ),
+    _grid(
+        "details of driving, and a clip",
+        _column("drive\np50 ms", measures.DRIVE, with_lost(50)),
+        _column("drive\n%", measures.DRIVE, single("delivered_percent")),
+        _column("stopped\ntimes", measures.DRIVE, single("trips"), whole=True),
+        _column("at rest\ns", measures.DRIVE, single("rest_s")),
+        _column("clip\nms", measures.CLIP, with_lost(100)),
+    ),
+    _grid(
+        "after media were switched off",
+        *_after(measures.AFTER_VIDEO, "video"),
+        *_after(measures.AFTER_AUDIO, "audio"),
+    ),
 )
-_DETAILS = (
-    _Column("video\nkbit/s", measures.PICTURES, _number("kbit_up")),
-    _Column("audio\nkbit/s", measures.SOUND, _number("kbit_up")),
-    _Column("video\ndrops", measures.PICTURES, _number("dropped_up"), whole=True),
-    _Column("audio\ndrops", measures.SOUND, _number("dropped_up"), whole=True),
-    _Column("audio\np50 ms", measures.SOUND, _arrived(50)),
-    _Column("drive\np50 ms", measures.DRIVE, _percentile(50)),
-    _Column("drive\n%", measures.DRIVE, _number("delivered_percent")),
-    _Column("stopped\ntimes", measures.DRIVE, _number("trips"), whole=True),
-    _Column("at rest\ns", measures.DRIVE, _number("rest_s")),
-)
-_AFTERWARDS = (
-    _Column("clip\nms", measures.CLIP, _percentile(100)),
-    _Column("no video\nbytes", measures.AFTER_VIDEO, _number("bytes_up"), whole=True),
-    _Column("heart-\nbeats", measures.AFTER_VIDEO, _number("heartbeats"), whole=True),
-    _Column("gap\ns", measures.AFTER_VIDEO, _number("longest_gap_s")),
-    _Column("no audio\nbytes", measures.AFTER_AUDIO, _number("bytes_up"), whole=True),
-    _Column("heart-\nbeats", measures.AFTER_AUDIO, _number("heartbeats"), whole=True),
-    _Column("gap\ns", measures.AFTER_AUDIO, _number("longest_gap_s")),
-)
 
 
-# -- the assessment
+# -- the aims, for our own encodings
 
 
-@dataclass(frozen=True, slots=True)
-class _Aim:
-    trial: str
-    words: str
-    measure: str
-    value: Callable[[Cell], float]
-    limit: float
-    unit: str
-    least: bool = False  # else at most
+def _aim(
+    trial: str, words: str, measure: str, value: _Value, unit: str,
+    *, at_most: float | None = None, at_least: float | None = None,
+) -> Aim:  # fmt: skip
+    def beside(cell: Cell) -> str:
+        """By how much it was missed, how much was lost, and in which window."""
+        found, sent = value(cell), cell.figures.get("sent")
+        by = (at_least - found) if at_least is not None else found - (at_most or 0.0)
+        lost = (cell.lost or 0) / sent if isinstance(sent, int) and sent and at_least is None else 0.0
+        parts = [
+            f", by {figure(by)} {unit}" if by > 0 and math.isfinite(by) else "",
+            f", {figure(100 * lost)} % lost" if lost > _LOSS_SHOWN else "",
+        ]
+        return f"{''.join(parts)}, window of {single('window_s')(cell):.3g} s"
 
-    def judged(self, subject: str, cell: Cell) -> Judged:
-        value = self.value(cell)
-        met = value >= self.limit if self.least else value <= self.limit
-        shown = f"{_plain(value)} {self.unit}" if math.isfinite(value) else "too much was lost"
-        if not cell.samples and math.isnan(value):
-            shown = "nothing arrived"
-        elif not met and math.isfinite(value):
-            shown += f", by {_plain(abs(value - self.limit))} {self.unit}"
-        shown += f"{'' if self.least else _lost(cell)}, window of {_number('window_s')(cell):.3g} s"
-        bound = "at least" if self.least else "at most"
-        what = f"{subject} at {self.trial}, {self.words} {bound} {self.limit:g} {self.unit}"
-        return Judged(what=what, outcome=outcome(met), measured=shown)
+    bound = "at most" if at_least is None else "at least"
+    return Aim(
+        what=f"{{variant}} at {trial}, {words} {bound} {{bound:g}} {unit}",
+        of=lambda cell: cell.variant.endswith(_OURS) and (cell.measure, cell.params.get("trial")) == (measure, trial),
+        value=value, at_most=at_most, at_least=at_least, unit=unit, least=0, never="too much was lost", beside=beside,
+    )  # fmt: skip
 
 
-_AIMS = (
-    _Aim(paper.NARROW, "sound delivered", measures.SOUND, _number("delivered_percent"), paper.NARROW_SOUND_PERCENT, "%",
-         least=True),
-    _Aim(paper.NARROW, "sound p95", measures.SOUND, _p95, paper.NARROW_SOUND_P95_MS, "ms"),
-    _Aim(paper.NARROW, "longest time without a new picture", measures.PICTURES, _number("longest_gap_s"),
-         paper.NARROW_PICTURE_GAP_S, "s"),
-    _Aim(paper.WORST, "sound delivered", measures.SOUND, _number("delivered_percent"), paper.WORST_SOUND_PERCENT, "%",
-         least=True),
-    _Aim(paper.WORST, "drive p95", measures.DRIVE, _p95, paper.WORST_DRIVE_P95_MS, "ms"),
-    _Aim(paper.WORST, "seen offline", measures.HEARTBEAT_GAP, _number("longest_offline_s"), paper.WORST_OFFLINE_S, "s"),
+def behind_media(cells: Sequence[Cell]) -> Iterator[Judged]:
+    """The aim that commands do not wait behind media. Trials with loss or delay are excluded: they dominate the p95."""
+    steady = {one.name for one in chosen() if not one.up.loss and not one.up.timed}
+    for subject in (one for one in _subjects(cells) if one.endswith(_OURS)):
+        alone = _by_trial(cells, subject, measures.DRIVE_ALONE)
+        waits = {
+            f"{measure.removeprefix('drive during ')} at {trial}": _p95(busy) - _p95(alone[trial])
+            for measure in (measures.DRIVE_VIDEO, measures.DRIVE_AUDIO)
+            for trial, busy in _by_trial(cells, subject, measure).items()
+            if trial in steady and trial in alone and math.isfinite(_p95(alone[trial]))
+        }
+        if waits:
+            longest = max(waits, key=lambda name: waits[name])
+            most = f"most: {waits[longest]:+.0f} ms" if math.isfinite(waits[longest]) else "some were lost"
+            yield Judged(
+                what=f"{subject}, drive commands wait at most one command's time ({_DRIVE_WAITS_MS:g} ms) behind media"
+                ", p95 against the same trial without",
+                outcome=outcome(waits[longest] <= _DRIVE_WAITS_MS),
+                measured=f"{most}, {longest}",
+            )
+
+
+AIMS = (
+    _aim(paper.NARROW, "sound delivered", measures.SOUND, single("delivered_percent"), "%",
+         at_least=paper.NARROW_SOUND_PERCENT),
+    _aim(paper.NARROW, "sound p95", measures.SOUND, _p95, "ms", at_most=paper.NARROW_SOUND_P95_MS),
+    _aim(paper.NARROW, "longest time without a new picture", measures.PICTURES, single("longest_gap_s"), "s",
+         at_most=paper.NARROW_PICTURE_GAP_S),
+    _aim(paper.WORST, "sound delivered", measures.SOUND, single("delivered_percent"), "%",
+         at_least=paper.WORST_SOUND_PERCENT),
+    _aim(paper.WORST, "drive p95", measures.DRIVE, _p95, "ms", at_most=paper.WORST_DRIVE_P95_MS),
+    _aim(paper.WORST, "seen offline", measures.HEARTBEAT_GAP, single("longest_offline_s"), "s",
+         at_most=paper.WORST_OFFLINE_S),
+    behind_media,
 )  # fmt: skip
 
 
-def _lost(cell: Cell) -> str:
-    """The lost share as text, if it exceeds a threshold."""
-    sent = cell.figures.get("sent")
-    share = (cell.lost or 0) / sent if isinstance(sent, int) and sent else 0.0
-    return f", {_plain(100 * share)} % lost" if share > _LOSS_SHOWN else ""
+# -- the sentences
 
 
-def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
-    """The aims for our own encodings, then comparisons."""
-    ours = [one.name for one in SUBJECTS if one.form == _OURS and _trials(cells, one.name)]
-    judged = [
-        aim.judged(subject, cell)
-        for aim in _AIMS
-        for subject in ours
-        if (cell := _find(cells, subject, aim.measure, aim.trial)) is not None
-    ]
-    judged += [one for subject in ours for one in _media_delay_aim(cells, subject)]
-    return [*judged, *_encodings(cells), _trips(cells), *_clips(cells), *_transports(cells)]
-
-
-def _media_delay_aim(cells: Sequence[Cell], subject: str) -> Iterator[Judged]:
-    """The aim that commands do not wait behind media. Trials with loss or delay are excluded: they dominate the p95."""
-    steady = {one.name for one in trials() if not one.up.loss and not one.up.timed}
-    waits = {
-        f"{measure.removeprefix('drive during ')} at {trial}": _p95(busy) - _p95(alone)
-        for trial in _trials(cells, subject)
-        if trial in steady
-        for measure in (measures.DRIVE_VIDEO, measures.DRIVE_AUDIO)
-        if (alone := _find(cells, subject, measures.DRIVE_ALONE, trial)) is not None
-        and (busy := _find(cells, subject, measure, trial)) is not None
-        and math.isfinite(_p95(alone))
-    }
-    if not waits:
-        return
-    longest = max(waits, key=lambda name: waits[name])
-    met = waits[longest] <= _DRIVE_WAITS_MS
-    what = f"{subject}, drive commands wait at most one command's time ({_DRIVE_WAITS_MS:g} ms) behind media"
-    most = f"most: {waits[longest]:+.0f} ms" if math.isfinite(waits[longest]) else "some were lost"
-    what += ", p95 against the same trial without"
-    yield Judged(what=what, outcome=outcome(met), measured=f"{most}, {longest}")
-
-
-def _encodings(cells: Sequence[Cell]) -> Iterator[str]:
+def encodings(cells: Sequence[Cell]) -> Iterator[str]:
     for trial in (paper.NARROW, paper.WORST):
         shares = [
-            f"{subject.name} {_plain(_number('on_time_percent')(cell))} %"
-            for subject in SUBJECTS
-            if (cell := _find(cells, subject.name, measures.SOUND, trial)) is not None
+            f"{subject} {figure(single('on_time_percent')(found[trial]))} %"
+            for subject in _subjects(cells)
+            if trial in (found := _by_trial(cells, subject, measures.SOUND))
         ]
         if len(shares) > 1:
             yield f"Sound that arrived within a second at {trial}: {', '.join(shares)}."
 
 
-def _clips(cells: Sequence[Cell]) -> Iterator[str]:
-    played = {subject.name: list(_by_trial(cells, subject.name, measures.CLIP).values()) for subject in SUBJECTS}
-    words = [
-        f"{name} {sum(len(cell.samples) for cell in found)} of {len(found)}"
-        + (f" (p50 {_plain(percentile(times, 50))} ms, longest {_plain(max(times))} ms)" if times else "")
-        for name, found in played.items()
-        if found
-        for times in [[sample for cell in found for sample in cell.samples]]
-    ]
-    if words:
-        yield f"Clips that the loudspeaker played when commanded: {', '.join(words)}."
-
-
-def _trips(cells: Sequence[Cell]) -> str:
+def trips(cells: Sequence[Cell]) -> Iterator[str]:
     """Stops by the robot, and rest times of the wheels: a robot that no command reaches never stops."""
     lines = []
-    for subject in SUBJECTS:
-        driven = _by_trial(cells, subject.name, measures.DRIVE).values()
-        trips, rest_s, of_s = (sum(map(_number(name), driven)) for name in ("trips", "rest_s", "window_s"))
-        if driven:
-            lines.append(f"{subject.name} {trips:.0f} (wheels at rest for {_plain(rest_s)} of {_plain(of_s)} s)")
-    return f"Stops by the robot while it was driven: {', '.join(lines)}."
+    for subject in _subjects(cells):
+        driven = _by_trial(cells, subject, measures.DRIVE).values()
+        times, rest_s, of_s = (sum(map(single(name), driven)) for name in ("trips", "rest_s", "window_s"))
+        lines.append(f"{subject} {times:.0f} (wheels at rest for {figure(rest_s)} of {figure(of_s)} s)")
+    yield f"Stops by the robot while it was driven: {', '.join(lines)}."
 
 
-def _transports(cells: Sequence[Cell]) -> Iterator[str]:
+def clips(cells: Sequence[Cell]) -> Iterator[str]:
+    lines = []
+    for subject in _subjects(cells):
+        found = _by_trial(cells, subject, measures.CLIP).values()
+        times = [sample for cell in found for sample in cell.samples]
+        took = f" (p50 {figure(percentile(times, 50))} ms, longest {figure(max(times))} ms)" if times else ""
+        lines.append(f"{subject} {len(times)} of {len(found)}{took}")
+    yield f"Clips that the loudspeaker played when commanded: {', '.join(lines)}."
+
+
+def transports(cells: Sequence[Cell]) -> Iterator[str]:
     """Compares Zenoh and MQTT inside the robot, with trials as rounds: both ran at the same time."""
-    for form in dict.fromkeys(subject.form for subject in SUBJECTS):
+    for form in dict.fromkeys(subject.partition(" ")[2] for subject in _subjects(cells)):
         for what, measure in (("drive", measures.DRIVE), ("sound", measures.SOUND), ("video", measures.PICTURES)):
             mqtt, zenoh = (_by_trial(cells, f"{kind} {form}", measure) for kind in ("mqtt", "zenoh"))
             common = [trial for trial in mqtt if trial in zenoh]
@@ -269,25 +199,13 @@ def _transports(cells: Sequence[Cell]) -> Iterator[str]:
                 yield f"{form}, {what} p50 over {len(common)} trials: {interval.words('zenoh', 'mqtt')}."
 
 
+SENTENCES = (encodings, trips, clips, transports)
+
+
 def _by_trial(cells: Sequence[Cell], subject: str, measure: str) -> dict[str, Cell]:
-    return {
-        str(cell.params["trial"]): cell
-        for cell in cells
-        if cell.variant == subject and cell.measure == measure and "trial" in cell.params
-    }
+    found = [cell for cell in cells if (cell.variant, cell.measure) == (subject, measure)]
+    return {str(cell.params["trial"]): cell for cell in found}
 
 
-def _find(cells: Sequence[Cell], subject: str, measure: str, trial: str) -> Cell | None:
-    return _by_trial(cells, subject, measure).get(trial)
-
-
-def _trials(cells: Sequence[Cell], subject: str) -> list[str]:
-    return list(_by_trial(cells, subject, measures.DRIVE))
-
-
-def _all_trials(cells: Sequence[Cell]) -> list[str]:
-    return list(dict.fromkeys(trial for subject in SUBJECTS for trial in _trials(cells, subject.name)))
-
-
-def _plain(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+def _subjects(cells: Sequence[Cell]) -> list[str]:
+    return list(dict.fromkeys(cell.variant for cell in cells))

@@ -5,15 +5,15 @@ from __future__ import annotations
 import sys
 import wave
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from pebble.bench.impair.messages import OperatorReport, RecoveryRequest, TrialRequest
+from pebble.bench.impair.metrics import OperatorReport, RecoveryRequest, TrialRequest
 from pebble.bench.impair.network import ImpairedNetwork, open_network
 from pebble.bench.impair.operator import CLIP
-from pebble.bench.impair.plan import Subject
 from pebble.errors import PebbleError
 from pebble.media.pcm import to_bytes
 from pebble.media.speech import Speech
@@ -28,6 +28,30 @@ from pebble.transports.segments import sweep
 WIDTH, HEIGHT, FPS = 640, 480, 15  # as the original is configured
 CLIP_S = 0.5
 _AUDIO_RATE = 16_000
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """One robot under test. Encodings are requested by the operator; None: as the robot is configured."""
+
+    name: str
+    transport: str  # inside the robot: "mqtt" or "zenoh"
+    video: str | None = None
+    audio: str | None = None
+
+    @property
+    def form(self) -> str:
+        """Its encodings: the second part of its name."""
+        return self.name.partition(" ")[2]
+
+
+#: The robots are configured with the original's settings: JSON pictures and PCM.
+SUBJECTS = (
+    Subject("mqtt original", "mqtt"),
+    Subject("zenoh original", "zenoh"),
+    Subject("mqtt h264 opus", "mqtt", "h264", "opus"),
+    Subject("zenoh h264 opus", "zenoh", "h264", "opus"),
+)
 
 
 class ImpairedRobot:

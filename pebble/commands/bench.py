@@ -6,14 +6,14 @@ The command of a comparison follows from its declaration; those that do not run 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from pebble.bench.comparison import FOLDER, Comparison, Option
+from pebble.bench.comparison import FOLDER, Comparison, Option, as_word
 from pebble.commands import bench_robot
 from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
@@ -122,7 +122,7 @@ def command_of(about: Comparison) -> Callable[..., int]:
     def run(*, quick: bool = False, output: Path = FOLDER, **given: Any) -> int:
         from pebble.bench.engine import run as run_
 
-        wanted = {option.name: _parsed(option, given[_python(option)]) for option in about.options}
+        wanted = {option.key: _parsed(option, given[_python(option)]) for option in about.options}
         mode = next((mode for name, mode in about.modes.items() if wanted.get(name)), about)
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
@@ -132,13 +132,19 @@ def command_of(about: Comparison) -> Callable[..., int]:
     parameters |= {"quick": (Quick, False)} if about.has_quick else {}
     parameters["output"] = (Output, FOLDER)
     run.__doc__ = about.help
-    run.__annotations__ = {name: annotation for name, (annotation, _) in parameters.items()}
-    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    return with_parameters(
+        run,
         [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
             for name, (annotation, default) in parameters.items()
-        ]
+        ],
     )
+
+
+def with_parameters(run: Callable[..., int], parameters: Sequence[inspect.Parameter]) -> Callable[..., int]:
+    """The function with the parameters that typer is to see."""
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return run
 
 
@@ -154,8 +160,8 @@ def _annotation(about: Comparison, option: Option) -> Any:
 
 
 def _default(about: Comparison, option: Option) -> str:
-    full, quick = (budget.get(option.name) for budget in (about.full, about.quick))
-    if option.name == "variants":
+    full, quick = (budget.get(option.key) for budget in (about.full, about.quick))
+    if option.key == "variants" or (option.many and full == list(option.known)):
         return " [default: all]"
     if full is None or option.kind is bool:
         return ""
@@ -165,7 +171,7 @@ def _default(about: Comparison, option: Option) -> str:
 
 def _shown(value: Any) -> str:
     values = [value] if isinstance(value, (str, int, float)) else value
-    return ", ".join(one if isinstance(one, str) else f"{one:g}" for one in values)
+    return ", ".join(as_word(one) for one in values)
 
 
 def _parsed(option: Option, value: Any) -> Any:

@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
-from pebble.bench.comparison import FOLDER
+from pebble.bench import catalogue
 from pebble.client.connection import Target
-from pebble.commands.options import CaCert, Output, PasswordFile, split_names
+from pebble.commands.bench import command_of, with_parameters
+from pebble.commands.options import CaCert, PasswordFile
 from pebble.errors import PebbleError
 
 _INTO: Final = Path("impair")
 _SECONDS: Final = 120.0
-_SIMULATED: Final = frozenset({"trials", "subjects", "both_ways", "link", "window", "quick", "output"})
 
 
 def impair(
     context: typer.Context,
-    trials: Annotated[
-        str | None, typer.Option(help="Some of them, separated by commas. [default: all 16]", metavar="NAMES")
-    ] = None,
-    subjects: Annotated[
-        str | None,
-        typer.Option(help='Such as "mqtt original,zenoh h264 opus". [default: all four]', metavar="NAMES"),
-    ] = None,
-    both_ways: Annotated[bool, typer.Option("--both-ways", help="Impair the direction to the robot, too.")] = False,
-    link: Annotated[str, typer.Option(help="auto, namespaces (needs root) or proxy.", metavar="KIND")] = "auto",
-    window: Annotated[
-        float | None, typer.Option(help="Seconds of video, and of audio, per trial. [default: 8; quick: 4]")
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Four trials, short windows, all robots at the same time.")
-    ] = False,
-    output: Output = FOLDER,
+    *,
     robot: Annotated[
         str | None,
         typer.Option(help="Measure this real robot; the options below belong to it.", metavar="[SYSTEM/TYPE/]ID"),
@@ -48,6 +35,7 @@ def impair(
     compare: Annotated[bool, typer.Option("--compare", help="Only print the table of all labels.")] = False,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
+    **simulated: Any,
 ) -> int:
     """Robots behind an impaired network: the trials of the paper's section 4.2.
 
@@ -65,29 +53,21 @@ def impair(
         pebble impair --robot goob --url mqtt://192.168.1.2 --label 512k
         pebble impair --compare
     """
-    _check_options(context)
+    _check_options(context, simulated)
     if compare:
         return _print_table(into or _INTO)
     if robot is not None:
         target = Target(url=url, robot=robot, password_file=password_file, ca_cert=ca_cert)
         return _measure(target, label, into or _INTO, seconds or _SECONDS, media=not no_media, replace=replace)
-    from pebble.bench.impair.plan import NAMES, ImpairPlan
-    from pebble.bench.impair.run import run
-
-    return run(
-        ImpairPlan(
-            trials=() if trials is None else split_names(trials),
-            subjects=NAMES if subjects is None else split_names(subjects),
-            both_ways=both_ways,
-            network=link,
-            window_s=window,
-            quick=quick,
-            output=output,
-        )
-    )
+    return _simulated()(**simulated)
 
 
-def _check_options(context: typer.Context) -> None:
+def _simulated() -> Callable[..., int]:
+    """The command of the comparison, which measures simulated robots."""
+    return command_of(catalogue.find("impair"))
+
+
+def _check_options(context: typer.Context, simulated: Collection[str]) -> None:
     """Raises PebbleError for options that do not belong together."""
     given = []
     for name in context.params:
@@ -97,9 +77,9 @@ def _check_options(context: typer.Context) -> None:
     if "compare" in given:
         wrong, why = [name for name in given if name not in ("compare", "into")], "does not go with --compare"
     elif "robot" in given:
-        wrong, why = [name for name in given if name in _SIMULATED], "is for simulated robots, --robot for a real one"
+        wrong, why = [name for name in given if name in simulated], "is for simulated robots, --robot for a real one"
     else:
-        wrong, why = [name for name in given if name not in _SIMULATED], "is for a real robot: add --robot ID"
+        wrong, why = [name for name in given if name not in simulated], "is for a real robot: add --robot ID"
     if wrong:
         raise PebbleError(f"--{wrong[0].replace('_', '-')} {why}")
     for name in ("url", "label"):
@@ -126,7 +106,7 @@ def _measure(target: Target, label: str | None, into: Path, seconds: float, *, m
 def _print_table(into: Path) -> int:
     from rich.console import Console
 
-    from pebble.bench.impair.side_by_side import columns, table
+    from pebble.bench.impair.real_robot import columns, table
     from pebble.commands.show import printable
 
     found, console = columns(into), Console()
@@ -140,4 +120,12 @@ def _print_table(into: Path) -> int:
 
 
 def register(app: typer.Typer) -> None:
-    app.command("impair")(impair)
+    """The options of the comparison, and then those of a real robot."""
+
+    def run(context: typer.Context, **given: Any) -> int:
+        return impair(context, **given)
+
+    declared, own = inspect.signature(_simulated()), inspect.signature(impair, eval_str=True)
+    context, *real, _ = own.parameters.values()
+    run.__doc__ = impair.__doc__
+    app.command("impair")(with_parameters(run, [context, *declared.parameters.values(), *real]))

@@ -16,7 +16,7 @@ from rich.console import Console
 from pebble.bench import catalogue, engine, null
 from pebble.bench.aims import Aim, single, with_lost
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
-from pebble.bench.results import Cell, Judged, Results, load
+from pebble.bench.results import OVER_TIME, Cell, Judged, Results, load
 from pebble.bench.tables import COUNT, Claims, Grid, percentile_column
 from pebble.commands.bench import command_of
 from pebble.errors import PebbleError
@@ -125,6 +125,27 @@ def test_single_values_are_joined_as_declared(tmp_path: Path) -> None:
     assert measured(about, tmp_path).cells[0].figures == {"topics": 3, "last": 1}
 
 
+def test_a_curve_keeps_its_times_and_its_values(tmp_path: Path) -> None:
+    curve = Cell(variant="pipe", measure=f"way{OVER_TIME}", unit="us", rounds=[[0.0, 1.0], [7.0, 8.0]])
+    results = measured(declared(measure_round=lambda _round: [curve], full=Budget(1)), tmp_path)
+    assert results.cells[0].rounds == [[0.0, 1.0], [7.0, 8.0]]
+
+
+def test_tables_name_options_of_the_run(tmp_path: Path) -> None:
+    grid, console = Grid(title="times", rows=("size",), columns=(COUNT,)), Console(file=io.StringIO(), width=100)
+    about = declared(tables=(grid,), title_suffix=", for {seconds:g} s{quick}")
+    assert engine.run(about.run_of(quick=True, output=tmp_path, console=console)) == 0
+    assert isinstance(console.file, io.StringIO)
+    assert "times, for 2 s, quick" in console.file.getvalue()
+
+
+def test_an_option_may_set_a_value_of_another_name(tmp_path: Path) -> None:
+    option = Option(name="way", sets="variants", many=True, known=("pipe", "socket"), help="W.")
+    results = measured(declared(options=(option,)), tmp_path, variants=["socket"])
+    assert " ".join(results.command) == "pebble bench wake-up --way socket"
+    assert {cell.variant for cell in results.cells} == {"socket"}
+
+
 def test_variants_that_cannot_be_measured_are_left_out(tmp_path: Path) -> None:
     about = declared(missing=lambda name: "no sockets here" if name == "socket" else None)
     assert {cell.variant for cell in measured(about, tmp_path).cells} == {"pipe"}
@@ -135,12 +156,11 @@ def test_variants_that_cannot_be_measured_are_left_out(tmp_path: Path) -> None:
 def test_what_ended_a_run_early_is_raised_when_results_are_written(tmp_path: Path) -> None:
     def measure(round_: Round) -> Iterator[Cell]:
         yield from (case.cell("way", "us", [1.0]) for case in round_.cases())
-        round_.run.problem = PebbleError("ended early")
-        round_.run.notes.append("The run ended early.")
+        round_.run.problem = PebbleError("the run ended early: it broke")
 
     with pytest.raises(PebbleError, match="ended early"):
         engine.run(declared(measure_round=measure).run_of(output=tmp_path, quick=True))
-    assert load(tmp_path / "wake-up.json").assessment == ["The run ended early."]
+    assert load(tmp_path / "wake-up.json").assessment == ["The run ended early: it broke"]
 
 
 # -- null tests
@@ -228,7 +248,7 @@ def test_every_comparison_is_in_the_module_that_the_catalogue_names(name: str) -
     about = catalogue.find(name)
     assert about.name == name
     assert about.title
-    assert {option.name for option in about.options} <= {*about.full, "variants"}
+    assert {option.key for option in about.options} <= {*about.full, "variants"}
 
 
 # -- tables, sentences and aims

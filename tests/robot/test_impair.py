@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from pebble.bench import engine
 from pebble.bench.impair import cells
-from pebble.bench.impair.messages import TrialRequest
 from pebble.bench.impair.network import why_no_namespaces
-from pebble.bench.impair.plan import ImpairPlan
-from pebble.bench.impair.run import run
+from pebble.bench.impair.trials import IMPAIR
 from pebble.bench.results import load
 from pebble.rig.programs import children
 from tests.robot.rig import Rig, descendants
@@ -25,7 +24,7 @@ from tests.support import ROOT, until
 pytestmark = pytest.mark.alone  # whole robots
 
 MEASURES = (cells.SOUND, cells.PICTURES, cells.DRIVE, cells.HEARTBEAT_GAP)
-SHORT = {"alone_s": 0.3, "window_s": 1.0, "grace_s": 0.2, "off_s": 0.6, "clip_s": 20.0}
+SHORT = {"quiet_s": 0.1, "alone_s": 0.3, "window_s": 1.0, "grace_s": 0.2, "off_s": 0.6, "clip_s": 20.0}
 
 
 @pytest.fixture
@@ -45,13 +44,10 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     kind: str, subject: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
-    monkeypatch.setattr("pebble.bench.impair.run._QUIET_QUICK_S", 0.1)
-    monkeypatch.setattr(
-        ImpairPlan, "request", lambda _plan, one: TrialRequest(video=one.video, audio=one.audio, **SHORT)
-    )
     printed = io.StringIO()
-    plan = ImpairPlan(trials=["512k"], subjects=[subject], network=kind, window_s=1.0, quick=True, output=tmp_path)
-    assert run(plan, Console(file=printed, width=120)) == 0
+    given = {"trials": ["512k"], "variants": [subject], "link": kind, **SHORT}
+    console = Console(file=printed, width=120)
+    assert engine.run(IMPAIR.run_of(quick=True, output=tmp_path, console=console, **given)) == 0
     results = load(tmp_path / "impair.json")
     sound, video, drive, heartbeat, after_video, after_audio, clip = (
         results.find(subject, measure, trial="512k")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pebble.bench.impair.conditions import Condition, Shape
-from pebble.bench.impair.namespaces import obstacle
+from pebble.bench.impair.network import why_no_namespaces
 from pebble.bench.page_links import linked
 from pebble.bench.page_rig import Rig
 from tests.web.ears import PLAIN_MICROPHONE, TAP, compared, fake_microphone, played, recorded, write_voice
@@ -19,7 +19,7 @@ THIN = Condition("256 kbit/s, 2 %", up=Shape(kbit=256, loss=0.02), down=Shape(lo
 
 @pytest.fixture
 def far(tmp_path: Path) -> Iterator[Rig]:
-    if reason := obstacle():
+    if reason := why_no_namespaces():
         pytest.skip(f"no namespaces: {reason}")
     write_voice(voice := tmp_path / "voice.wav")
     with linked(THIN, "goob", flags=fake_microphone(voice)) as rig:

@@ -2,7 +2,8 @@
 
 import pytest
 
-from pebble.bench.impair.conditions import Handover, Schedule, Shape, chosen, trials
+from pebble.bench.impair.conditions import Handover, Schedule, Shape, chosen
+from pebble.bench.impair.trials import IMPAIR
 from pebble.errors import PebbleError
 
 NAMES = [
@@ -13,11 +14,11 @@ SATELLITE = Shape(delay_ms=25, handover=Handover(15, first_s=5, gap_ms=100, extr
 
 
 def test_the_trials_are_the_papers_and_two_profiles() -> None:
-    assert [condition.name for condition in trials()] == NAMES
+    assert [condition.name for condition in chosen()] == NAMES
 
 
 def test_names_match_their_shapes() -> None:
-    shapes = {condition.name: condition.up for condition in trials()}
+    shapes = {condition.name: condition.up for condition in chosen()}
     assert shapes["base-start"] == shapes["base-end"] == Shape()
     assert shapes["512k"] == Shape(kbit=512)
     assert shapes["10%"] == Shape(loss=0.1)
@@ -25,20 +26,20 @@ def test_names_match_their_shapes() -> None:
 
 
 def test_only_the_uplink_is_shaped_unless_both_ways_are_asked_for() -> None:
-    assert {condition.down for condition in trials()[:14]} == {Shape()}
-    assert all(condition.down == condition.up for condition in trials(both_ways=True)[:14])
+    assert {condition.down for condition in chosen()[:14]} == {Shape()}
+    assert all(condition.down == condition.up for condition in chosen(both_ways=True)[:14])
 
 
 def test_the_profiles_have_their_own_downlink() -> None:
-    assert trials()[14:] == trials(both_ways=True)[14:]
-    assert all(condition.up.timed and condition.down.timed for condition in trials()[14:])
-    assert not any(condition.up.timed for condition in trials()[:14])
+    assert chosen()[14:] == chosen(both_ways=True)[14:]
+    assert all(condition.up.timed and condition.down.timed for condition in chosen()[14:])
+    assert not any(condition.up.timed for condition in chosen()[:14])
 
 
 def test_some_trials_can_be_chosen() -> None:
     assert [each.name for each in chosen(["base-end", "256k"])] == ["256k", "base-end"]
-    with pytest.raises(PebbleError, match=r"no trial '300k': choose from base-start, 1024k"):
-        chosen(["256k", "300k"])
+    with pytest.raises(PebbleError, match=r"--trials: unknown 300k: there are base-start, 1024k"):
+        IMPAIR.run_of(trials=["256k", "300k"])
 
 
 @pytest.mark.parametrize("problem", [{"kbit": 0}, {"loss": 1.0}, {"loss": -0.1}, {"delay_ms": -1}])

@@ -5,17 +5,19 @@ from __future__ import annotations
 import io
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from rich.console import Console
 
 from pebble.bench.impair import cells, metrics
 from pebble.bench.impair.cells import Trial, cells_of, over_time
-from pebble.bench.impair.messages import ClipCommand, Command, Heartbeat, Picture, Record, Sound, Window
+from pebble.bench.impair.metrics import ClipCommand, Command, Heartbeat, Picture, Record, Sound, Window
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.plan import NAMES, QUICK, ImpairPlan
-from pebble.bench.impair.report import assessment, tables
-from pebble.bench.results import Cell, Results
+from pebble.bench.impair.robots import SUBJECTS, ImpairedRobot
+from pebble.bench.impair.trials import IMPAIR, NAMES, QUICK, conditions, groups
+from pebble.bench.results import Cell
 from pebble.errors import PebbleError
 from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry, motors_entry
@@ -25,7 +27,7 @@ WINDOW = Window(10 * S, 20 * S, first_s=0.5)
 
 
 def lines_of(cells: list[Cell]) -> list[str]:
-    return [str(one) for one in assessment(cells)]
+    return [str(one) for one in IMPAIR.assessed(cells)]
 
 
 def packet(number: int, late_ms: float = 50, at_ms: float | None = None) -> Sound:
@@ -297,47 +299,48 @@ def test_transports_are_compared_where_both_were_tried() -> None:
     assert not any("zenoh and mqtt" in sentence for sentence in lines_of(cells_of(both[::2], fps=10)))
 
 
-@pytest.mark.parametrize(("width", "number"), [(80, 4), (105, 6), (120, 6)])
-def test_the_tables_fit(width: int, number: int) -> None:
+def test_the_tables_fit_a_terminal() -> None:
     tried = [trial(name, condition) for condition in ("wifi-power-save", "64k+5%") for name in NAMES]
-    results = Results(bench="impair", cells=cells_of(tried, fps=10), options={"link_words": "a proxy", "window_s": 8.0})
-    console = Console(file=io.StringIO(), width=width)
-    shown = list(tables(results, width))
-    assert len(shown) == number
+    console = Console(file=io.StringIO(), width=80)
+    shown = IMPAIR.shown(cells_of(tried, fps=10))
+    assert len(shown) == 4
     for table in shown:
-        assert console.measure(table).maximum <= width
-        assert "a proxy" in str(table.title)
+        assert console.measure(table).maximum <= 80
+        assert table.row_count == 8
 
 
-# -- plans
+# -- options
 
 
 @pytest.mark.parametrize(
-    "plan",
+    "given",
     [
-        ImpairPlan(trials=["512"]),
-        ImpairPlan(subjects=["pigeon"]),
-        ImpairPlan(subjects=[]),
-        ImpairPlan(network="string"),
-        ImpairPlan(window_s=0.1),
-        ImpairPlan(window_s=math.nan),
+        {"trials": ["512"]},
+        {"variants": ["pigeon"]},
+        {"variants": []},
+        {"link": "string"},
+        {"window_s": 0.1},
+        {"window_s": math.nan},
     ],
 )
-def test_invalid_options_are_refused_before_anything_starts(plan: ImpairPlan) -> None:
+def test_invalid_options_are_refused_before_anything_starts(given: dict[str, Any]) -> None:
     with pytest.raises(PebbleError):
-        plan.check()
+        IMPAIR.run_of(**given)
 
 
-def test_a_full_plan_groups_transports_and_a_quick_one_all_subjects() -> None:
-    assert [[one.name for one in group] for group in ImpairPlan().groups()] == [list(NAMES[:2]), list(NAMES[2:])]
-    assert [len(group) for group in ImpairPlan(quick=True).groups()] == [4]
-    assert tuple(condition.name for condition in ImpairPlan(quick=True).conditions()) == QUICK
-    assert len(ImpairPlan().conditions()) == 16
+def test_a_full_run_groups_transports_and_a_quick_one_all_subjects() -> None:
+    full, quick = IMPAIR.run_of(), IMPAIR.run_of(quick=True)
+    robots = [cast(ImpairedRobot, SimpleNamespace(subject=subject)) for subject in SUBJECTS]
+    assert [[one.subject.name for one in group] for group in groups(full, robots)] == [list(NAMES[:2]), list(NAMES[2:])]
+    assert [len(group) for group in groups(quick, robots)] == [4]
+    assert tuple(condition.name for condition in conditions(quick)) == QUICK
+    assert len(conditions(full)) == 16
 
 
-def test_the_command_line_repeats_the_plan() -> None:
-    assert ImpairPlan().command() == ["pebble", "impair", "--link", "auto", "--window", "8"]
-    plan = ImpairPlan(trials=["256k", "1%"], subjects=[NAMES[3]], both_ways=True, network="proxy", quick=True)
-    assert plan.command()[4:] == [
-        *("--window", "4", "--trials", "256k,1%", "--subjects", "zenoh h264 opus", "--both-ways", "--quick")
+def test_the_command_line_repeats_the_run() -> None:
+    assert IMPAIR.run_of().command == ["pebble", "impair", "--link", "auto", "--window", "8"]
+    run = IMPAIR.run_of(trials=["256k", "1%"], variants=[NAMES[3]], both_ways=True, link="proxy", quick=True)
+    assert run.command == [
+        *("pebble", "impair", "--trials", "256k,1%", "--subjects", "zenoh h264 opus", "--both-ways"),
+        *("--link", "proxy", "--window", "4", "--quick"),
     ]

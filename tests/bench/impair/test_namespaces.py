@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.impair import namespaces
+from pebble.bench.impair import network as networks
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import open_network
 from pebble.errors import PebbleError
@@ -76,15 +76,15 @@ def test_the_namespaces_have_no_other_connection() -> None:
 
 
 def test_a_missing_program_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(namespaces, "_SBIN", "/nowhere")
+    monkeypatch.setattr(networks, "_SBIN", "/nowhere")
     monkeypatch.setenv("PATH", "/nowhere")
-    assert namespaces.obstacle.__wrapped__() == "ip is not installed: apt-get install iproute2"
+    assert networks.why_no_namespaces.__wrapped__() == "ip is not installed: apt-get install iproute2"
 
 
 def test_namespaces_that_fail_are_an_error_and_not_replaced_by_a_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(namespaces, "_TABLE", "nonsense")
+    monkeypatch.setattr(networks, "_TABLE", "nonsense")
     with pytest.raises(PebbleError, match="namespaces do not work here: nft -f -: "):
-        namespaces.obstacle.__wrapped__()
+        networks.why_no_namespaces.__wrapped__()
 
 
 def test_a_user_without_permission_gets_the_reason() -> None:

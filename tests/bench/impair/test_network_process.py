@@ -6,13 +6,13 @@ import signal
 import pytest
 
 from pebble.bench.impair import network as module
-from pebble.bench.impair.network import NetworkProcess
+from pebble.bench.impair.network import ProxyNetwork
 from pebble.errors import PebbleError
 from pebble.rig import worker
 
 
 def test_a_late_answer_is_not_taken_for_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    process = NetworkProcess("network", "pebble.bench.impair.proxy_process")
+    process = ProxyNetwork()
     monkeypatch.setattr(module, "_ANSWER_S", 0.1)
     monkeypatch.setattr(worker, "_END_S", 0.1)
     os.kill(process.pid, signal.SIGSTOP)

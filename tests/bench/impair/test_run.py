@@ -12,12 +12,13 @@ from typing import Self
 import pytest
 from rich.console import Console
 
-from pebble.bench.impair import run as module
+from pebble.bench import engine
+from pebble.bench.impair import trials as module
 from pebble.bench.impair.conditions import Condition
-from pebble.bench.impair.messages import ClipCommand, OperatorReport, Record, RecoveryRequest, TrialRequest, Window
+from pebble.bench.impair.metrics import ClipCommand, OperatorReport, Record, RecoveryRequest, TrialRequest, Window
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.plan import ImpairPlan, Subject
-from pebble.bench.impair.run import run
+from pebble.bench.impair.robots import Subject
+from pebble.bench.impair.trials import IMPAIR
 from pebble.bench.results import load
 from pebble.errors import PebbleError
 
@@ -100,17 +101,20 @@ class FakeTestBed:
         self._log.append("hurry")
 
 
-PLAN = ImpairPlan(trials=["1024k", "5%"], subjects=["mqtt original", "zenoh original", "mqtt h264 opus"])
-
-
 def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int, network: str = "proxy") -> tuple[list[str], str]:
     log: list[str] = []
     printed = io.StringIO()
     monkeypatch.setattr(module, "TestBed", FakeTestBed(log, trials))
     monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
-    plan = ImpairPlan(trials=PLAN.trials, subjects=PLAN.subjects, network=network, output=folder)
+    run = IMPAIR.run_of(
+        trials=["1024k", "5%"],
+        variants=["mqtt original", "zenoh original", "mqtt h264 opus"],
+        link=network,
+        output=folder,
+        console=Console(file=printed, width=120),
+    )
     try:
-        run(plan, Console(file=printed, width=120))
+        engine.run(run)
     except PebbleError as error:
         log.append(str(error))
     return log, printed.getvalue()
@@ -135,8 +139,10 @@ def test_the_file_records_the_conditions(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert (results.bench, results.options["link"], results.options["window_s"]) == ("impair", "proxy", 8.0)
     marks = [mark.partition("@")[0] for mark in str(results.options["marks"]).split(";")]
     assert marks == ["1024k", "5%"]
-    assert results.command[:4] == ["pebble", "impair", "--link", "proxy"]
+    assert "--link proxy" in " ".join(results.command)
     assert results.options["why_proxy"] is None
+    assert {len(cell.rounds) for cell in results.cells if "trial" in cell.params} == {1}
+    assert {len(cell.rounds) for cell in results.cells if "trial" not in cell.params} <= {2}  # curves
 
 
 def test_an_automatic_proxy_is_explained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -145,7 +151,7 @@ def test_an_automatic_proxy_is_explained(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert "A proxy replaces the network namespaces: not permitted" in printed
     results = load(tmp_path / "impair.json")
     assert (results.options["link"], results.options["why_proxy"]) == ("proxy", "not permitted")
-    assert results.command[:4] == ["pebble", "impair", "--link", "proxy"]
+    assert "--link proxy" in " ".join(results.command)
 
 
 def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
