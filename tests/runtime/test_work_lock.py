@@ -6,7 +6,7 @@ from pebble.runtime.work_lock import WorkLock
 from tests.support import until
 
 
-def test_nobody_else_gets_in_before_the_own_thread_once_that_waits() -> None:
+def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
     lock, ends = WorkLock(), threading.Event()
 
     def work() -> None:
@@ -26,7 +26,7 @@ def test_nobody_else_gets_in_before_the_own_thread_once_that_waits() -> None:
     assert lock.try_enter()
 
 
-def test_a_lock_that_is_shut_lets_nobody_in() -> None:
+def test_a_lock_that_is_shut_is_never_entered() -> None:
     lock = WorkLock()
     lock.shut()
     assert not lock.try_enter()

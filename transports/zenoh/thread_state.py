@@ -12,11 +12,11 @@ import ctypes
 import threading
 
 _ensure = ctypes.pythonapi.PyGILState_Ensure
-_kept = threading.local()  # part of the state: empty in a new one
+_remembered = threading.local()  # part of the state: empty in a new one
 
 
 def keep_thread_state() -> None:
     """Let the calling thread keep its state until it ends; to be called at the beginning of each callback."""
-    if not hasattr(_kept, "since"):
+    if not hasattr(_remembered, "it"):
         _ensure()
-        _kept.since = True
+        _remembered.it = True

@@ -12,7 +12,7 @@ from tests.transports.zenoh_net import HubProcess
 SESSIONS, MESSAGES = 10, 20
 
 
-def test_few_states_are_kept_however_many_messages_and_sessions(
+def test_there_are_few_states_however_many_messages_and_sessions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, received, ensure = list[None](), list[Message](), thread_state._ensure
