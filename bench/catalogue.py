@@ -24,6 +24,7 @@ MODULES: Final = {
     "estop": "estop",
     "fleet": "fleet",
     "traffic": "traffic",
+    "page": "page",
     "impair": "impair.trials",
 }
 

@@ -154,6 +154,7 @@ class Comparison:
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
     pictures: Sequence[Drawing] = ()
 
+    folder: Path = FOLDER  # of the results, by default
     is_null: bool = False  # one variant in three roles: see pebble.bench.null
     modes: Mapping[str, Comparison] = field(default_factory=dict)  # what is run instead if this option is given
     words: Sequence[str] = ()  # what starts its command line after ``pebble``; by default ``bench NAME``

@@ -11,26 +11,22 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.console import Console
 from rich.table import Table
 
 from pebble.bench import page_cases as cases
 from pebble.bench import page_links as links
-from pebble.bench.engine import check_folder
+from pebble.bench.aims import outcome
+from pebble.bench.comparison import Budget, Case, Comparison, Option
 from pebble.bench.page_rig import Rig, rig
-from pebble.bench.results import Cell, Results, Stopwatch, percentile
+from pebble.bench.results import Cell, Judged, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
-from pebble.runtime.signals import interrupted_by_signals
 
-FOLDER = Path("build/page")
 IDLE_LOAD = 0.5  # of the machine, for figures that count
-TRIES = 3
-_QUICK = 0.25  # of the samples
 _LOAD_STEP_S = 5.0
 
 
@@ -56,7 +52,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class PageCase:
     """Rows that are measured together."""
 
     name: str
@@ -91,12 +87,12 @@ _PICTURES = {"json": "17 / 24", "pbvd": "14 / 18", "pbvz": "17 / 22", "h264": "1
 _V, _R = f"{cases.VIEWERS} viewers", f"{cases.ROBOTS_SHOWN} robots"
 
 CASES = (
-    Case("keys", cases.keys, (
+    PageCase("keys", cases.keys, (
         Row("key to MQTT", "ms", Goal(2, 5), "0.93 / 1.35"),
         Row("key to motors", "ms", Goal(10, 20), "6.2 / 9.4"),
         Row("release to stop", "ms", _STOP, "7 / 18"),
     ), _goob),
-    Case("interruptions", cases.interruptions, (
+    PageCase("interruptions", cases.interruptions, (
         Row("blur to stop", "ms", _STOP, "12"),
         Row("hidden to stop", "ms", _STOP, "48"),
         Row("frozen to stop", "ms", _GONE, "250"),
@@ -105,13 +101,13 @@ CASES = (
         Row("server frozen to stop", "ms", _SERVER, "723"),
         Row("server killed to stop", "ms", _SERVER, "739"),
     ), _goob),
-    Case("stops", cases.stops, (
+    PageCase("stops", cases.stops, (
         Row("STOP to motors", "ms", Goal(None, 50), "12-28"),
         Row("STOP to confirmed", "ms", Goal(None, 300)),
         Row("STOP ALL to motors", "ms", Goal(None, 150), "52-67"),
         Row("STOP ALL to confirmed", "ms", Goal(None, 300)),
     )),
-    Case("pictures", cases.pictures, tuple(
+    PageCase("pictures", cases.pictures, tuple(
         row
         for encoding, prototype in _PICTURES.items()
         for row in (
@@ -119,38 +115,38 @@ CASES = (
             Row(f"scene, {encoding} lost", "%", Goal(0, 0), "0"),
         )
     ), _goob_alone),
-    Case("loading", cases.loading, (
+    PageCase("loading", cases.loading, (
         Row("first robot", "ms", Goal(None, 1000), "400-700"),
         Row("first picture", "ms", Goal(None, 3000), "1700-2500"),
     )),
-    Case("files", cases.files, (
+    PageCase("files", cases.files, (
         Row("page, kB", "kB"),
         Row("page, kB gz", "kB", Goal(60), "14"),
         Row("with other screens, kB gz", "kB"),
         Row("requests", ""),
         Row("foreign hosts", "", Goal(0), "0"),
     ), _goob),
-    Case("driving", cases.driving, (
+    PageCase("driving", cases.driving, (
         Row("1 viewer, driving: CPU", "%", Goal(8), "5.0"),
         Row("1 viewer, driving: RSS", "MB", Goal(60), "36"),
     ), _goob),
-    Case("viewers", cases.viewers, (
+    PageCase("viewers", cases.viewers, (
         Row(f"{_V}: CPU", "%", Goal(25), "5.2"),
         Row(f"{_V}: RSS", "MB", Goal(80), "37"),
         Row("frames of each viewer", "%", Goal(at_least=95), "50"),
         Row("robot's uplink, of that with 1 viewer", "%", Goal(110)),
     ), _goob),
-    Case("crowd", cases.crowd, (
+    PageCase("crowd", cases.crowd, (
         Row(f"{_R}: ms an update", "ms", Goal(8)),
         Row(f"{_R}: CPU", "%", Goal(10)),
         Row(f"{_R}: RSS", "MB", Goal(80)),
     ), _lamp),
-    Case("thin link", links.pictures, (
+    PageCase("thin link", links.pictures, (
         Row("2 Mbit/s: picture age", "ms", Goal(250), "183 / 209"),
         Row("2 Mbit/s: offered", "Mbit/s", Goal(at_least=3.8), "4.2"),
         Row("2 Mbit/s: drawn a second", ""),
     ), _thin),
-    Case("far link", links.driving, (
+    PageCase("far link", links.driving, (
         Row("256 kbit/s: drive", "ms", Goal(None, 110)),
         Row("256 kbit/s: drive, arrived", "%"),
         Row("256 kbit/s: gestures interrupted", ""),
@@ -160,72 +156,26 @@ CASES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PagePlan:
-    """The options of a run."""
-
-    only: Sequence[str] = ()  # names of cases; none: all
-    tries: int = TRIES
-    quick: bool = False  # one try with fewer samples
-    wait_s: float = 0.0  # at most, for an idle machine, before each try
-    output: Path = FOLDER
-
-    def check(self) -> None:
-        """Raises PebbleError naming an invalid option."""
-        unknown = set(self.only) - {case.name for case in CASES}
-        if unknown:
-            raise PebbleError(f"no case {min(unknown)!r}: choose from {', '.join(case.name for case in CASES)}")
-        check_folder(self.output)
-
-    def chosen(self) -> list[Case]:
-        return [case for case in CASES if not self.only or case.name in self.only]
-
-    def command(self) -> list[str]:
-        """The command line that repeats the run."""
-        only = ["--only", ",".join(self.only)] if self.only else []
-        return ["pebble", "bench", "page", *only, *(["--quick"] if self.quick else ["--tries", str(self.tries)])]
+ROWS = {row.key: row for case in CASES for row in case.rows}
 
 
-@dataclass(slots=True)
-class Tried:
-    """The samples of one case: of each try, with the load of the machine before it."""
-
-    case: Case
-    loads: list[float] = field(default_factory=list)
-    tries: list[cases.Samples] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-
-
-def run(plan: PagePlan, console: Console | None = None) -> int:
-    """Measures, prints and writes; returns 0 if every case has results. Raises PebbleError for invalid options."""
-    console = console or Console()
-    plan.check()
-    watch = Stopwatch("page", plan.command(), {"tries": plan.tries, "quick": plan.quick})
-    done: list[Tried] = []
-    with interrupted_by_signals():
-        for case in plan.chosen():
-            done.append(_tried(case, plan, console))
-            console.print(table([done[-1]]))
-    _write(
-        watch.results([cell for one in done for cell in cells_of(one)], _notes(done), quick=plan.quick), plan, console
-    )
-    return int(any(not one.tries for one in done))
-
-
-def _tried(case: Case, plan: PagePlan, console: Console) -> Tried:
-    tried = Tried(case)
-    for number in range(1 if plan.quick else plan.tries):
-        load = _idle(plan.wait_s)
-        busy = "" if load < IDLE_LOAD else ", busy: read the figures as upper bounds"
-        console.print(f"{case.name}, try {number + 1}: load {load:.2f}{busy}", highlight=False)
-        try:
-            with case.setting() as made:
-                tried.tries.append(case.measure(made, _QUICK if plan.quick else 1.0))
-            tried.loads.append(load)
-        except PebbleError as error:
-            tried.problems.append(str(error))
-            console.print(f"{case.name}: {error}", style="red", highlight=False, markup=False)
-    return tried
+def measure(case: Case) -> Iterator[Cell]:
+    """One try. One that fails is noted, and its rows are empty."""
+    run, name = case.run, str(case.condition["case"])
+    about = next(one for one in CASES if one.name == name)
+    load = _idle(run["wait"])
+    busy = "" if load < IDLE_LOAD else ", busy: read the figures as upper bounds"
+    run.notes.append(f"{name}, try {case.number + 1}: load {load:.2f}{busy}")
+    run.console.print(run.notes[-1], highlight=False)
+    samples: cases.Samples = {}
+    try:
+        with about.setting() as made:
+            samples = about.measure(made, run["scale"])
+    except PebbleError as error:
+        run.notes.append(f"{name}, try {case.number + 1}: {error}")
+        run.console.print(run.notes[-1], style="red", highlight=False, markup=False)
+    for row in about.rows:
+        yield case.cell(row.key, row.unit, samples.get(row.key, []))
 
 
 def _idle(wait_s: float) -> float:
@@ -279,36 +229,71 @@ def shown(goal: Goal, samples: Sequence[float]) -> str:
     return f"{figure(percentile(samples, 50))} / {figure(percentile(samples, 95))}{low}"
 
 
-def table(done: Sequence[Tried]) -> Table:
+def tables(cells: Sequence[Cell]) -> Iterator[Table]:
     """A line for each row: the best try, its goal, the prototype's figure, and the other tries."""
-    rows = plain_table(
-        "p50 / p95 of the best try", ["", "unit", "measured", "n", "goal", "", "prototype", "others"], left=2
-    )
-    for tried in done:
-        for row in tried.case.rows:
-            best, *others = ranked(row, [one.get(row.key, []) for one in tried.tries]) or [()]
-            state = {None: "", True: "met", False: "MISSED"}[met(row.goal, best) if best else None]
-            measured = shown(row.goal, best) if best else "not measured"
-            rest = "; ".join(shown(row.goal, one) for one in others)
-            rows.add_row(row.key, row.unit, measured, str(len(best)), words(row.goal), state, row.prototype, rest)
-    return rows
+    heads = ["", "unit", "measured", "n", "goal", "", "prototype", "others"]
+    table, before = plain_table("p50 / p95 of the best try", heads, left=2), None
+    for cell in cells:
+        row = ROWS[cell.measure]
+        best, *others = ranked(row, cell.rounds) or [()]
+        state = {None: "", True: "met", False: "MISSED"}[met(row.goal, best) if best else None]
+        measured = shown(row.goal, best) if best else "not measured"
+        rest = "; ".join(shown(row.goal, one) for one in others)
+        if before not in (None, cell.params["case"]):
+            table.add_section()
+        before = cell.params["case"]
+        table.add_row(row.key, row.unit, measured, str(len(best)), words(row.goal), state, row.prototype, rest)
+    yield table
 
 
-def cells_of(tried: Tried) -> Iterator[Cell]:
-    """One cell for each row; a round is a try."""
-    for row in tried.case.rows:
-        rounds = [one.get(row.key, []) for one in tried.tries]
-        yield Cell(variant="page", params={"case": tried.case.name}, measure=row.key, unit=row.unit, rounds=rounds)
+def goals(cells: Sequence[Cell]) -> Iterator[Judged]:
+    """The goals as aims, each judged by the best try."""
+    for cell in cells:
+        row = ROWS[cell.measure]
+        best = next(iter(ranked(row, cell.rounds)), ())
+        if row.goal != NO_GOAL:
+            what = f"{row.key}, p50 / p95 {words(row.goal)} {row.unit}".strip()
+            measured = f"{shown(row.goal, best)} {row.unit}".strip() if best else "not measured"
+            yield Judged(
+                what=what, outcome=outcome(bool(best and met(row.goal, best)), judged=bool(best)), measured=measured
+            )
 
 
-def _notes(done: Sequence[Tried]) -> list[str]:
-    loads = [
-        f"{one.case.name}: load before {', '.join(f'{load:.2f}' for load in one.loads) or 'no try'}" for one in done
-    ]
-    return [*loads, *(f"{one.case.name}: {problem}" for one in done for problem in one.problems)]
+def _is_complete(cells: Sequence[Cell]) -> bool:
+    """Whether a try of each case has ended well."""
+    measured = {cell.params["case"] for cell in cells if cell.samples}
+    return all(cell.params["case"] in measured for cell in cells)
 
 
-def _write(results: Results, plan: PagePlan, console: Console) -> None:
-    path = plan.output / "page.json"
-    results.save(path)
-    console.print(f"Written: {path}", style="dim", highlight=False, soft_wrap=True)
+PAGE = Comparison(
+    name="page",
+    title="The operator page",
+    what="What a driver feels in a browser, and what the page's server costs, beside the goals.",
+    help="""The operator page in a browser: what a driver feels, and what its server costs.
+
+    From a key to the motors of a simulated robot, from whatever interrupts a driver to their stop, from the camera to
+    the screen; many viewers, many robots, slow links. Needs mosquitto and its clients, chromium, the extra dev, and
+    root for the links.
+
+    \b
+        pebble bench page
+        pebble bench page --quick --only keys,stops
+    """,
+    options=(
+        Option(name="only", sets="cases", many=True, known=[case.name for case in CASES], metavar="NAMES",
+               recorded=False, help="Some of the cases, separated by commas."),
+        Option(name="tries", sets="rounds", kind=int, least=1, most=10_000,
+               help="How often each case is measured; the best time counts."),
+        Option(name="wait", kind=float, least=0, help="Seconds to wait, at most, for an idle machine."),
+    ),
+    full=Budget(1800, cases=[case.name for case in CASES], rounds=3, wait=0.0, scale=1.0),
+    quick=Budget(300, rounds=1, scale=0.25),  # of the samples
+    folder=Path("build/page"),
+    variants=("page",),
+    conditions=lambda run: [{"case": case.name} for case in CASES if case.name in run["cases"]],
+    measure=measure,
+    tables=(tables,),
+    assessment=(goals,),
+    complete=_is_complete,
+    reported=None,
+)  # fmt: skip

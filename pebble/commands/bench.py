@@ -130,7 +130,7 @@ def command_of(about: Comparison) -> Callable[..., int]:
         _python(option): (_annotation(about, option), None) for option in about.options
     }
     parameters |= {"quick": (Quick, False)} if about.has_quick else {}
-    parameters["output"] = (Output, FOLDER)
+    parameters["output"] = (Output, about.folder)
     run.__doc__ = about.help
     return with_parameters(
         run,

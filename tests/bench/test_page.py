@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import io
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 from rich.console import Console
 
-from pebble.bench.page import CASES, Case, Goal, PagePlan, Row, Tried, cells_of, met, ranked, shown, table, words, worst
+from pebble.bench import engine
+from pebble.bench import page as module
+from pebble.bench.page import CASES, PAGE, Goal, PageCase, Row, met, ranked, shown, words, worst
 from pebble.bench.page_cases import lost_percent
+from pebble.bench.page_rig import Rig
+from pebble.bench.results import load
 from pebble.errors import PebbleError
 
 KEY = Row("key to MQTT", "ms", Goal(2, 5), "0.93 / 1.35")
@@ -57,21 +64,36 @@ def test_goals_and_figures_as_text() -> None:
     assert shown(Goal(8), [4.2]) == "4.20"
 
 
-def text(tried: Tried) -> list[str]:
+def test_the_table_shows_the_best_try_its_goal_the_prototype_and_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = iter([{"key to MQTT": [3.0, 6.0]}, {"key to MQTT": [1.0, 2.0]}])
+    case = PageCase("keys", lambda _rig, _scale: next(tries), (KEY, FRAMES), lambda: nullcontext(cast(Rig, None)))
+    monkeypatch.setattr(module, "CASES", (case,))
     console = Console(file=io.StringIO(), width=200)
-    console.print(table([tried]))
+    assert engine.run(PAGE.run_of(rounds=2, output=tmp_path, console=console)) == 0
     assert isinstance(console.file, io.StringIO)
-    return [" ".join(line.split()) for line in console.file.getvalue().splitlines()]
-
-
-def test_the_table_shows_the_best_try_its_goal_the_prototype_and_the_others() -> None:
-    case = Case("keys", lambda _rig, _scale: {}, (KEY, FRAMES))
-    tried = Tried(case, tries=[{"key to MQTT": [3.0, 6.0]}, {"key to MQTT": [1.0, 2.0]}])
-    lines = text(tried)
+    lines = [" ".join(line.split()) for line in console.file.getvalue().splitlines()]
     assert "key to MQTT ms 1.00 / 2.00 2 ≤ 2 / 5 met 0.93 / 1.35 3.00 / 6.00" in lines
-    assert "frames of each viewer % not measured 0 ≥ 95 each –" in lines
-    (key, frames) = cells_of(tried)
-    assert (key.rounds, frames.rounds) == ([[3.0, 6.0], [1.0, 2.0]], [[], []])
+    assert "frames of each viewer % not measured 0 ≥ 95 each 50" in lines
+    results = load(tmp_path / "page.json")
+    assert [cell.rounds for cell in results.cells] == [[[3.0, 6.0], [1.0, 2.0]], [[], []]]
+    assert [aim.outcome for aim in results.aims] == ["met", "not judged"]
+    assert results.assessment[1].startswith("keys, try 2: load ")
+
+
+def test_a_case_that_fails_is_noted_and_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_rig: Rig, _scale: float) -> dict[str, list[float]]:
+        raise PebbleError("no picture")
+
+    failing = PageCase("pictures", fail, (FRAMES,), lambda: nullcontext(cast(Rig, None)))
+    working = replace(failing, name="keys", measure=lambda _rig, _scale: {KEY.key: [1.0]}, rows=(KEY,))
+    monkeypatch.setattr(module, "CASES", (failing, working))
+    console = Console(file=io.StringIO(), width=200)
+    assert engine.run(PAGE.run_of(quick=True, output=tmp_path, console=console)) == 1
+    results = load(tmp_path / "page.json")
+    assert [cell.samples for cell in results.cells] == [[], [1.0]]
+    assert "pictures, try 1: no picture" in results.assessment
 
 
 def test_every_row_is_named_once() -> None:
@@ -79,11 +101,12 @@ def test_every_row_is_named_once() -> None:
     assert len(set(keys)) == len(keys)
 
 
-def test_an_unknown_case_is_named(tmp_path: Path) -> None:
-    with pytest.raises(PebbleError, match="no case 'keyz': choose from keys, "):
-        PagePlan(only=["keyz"], output=tmp_path).check()
-    assert [case.name for case in PagePlan(only=["keys"], output=tmp_path).chosen()] == ["keys"]
-    assert PagePlan(only=["keys"], quick=True).command() == ["pebble", "bench", "page", "--only", "keys", "--quick"]
+def test_an_unknown_case_is_named() -> None:
+    with pytest.raises(PebbleError, match="--only: unknown keyz: there are keys, "):
+        PAGE.run_of(cases=["keyz"])
+    run = PAGE.run_of(cases=["keys"], quick=True)
+    assert PAGE.conditions(run) == [{"case": "keys"}]
+    assert " ".join(run.command) == "pebble bench page --only keys --tries 1 --wait 0 --quick"
 
 
 def test_lost_pictures_are_counted_by_their_numbers() -> None:

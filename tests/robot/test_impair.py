@@ -83,7 +83,7 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
         command, cwd=ROOT, env={**os.environ, "TMPDIR": str(tmp_path)}, stdout=subprocess.DEVNULL
     )
     try:
-        assert until(lambda: len(list(tmp_path.glob("pbl-*/*/operator.log"))) == 1, 60), "the robot does not start"
+        assert until(lambda: len(list(tmp_path.glob("pbl-*/the operator*.log"))) == 1, 60), "the robot does not start"
         started = descendants(process.pid)
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 130
