@@ -8,9 +8,11 @@ command is, bounds a queue, or stops the motors when commands end.
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import serial
@@ -19,8 +21,11 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.contract import DRIVE, INCOMING, ONLINE, OUTGOING, STATUS, TOUCH_SENSORS
 
-_HEARTBEAT_S = 1.0
 _BAUD = 460_800
+_HEARTBEAT_S = 0.25  # as a robot of ours, so that both carry the same
+_STATUS_EVERY = 4  # heartbeats
+_READ_S = 1.0
+_PIECE = 4096  # bytes
 _TOUCH = ("a0", "a1", "a2")
 
 
@@ -47,15 +52,16 @@ def bridge(remote_port: int, local_port: int, base: str) -> None:
     for one in (remote, local):
         one.loop_start()
     state = {"value": {"services": {"bridge": {"state": "ready"}}}}
-    while True:
-        remote.publish(STATUS.topic(base), json.dumps(state), 1, True)
-        remote.publish(ONLINE.topic(base), json.dumps({"t": round(1000 * time.time())}), 1)
+    for number in itertools.count():
+        if number % _STATUS_EVERY == 0:
+            remote.publish(STATUS.topic(base), json.dumps(state), 1, True)
+        remote.publish(ONLINE.topic(base), json.dumps({"t": round(1000 * time.time())}), 1, True)
         time.sleep(_HEARTBEAT_S)
 
 
-def serial_bridge(local_port: int, base: str, device: str, baud: int) -> None:
-    """Writes a line for each drive command, and publishes each report of the touch sensors."""
-    port = serial.Serial(device, baud)
+def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> None:
+    """Writes a line for each drive command, and with ``reports`` publishes each one of the touch sensors."""
+    port = serial.Serial(device, _BAUD, timeout=_READ_S)
 
     def drive(_client: Client, _data: Any, message: MQTTMessage) -> None:
         wanted = json.loads(message.payload)
@@ -65,19 +71,29 @@ def serial_bridge(local_port: int, base: str, device: str, baud: int) -> None:
     local = client(local_port, DRIVE.topic(base))
     local.on_message = drive
     local.loop_start()
-    for line in port:
+    for line in _lines(port):
+        if not reports:
+            continue
         fields = dict(token.split("=", 1) for token in line.decode().split() if "=" in token)
         if all(name in fields for name in _TOUCH):
             touch = {name: int(fields[name]) for name in _TOUCH}
-            local.publish(TOUCH_SENSORS.topic(base), json.dumps({"value": touch}))
+            local.publish(TOUCH_SENSORS.topic(base), json.dumps({"value": touch}), TOUCH_SENSORS.default_qos)
 
 
-def main(part: str, local: str, remote: str, base: str, device: str) -> None:
-    """Ports of the two brokers, the base of the robot's topics, and its serial line."""
+def _lines(port: serial.Serial) -> Iterator[bytes]:
+    """Without pyserial's own ``readline``, which reads byte by byte."""
+    rest = b""
+    while True:
+        *lines, rest = (rest + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
+        yield from lines
+
+
+def main(part: str, local: str, remote: str, base: str, device: str, reports: str = "") -> None:
+    """Ports of the two brokers, the base of the robot's topics, its serial line; ``--reports`` publishes reports."""
     if part == "bridge":
         bridge(int(remote), int(local), base)
     else:
-        serial_bridge(int(local), base, device, _BAUD)
+        serial_bridge(int(local), base, device, reports=bool(reports))
 
 
 if __name__ == "__main__":
