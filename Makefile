@@ -121,7 +121,7 @@ firmware: .venv/.ready-dev
 report: .venv/.ready-bench
 	@sh tools/debian-packages.sh mosquitto=mosquitto
 	@sh tools/debian-packages.sh ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them a proxy impairs the network"
-	@$(VENV) -c "import sys; from pebble.bench.frames_variants import missing; sys.exit(missing('gstreamer-shm') is not None)" || \
+	@$(VENV) -c "import sys; from pebble.bench.frames import missing; sys.exit(missing('gstreamer-shm') is not None)" || \
 		sh tools/debian-packages.sh =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad =gir1.2-gst-plugins-base-1.0 \
 		=python3-gst-1.0 =python3-numpy || echo "pebble: continuing without GStreamer"
 	@$(VENV) -m pebble.cli bench report $(if $(QUICK),--quick build/report-quick,docs/results)

@@ -10,15 +10,15 @@ from pebble.errors import PebbleError
 
 #: The module of each comparison, which has it as a constant of the same name: CONTROL_NULL.
 MODULES: Final = {
-    "control": "unported",
-    "control-null": "unported",
+    "control": "control",
+    "control-null": "control",
     "bridge": "unported",
     "bridge-profile": "unported",
     "bridge-null": "unported",
     "startup": "startup",
     "cost": "cost",
-    "frames": "unported",
-    "frames-null": "unported",
+    "frames": "frames",
+    "frames-null": "frames",
     "video": "video",
     "sound": "sound",
     "estop": "estop",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pebble.bench.control_wire import Exchange
+from pebble.bench.control_ends import Exchange
 from pebble.errors import PebbleError
 
 #: The largest relative drift: quartz is within 50 ppm on each side unless NTP slews it.

@@ -29,6 +29,16 @@ Tables = Callable[[Sequence[Cell]], Iterable[Table]]
 Assess = Callable[[Sequence[Cell]], Iterable[str | Judged]]
 
 
+def of_known(how: Callable[[Sequence[float]], float], digits: int) -> Combine:
+    """Joins the values of the rounds that have one; None without any."""
+
+    def combine(values: Sequence[float | None]) -> float | None:
+        known = [one for one in values if one is not None]
+        return round(how(known), digits) if known else None
+
+    return combine
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
     """One option of the command line. Its defaults are values of the budgets, under the same name."""
@@ -43,6 +53,7 @@ class Option:
     most: float | None = None
     metavar: str | None = None
     recorded: bool = True  # among the options of the results
+    private: bool = False  # results name no hosts and files: neither recorded nor, with its value, in their command
 
     def check(self, value: Any) -> None:
         """Raises PebbleError for an invalid value."""
@@ -61,8 +72,10 @@ class Option:
         """As on the command line; names only if they are not the default ones."""
         if self.kind is bool:
             return [f"--{self.name}"] if value else []
-        if value is None or (self.many and list(value) == list(default)):
+        if value is None or (self.many and list(value) == list(default or ())):
             return []
+        if self.private:
+            return [f"--{self.name}", self.metavar or self.name.upper()]
         if self.repeated:
             return [word for one in value for word in (f"--{self.name}", _word(one))]
         return [f"--{self.name}", ",".join(map(_word, value if self.many else [value]))]
@@ -126,6 +139,7 @@ class Comparison:
     measures: Sequence[str] = ()  # the order of the cells; else as they were measured
     figures: Mapping[str, Combine] = field(default_factory=dict)  # how single values are joined; else the last one
 
+    derived: Callable[[list[Cell]], list[Cell]] = lambda cells: cells  # what all rounds together make of the cells
     tables: Sequence[Tables] = ()  # see pebble.bench.tables
     legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
@@ -213,7 +227,7 @@ class Run:
 
     def records(self) -> dict[str, Value | list[Value]]:
         """All options that affect the results."""
-        unrecorded = {"variants"} | {one.name for one in self.comparison.options if not one.recorded}
+        unrecorded = {"variants"} | {one.name for one in self.comparison.options if one.private or not one.recorded}
         values = {name: value for name, value in self.options.items() if name not in unrecorded}
         return {**values, **self.comparison.constants, **self.recorded}
 

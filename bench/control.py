@@ -2,179 +2,192 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
+from pebble.bench import control_far as far
 from pebble.bench import null
-from pebble.bench.control_ends import SliceSpec
-from pebble.bench.control_participants import Participants, Slice, joined
-from pebble.bench.control_plan import Condition, ControlPlan
-from pebble.bench.control_report import MEASURES, ONE_WAY, assessment, legend, tables, wake_up_cost
-from pebble.bench.engine import check_folder, finish
-from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Judged, Stopwatch, Value, percentile, rounded
+from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, of_known, rounds, seconds, variants
+from pebble.bench.control_ends import SMALLEST, SliceSpec, rate_name, size_name
+from pebble.bench.control_participants import LOADS, MEDIA, NONE, P2P, VARIANTS, Participants
+from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, legend, tables, wake_up_cost
+from pebble.bench.engine import roles_of
+from pebble.bench.pictures import ecdf, null_ratios, ratios
+from pebble.bench.results import Cell, Value, percentile, rounded
 from pebble.bench.wake_up import wake_up_us
 from pebble.errors import PebbleError
-from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports.segments import sweep
 
-_AROUND_S = 0.25  # overhead of a slice: first messages, last replies, switching the load
-_START_S = 0.9  # to start one role, for the estimate
-
-Round = dict[tuple[str, Condition], Slice]
+SIZES = (40, 1024)
+RATES = (20.0, 200.0, 1000.0)
+LOADED_SIZE, LOADED_RATES = 40, (20.0, 200.0)  # with a load, unless given
+_LARGEST, _FASTEST = 1 << 20, 2000.0
 
 
-def run(plan: ControlPlan, console: Console | None = None) -> int:
-    """Measures, prints and writes; returns 0 if every role has results of enough rounds, if so many were requested.
-
-    Raises PebbleError.
-    """
-    console = console or Console()
-    check_folder(plan.output)
-    console.print(_announcement(plan), highlight=False, soft_wrap=True)
-    watch = Stopwatch(plan.bench, plan.command, _options(plan))
-    wake_ups_us = wake_up_us()
-    with interrupted_by_signals():
-        try:
-            measured, problems = _measure(plan, console)
-        finally:
-            sweep()  # Zenoh leaves a file behind even after a regular end
-    cells = cells_of(plan, measured)
-    tested = null.assessment(cells) if plan.null else [*wake_up_cost(cells, *wake_ups_us), *assessment(cells)]
-    lines: list[str | Judged] = list(tested)
-    if len(measured) < plan.rounds:
-        why = ", ".join(dict.fromkeys(problems))
-        lines.insert(0, f"{plan.rounds - len(measured)} of {plan.rounds} rounds failed and were left out: {why}")
-    results = watch.results(cells, lines, quick=plan.quick)
-    for line in legend(plan.roles):
-        console.print(line, style="dim", highlight=False, soft_wrap=True)
-    for table in tables(cells):
-        console.print(table)
-    finish(results, plan.output, console)
-    enough = len(measured) >= LEAST_ROUNDS or plan.rounds < LEAST_ROUNDS
-    return 0 if enough and all(cell.samples for cell in cells) else 1
-
-
-def _announcement(plan: ControlPlan) -> str:
-    starts = -(-plan.rounds // plan.fresh_every)
-    slices = plan.passes * len(plan.roles) * len(plan.conditions)
-    minutes = (plan.rounds * slices * (plan.seconds + _AROUND_S) + starts * len(plan.roles) * _START_S) / 60
-    return f"{slices} slices of {plan.seconds:g} s in each of {plan.rounds} rounds: about {minutes:.1f} min"
-
-
-def _options(plan: ControlPlan) -> dict[str, Value | list[Value]]:
-    return {
-        "variants": list(plan.roles),
-        "seconds": plan.seconds,
-        "rounds": plan.rounds,
-        "passes": plan.passes,
-        "fresh_every": plan.fresh_every,
-        "loads": list(plan.loads),
-    }
-
-
-def _measure(plan: ControlPlan, console: Console) -> tuple[list[Round], list[str]]:
-    """Measures all rounds; also returns the problems. A round in which a process failed is left out for all roles.
-
-    Raises PebbleError if no round succeeded.
-    """
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console,
-        transient=True,
-    )  # fmt: skip
-    rounds: list[Round] = []
-    problems: list[str] = []
-    work_us: dict[Condition, float] = {}
-    with progress:
-        bar = progress.add_task("control", total=plan.rounds * plan.passes * len(plan.roles) * len(plan.conditions))
-        for first in range(0, plan.rounds, plan.fresh_every):
-            progress.update(bar, description=f"round {first + 1} of {plan.rounds}: starting")
-            try:
-                with Participants(plan.roles, plan.loads) as participants:
-                    if plan.null and not work_us:
-                        work_us = {condition: _pilot(participants, plan, condition) for condition in plan.conditions}
-                    for number in range(first, min(first + plan.fresh_every, plan.rounds)):
-                        progress.update(bar, description=f"round {number + 1} of {plan.rounds}")
-                        rounds.append(_round(participants, plan, number, work_us, lambda: progress.advance(bar)))
-                        work_us = {condition: _planted_us(plan, condition, rounds) for condition in work_us}
-            except PebbleError as error:
-                problems.append(str(error).partition("\n")[0].rstrip(":"))
-                console.print(f"round {len(rounds) + 1}: {error}", style="red", highlight=False, markup=False)
-    if not rounds:
-        raise PebbleError("no round could be measured: see the lines above")
-    return rounds, problems
-
-
-def _round(
-    participants: Participants,
-    plan: ControlPlan,
-    number: int,
-    work_us: Mapping[Condition, float],
-    done: Callable[[], None],
-) -> Round:
-    """Measures the roles of each condition one after another; every other pass runs in reverse order."""
-    measured: dict[tuple[str, Condition], list[Slice]] = {}
-    for pass_ in range(plan.passes):
-        step = -1 if (number + pass_) % 2 else 1
-        for condition in plan.conditions[::step]:
-            for role in plan.roles[::step]:
-                spec = _slice_spec(plan, condition, work_us.get(condition, 0.0), slowed=null.is_slowed(role))
-                measured.setdefault((role, condition), []).append(participants.run(role, spec, condition.load))
-                done()
-    return {key: joined(slices) for key, slices in measured.items()}
-
-
-def _pilot(participants: Participants, plan: ControlPlan, condition: Condition) -> float:
-    """How long, in us, each role works at each message of the first round: a fifth of the usual latency.
-
-    The slowed role works after taking the time stamp, the others before it; nothing else differs.
-    """
-    answer = participants.run(plan.roles[0], _slice_spec(plan, condition), condition.load).answer
-    return null.SLOWDOWN * percentile(answer.one_way, 50)
-
-
-def _planted_us(plan: ControlPlan, condition: Condition, rounds: Sequence[Round]) -> float:
-    """The same for the next round, from all latencies so far."""
-    plain = [one[role, condition].answer.one_way for one in rounds for role in plan.roles if not null.is_slowed(role)]
-    latencies = [latency for one in plain for latency in one]
-    return null.SLOWDOWN * percentile(latencies, 50) if latencies else 0.0
-
-
-def _slice_spec(plan: ControlPlan, condition: Condition, work_us: float = 0.0, *, slowed: bool = False) -> SliceSpec:
-    return SliceSpec(size=condition.size, rate=condition.rate, seconds=plan.seconds, work_us=work_us, slowed=slowed)
-
-
-def cells_of(plan: ControlPlan, measured: Sequence[Round]) -> list[Cell]:
-    """One-way times first. The null test uses only these, since its slowdown is a fifth of them."""
+def conditions(run: Run) -> list[dict[str, Value]]:
+    """With sizes or rates given all of them with every load, else only some with a load."""
+    one, given = run.quick or run.comparison.is_null, run["sizes"] is not None or run["rates"] is not None
     return [
-        Cell(
-            variant=role,
-            params=condition.params,
-            measure=measure,
-            unit="us",
-            rounds=[getattr(one[role, condition].answer, field) for one in measured],
-            figures=_figures([one[role, condition] for one in measured]),
-        )
-        for measure, field in MEASURES.items()
-        if not plan.null or measure == ONE_WAY
-        for condition in plan.conditions
-        for role in plan.roles
+        {"size": size_name(size), "rate": rate_name(rate), "load": load}
+        for load in _loads(run)
+        for size in run["sizes"] or ((LOADED_SIZE,) if one else SIZES)
+        for rate in run["rates"] or ((200.0,) if one else RATES)
+        if one or given or load == NONE or (size == LOADED_SIZE and rate in LOADED_RATES)
     ]
 
 
-def _figures(slices: Sequence[Slice]) -> dict[str, Value]:
-    whole = joined(slices)
-    return {
-        "sent": whole.answer.sent,
-        "late": whole.answer.late,
-        "cpu_percent": round(whole.cpu, 1),
-        "broker_cpu_percent": round(whole.backbone_cpu, 1),
-        "call_us": rounded(percentile(whole.answer.call, 50), 1),
-        "fabric_us": rounded(percentile(whole.answer.transport_times, 50), 1),
-        "inbox_us": rounded(percentile(whole.answer.inbox, 50), 1),
-        "wake_ups": round(whole.wake_ups, 1),
-        "broker_wake_ups": round(whole.backbone_wake_ups, 1),
-        "pictures_hz": rounded(whole.pictures_hz, 1),
+def _loads(run: Run) -> list[str]:
+    return list(run["loads"] or ((NONE,) if run.comparison.is_null else (NONE, MEDIA) if run.quick else LOADS))
+
+
+def prepare(run: Run) -> None:
+    run.recorded["loads"] = [*_loads(run)]
+
+
+def environment(run: Run) -> Participants:
+    return Participants(roles_of(run), _loads(run))
+
+
+def measure(case: Case) -> Iterator[Cell]:
+    """One slice. The null test uses only the one-way times, since its slowdown is a fifth of them."""
+    participants: Participants = case.env
+    found = participants.run(case.role, SliceSpec.of(case), str(case.condition["load"]))
+    answer = found.answer
+    figures: dict[str, Any] = {
+        "sent": answer.sent,
+        "late": answer.late,
+        "cpu_percent": found.cpu,
+        "broker_cpu_percent": found.backbone_cpu,
+        "call_us": rounded(percentile(answer.call, 50), 1),
+        "fabric_us": rounded(percentile(answer.transport_times, 50), 1),
+        "inbox_us": rounded(percentile(answer.inbox, 50), 1),
+        "wake_ups": found.wake_ups,
+        "broker_wake_ups": found.backbone_wake_ups,
+        "pictures_hz": found.pictures_hz,
     }
+    yield case.cell(ONE_WAY, "us", answer.one_way, **figures)
+    if not case.run.comparison.is_null:
+        yield case.cell(ROUND_TRIP, "us", answer.round_trip, **figures)
+
+
+def wake_ups(cells: Sequence[Cell]) -> Iterator[str]:
+    try:
+        yield from wake_up_cost(cells, *wake_up_us())
+    except PebbleError as error:
+        yield str(error)
+
+
+_JOINED: Mapping[str, Combine] = {
+    "late": sum,
+    **dict.fromkeys(("call_us", "fabric_us", "inbox_us"), of_known(median, 1)),
+    **dict.fromkeys(
+        ("cpu_percent", "broker_cpu_percent", "wake_ups", "broker_wake_ups", "pictures_hz"), of_known(fmean, 1)
+    ),
+}
+_OPTIONS = (
+    variants(tuple(VARIANTS)),
+    Option(
+        name="sizes", kind=int, many=True, least=SMALLEST, most=_LARGEST, metavar="BYTES", recorded=False,
+        help="Bytes, for example 40,1024.",
+    ),
+    Option(
+        name="rates", kind=float, many=True, least=1, most=_FASTEST, metavar="HZ", recorded=False,
+        help="Messages a second, for example 20,200.",
+    ),
+    Option(
+        name="loads", many=True, known=LOADS, metavar="NAMES", recorded=False, help="Some of none, media and hog."
+    ),
+    seconds("Duration of one case in a round."),
+    rounds("Rounds of all cases."),
+    Option(
+        name="null", kind=bool, recorded=False, help="One variant against itself, and against itself slowed by a fifth."
+    ),
+    Option(
+        name="far", metavar="URL", private=True, help="Measure against `pebble bench echo` on another machine."
+    ),
+    Option(
+        name="password-file", kind=Path, metavar="FILE", private=True,
+        help="File with the broker's password; else $PEBBLE_PASSWORD.",
+    ),
+    Option(
+        name="ca-cert", kind=Path, metavar="FILE", private=True,
+        help="Certificate authority to trust with mqtts://.",
+    ),
+)  # fmt: skip
+_UNSET = dict.fromkeys(("sizes", "rates", "loads", "null", "far", "password-file", "ca-cert"))
+
+CONTROL_FAR = Comparison(
+    name="control-far",
+    title="Between two machines",
+    what="Round trips to an echo on another machine, and one-way times as precise as the two clocks allow.",
+    options=_OPTIONS,
+    full=Budget(90, **_UNSET, seconds=2.0, rounds=10, fresh_every=10_000),  # one connection for all rounds
+    quick=Budget(5, seconds=1.0, rounds=4),
+    variants=(far.VARIANT,),
+    conditions=far.conditions,
+    prepare=far.prepare,
+    environment=far.environment,
+    measure=far.measure,
+    measures=far.MEASURES,
+    figures=far.JOINED,
+    derived=far.derived,
+    tables=far.TABLES,
+    assessment=(far.assessment,),
+    complete=lambda cells: all(cell.samples for cell in cells if cell.measure == ROUND_TRIP),
+    words=("bench", "control"),
+    reported=None,
+)
+_CONTROL = Comparison(
+    name="control",
+    title="Service to service",
+    what="A message of a drive command's size goes from one process to another and back, as between a robot's "
+    "services: unloaded, with camera frames on the same transport, and beside a process that uses a whole core. "
+    "One-way is from just before the publish call until the receiver's handler runs; both ends use the same clock.",
+    help="""Round trips between two services: MQTT and Zenoh; unloaded, with camera frames, beside a busy process.
+
+    Each round starts two processes and a broker or hub for each variant. Needs mosquitto.
+    With --null: one variant (zenoh-p2p), 40 B at 200 Hz. The run fails if it finds a difference where there is none,
+    or misses the planted one.
+
+    \b
+        pebble bench control
+        pebble bench control --variants mqtt,zenoh-p2p --sizes 40 --rates 200 --rounds 20
+        pebble bench control --null --variants mqtt
+        pebble bench control --far mqtt://broker.local
+    """,
+    options=_OPTIONS,
+    full=Budget(700, **_UNSET, seconds=0.35, rounds=10, passes=2, fresh_every=1),
+    quick=Budget(40, seconds=0.3, rounds=4, passes=1, fresh_every=2),
+    variants=tuple(VARIANTS),
+    conditions=conditions,
+    prepare=prepare,
+    environment=environment,
+    measure=measure,
+    measures=(ONE_WAY, ROUND_TRIP),
+    figures=_JOINED,
+    tables=(tables,),
+    legend=legend,
+    assessment=(wake_ups, assessment),
+    summary_lines=5,
+    pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
+)
+CONTROL_NULL = replace(
+    _CONTROL,
+    name="control-null",
+    title="Service to service: the null test",
+    what="One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
+    "The first interval must include 1.00, the second must lie above it; otherwise the comparison above finds "
+    "differences that do not exist, or misses some that do.",
+    full=Budget(180, **{**_UNSET, "null": True}, seconds=0.3, rounds=30, passes=2, fresh_every=1),
+    quick=Budget(10, seconds=0.25, rounds=4, passes=1, fresh_every=2),
+    is_null=True,
+    variants=(P2P,),
+    assessment=(null.assessment,),
+    words=("bench", "control"),
+    reported=("--null",),
+    summary_lines=0,
+    pictures=(null_ratios("Null test of control"), ecdf("Null test of control")),
+)
+CONTROL = replace(_CONTROL, modes={"far": CONTROL_FAR, "null": CONTROL_NULL})

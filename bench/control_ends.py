@@ -10,16 +10,18 @@ import math
 import struct
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
 
-from pebble.bench.control_wire import Exchange, parse, request, stamped
 from pebble.bench.null import spin
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.runtime.inbox import Inbox
 from pebble.transports import Message, QoS, State, Transport
+
+if TYPE_CHECKING:
+    from pebble.bench.comparison import Case
 
 REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"  # followed by the sender's name
 QOS = QoS(DRIVE.default_qos)
@@ -27,6 +29,11 @@ _LEAD_S = 0.1  # messages at the start of a slice do not count: caches are cold 
 _LAST_S = 1.0  # how long to wait for the last replies of a slice
 _POLL_S = 0.01
 _CONNECT_S = 10.0
+
+_FORM = struct.Struct("<Qqqq")
+_ECHOED = struct.Struct("<qq")
+_ECHOED_AT = 16  # behind the number and the first stamp
+SMALLEST = _FORM.size
 
 Handler = Callable[[str, bytes], None]
 Clock = Callable[[], int]  # ns
@@ -40,6 +47,59 @@ class SliceSpec(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float
     work_us: float = 0.0  # of busy work at each message: before its time stamp,
     slowed: bool = False  # or, if slowed, between time stamp and publish call
+
+    @staticmethod
+    def of(case: Case) -> SliceSpec:
+        """The slice of a case, whose condition has the :func:`size_name` and the :func:`rate_name`."""
+        number, unit = str(case.condition["size"]).split()
+        return SliceSpec(
+            size=int(number) * (1024 if unit == "KB" else 1),
+            rate=float(str(case.condition["rate"]).split()[0]),
+            seconds=case.run["seconds"],
+            work_us=case.planted_us,
+            slowed=case.slowed,
+        )
+
+
+def size_name(size: int) -> str:
+    return f"{size // 1024} KB" if size % 1024 == 0 else f"{size} B"
+
+
+def rate_name(rate: float) -> str:
+    return f"{rate:g} Hz"
+
+
+# -- messages: a number, three time stamps, and padding to the requested size
+
+
+class Exchange(NamedTuple):
+    """NTP's four stamps in ns. Near clock: t1 (sent) and t4 (received). Far clock: t2 (received) and t3 (sent)."""
+
+    t1: int
+    t2: int
+    t3: int
+    t4: int
+    transport_ns: int = 0  # before t4: when the near transport received it
+
+
+def request(number: int, t1: int, size: int) -> bytes:
+    return _FORM.pack(number, t1, 0, 0).ljust(size, b"\0")
+
+
+def stamped(payload: bytes, t2: int, t3: int) -> bytes:
+    """The same message with the echo's stamps, of the same length. Raises struct.error for a foreign message."""
+    message = bytearray(payload)
+    _ECHOED.pack_into(message, _ECHOED_AT, t2, t3)
+    return bytes(message)
+
+
+def parse(payload: bytes) -> tuple[int, int, int, int]:
+    """Number, t1, t2, t3. Raises struct.error for a foreign message."""
+    number, t1, t2, t3 = _FORM.unpack_from(payload)
+    return number, t1, t2, t3
+
+
+# -- connections, and the two ends
 
 
 class Connection(Protocol):

@@ -1,4 +1,4 @@
-"""The processes of the control comparison: brokers and hubs, two ends for each role, and the loads."""
+"""The variants of the control comparison and their processes: brokers and hubs, two ends for each role, and loads."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean
 
 import msgspec
 
 from pebble.bench.control_ends import SliceSpec
-from pebble.bench.control_plan import HOG, MEDIA, NONE
-from pebble.bench.control_variants import VARIANTS, Variant
 from pebble.bench.control_worker import Answer, Endpoint
 from pebble.bench.null import variant_of
 from pebble.bench.usage import cpu_s, wake_ups
@@ -24,6 +21,7 @@ from pebble.rig.programs import Program
 from pebble.rig.worker import Worker
 from pebble.transports.settings import ZenohSettings
 
+NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
 _FLOWING = 3  # pictures received until the stream counts as flowing
@@ -32,8 +30,37 @@ _POLL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """``kind`` is a transport, or ``paho``; ``broker`` holds lines of mosquitto's configuration."""
+
+    about: str
+    kind: str
+    protocol: str = "3.1.1"
+    broker: tuple[str, ...] = ()
+    client: bool = False  # Zenoh client mode: everything goes through the hub
+
+    @property
+    def on_zenoh(self) -> bool:
+        return self.kind == "zenoh"
+
+
+_NODELAY = ("set_tcp_nodelay true",)
+VARIANTS = {
+    "paho": Variant(about="stock paho at both ends, stock mosquitto: TCP_NODELAY nowhere", kind="paho"),
+    "mqtt": Variant(about="Pebble's MQTT transport (TCP_NODELAY), stock mosquitto (without)", kind="mqtt"),
+    "mqtt-nodelay": Variant(about="the same, with TCP_NODELAY in the broker", kind="mqtt", broker=_NODELAY),
+    "mqtt5": Variant(about="MQTT 5, TCP_NODELAY on both sides", kind="mqtt", protocol="5", broker=_NODELAY),
+    "zenoh-p2p": Variant(about="Pebble's Zenoh transport, peer to peer", kind="zenoh"),
+    "zenoh-hub": Variant(about="the same, through the hub", kind="zenoh", client=True),
+}
+BASELINE = "mqtt"
+P2P, HUB = "zenoh-p2p", "zenoh-hub"
+MQTT = tuple(name for name, variant in VARIANTS.items() if not variant.on_zenoh)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Slice:
-    """Results of one role under one condition in one round; CPU in % of one core, wake-ups per round trip."""
+    """Results of one slice of one role; CPU in % of one core, wake-ups per round trip."""
 
     answer: Answer
     cpu: float
@@ -46,21 +73,6 @@ class Slice:
 def _used(pids: Sequence[int]) -> tuple[float, int]:
     """CPU seconds and wake-ups so far."""
     return cpu_s(pids), wake_ups(pids)
-
-
-def joined(slices: Sequence[Slice]) -> Slice:
-    """Merges slices of the same role and condition; at least one."""
-    rates = [one.pictures_hz for one in slices if one.pictures_hz is not None]
-    answers = [msgspec.structs.asdict(one.answer) for one in slices]
-    sums = {name: sum((answer[name] for answer in answers), type(zero)()) for name, zero in answers[0].items()}
-    return Slice(
-        answer=Answer(**sums),
-        cpu=fmean(one.cpu for one in slices),
-        backbone_cpu=fmean(one.backbone_cpu for one in slices),
-        wake_ups=fmean(one.wake_ups for one in slices),
-        backbone_wake_ups=fmean(one.backbone_wake_ups for one in slices),
-        pictures_hz=fmean(rates) if rates else None,
-    )
 
 
 class Backbone:

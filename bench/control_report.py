@@ -3,72 +3,62 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 from rich.table import Table
 
-from pebble.bench.aims import MISSED, NOT_JUDGED, outcome
-from pebble.bench.control_plan import HOG, LOADED_SIZE, MEDIA, NONE, rate_name, size_name
-from pebble.bench.control_variants import BASELINE, HUB, MQTT, P2P, VARIANTS
-from pebble.bench.frames_loop import RATE_HZ
+from pebble.bench.aims import MISSED, NOT_JUDGED, outcome, single
+from pebble.bench.control_participants import BASELINE, HOG, HUB, MEDIA, MQTT, NONE, P2P, VARIANTS
 from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Judged
-from pebble.bench.tables import base_of, figure, plain_table
+from pebble.bench.tables import Column, Grid, base_of, figure, plain_table
 
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
-MEASURES = {ONE_WAY: "one_way", ROUND_TRIP: "round_trip"}  # by the field of a worker's answer
+RATE_HZ = 30.0  # of the pictures, as in bench/frames_loop.py
 _LONG_US = 995.0
 _MUCH_LATE, _MUCH_LOST = 0.05, 0.005
 _FEWER = 0.9 * RATE_HZ  # pictures: the load is lighter than intended
 AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
-_JUDGED = {"size": size_name(LOADED_SIZE), "rate": rate_name(200)}
-
+_JUDGED = {"size": "40 B", "rate": "200 Hz"}
 
 _CellsByVariant = dict[tuple[str, str], Cell]  # by variant and load
 
 
-def legend(roles: Sequence[str]) -> list[str]:
-    names = dict.fromkeys(variant_of(role) for role in roles)
+def legend(cells: Sequence[Cell]) -> list[str]:
+    names = dict.fromkeys(variant_of(cell.variant) for cell in cells)
     return [f"{name}: {VARIANTS[name].about}" for name in names]
 
 
 def tables(cells: Sequence[Cell]) -> list[Table]:
     """One table per measure with a column for each variant; then the ratios to the baseline, if it was measured."""
     measures = list(dict.fromkeys(cell.measure for cell in cells))
-    found = [_times([cell for cell in cells if cell.measure == measure], measure) for measure in measures]
+    found = [
+        _side_by_side(
+            f"{measure}, {cells[0].unit}: p50/p99 (k: thousands)",
+            [cell for cell in cells if cell.measure == measure],
+            lambda cell: f"{_short(cell.percentile(50))}/{_short(cell.percentile(99))}",
+        )
+        for measure in measures
+    ]
     others = [cell for cell in cells if cell.measure == ONE_WAY and cell.variant != BASELINE]
     if others and len(others) < len(cells) / len(measures):
-        found.append(_ratios(others, cells))
-    known = [cell for cell in cells if _is_judged(cell) and cell.params["load"] == NONE and "fabric_us" in cell.figures]
-    return [*found, _hops(known)] if known else found
+        title = f"{ONE_WAY}, p50 as a ratio to that of {BASELINE}, and its 99 % interval"
+        found.append(_side_by_side(title, others, lambda cell: _ratio(cell, base_of(cell, cells, BASELINE))))
+    return [*found, *(_HOPS(cells) if any(map(_HOPS.of, cells)) else ())]
 
 
-def _times(cells: Sequence[Cell], measure: str) -> Table:
+def _side_by_side(title: str, cells: Sequence[Cell], shown: Callable[[Cell], str]) -> Table:
+    """A row for each condition, a column for each variant."""
     names = list(dict.fromkeys(cell.variant for cell in cells))
-    table = _table(f"{measure}, {cells[0].unit}: p50/p99 (k: thousands)", names)
-    for row in _by_condition(cells):
-        by_name = {cell.variant: f"{_short(cell.percentile(50))}/{_short(cell.percentile(99))}" for cell in row}
-        table.add_row(*_conditions(row[0]), *(by_name.get(name, "") for name in names))
-    return table
-
-
-def _ratios(cells: Sequence[Cell], all_cells: Sequence[Cell]) -> Table:
-    names = list(dict.fromkeys(cell.variant for cell in cells))
-    table = _table(f"{ONE_WAY}, p50 as a ratio to that of {BASELINE}, and its 99 % interval", names)
-    for row in _by_condition(cells):
-        by_name = {cell.variant: _ratio(cell, base_of(cell, all_cells, BASELINE)) for cell in row}
-        table.add_row(*_conditions(row[0]), *(by_name.get(name, "") for name in names))
-    return table
-
-
-def _hops(cells: Sequence[Cell]) -> Table:
-    heads = ["publish\ncall", "thread\nhas it", "handler\nruns", "wake-ups:\nends", "broker\nor hub"]
-    table = plain_table("where the time goes: 40 B at 200 Hz, unloaded, medians, us", ["variant", *heads])
-    for cell in cells:
-        known = (cell.figures.get(name) for name in ("call_us", "fabric_us", "inbox_us", "wake_ups", "broker_wake_ups"))
-        table.add_row(cell.variant, *(figure(math.nan if value is None else float(value)) for value in known))
+    heads = [name.replace("-", "-\n").replace(" ", "\n", 1) for name in names]
+    table = plain_table(title, ["size", "Hz", "load", *heads])
+    table.padding = 0  # six variants in 80 columns
+    for params in dict.fromkeys(tuple(cell.params.items()) for cell in cells):
+        row = {cell.variant: shown(cell) for cell in cells if tuple(cell.params.items()) == params}
+        conditions = (str(value).removesuffix(" Hz") for _, value in params)
+        table.add_row(*conditions, *(row.get(name, "") for name in names))
     return table
 
 
@@ -87,22 +77,6 @@ def _ratio(cell: Cell, base: Cell | None) -> str:
     if interval.few:
         return str(interval)
     return f"{figure(interval.ratio)}\n{figure(interval.low)}–{figure(interval.high)}"
-
-
-def _conditions(cell: Cell) -> list[str]:
-    return [str(value).removesuffix(" Hz") for value in cell.params.values()]
-
-
-def _by_condition(cells: Sequence[Cell]) -> list[list[Cell]]:
-    conditions = dict.fromkeys(tuple(cell.params.items()) for cell in cells)
-    return [[cell for cell in cells if tuple(cell.params.items()) == params] for params in conditions]
-
-
-def _table(title: str, names: Sequence[str]) -> Table:
-    heads = [name.replace("-", "-\n").replace(" ", "\n", 1) for name in names]
-    table = plain_table(title, ["size", "Hz", "load", *heads])
-    table.padding = 0  # six variants in 80 columns
-    return table
 
 
 def wake_up_cost(cells: Sequence[Cell], same_us: float, other_us: float) -> list[str]:
@@ -142,6 +116,24 @@ def _judged(cells: Sequence[Cell]) -> _CellsByVariant:
 
 def _is_judged(cell: Cell) -> bool:
     return cell.measure == ONE_WAY and all(cell.params.get(name) == value for name, value in _JUDGED.items())
+
+
+def _hop(head: str, name: str) -> Column:
+    return Column(head, lambda cell: figure(single(name)(cell)))
+
+
+_HOPS = Grid(
+    title="where the time goes: 40 B at 200 Hz, unloaded, medians, us",
+    rows=("variant",),
+    columns=(
+        _hop("publish\ncall", "call_us"),
+        _hop("thread\nhas it", "fabric_us"),
+        _hop("handler\nruns", "inbox_us"),
+        _hop("wake-ups:\nends", "wake_ups"),
+        _hop("broker\nor hub", "broker_wake_ups"),
+    ),
+    of=lambda cell: _is_judged(cell) and cell.params["load"] == NONE and "fabric_us" in cell.figures,
+)
 
 
 def _better(by_variant: _CellsByVariant, load: str, percent: float) -> str | None:

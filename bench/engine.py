@@ -39,7 +39,7 @@ def run(run: Run) -> int:
             _measure(run, collected, rounds)
         finally:
             sweep()  # Zenoh leaves files behind even after a regular end
-    cells = collected.cells()
+    cells = about.derived(collected.cells())
     for table in about.shown(cells):
         console.print(table)
     for line in about.legend(cells):
@@ -55,24 +55,28 @@ def run(run: Run) -> int:
 
 def _leave_out_missing(run: Run) -> None:
     """Prints why a variant cannot be measured on this machine. Raises PebbleError if none can."""
-    if not run.options.get("variants"):
-        return
-    reasons = {name: run.comparison.missing(name) for name in run["variants"]}
+    reasons = {name: run.comparison.missing(name) for name in _named(run)}
     for name, reason in reasons.items():
         if reason is not None:
             run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
-    run.options["variants"] = [name for name, reason in reasons.items() if reason is None]
-    if not run["variants"]:
+    left = [name for name, reason in reasons.items() if reason is None]
+    if reasons and not left:
         raise PebbleError("no variant can be measured on this machine")
+    if len(left) < len(reasons):
+        run.options["variants"] = left
+
+
+def _named(run: Run) -> Sequence[str]:
+    """The variants that were asked for; a null test may have an option for its only one."""
+    null_of = run.options.get("null")
+    return [null_of] if isinstance(null_of, str) and run.comparison.is_null else run.options.get("variants") or ()
 
 
 def roles_of(run: Run) -> Sequence[str]:
     """The variants, or the roles of the only one in a null test. Raises PebbleError if several are named."""
-    names: Sequence[str] = run.options.get("variants") or [""]
+    names = _named(run) or [""]
     if not run.comparison.is_null:
         return names
-    if isinstance(one := run.options.get("null"), str):
-        names = [one]
     if len(names) != 1 or len(run.comparison.conditions(run)) != 1:
         raise PebbleError("--null takes one variant, one size and one of everything else")
     return null.roles(names[0])

@@ -2,191 +2,154 @@
 
 from __future__ import annotations
 
-import itertools
+import functools
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-from pebble.bench.comparison import FOLDER
-from pebble.bench.engine import check_folder, finish
-from pebble.bench.frames_report import Round, assessment, cell_of, complete, legend, tables
-from pebble.bench.frames_variants import VARIANTS, Case, missing, parse_size
-from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import LONGEST_S, Cell, Stopwatch, Value
+from pebble.bench import null
+from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, of_known, rounds, seconds, variants
+from pebble.bench.pictures import ecdf, null_ratios, tails
+from pebble.bench.ratios import LEAST_ROUNDS, paired
+from pebble.bench.results import Cell, Value
+from pebble.bench.tables import COUNT, LOST, Column, Grid, figure, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker
+from pebble.rig.broker import Broker, BrokerKind, best_kind
 from pebble.rig.processes import Processes
 from pebble.rig.worker import Worker
-from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports.segments import sweep
 
-SIZES = ("640x480", "1920x1080")
-READERS = (1, 3)
-_LEAST_ROUNDS = 2  # one shows no variation
+VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
+_ABOUT = {
+    "zenoh-shm": "created in the shared segment, read as a view: no copy",
+    "zenoh-copy": "shared memory, one copy in and one out",
+    "zenoh-net": "Zenoh without shared memory",
+    "mqtt": "mosquitto and paho, QoS 0",
+    "gstreamer-shm": "shmsink and shmsrc, created in the segment, one copy out",
+    "memcpy": "no transport: a bare copy of as many bytes between two frames",
+}
+INSTALL_GSTREAMER = (
+    "apt-get install -y --no-install-recommends gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
+    " gir1.2-gst-plugins-base-1.0 python3-gst-1.0 python3-numpy"
+)
+_INSTALL_MOSQUITTO = "apt-get install -y --no-install-recommends mosquitto"
+_SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
+_PROBE = """
+import gi, numpy
+gi.require_version("Gst", "1.0")
+gi.require_version("GstApp", "1.0")
+from gi.repository import Gst, GstApp
+Gst.init(None)
+for name in ("shmsink", "shmsrc", "appsrc", "appsink"):
+    assert Gst.ElementFactory.find(name), name
+"""
+_PROBE_S = 20.0
+OURS = "zenoh-shm"
+SIZES, READERS = ("640x480", "1920x1080"), (1, 3)
 _READY_S = 20.0
-_AROUND_S = 1.15  # to start and end the processes of a case, for the estimate
 _STARTUP_S = 0.1  # from the last process ready to the first counted frame
 _ANSWER_S = 10.0
 
-Measured = Mapping[Case, list[Round | None]]  # None: a round that failed
+
+class Size(NamedTuple):
+    """A picture in BGR, three bytes per pixel."""
+
+    width: int
+    height: int
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height}"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FramesPlan:
-    """The options of a run. One round runs every case once for ``seconds``, with processes of its own."""
-
-    seconds: float = 0.5
-    rounds: int = LEAST_ROUNDS
-    sizes: Sequence[str] = SIZES
-    readers: Sequence[int] = READERS
-    variants: Sequence[str] = VARIANTS
-    output: Path = FOLDER
-    quick: bool = False  # the results are marked as quick
-
-    def check(self) -> None:
-        """Raises PebbleError naming an invalid option."""
-        unknown = [name for name in self.variants if name not in VARIANTS]
-        if unknown or not self.variants:
-            raise PebbleError(f"unknown variant {', '.join(unknown)}: there are {', '.join(VARIANTS)}")
-        if not 0 < self.seconds <= LONGEST_S:
-            raise PebbleError(f"seconds must be positive, and at most {LONGEST_S:.0f}")
-        if self.rounds < _LEAST_ROUNDS or min(self.readers, default=0) < 1:
-            raise PebbleError(f"at least {_LEAST_ROUNDS} rounds and one reader are needed")
-        if any(len(set(some)) < len(some) for some in (self.variants, self.sizes, self.readers)):
-            raise PebbleError("a variant, size or number of readers is named twice")
-        for size in self.sizes:
-            parse_size(size)
-        check_folder(self.output)
-
-    def options(self) -> dict[str, Value | list[Value]]:
-        """All options that affect the results."""
-        return {
-            "seconds": self.seconds,
-            "rounds": self.rounds,
-            "sizes": list(self.sizes),
-            "readers": list(self.readers),
-            "variants": list(self.variants),
-        }
-
-    def command(self) -> list[str]:
-        """The command line that repeats the run."""
-        words = ["pebble", "bench", "frames", "--seconds", f"{self.seconds:g}", "--rounds", str(self.rounds)]
-        words += itertools.chain(*(("--size", size) for size in self.sizes))
-        words += itertools.chain(*(("--readers", str(count)) for count in self.readers))
-        return [*words, "--variants", ",".join(self.variants), *(["--quick"] if self.quick else [])]
+def parse_size(text: str) -> Size:
+    """``640x480`` or ``640×480``. Raises PebbleError."""
+    width, _, height = text.replace("×", "x").partition("x")
+    if not (width.isdecimal() and height.isdecimal()) or not 8 <= int(width) * int(height) <= 10**8:
+        raise PebbleError(f"not a size: {text} (example: 640x480)")
+    if int(width) % 4:
+        raise PebbleError(f"{text}: the width must be a multiple of 4, or GStreamer pads the rows")
+    return Size(int(width), int(height))
 
 
-def plan(*, quick: bool = False, **given: Any) -> FramesPlan:
-    """The default or quick plan, with the ``given`` options replaced."""
-    usual = {"rounds": 2, "seconds": 0.5, "sizes": SIZES[:1], "readers": READERS[:1]} if quick else {}
-    return FramesPlan(quick=quick, **{**usual, **given})
+def conditions(run: Run) -> list[dict[str, Value]]:
+    return [{"size": str(parse_size(size)), "readers": count} for size in run["size"] for count in run["readers"]]
 
 
-def run(plan: FramesPlan, console: Console | None = None) -> int:
-    """Measures, prints and writes; returns 0 if every available case has results of enough rounds. Raises PebbleError.
-
-    Variants whose programs are not installed are left out, with the reason.
-    """
-    console = console or Console()
-    plan.check()
-    watch = Stopwatch("frames", plan.command(), plan.options())
-    variants = _installed(plan.variants, console)
-    cases = [
-        Case(name, parse_size(size), readers) for size in plan.sizes for readers in plan.readers for name in variants
-    ]
-    if not cases:
-        return 1
-    cells = cells_of(measure(cases, plan, console))
-    for line in legend(variants):
-        console.print(line, style="dim", highlight=False)
-    for figures in tables(cells):
-        console.print(figures)
-    finish(watch.results(cells, assessment(cells), quick=plan.quick), plan.output, console)
-    return 0 if complete(cells, plan.rounds) else 1
+def prepare(run: Run) -> None:
+    if run.comparison.is_null and "variants" in run.options:
+        raise PebbleError("--null names the variant: leave --variants out")
 
 
-def _installed(variants: Sequence[str], console: Console) -> list[str]:
-    reasons = {name: missing(name) for name in variants}
-    for name, reason in reasons.items():
-        if reason is not None:
-            console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
-    return [name for name in variants if reasons[name] is None]
+def missing(variant: str) -> str | None:
+    """Why this variant cannot run on this machine, with the command that installs it; None if it can."""
+    check = _NEEDS.get(variant)
+    return check() if check is not None else None
 
 
-def cells_of(measured: Measured) -> list[Cell]:
-    return [cell_of(case, rounds) for case, rounds in measured.items()]
-
-
-def measure(
-    cases: Sequence[Case],
-    plan: FramesPlan,
-    console: Console,
-    slower_us: Callable[[Case, Measured], float] = lambda _case, _so_far: 0.0,
-) -> Measured:
-    """Runs every case in every round, so that a temporary disturbance affects all of them.
-
-    ``slower_us`` returns, from the measurements so far, how long a case's writer delays each frame.
-    """
-    minutes = plan.rounds * len(cases) * (plan.seconds + _AROUND_S) / 60
-    console.print(f"{len(cases)} cases, {plan.rounds} rounds of {plan.seconds:g} s: about {minutes:.1f} min")
-    measured: dict[Case, list[Round | None]] = {case: [] for case in cases}
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console,
-        transient=True,
-    )  # fmt: skip
-    with interrupted_by_signals(), _swept(), progress:
-        bar = progress.add_task("frames", total=plan.rounds * len(cases))
-        for number in range(plan.rounds):
-            for case in cases[:: -1 if number % 2 else 1]:
-                progress.update(bar, description=f"round {number + 1}: {case}")
-                held_up = replace(case, slower_us=slower_us(case, measured))
-                measured[case].append(_try_case(held_up, plan.seconds, console))
-                progress.advance(bar)
-    return measured
-
-
-@contextmanager
-def _swept() -> Iterator[None]:
+def _mosquitto() -> str | None:
     try:
-        yield
-    finally:
-        sweep()  # Zenoh leaves a file behind even after a regular end
+        installed = best_kind() is BrokerKind.MOSQUITTO
+    except PebbleError:
+        installed = False
+    return None if installed else f"mosquitto is not installed: {_INSTALL_MOSQUITTO}"
 
 
-def _try_case(case: Case, seconds: float, console: Console) -> Round | None:
+@functools.cache
+def _gstreamer() -> str | None:
     try:
-        return run_case(case, seconds)
-    except PebbleError as error:
-        console.print(f"{case}: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return None
+        probe = subprocess.run([_SYSTEM_PYTHON, "-c", _PROBE], capture_output=True, timeout=_PROBE_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{error}; GStreamer is read by {_SYSTEM_PYTHON}: {INSTALL_GSTREAMER}"
+    return None if probe.returncode == 0 else f"GStreamer is not installed: {INSTALL_GSTREAMER}"
 
 
-def run_case(case: Case, seconds: float) -> Round:
-    """Runs one writer and its readers, each as a process. Raises PebbleError if one of them fails."""
+_NEEDS: dict[str, Callable[[], str | None]] = {"mqtt": _mosquitto, "gstreamer-shm": _gstreamer}
+
+
+# -- one case
+
+
+def measure(case: Case) -> Iterator[Cell]:
+    """Runs one writer and its readers, each as a process. Raises PebbleError if one of them fails.
+
+    CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean.
+    """
     with Processes() as processes:
-        broker = processes.broker() if case.needs_broker else None
+        broker = processes.broker() if case.variant == "mqtt" else None
         if broker is not None:
             broker.wait()
+        writer_first = case.variant == "gstreamer-shm"  # its readers fail without a writer; the others wait
         workers: list[Worker] = []
-        for name in ("writer", *(f"reader {number + 1}" for number in range(case.readers))):
-            command = case.command(name.partition(" ")[0], processes.folder, broker.port if broker is not None else 0)
+        for name in ("writer", *(f"reader {number + 1}" for number in range(_readers(case)))):
+            command = _command(case, name.partition(" ")[0], processes.folder, broker.port if broker is not None else 0)
             workers.append(processes.command(f"{case}: {name}", command))
-            if name == "writer" and case.needs_writer_first:
+            if name == "writer" and writer_first:
                 workers[0].answer(_READY_S)
-        for worker in workers[1 if case.needs_writer_first else 0 :]:
+        for worker in workers[1 if writer_first else 0 :]:
             worker.answer(_READY_S)
-        return _observe(case, workers, broker, seconds)
+        yield _observed(case, workers, broker, case.run["seconds"])
 
 
-def _observe(case: Case, workers: Sequence[Worker], broker: Broker | None, seconds: float) -> Round:
+def _readers(case: Case) -> int:
+    return int(case.condition["readers"] or 0)
+
+
+def _command(case: Case, end: str, folder: Path, port: int) -> list[str]:
+    """The command of one end (writer or reader); ``folder`` is for sockets, ``port`` is the broker's."""
+    size, slower_us = parse_size(str(case.condition["size"])), str(case.planted_us if case.slowed else 0.0)
+    if case.variant == "gstreamer-shm":
+        program, socket = Path(__file__).with_name("frames_gstreamer.py"), folder / "gst.sock"
+        return [_SYSTEM_PYTHON, str(program), end, str(socket), str(size.width), str(size.height), slower_us]
+    where = str(port if case.variant == "mqtt" else folder)
+    return [sys.executable, "-m", "pebble.bench.frames_worker", case.variant, end, where, str(size), slower_us]
+
+
+def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seconds: float) -> Cell:
     begin = time.monotonic_ns() + int(_STARTUP_S * 1e9)
     for worker in workers:
         worker.send(f"{begin} {begin + int(seconds * 1e9)}")
@@ -194,16 +157,167 @@ def _observe(case: Case, workers: Sequence[Worker], broker: Broker | None, secon
     before = cpu_s([broker.pid]) if broker is not None else 0.0
     time.sleep(seconds)
     used = cpu_s([broker.pid]) - before if broker is not None else None
-    answers = [worker.answer(_ANSWER_S) for worker in workers]
-    bare = case.variant == "memcpy"  # has no writer
-    return Round(
-        latencies_us=[latency for reader in answers[1:] for latency in reader["latencies_us"]],
-        sent=answers[0]["sent"],
-        fallbacks=answers[0]["fallbacks"],
-        torn=sum(reader["torn"] for reader in answers[1:]),
-        cpu_writer=0.0 if bare else answers[0]["cpu"],
-        cpu_reader=statistics.fmean(reader["cpu"] for reader in answers[1:]),
+    writer, *readers = (worker.answer(_ANSWER_S) for worker in workers)
+    bare = case.variant == "memcpy"  # has no writer; it times copies, so there is no number of sent ones
+    return case.cell(
+        "frame",
+        "us",
+        (latency for reader in readers for latency in reader["latencies_us"]),
+        cpu_writer=0.0 if bare else writer["cpu"],
+        cpu_reader=statistics.fmean(reader["cpu"] for reader in readers),
         cpu_broker=None if used is None else 100 * used / seconds,
         memory_writer_mb=0.0 if bare else pss_mb(workers[0].pid),
         memory_reader_mb=0.0 if bare else statistics.fmean(pss_mb(worker.pid) for worker in workers[1:]),
+        torn=sum(reader["torn"] for reader in readers),
+        fallbacks=writer["fallbacks"],  # frames that did not go through shared memory, since the start
+        **({} if bare else {"sent": writer["sent"] * len(readers)}),  # each frame to each reader
     )
+
+
+_JOINED: Mapping[str, Combine] = {
+    "torn": sum,
+    "fallbacks": sum,
+    **dict.fromkeys(
+        ("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb"),
+        of_known(statistics.median, 2),
+    ),
+}
+
+
+# -- the report
+
+
+def assessment(cells: Sequence[Cell]) -> Iterator[str]:
+    """Compares frames without copies with each other variant, one line each: latency, and a reader's CPU."""
+    judged, pairs = all(len(cell.rounds) >= LEAST_ROUNDS for cell in cells), 0
+    for ours in (cell for cell in cells if cell.variant == OURS):
+        for theirs in (cell for cell in cells if cell is not ours and cell.params == ours.params):
+            ratio, pairs = paired(ours.rounds, theirs.rounds), pairs + 1
+            words = ratio.words(OURS, theirs.variant) if judged else f"{OURS} / {theirs.variant} = {ratio}"
+            yield f"{_conditions(ours)}: {words}{_reader_cpu(ours, theirs)}"
+    if pairs and not judged:
+        yield f"Nothing is judged: that needs {LEAST_ROUNDS} rounds."
+
+
+def _reader_cpu(ours: Cell, theirs: Cell) -> str:
+    one, other = (cell.figures.get("cpu_reader") for cell in (ours, theirs))
+    if theirs.variant == "memcpy" or not isinstance(one, (int, float)) or not isinstance(other, (int, float)):
+        return ""
+    return f"; CPU of a reader {figure(one)} % against {figure(other)} %"
+
+
+def faults(cells: Sequence[Cell]) -> Iterator[str]:
+    """Failed rounds, and frames that did not arrive as they should."""
+    words = {"torn": "frames arrived torn", "fallbacks": "frames could not go through shared memory"}
+    for cell in cells:
+        where, failed = f"{_conditions(cell)}, {cell.variant}", sum(not one for one in cell.rounds)
+        if failed:
+            yield f"{where}: {failed} rounds failed and are left out"
+        yield from (f"{where}: {cell.figures[name]} {what}" for name, what in words.items() if cell.figures.get(name))
+
+
+def complete(cells: Sequence[Cell]) -> bool:
+    """Whether every case has results, of enough of its rounds to judge."""
+    least = (LEAST_ROUNDS if len(cell.rounds) >= LEAST_ROUNDS else 1 for cell in cells)
+    return all(sum(map(bool, cell.rounds)) >= enough for cell, enough in zip(cells, least, strict=True))
+
+
+def legend(cells: Sequence[Cell]) -> Iterator[str]:
+    measured = {null.variant_of(cell.variant) for cell in cells}
+    yield from (f"{variant}: {about}" for variant, about in _ABOUT.items() if variant in measured)
+    yield "µs: from “frame complete in the writer” to “numpy array in the reader”."
+    yield "CPU %: of one core, writer / each reader / broker. PSS: writer / each reader."
+
+
+def _conditions(cell: Cell) -> str:
+    count = cell.params["readers"]
+    return f"{cell.params['size']}, {'one reader' if count == 1 else f'{count} readers'}"
+
+
+def _column(head: str, *names: str, bare: Sequence[str] = ()) -> Column:
+    """Single values side by side; a bare copy has only the ``bare`` ones."""
+
+    def value(cell: Cell) -> str:
+        found = [cell.figures.get(name) for name in (bare if cell.variant == "memcpy" else names)]
+        known = [one for one in found if isinstance(one, (int, float))]
+        return " / ".join(f"{one:.0f}" if one >= 20 else f"{one:.1f}" for one in known)
+
+    return Column(head, value)
+
+
+FRAMES = Comparison(
+    name="frames",
+    title="Camera frames inside the robot",
+    what="BGR pictures at 30 Hz from one process to others on the same machine. The latency is from the last byte "
+    "written until the reader has a whole numpy array.",
+    help="""Camera frames from one process to others: latency, CPU and memory.
+
+    BGR pictures at 30 Hz through Zenoh shared memory (without copies, and with), Zenoh without shared memory, MQTT
+    through mosquitto, and GStreamer's shared memory, compared with a bare copy. Each round measures every variant.
+
+    With --null: one variant, one size (640x480), one reader, 30 rounds of 0.4 s. The run fails if it finds a
+    difference where there is none, or misses the planted one.
+
+    \b
+        pebble bench frames
+        pebble bench frames --size 640x480 --readers 1 --variants zenoh-shm,gstreamer-shm
+        pebble bench frames --null zenoh-shm
+    """,
+    options=(
+        seconds("Duration of each case in a round."),
+        rounds("Rounds of all cases.", least=2),  # one shows no variation
+        Option(name="size", many=True, repeated=True, metavar="SIZE", help="640x480; may be given several times."),
+        Option(
+            name="readers", kind=int, many=True, repeated=True, least=1, most=16, metavar="COUNT",
+            help="May be given several times.",
+        ),
+        variants(VARIANTS),
+        Option(
+            name="null", known=VARIANTS, metavar="VARIANT", recorded=False,
+            help="Only this one, against itself and against itself slowed by a fifth.",
+        ),
+    ),
+    full=Budget(330, seconds=0.5, rounds=LEAST_ROUNDS, size=SIZES, readers=READERS, null=None),
+    quick=Budget(20, rounds=2, size=SIZES[:1], readers=READERS[:1]),
+    variants=VARIANTS,
+    conditions=conditions,
+    prepare=prepare,
+    missing=missing,
+    measure=measure,
+    alone=True,
+    measures=("frame",),
+    figures=_JOINED,
+    tables=(
+        Grid(
+            title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),
+            columns=(
+                percentile_column(50, "p50 µs"), percentile_column(99, "p99 µs"), percentile_column(100, "max µs"),
+                _column("CPU %", "cpu_writer", "cpu_reader", "cpu_broker", bare=("cpu_reader",)),
+                _column("PSS MB", "memory_writer_mb", "memory_reader_mb"), LOST, COUNT,
+            ),
+        ),
+    ),
+    legend=legend,
+    assessment=(assessment, faults),
+    complete=complete,
+    summary_lines=4,
+    pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
+)  # fmt: skip
+FRAMES_NULL = replace(
+    FRAMES,
+    name="frames-null",
+    title="Camera frames: the null test",
+    what="One frame transport against itself, and with a fifth of its usual latency planted by the writer. The "
+    "first interval must include 1.00, the second must lie above it.",
+    full=Budget(130, seconds=0.4, rounds=30, size=SIZES[:1], readers=READERS[:1], null=OURS),
+    quick=Budget(8, rounds=2),
+    is_null=True,
+    variants=(),
+    legend=lambda _cells: (),
+    assessment=(null.assessment, faults),
+    words=("bench", "frames"),
+    reported=("--null", OURS),
+    summary_lines=0,
+    pictures=(null_ratios("Null test of frames"), ecdf("Null test of frames")),
+)
+FRAMES = replace(FRAMES, modes={"null": FRAMES_NULL})

@@ -155,6 +155,7 @@ def single_column(head: str, name: str, how: str = "g") -> Column:
 
 
 COUNT = Column("n", lambda cell: str(len(cell.samples)))
+LOST = Column("lost", lambda cell: "" if cell.lost is None else str(cell.lost))
 SPREAD = Column("", lambda cell: spread(cell))
 
 
@@ -168,7 +169,8 @@ class Grid:
     """A table: a row for each value of the ``rows`` (parameters, ``measure``, ``unit`` or ``variant``).
 
     The columns are repeated side by side for each variant, unless it is one of the rows; with ``ratio`` the second
-    variant's value as a ratio to the first's comes last. A row of the name ``last`` comes last, in bold.
+    variant's value as a ratio to the first's comes last. A row of the name ``last`` comes last, in bold. There is one
+    table for all values of ``each`` of these parameters, which the title may name.
     """
 
     title: str
@@ -179,9 +181,16 @@ class Grid:
     ratio: bool = False
     last: str = ""
     caption: str = ""
+    each: Sequence[str] = ()
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Table]:
-        cells = [cell for cell in cells if self.of(cell)]
+        tables: dict[tuple[str, ...], list[Cell]] = {} if self.each else {(): []}
+        for cell in filter(self.of, cells):
+            tables.setdefault(tuple(_field(cell, name) for name in self.each), []).append(cell)
+        for names, some in tables.items():
+            yield self._table(self.title.format(**dict(zip(self.each, names, strict=True))), some)
+
+    def _table(self, title: str, cells: Sequence[Cell]) -> Table:
         variants = list(dict.fromkeys(cell.variant for cell in cells)) if "variant" not in self.rows else [None]
         groups: dict[tuple[str, ...], list[Cell]] = {}
         for cell in cells:
@@ -189,7 +198,7 @@ class Grid:
         named = variants if len(variants) > 1 or self.ratio else [None]
         heads = [" ".join(filter(None, (one, column.head))) for one in named for column in self.columns]
         heads += [f"{variants[1]} / {variants[0]}"] if self.ratio and len(variants) > 1 else []
-        table = plain_table(self.title, [*(self.heads or self.rows), *heads], left=len(self.rows))
+        table = plain_table(title, [*(self.heads or self.rows), *heads], left=len(self.rows))
         firsts, before = [row[0] for row in groups], None
         for row in sorted(groups, key=lambda names: self._order(names, list(groups))):
             if before not in (None, row[0]) and max(map(firsts.count, (before, row[0]))) > 1:
@@ -200,7 +209,7 @@ class Grid:
             table.add_row(*names, *shown, style="bold" if self.last in row and self.last else None)
             before = row[0]
         table.caption, table.caption_justify = self.caption or None, "left"
-        yield table
+        return table
 
     def _order(self, row: tuple[str, ...], rows: list[tuple[str, ...]]) -> tuple[int, bool, int]:
         """Rows of the same first name stay together, and the last one comes last."""

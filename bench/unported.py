@@ -6,31 +6,8 @@ Their command lines are in pebble.commands, and their runs in modules of their o
 from __future__ import annotations
 
 from pebble.bench.comparison import Budget, Comparison
-from pebble.bench.pictures import Drawn, ecdf, null_ratios, ratios, tails
+from pebble.bench.pictures import Drawn, ecdf, null_ratios, ratios
 
-CONTROL = Comparison(
-    name="control",
-    title="Service to service",
-    what="A message of a drive command's size goes from one process to another and back, as between a robot's "
-    "services: unloaded, with camera frames on the same transport, and beside a process that uses a whole core. "
-    "One-way is from just before the publish call until the receiver's handler runs; both ends use the same clock.",
-    full=Budget(700),
-    quick=Budget(40),
-    summary_lines=5,
-    pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
-)
-CONTROL_NULL = Comparison(
-    name="control-null",
-    title="Service to service: the null test",
-    what="One variant against itself, and against itself with a fifth of its usual latency planted by the sender. "
-    "The first interval must include 1.00, the second must lie above it; otherwise the comparison above finds "
-    "differences that do not exist, or misses some that do.",
-    full=Budget(180),
-    quick=Budget(10),
-    words=("bench", "control"),
-    reported=("--null",),
-    pictures=(null_ratios("Null test of control"), ecdf("Null test of control")),
-)
 BRIDGE = Comparison(
     name="bridge",
     title="Operator to wheels, and back",
@@ -65,27 +42,6 @@ BRIDGE_NULL = Comparison(
     words=("bench", "bridge"),
     reported=("--null",),
     pictures=(null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
-)
-FRAMES = Comparison(
-    name="frames",
-    title="Camera frames inside the robot",
-    what="BGR pictures at 30 Hz from one process to others on the same machine. The latency is from the last byte "
-    "written until the reader has a whole numpy array.",
-    full=Budget(330),
-    quick=Budget(20),
-    summary_lines=4,
-    pictures=(tails("Frames between processes"), ecdf("Frames between processes")),
-)
-FRAMES_NULL = Comparison(
-    name="frames-null",
-    title="Camera frames: the null test",
-    what="One frame transport against itself, and with a fifth of its usual latency planted by the writer. The "
-    "first interval must include 1.00, the second must lie above it.",
-    full=Budget(130),
-    quick=Budget(8),
-    words=("bench", "frames"),
-    reported=("--null", "zenoh-shm"),
-    pictures=(null_ratios("Null test of frames"), ecdf("Null test of frames")),
 )
 IMPAIR = Comparison(
     name="impair",

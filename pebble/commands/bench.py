@@ -14,8 +14,8 @@ import typer
 from typer.core import TyperGroup
 
 from pebble.bench.comparison import FOLDER, Comparison, Option
-from pebble.commands import bench_control, bench_robot
-from pebble.commands.options import Output, Quick, split_names
+from pebble.commands import bench_robot
+from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
@@ -27,52 +27,6 @@ _GROUP_HELP = """Comparisons, side by side in one run on this machine.
     pebble bench frames
     pebble bench fleet --robots 200
 """
-
-
-def frames(
-    seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="Duration of each case in a round. [default: 0.5]")
-    ] = None,
-    rounds: Annotated[int | None, typer.Option(min=2, help="Rounds of all cases. [default: 8]")] = None,
-    size: Annotated[
-        list[str] | None, typer.Option(help="640x480; may be given several times. [default: 640x480, 1920x1080]")
-    ] = None,
-    readers: Annotated[
-        list[int] | None, typer.Option(min=1, max=16, help="May be given several times. [default: 1, 3]")
-    ] = None,
-    variants: Annotated[
-        str | None, typer.Option(help="Some of them, separated by commas. [default: all]", metavar="NAMES")
-    ] = None,
-    null: Annotated[
-        str | None,
-        typer.Option(help="Only this one, against itself and against itself slowed by a fifth.", metavar="VARIANT"),
-    ] = None,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
-    """Camera frames from one process to others: latency, CPU and memory.
-
-    BGR pictures at 30 Hz through Zenoh shared memory (without copies, and with), Zenoh without shared memory, MQTT
-    through mosquitto, and GStreamer's shared memory, compared with a bare copy. Each round measures every variant.
-
-    With --null: one variant, one size (640x480), one reader, 30 rounds of 0.4 s. The run fails if it finds a
-    difference where there is none, or misses the planted one.
-
-    \b
-        pebble bench frames
-        pebble bench frames --size 640x480 --readers 1 --variants zenoh-shm,gstreamer-shm
-        pebble bench frames --null zenoh-shm
-    """
-    from pebble.bench import frames as comparison
-    from pebble.bench import frames_null
-
-    if null is not None and variants is not None:
-        raise PebbleError("--null names the variant: leave --variants out")
-    chosen = variants if null is None else null
-    names = None if chosen is None else split_names(chosen)
-    given = {"seconds": seconds, "rounds": rounds, "sizes": size, "readers": readers, "variants": names}
-    run, plan = (comparison.run, comparison.plan) if null is None else (frames_null.run, frames_null.plan)
-    return run(plan(quick=quick, output=output, **{name: value for name, value in given.items() if value}))
 
 
 def compare(
@@ -94,6 +48,21 @@ def compare(
     from pebble.bench.compare import run
 
     return run(a, b, threshold=threshold, everything=everything)
+
+
+def echo(
+    url: Annotated[str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", show_default=False)],
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine.
+
+    \b
+        pebble bench echo mqtt://broker.local
+    """
+    from pebble.bench.control_far import serve, settings_of
+
+    return serve(settings_of(url, password_file, ca_cert))
 
 
 def report(
@@ -186,9 +155,17 @@ def _annotation(about: Comparison, option: Option) -> Any:
 
 def _default(about: Comparison, option: Option) -> str:
     full, quick = (budget.get(option.name) for budget in (about.full, about.quick))
-    if full is None or option.many or option.kind is bool:
-        return " [default: all]" if option.name == "variants" else ""
-    return f" [default: {full:g}{'' if quick is None or quick == full else f', quick {quick:g}'}]"
+    if option.name == "variants":
+        return " [default: all]"
+    if full is None or option.kind is bool:
+        return ""
+    shown = [_shown(one) for one in (full, *([] if quick in (None, full) else [quick]))]
+    return f" [default: {'; quick '.join(shown) if option.many else ', quick '.join(shown)}]"
+
+
+def _shown(value: Any) -> str:
+    values = [value] if isinstance(value, (str, int, float)) else value
+    return ", ".join(one if isinstance(one, str) else f"{one:g}" for one in values)
 
 
 def _parsed(option: Option, value: Any) -> Any:
@@ -208,6 +185,6 @@ def _python(option: Option) -> str:
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (frames, *bench_control.COMMANDS, *bench_robot.COMMANDS, compare, report):
+    for command in (*bench_robot.COMMANDS, compare, echo, report):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")

@@ -1,28 +1,28 @@
 """Short real runs of the control comparison: real processes, brokers and hubs, and nothing of them afterwards."""
 
 import io
-import math
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, control_far
-from pebble.bench.control_ends import SliceSpec
-from pebble.bench.control_far import BACK, THERE, FarPlan
-from pebble.bench.control_participants import Participants
-from pebble.bench.control_plan import ControlPlan
+from pebble.bench import control_far, engine
+from pebble.bench.clock import Offset
+from pebble.bench.comparison import Case, Comparison
+from pebble.bench.control import CONTROL, CONTROL_FAR
+from pebble.bench.control_ends import Exchange, SliceSpec
+from pebble.bench.control_far import BACK, THERE
+from pebble.bench.control_participants import VARIANTS, Participants
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP
-from pebble.bench.control_variants import VARIANTS
-from pebble.bench.results import load
+from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig.programs import children
-from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker, Child, until
 
 SHIFT_NS = 1_500_000_000
@@ -37,6 +37,13 @@ serve(MqttSettings(host="127.0.0.1", port=int(sys.argv[1])), lambda: wall() + {S
 
 def command(*options: str) -> list[str]:
     return [sys.executable, "-m", "pebble.cli", "bench", "control", *options]
+
+
+def ran(about: Comparison, folder: Path, **given: Any) -> tuple[int, str]:
+    """The exit code and what was printed."""
+    printed = io.StringIO()
+    code = engine.run(about.run_of(output=folder, console=Console(file=printed, width=80), **given))
+    return code, printed.getvalue()
 
 
 @pytest.fixture
@@ -66,11 +73,11 @@ def test_all_variants_alone_and_beside_a_busy_process(temporary: Path, tmp_path:
 @pytest.mark.thorough
 @pytest.mark.usefixtures("no_plots")
 def test_pictures_flow_beside_the_messages_and_replies_take_longer_than_the_way_there(tmp_path: Path) -> None:
-    plan = ControlPlan.of(
-        variants=["mqtt", "zenoh-p2p"], sizes=[1024], rates=[100.0], loads=["media"], seconds=0.1, rounds=1,
-        output=tmp_path,
+    code, _ = ran(
+        CONTROL, tmp_path, variants=["mqtt", "zenoh-p2p"], sizes=[1024], rates=[100.0], loads=["media"], seconds=0.1,
+        rounds=1,
     )  # fmt: skip
-    assert control.run(plan, Console(file=io.StringIO())) == 0
+    assert code == 0
     cells = load(tmp_path / "control.json").cells
     assert [cell.variant for cell in cells] == ["mqtt", "zenoh-p2p"] * 2
     assert all(float(cell.figures["pictures_hz"] or 0) > 0 for cell in cells)
@@ -120,8 +127,8 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 
 @pytest.fixture
-def settings(broker: Broker) -> MqttSettings:
-    return MqttSettings(host="127.0.0.1", port=broker.port)
+def url(broker: Broker) -> str:
+    return f"mqtt://127.0.0.1:{broker.port}"
 
 
 @pytest.fixture
@@ -135,18 +142,21 @@ def echo(broker: Broker) -> Iterator[Child]:
 
 
 @pytest.mark.usefixtures("echo", "no_plots")
-def test_a_far_clock_is_found_within_its_error(settings: MqttSettings, tmp_path: Path) -> None:
-    printed = io.StringIO()
-    plan = FarPlan.of(sizes=[40], rates=[200.0], seconds=0.3, rounds=2, output=tmp_path)
-    assert control_far.measure(plan, settings, Console(file=printed, width=80)) == 0
-    round_trip, there, back = load(tmp_path / "control-far.json").cells
+def test_a_far_clock_is_found_within_its_error(url: str, tmp_path: Path) -> None:
+    code, printed = ran(CONTROL_FAR, tmp_path, far=url, sizes=[40], rates=[200.0], seconds=0.3, rounds=2)
+    assert code == 0
+    results = load(tmp_path / "control-far.json")
+    assert " ".join(results.command).endswith("--rounds 2 --far URL")  # results name no hosts
+    assert "far" not in results.options
+    round_trip, there, back = results.cells
+    assert [len(one) for one in round_trip.rounds] == [60, 60]
     assert [cell.measure for cell in (round_trip, there, back)] == [ROUND_TRIP, THERE, BACK]
     offset, error = there.figures["clock_offset_ms"], there.figures["clock_error_ms"]
     assert isinstance(offset, float)
     assert isinstance(error, float)
     assert abs(offset - SHIFT_NS / 1e6) <= error + 0.001
     assert str(there.params["clocks"]).startswith("± ")
-    assert "the far clock is +1" in printed.getvalue()
+    assert "the far clock is +1" in printed
 
 
 def test_the_echo_ends_with_ctrl_c(broker: Broker) -> None:
@@ -165,29 +175,41 @@ def test_a_clock_that_is_slewed_is_not_used(monkeypatch: pytest.MonkeyPatch) -> 
     assert wall() >= before
 
 
-def test_a_missing_far_echo_is_reported(
-    settings: MqttSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_far_echo_is_reported(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control_far, "_ANSWER_S", 0.3)
     with pytest.raises(PebbleError, match="run `pebble bench echo URL` on the other machine"):
-        control_far.measure(FarPlan.of(output=tmp_path), settings, Console(file=io.StringIO()))
+        ran(CONTROL_FAR, tmp_path, far=url)
 
 
-def test_one_way_times_that_the_clocks_error_hides_are_unknown() -> None:
-    case = control_far.FarCase(40, 20.0)
-    case.sent, case.rounds, case.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [control_far.Offset(0, 10)]
-    round_trip, there, back = control_far.cells_of(case)
+def far_cells(exchanges: Sequence[Exchange], monkeypatch: pytest.MonkeyPatch, offset: Offset | None) -> list[Cell]:
+    """The cells of one round with these exchanges."""
+
+    class Answered:
+        def run(self, _spec: SliceSpec) -> tuple[int, int, Sequence[Exchange]]:
+            return len(exchanges), 0, exchanges
+
+    if offset is not None:
+        monkeypatch.setattr(control_far, "estimate", lambda _exchanges: offset)
+    run, condition = CONTROL_FAR.run_of(), {"size": "40 B", "rate": "20 Hz"}
+    collected = engine.Collected(CONTROL_FAR, ["mqtt"], [condition])
+    case = Case(run=run, number=0, variant="mqtt", role="mqtt", condition=condition, env=Answered())
+    collected.add(control_far.measure(case))
+    return control_far.derived(collected.cells())
+
+
+def test_one_way_times_that_the_clocks_error_hides_are_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = far_cells([Exchange(0, 10, 10, 20)], monkeypatch, Offset(0, 10))
+    round_trip, there, back = cells
     assert round_trip.samples == [2e-5]
     assert there.samples == back.samples == []
-    assert any("one-way there: unknown" in line for line in control_far.assessment([case]))
+    assert any("one-way there: unknown" in line for line in control_far.assessment(cells))
 
 
-def test_clocks_that_could_not_be_compared_leave_the_round_trips() -> None:
-    case = control_far.FarCase(40, 20.0)
-    case.sent, case.rounds, case.offsets = 1, [[control_far.Exchange(0, 10, 10, 20)]], [None]
-    assert math.isnan(case.error_ms)
-    assert [len(cell.samples) for cell in control_far.cells_of(case)] == [1, 0, 0]
-    assert "one-way times are unknown" in control_far.assessment([case])[-1]
+def test_clocks_that_could_not_be_compared_leave_the_round_trips(monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = far_cells([Exchange(0, 10, 10, 20)], monkeypatch, None)  # one is too few
+    assert [cell.figures.get("clock_error_ms") for cell in cells] == [None] * 3
+    assert [len(cell.samples) for cell in cells] == [1, 0, 0]
+    assert "one-way times are unknown" in [*control_far.assessment(cells)][-1]
 
 
 @pytest.mark.parametrize(

@@ -6,18 +6,29 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, control_load, null
-from pebble.bench.control_ends import REPLIES, REQUESTS, Echo, Handler, Sender, SliceSpec
-from pebble.bench.control_participants import Slice
-from pebble.bench.control_plan import Condition, ControlPlan
+from pebble.bench import control, control_load, engine, null
+from pebble.bench.comparison import Case, Comparison
+from pebble.bench.control import CONTROL, CONTROL_NULL
+from pebble.bench.control_ends import (
+    REPLIES,
+    REQUESTS,
+    Echo,
+    Handler,
+    Sender,
+    SliceSpec,
+    parse,
+    rate_name,
+    request,
+    size_name,
+    stamped,
+)
+from pebble.bench.control_participants import VARIANTS, Slice
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, tables
-from pebble.bench.control_variants import VARIANTS
-from pebble.bench.control_wire import parse, request, stamped
 from pebble.bench.control_worker import Answer
 from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
@@ -102,27 +113,37 @@ def test_a_foreign_request_is_not_echoed() -> None:
 
 
 def test_the_default_has_sixty_cells_and_the_quick_one_twelve() -> None:
-    assert len(ControlPlan.of().conditions) * len(ControlPlan.of().roles) == 60
-    quick = ControlPlan.of(quick=True)
-    assert len(quick.conditions) * len(quick.roles) == 12
-    assert {condition.load for condition in quick.conditions} == {"none", "media"}
+    run = CONTROL.run_of()
+    assert len(control.conditions(run)) * len(run["variants"]) == 60
+    run = CONTROL.run_of(quick=True)
+    assert len(control.conditions(run)) * len(run["variants"]) == 12
+    assert {one["load"] for one in control.conditions(run)} == {"none", "media"}
 
 
 def test_what_is_asked_for_is_what_is_run_and_remembered() -> None:
-    plan = ControlPlan.of(variants=["mqtt"], sizes=[40], rates=[20.0], loads=["none", "hog"], seconds=0.5, rounds=2)
-    assert plan.conditions == (Condition(40, 20.0, "none"), Condition(40, 20.0, "hog"))
-    assert plan.command == [
+    given: dict[str, Any] = {"variants": ["mqtt"], "sizes": [40], "rates": [20.0], "loads": ["none", "hog"]}
+    run = CONTROL.run_of(**given, seconds=0.5, rounds=2)
+    assert control.conditions(run) == [{"size": "40 B", "rate": "20 Hz", "load": load} for load in ("none", "hog")]
+    assert run.command == [
         *("pebble", "bench", "control", "--variants", "mqtt", "--sizes", "40", "--rates", "20"),
         *("--loads", "none,hog", "--seconds", "0.5", "--rounds", "2"),
     ]
-    assert ControlPlan.of(loads=["media"]).conditions == tuple(Condition(40, rate, "media") for rate in (20.0, 200.0))
+    loaded = control.conditions(CONTROL.run_of(loads=["media"]))
+    assert loaded == [{"size": "40 B", "rate": rate, "load": "media"} for rate in ("20 Hz", "200 Hz")]
+
+
+@pytest.mark.parametrize(("size", "rate"), [(40, 200.0), (1024, 0.5), (1536, 1000.0)])
+def test_a_condition_is_the_slice_that_it_names(size: int, rate: float) -> None:
+    condition = {"size": size_name(size), "rate": rate_name(rate)}
+    case = Case(run=CONTROL.run_of(), number=0, variant="mqtt", role="mqtt", condition=condition)
+    assert SliceSpec.of(case) == SliceSpec(size=size, rate=rate, seconds=0.35)
 
 
 def test_the_null_test_runs_one_variant_in_three_roles() -> None:
-    plan = ControlPlan.of(null=True, quick=True, variants=["mqtt"])
-    assert plan.roles == null.roles("mqtt")
-    assert plan.bench == "control-null"
-    assert ControlPlan.of(null=True).rounds >= 8
+    run = CONTROL_NULL.run_of(quick=True, variants=["mqtt"])
+    assert engine.roles_of(run) == null.roles("mqtt")
+    assert " ".join(run.command).endswith("--rounds 4 --null --quick")
+    assert CONTROL_NULL.run_of().rounds >= 8
 
 
 @pytest.mark.parametrize(
@@ -139,9 +160,17 @@ def test_the_null_test_runs_one_variant_in_three_roles() -> None:
         {"rounds": 0},
     ],
 )
-def test_invalid_options_are_refused_before_anything_starts(nonsense: dict[str, object]) -> None:
+def test_invalid_options_are_refused_before_anything_starts(nonsense: dict[str, object], tmp_path: Path) -> None:
+    about = CONTROL_NULL if "null" in nonsense else CONTROL
     with pytest.raises(PebbleError):
-        ControlPlan.of(**nonsense)  # type: ignore[arg-type]
+        engine.run(about.run_of(**nonsense, output=tmp_path))  # type: ignore[arg-type]
+
+
+def ran(folder: Path, about: Comparison = CONTROL, **given: Any) -> tuple[int, str]:
+    """The exit code and what was printed."""
+    printed = io.StringIO()
+    code = engine.run(about.run_of(output=folder, console=Console(file=printed, width=80), **given))
+    return code, printed.getvalue()
 
 
 class FakeParticipants:
@@ -183,47 +212,42 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeParticipants]:
 def test_every_other_round_goes_backwards_and_one_that_fails_is_left_out_for_all(
     fake: type[FakeParticipants], tmp_path: Path
 ) -> None:
-    printed = io.StringIO()
-    plan = ControlPlan.of(variants=["mqtt", "zenoh-p2p"], sizes=[40], rates=[200.0], loads=["none", "hog"], rounds=4,
-                   output=tmp_path)  # fmt: skip
-    assert (
-        control.run(plan, Console(file=printed, width=80)) == 0
-    )  # fewer rounds were requested than are needed to judge
+    given: dict[str, Any] = {"variants": ["mqtt", "zenoh-p2p"], "sizes": [40], "rates": [200.0]}
+    code, printed = ran(tmp_path, **given, loads=["none", "hog"], rounds=4)
+    assert code == 0  # fewer rounds were requested than are needed to judge
     there = [("mqtt", "none"), ("zenoh-p2p", "none"), ("mqtt", "hog"), ("zenoh-p2p", "hog")]
     expected = [*there, *there[::-1]] * 2 + [*there[::-1], *there]
     assert [(role, load) for role, _, load in fake.calls] == expected
-    assert "mqtt: echo said nothing" in printed.getvalue()
+    assert "mqtt: echo said nothing" in printed
     results = load(tmp_path / "control.json")
     assert all(len(cell.rounds) == 3 for cell in results.cells)
-    assert results.assessment[0] == "1 of 4 rounds failed and were left out: mqtt: echo said nothing"
+    assert results.assessment[0] == "1 of 4 rounds failed and were left out; round 2: mqtt: echo said nothing"
     assert {cell.lost for cell in results.cells} == {0}
-    assert "50.0 70.0 30.0 7.00 3.50" in " ".join(printed.getvalue().split())
+    assert "50.0 70.0 30.0 7.00 3.50" in " ".join(printed.split())
     assert "10.5 with mqtt and 10.5 with zenoh-p2p such wake-ups" in results.assessment[1]
 
 
 @pytest.mark.usefixtures("fake")
 @pytest.mark.parametrize(("rounds", "code"), [(8, 1), (9, 0)])
 def test_too_few_rounds_that_are_left_are_an_error(rounds: int, code: int, tmp_path: Path) -> None:
-    plan = ControlPlan.of(variants=["mqtt"], sizes=[40], rates=[200.0], loads=["none"], rounds=rounds, output=tmp_path)
-    assert control.run(plan, Console(file=io.StringIO(), width=80)) == code
+    given: dict[str, Any] = {"variants": ["mqtt"], "sizes": [40], "rates": [200.0], "loads": ["none"]}
+    assert ran(tmp_path, **given, rounds=rounds)[0] == code
 
 
 @pytest.mark.usefixtures("fake")
 def test_a_round_of_several_passes_has_the_samples_of_all(tmp_path: Path) -> None:
-    plan = ControlPlan.of(null=True, rounds=1, output=tmp_path)
-    assert control.run(plan, Console(file=io.StringIO(), width=80)) == 0
+    assert ran(tmp_path, CONTROL_NULL, rounds=1)[0] == 0
     for one in load(tmp_path / "control-null.json").cells:
-        assert [len(samples) for samples in one.rounds] == [10 * plan.passes]
+        assert [len(samples) for samples in one.rounds] == [10 * CONTROL_NULL.full["passes"]]
         assert one.lost == 0
 
 
 def test_all_roles_work_for_a_fifth_of_the_pilot_s_median_and_the_slowed_one_when_the_time_runs(
     fake: type[FakeParticipants], tmp_path: Path
 ) -> None:
-    plan = ControlPlan.of(null=True, rounds=10, variants=["mqtt"], output=tmp_path)
-    assert control.run(plan, Console(file=io.StringIO(), width=80)) == 0
+    assert ran(tmp_path, CONTROL_NULL, rounds=10, variants=["mqtt"])[0] == 0
     pilot, *measured = [(role, spec) for role, spec, _ in fake.calls]
-    assert pilot == ("mqtt", SliceSpec(size=40, rate=200.0, seconds=plan.seconds))
+    assert pilot == ("mqtt", SliceSpec(size=40, rate=200.0, seconds=CONTROL_NULL.full["seconds"]))
     assert [spec.work_us for _, spec in measured] == pytest.approx([0.2 * 104.0] * len(measured))
     assert all(spec.slowed == null.is_slowed(role) for role, spec in measured)
     results = load(tmp_path / "control-null.json")

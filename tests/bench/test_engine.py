@@ -15,7 +15,7 @@ from rich.console import Console
 
 from pebble.bench import catalogue, engine, null
 from pebble.bench.aims import Aim, single, with_lost
-from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, rounds, seconds, variants
+from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
 from pebble.bench.results import Cell, Judged, Results, load
 from pebble.bench.tables import COUNT, Claims, Grid, percentile_column
 from pebble.commands.bench import command_of
@@ -171,6 +171,25 @@ def test_one_thing_is_tested_at_a_time(tmp_path: Path) -> None:
     about = declared(is_null=True)
     with pytest.raises(PebbleError, match="takes one variant"):
         engine.run(about.run_of(output=tmp_path))
+
+
+def test_the_variant_of_a_null_test_may_be_missing_too(tmp_path: Path) -> None:
+    null_ = Option(name="null", known=("pipe", "socket"), help="Only this one.")
+    about = declared(
+        is_null=True, variants=(), options=(null_,), full=Budget(1, null="pipe"), conditions=lambda _run: SIZES[:1],
+        missing=lambda name: "no sockets here" if name == "socket" else None, legend=lambda _cells: (),
+    )  # fmt: skip
+    assert {cell.variant for cell in measured(about, tmp_path).cells} == set(null.roles("pipe"))
+    with pytest.raises(PebbleError, match="no variant can be measured"):
+        engine.run(about.run_of(null="socket", output=tmp_path))
+    with pytest.raises(PebbleError, match="--null: unknown pigeon"):
+        about.run_of(null="pigeon")
+
+
+def test_values_that_a_round_lacks_are_left_out() -> None:
+    join = of_known(max, 1)
+    assert join([1.25, None, 0.5]) == 1.2
+    assert join([None]) is None
 
 
 # -- the command line

@@ -7,14 +7,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import frames, frames_variants
-from pebble.bench.frames import FramesPlan
-from pebble.bench.frames_variants import Case, Size, parse_size
-from pebble.bench.results import load
+from pebble.bench import engine, frames
+from pebble.bench.comparison import Case
+from pebble.bench.frames import FRAMES, Size, parse_size
+from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig.programs import children
 from tests.support import ROOT, gone, until
@@ -22,6 +23,13 @@ from tests.support import ROOT, gone, until
 
 def command(*options: str) -> list[str]:
     return [sys.executable, "-m", "pebble.cli", "bench", "frames", *options]
+
+
+def measured(variant: str, seconds: float, size: str = "320x240", readers: int = 1, **more: Any) -> Cell:
+    """One real run of one case."""
+    run, condition = FRAMES.run_of(seconds=seconds), {"size": size, "readers": readers}
+    (cell,) = frames.measure(Case(run=run, number=0, variant=variant, role=variant, condition=condition, **more))
+    return cell
 
 
 def segments(pid: int) -> set[Path]:
@@ -54,18 +62,23 @@ def test_a_short_run_leaves_results_and_nothing_else(temporary: Path, tmp_path: 
 @pytest.mark.thorough
 @pytest.mark.parametrize("variant", ["zenoh-shm", "zenoh-copy"])
 def test_frames_in_shared_memory_arrive_whole_at_every_reader(variant: str) -> None:
-    round_ = frames.run_case(Case(variant, Size(320, 240), 2), 0.5)
-    assert len(round_.latencies_us) > 10
-    assert round_.torn == 0
-    assert round_.fallbacks < len(round_.latencies_us) / 4  # a reader without CPU time holds buffers
-    assert round_.memory_reader_mb > 0
+    cell = measured(variant, 0.5, readers=2)
+    assert len(cell.samples) > 10
+    assert cell.figures["torn"] == 0
+    assert float(cell.figures["fallbacks"] or 0) < len(cell.samples) / 4  # a reader without CPU time holds buffers
+    assert float(cell.figures["memory_reader_mb"] or 0) > 0
     assert children(os.getpid()) == []
 
 
 def test_the_bare_copy_counts_only_the_cpu_of_the_copier() -> None:
-    round_ = frames.run_case(Case("memcpy", Size(320, 240), 1), 0.5)
-    assert round_.latencies_us
-    assert round_.cpu_writer == 0.0
+    cell = measured("memcpy", 0.5)
+    assert cell.samples
+    assert cell.figures["cpu_writer"] == 0.0
+
+
+def test_a_writer_that_is_held_up_is_seen_in_every_latency() -> None:
+    cell = measured("zenoh-shm", 0.3, "64x48", slowed=True, planted_us=5000.0)
+    assert min(cell.samples) >= 5000.0
 
 
 def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
@@ -106,45 +119,46 @@ def test_workers_end_with_a_killed_bench(temporary: Path) -> None:
 def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(frames_variants, "_SYSTEM_PYTHON", "/nowhere/python3")
-    frames_variants._gstreamer.cache_clear()
+    monkeypatch.setattr(frames, "_SYSTEM_PYTHON", "/nowhere/python3")
+    frames._gstreamer.cache_clear()
     printed = io.StringIO()
+    run = FRAMES.run_of(variants=["zenoh-shm", "gstreamer-shm"], console=Console(file=printed, width=80))
     try:
-        assert frames._installed(["zenoh-shm", "gstreamer-shm"], Console(file=printed, width=80)) == ["zenoh-shm"]
+        engine._leave_out_missing(run)
     finally:
-        frames_variants._gstreamer.cache_clear()
+        frames._gstreamer.cache_clear()
+    assert run["variants"] == ["zenoh-shm"]
     assert "gstreamer-shm is left out" in printed.getvalue()
-    assert frames_variants.INSTALL_GSTREAMER in printed.getvalue()
+    assert frames.INSTALL_GSTREAMER in printed.getvalue()
 
 
 @pytest.mark.parametrize(
-    "plan",
+    "given",
     [
-        FramesPlan(variants=["zenoh"]),
-        FramesPlan(seconds=0.0),
-        FramesPlan(seconds=float("nan")),
-        FramesPlan(rounds=1),
-        FramesPlan(readers=[0]),
-        FramesPlan(sizes=["big"]),
-        FramesPlan(sizes=["1x1"]),
-        FramesPlan(sizes=["30x30"]),
-        FramesPlan(variants=[]),
-        FramesPlan(variants=["mqtt", "mqtt"]),
-        FramesPlan(output=Path("/dev/null/x")),
+        {"variants": ["zenoh"]},
+        {"seconds": 0.0},
+        {"seconds": float("nan")},
+        {"rounds": 1},
+        {"readers": [0]},
+        {"size": ["big"]},
+        {"size": ["1x1"]},
+        {"size": ["30x30"]},
+        {"variants": []},
+        {"variants": ["mqtt", "mqtt"]},
+        {"output": Path("/dev/null/x")},
     ],
 )
-def test_invalid_options_are_refused_before_anything_starts(plan: FramesPlan) -> None:
+def test_invalid_options_are_refused_before_anything_starts(given: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(PebbleError):
-        frames.run(plan, Console(file=io.StringIO()))
+        engine.run(FRAMES.run_of(**{"output": tmp_path, **given}, console=Console(file=io.StringIO())))
 
 
 def test_sizes_are_written_with_either_sign() -> None:
     assert parse_size("640×480") == parse_size("640x480") == Size(640, 480)
 
 
-def test_the_command_line_of_results_repeats_them(tmp_path: Path) -> None:
-    plan = frames.plan(quick=True, variants=["mqtt"], output=tmp_path)
-    assert " ".join(plan.command()) == (
+def test_the_command_line_of_results_repeats_them() -> None:
+    assert " ".join(FRAMES.run_of(quick=True, variants=["mqtt"]).command) == (
         "pebble bench frames --seconds 0.5 --rounds 2 --size 640x480 --readers 1 --variants mqtt --quick"
     )
 

@@ -1,68 +1,79 @@
 """Rounds become cells, cells become tables and an assessment."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 
-from pebble.bench.frames_report import Round, assessment, cell_of, complete, legend, tables
-from pebble.bench.frames_variants import VARIANTS, Case, Size
+from pebble.bench.comparison import Case
+from pebble.bench.engine import Collected
+from pebble.bench.frames import FRAMES, VARIANTS, complete, legend
 from pebble.bench.results import Cell
 
-HD = Size(1920, 1080)
+HD, SMALL = "1920x1080", "64x48"
+Measured = dict[str, Any]  # the samples and the single values of one round
 
 
-def a_round(*latencies_us: float, **more: Any) -> Round:
-    figures: dict[str, Any] = {
-        "sent": len(latencies_us),
-        "torn": 0,
-        "fallbacks": 0,
-        "cpu_writer": 2.0,
-        "cpu_reader": 1.0,
-    }
-    figures |= {"cpu_broker": None, "memory_writer_mb": 30.0, "memory_reader_mb": 20.0}
-    return Round(latencies_us=latencies_us, **{**figures, **more})
+def a_round(*latencies_us: float, **more: Any) -> Measured:
+    figures = {"cpu_writer": 2.0, "cpu_reader": 1.0, "cpu_broker": None, "memory_writer_mb": 30.0}
+    figures |= {"memory_reader_mb": 20.0, "torn": 0, "fallbacks": 0, "sent": len(latencies_us)}
+    return {"measure": "frame", "unit": "us", "samples": latencies_us, **figures, **more}
+
+
+FAILED: Measured = {"measure": "frame", "unit": "", "samples": []}
+
+
+def cell_of(variant: str, rounds: Sequence[Measured], *, size: str = HD, readers: int = 1) -> Cell:
+    collected, condition = Collected(FRAMES, [variant]), {"size": size, "readers": readers}
+    for number, one in enumerate(rounds):
+        case = Case(run=FRAMES.run_of(), number=number, variant=variant, role=variant, condition=condition)
+        collected.add([case.cell(**one)])
+    (cell,) = collected.cells()
+    return cell
 
 
 def eight_rounds(variant: str, latency_us: float, **more: Any) -> Cell:
-    return cell_of(Case(variant, HD, 1), [a_round(latency_us + number, **more) for number in range(8)])
+    return cell_of(variant, [a_round(latency_us + number, **more) for number in range(8)])
+
+
+def assessment(cells: Sequence[Cell]) -> list[str]:
+    return [str(line) for line in FRAMES.assessed(cells)]
 
 
 def test_every_round_keeps_its_place_and_its_samples() -> None:
-    cell = cell_of(Case("zenoh-shm", HD, 3), [a_round(1, 2), None, a_round(30)])
-    assert (cell.variant, cell.params) == ("zenoh-shm", {"size": "1920x1080", "readers": 3})
+    cell = cell_of("zenoh-shm", [a_round(1, 2), FAILED, a_round(30)], readers=3)
+    assert (cell.variant, cell.params, cell.unit) == ("zenoh-shm", {"size": "1920x1080", "readers": 3}, "us")
     assert cell.rounds == [[1, 2], [], [30]]
 
 
 def test_cpu_and_memory_are_medians_and_faults_are_counted() -> None:
-    cell = cell_of(
-        Case("mqtt", HD, 1),
-        [
-            a_round(1, cpu_writer=1.0, cpu_broker=7.0, torn=1),
-            a_round(1, cpu_writer=9.0, fallbacks=2),
-            a_round(1, cpu_writer=2.0, cpu_broker=9.0, torn=1),
-        ],
-    )
+    rounds = [
+        a_round(1, cpu_writer=1.0, cpu_broker=7.0, torn=1),
+        a_round(1, cpu_writer=9.0, fallbacks=2),
+        a_round(1, cpu_writer=2.0, cpu_broker=9.0, torn=1),
+    ]
+    cell = cell_of("mqtt", rounds)
     names = ("cpu_writer", "cpu_broker", "memory_reader_mb", "torn", "fallbacks")
     assert [cell.figures[name] for name in names] == [2.0, 8.0, 20.0, 2, 2]
 
 
 def test_each_reader_is_to_read_each_frame() -> None:
-    cell = cell_of(Case("mqtt", HD, 3), [a_round(1, 1, 1, 1, sent=2), a_round(sent=1)])
+    cell = cell_of("mqtt", [a_round(1, 1, 1, 1, sent=6), a_round(sent=3)], readers=3)
     assert cell.lost == 5
 
 
 def test_a_case_that_never_ran_is_there_and_empty() -> None:
-    cell = cell_of(Case("mqtt", HD, 1), [None] * 8)
-    assert (cell.samples, cell.figures["cpu_reader"], cell.lost) == ([], None, 0)
-    [table] = tables([cell])
+    cell = cell_of("mqtt", [FAILED] * 8)
+    assert (cell.samples, cell.figures, cell.lost) == ([], {}, None)
+    [table] = FRAMES.shown([cell])
     assert table.row_count == 1
     assert assessment([eight_rounds("zenoh-shm", 5.0), cell])[0].endswith("nothing was measured")
 
 
 def test_a_cell_has_the_name_of_its_role() -> None:
-    cell = cell_of(Case("mqtt", HD, 1, role="mqtt again"), [a_round(1)])
+    cell = cell_of("mqtt again", [a_round(1)])
     assert cell.variant == "mqtt again"
-    assert len(list(tables([cell]))) == 1
+    assert len(FRAMES.shown([cell])) == 1
 
 
 def test_words_compare_like_with_like() -> None:
@@ -70,7 +81,7 @@ def test_words_compare_like_with_like() -> None:
         eight_rounds("zenoh-shm", 500, cpu_reader=0.5),
         eight_rounds("gstreamer-shm", 1000),
         eight_rounds("memcpy", 500),
-        cell_of(Case("gstreamer-shm", HD, 3), [a_round(1)] * 8),
+        cell_of("gstreamer-shm", [a_round(1)] * 8, readers=3),
     ]
     against, memcpy = assessment(cells)
     assert against.startswith("1920x1080, one reader: zenoh-shm takes 0.50× the time of gstreamer-shm (")
@@ -80,7 +91,7 @@ def test_words_compare_like_with_like() -> None:
 
 @pytest.mark.parametrize(("rounds", "lines"), [(7, 2), (8, 1)])
 def test_few_rounds_are_shown_and_not_judged(rounds: int, lines: int) -> None:
-    cells = [cell_of(Case(name, HD, 1), [a_round(5.0)] * rounds) for name in ("zenoh-shm", "mqtt")]
+    cells = [cell_of(name, [a_round(5.0)] * rounds) for name in ("zenoh-shm", "mqtt")]
     assert len(assessment(cells)) == lines
     assert ("equal within noise" in assessment(cells)[0]) == (lines == 1)
 
@@ -89,14 +100,14 @@ def test_few_rounds_are_shown_and_not_judged(rounds: int, lines: int) -> None:
     ("gone", "asked", "enough"), [(0, 8, True), (2, 10, True), (3, 10, False), (1, 2, True), (2, 2, False)]
 )
 def test_failed_rounds_are_reported_and_too_few_are_not_enough(gone: int, asked: int, enough: bool) -> None:
-    cell = cell_of(Case("mqtt", HD, 1), [None] * gone + [a_round(1.0)] * (asked - gone))
-    assert complete([cell], asked) == enough
+    cell = cell_of("mqtt", [FAILED] * gone + [a_round(1.0)] * (asked - gone))
+    assert complete([cell]) == enough
     lines = [f"1920x1080, one reader, mqtt: {gone} rounds failed and are left out"]
     assert assessment([cell]) == (lines if gone else [])
 
 
 def test_torn_frames_and_fallbacks_are_reported() -> None:
-    cell = cell_of(Case("zenoh-copy", HD, 3), [a_round(1, torn=2), a_round(1, fallbacks=5)])
+    cell = cell_of("zenoh-copy", [a_round(1, torn=2), a_round(1, fallbacks=5)], readers=3)
     assert assessment([cell]) == [
         "1920x1080, 3 readers, zenoh-copy: 2 frames arrived torn",
         "1920x1080, 3 readers, zenoh-copy: 5 frames could not go through shared memory",
@@ -104,12 +115,18 @@ def test_torn_frames_and_fallbacks_are_reported() -> None:
 
 
 def test_one_table_for_each_size_and_number_of_readers() -> None:
-    small = Size(64, 48)
-    cells = [cell_of(Case(name, size, n), [a_round(1)]) for name in VARIANTS for size in (HD, small) for n in (3, 1)]
-    titles = [str(table.title) for table in tables(cells)]
-    assert titles == [f"{size} BGR at 30 Hz, {who}" for size in (small, HD) for who in ("one reader", "3 readers")]
-    assert [table.row_count for table in tables(cells)] == [len(VARIANTS)] * 4
+    cells = [
+        cell_of(name, [a_round(1)], size=size, readers=count)
+        for size in (SMALL, HD)
+        for count in (1, 3)
+        for name in VARIANTS
+    ]
+    tables = FRAMES.shown(cells)
+    assert [table.title for table in tables] == [
+        f"{size} BGR at 30 Hz, readers: {count}" for size in (SMALL, HD) for count in (1, 3)
+    ]
+    assert [table.row_count for table in tables] == [len(VARIANTS)] * 4
 
 
 def test_every_variant_is_explained() -> None:
-    assert len(legend(VARIANTS)) > len(VARIANTS)
+    assert len(list(legend([eight_rounds(name, 1.0) for name in VARIANTS]))) > len(VARIANTS)

@@ -2,15 +2,16 @@
 
 import io
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import frames, frames_null, null
+from pebble.bench import engine, null
+from pebble.bench.comparison import Case
+from pebble.bench.frames import FRAMES_NULL
 from pebble.bench.frames_loop import RATE_HZ
-from pebble.bench.frames_report import Round
-from pebble.bench.frames_variants import Case, Size
 from pebble.bench.plots_latency import LEAST
 from pebble.bench.results import Cell, Judged, load
 from pebble.errors import PebbleError
@@ -67,18 +68,16 @@ def test_nothing_measured_is_not_passed() -> None:
 
 
 def test_a_fifth_of_what_was_usual_is_planted() -> None:
-    plain, again, slowed = (Case("mqtt", Size(64, 48), 1, role) for role in null.roles("mqtt"))
-    so_far = {plain: [a_round(100), None], again: [a_round(300), a_round()], slowed: [a_round(9000)]}
-    assert frames_null.slowdown_us(slowed, so_far) == pytest.approx(40)
-    assert frames_null.slowdown_us(plain, so_far) == 0
-    assert frames_null.slowdown_us(slowed, {slowed: []}) == 0
-
-
-def a_round(*latencies_us: float) -> Round:
-    return Round(
-        latencies_us=latencies_us, sent=1, torn=0, fallbacks=0, cpu_writer=1, cpu_reader=1, cpu_broker=None,
-        memory_writer_mb=1, memory_reader_mb=1,
-    )  # fmt: skip
+    about, condition = FRAMES_NULL, {"size": "64x48", "readers": 1}
+    so_far = engine.Collected(about, null.roles("mqtt"), [condition])
+    assert so_far.planted_us(condition) == 0
+    times = {"mqtt": [[100.0], []], "mqtt again": [[300.0], []], "mqtt +20 %": [[9000.0]]}
+    so_far.add(
+        Cell(variant=role, params=condition, measure="frame", unit="us", rounds=[one])
+        for role, rounds in times.items()
+        for one in rounds
+    )
+    assert so_far.planted_us(condition) == pytest.approx(0.2 * 100)  # of all roles but the slowed one
 
 
 class Processes:
@@ -87,9 +86,9 @@ class Processes:
     def __init__(self, *, obedient: bool = True) -> None:
         self._noise, self._obedient = random.Random(1), obedient
 
-    def __call__(self, case: Case, _seconds: float) -> Round:
-        added = case.slower_us if self._obedient else 0.0
-        return a_round(*(added + self._noise.gauss(400, 8) for _ in range(20)))
+    def __call__(self, case: Case) -> list[Cell]:
+        added = case.planted_us if self._obedient and case.slowed else 0.0
+        return [case.cell("frame", "us", (added + self._noise.gauss(400, 8) for _ in range(20)), sent=20)]
 
 
 @pytest.mark.thorough
@@ -101,13 +100,10 @@ class Processes:
         (False, True, 0, ": not judged ("),
     ],
 )
-def test_frames_against_themselves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, obedient: bool, quick: bool, code: int, outcome: str
-) -> None:
-    monkeypatch.setattr(frames, "run_case", Processes(obedient=obedient))
+def test_frames_against_themselves(tmp_path: Path, obedient: bool, quick: bool, code: int, outcome: str) -> None:
     printed = io.StringIO()
-    plan = frames_null.plan(quick=quick, output=tmp_path)
-    assert frames_null.run(plan, Console(file=printed, width=80)) == code
+    about = replace(FRAMES_NULL, measure=Processes(obedient=obedient))
+    assert engine.run(about.run_of(quick=quick, output=tmp_path, console=Console(file=printed, width=80))) == code
     results = load(tmp_path / "frames-null.json")
     assert [cell.variant for cell in results.cells] == list(null.roles("zenoh-shm"))
     assert (results.bench, results.quick) == ("frames-null", quick)
@@ -118,16 +114,13 @@ def test_frames_against_themselves(
 
 
 def test_one_thing_is_tested_at_a_time(tmp_path: Path) -> None:
+    with pytest.raises(PebbleError, match="leave --variants out"):
+        engine.run(FRAMES_NULL.run_of(variants=["mqtt", "memcpy"], output=tmp_path))
     with pytest.raises(PebbleError, match="one variant, one size"):
-        frames_null.run(frames_null.plan(variants=["mqtt", "memcpy"], output=tmp_path))
+        engine.run(FRAMES_NULL.run_of(readers=[1, 3], output=tmp_path))
 
 
 @pytest.mark.parametrize("quick", [True, False])
 def test_frames_gives_enough_for_a_distribution(quick: bool) -> None:
-    plan = frames_null.plan(quick=quick)
-    assert plan.rounds * plan.seconds * RATE_HZ >= 1.1 * LEAST
-
-
-def test_a_writer_that_is_held_up_is_seen_in_every_latency() -> None:
-    took = frames.run_case(Case("zenoh-shm", Size(64, 48), 1, slower_us=5000.0), 0.3).latencies_us
-    assert min(took) >= 5000.0
+    run = FRAMES_NULL.run_of(quick=quick)
+    assert run.rounds * run["seconds"] * RATE_HZ >= 1.1 * LEAST
