@@ -12,9 +12,9 @@ from pebble.errors import PebbleError
 MODULES: Final = {
     "control": "control",
     "control-null": "control",
-    "bridge": "unported",
-    "bridge-profile": "unported",
-    "bridge-null": "unported",
+    "bridge": "bridge",
+    "bridge-profile": "bridge",
+    "bridge-null": "bridge",
     "startup": "startup",
     "cost": "cost",
     "frames": "frames",

@@ -6,43 +6,8 @@ Their command lines are in pebble.commands, and their runs in modules of their o
 from __future__ import annotations
 
 from pebble.bench.comparison import Budget, Comparison
-from pebble.bench.pictures import Drawn, ecdf, null_ratios, ratios
+from pebble.bench.pictures import Drawn
 
-BRIDGE = Comparison(
-    name="bridge",
-    title="Operator to wheels, and back",
-    what="A whole robot of each kind, with a stock broker between it and the operator. Down is from the operator's "
-    "publish call to the last byte of the command's line at the MCU's pty; up is from the "
-    "MCU's report to the operator.",
-    full=Budget(300),
-    quick=Budget(22),
-    summary_lines=3,
-    reported_full=("--with-media",),
-    pictures=(ecdf("Operator to wheels and back"), ratios("Operator to wheels and back", "mqtt")),
-)
-BRIDGE_PROFILE = Comparison(
-    name="bridge-profile",
-    title="Operator to wheels: where the time goes",
-    what="The same path of a command, hop by hop, from the time stamps of its packets on loopback: for a typical "
-    "command, and for the slowest ones.",
-    full=Budget(60),
-    quick=Budget(12),
-    root=True,
-    words=("bench", "bridge"),
-    reported=("--profile",),
-    pictures=(ecdf("Operator to wheels, hop by hop"),),
-)
-BRIDGE_NULL = Comparison(
-    name="bridge-null",
-    title="Operator to wheels: the null test",
-    what="One robot in three roles that take turns: plain, again, and with a fifth of the usual latency planted by "
-    "the operator. The first interval must include 1.00, the second must lie above it.",
-    full=Budget(150),
-    quick=Budget(14),
-    words=("bench", "bridge"),
-    reported=("--null",),
-    pictures=(null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
-)
 IMPAIR = Comparison(
     name="impair",
     title="On an impaired network",
