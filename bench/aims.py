@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Judged, percentile
-from pebble.bench.tables import figure
+from pebble.bench.tables import base_of, figure
 
 MET, MISSED, NOT_JUDGED = "met", "missed", "not judged"
 
@@ -75,3 +76,50 @@ class Aim:
         if math.isfinite(value):
             return f"{self.shown(value)} {self.unit}".strip()
         return "nothing arrived" if math.isnan(value) else self.never
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RatioAim:
+    """A bound for the ratio of a percentile of some cells to that of the variant ``to`` under the same conditions.
+
+    It is judged by the ratio's interval: met if all of it is within the bound, missed if all of it is beyond, and not
+    judged in between. Lost messages are infinitely late. ``what`` is as in :class:`Aim`.
+    """
+
+    what: str
+    of: Callable[[Cell], bool]
+    to: str
+    at_most: float
+    percent: float = 50
+    least: int = 1  # samples of each round, to be judged
+
+    def __call__(self, cells: Sequence[Cell]) -> Iterator[Judged]:
+        for cell in filter(self.of, cells):
+            base = base_of(cell, cells, self.to)
+            if base is not None and base is not cell:
+                yield self._judged(cell, base)
+
+    def _judged(self, cell: Cell, base: Cell) -> Judged:
+        rounds = [rounds_with_lost(one) for one in (cell, base)]
+        interval = paired(rounds[0], rounds[1], self.percent)
+        few = interval.few or min(len(one) for some in rounds for one in some) < self.least
+        decided = not few and (interval.high <= self.at_most or interval.low > self.at_most)
+        return Judged(
+            what=self.what.format(variant=cell.variant, measure=cell.measure, bound=self.at_most, **cell.params),
+            outcome=outcome(interval.high <= self.at_most, judged=decided),
+            measured=str(interval) + ("" if decided else _why(interval, few=few)),
+        )
+
+
+def _why(interval: Interval, *, few: bool) -> str:
+    if interval.few:
+        return f", {interval.rounds} of {LEAST_ROUNDS} rounds"
+    return ", too few samples in a round" if few else ", the interval includes the bound"
+
+
+def rounds_with_lost(cell: Cell) -> list[list[float]]:
+    """The rounds of a cell with its lost messages as infinitely late. Each round sends equally many."""
+    if cell.lost is None:
+        return cell.rounds
+    each = round((len(cell.samples) + cell.lost) / max(1, len(cell.rounds)))
+    return [[*one, *[math.inf] * (each - len(one))] for one in cell.rounds]

@@ -8,105 +8,315 @@ local transport and the serial bridge. Real processes, stock mosquitto, loopback
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from statistics import fmean
+from typing import Any
 
-from rich.console import Console
-from rich.progress import Progress
+from pebble.bench import null
+from pebble.bench.aims import Aim, RatioAim, with_lost
+from pebble.bench.bridge_operator import RATE_HZ, Arrived, DriveSegment
+from pebble.bench.bridge_profile import may_capture, profile_assessment, profile_tables, trace_commands
+from pebble.bench.bridge_report import (
+    COMMANDS,
+    CPU,
+    DOWN,
+    LOADED,
+    UNLOADED,
+    UP,
+    WAYS,
+    assessment,
+    legend,
+    suffix,
+    tables,
+    with_excess,
+)
+from pebble.bench.bridge_robots import BRIDGE as FORWARDER
+from pebble.bench.bridge_robots import HOP, SERIAL, STAND_IN, DrivenRobot, MediaLoad, OneHop
+from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
+from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
+from pebble.bench.ratios import LEAST_ROUNDS
+from pebble.bench.results import Cell, Value
+from pebble.errors import PebbleError
+from pebble.rig.robot import KINDS
 
-from pebble.bench import bridge_report
-from pebble.bench.bridge_drive import Arrived, DriveSegment
-from pebble.bench.bridge_driven_robot import DrivenRobot
-from pebble.bench.bridge_media import MediaLoad
-from pebble.bench.bridge_one_hop import HOP, OneHop
-from pebble.bench.bridge_plan import BridgePlan
-from pebble.bench.bridge_tally import LOADED, UNLOADED, Tally
-from pebble.bench.engine import Rounds, finish
-from pebble.bench.results import Stopwatch
-from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports.segments import sweep
-
+NULL_RATE_HZ = 100.0  # more than an operator's 20 a second, to shorten the test
+AIMS_MS, AIMED = {50: 0.7, 99: 2.0}, ((DOWN, UNLOADED), (UP, UNLOADED), (DOWN, COMMANDS))
+#: At most this ratio to the stand-in. Commands, by percentile: nothing else is forwarded.
+AIMS_COMMANDS = {50: {"mqtt": 1.0, "zenoh": 1.05}, 99: {"mqtt": 0.5, "zenoh": 0.5}}
+#: CPU for each message, by process: commands and reports are forwarded.
+AIMS_CPU = {FORWARDER: {"mqtt": 1.0, "zenoh": 1.1}, SERIAL: {"mqtt": 1.1, "zenoh": 1.4}}
+LEAST_SAMPLES = {50: 1, 99: 300}  # to assess an aim: with fewer, hardly any lie beyond that percentile
+LEAST_IN_ROUND = {50: 1, 99: 100}  # to assess a ratio over rounds
+_TURN_S, _NULL_TURN_S = 1.0, 0.05  # of driving one robot before the next one
 _STARTUP_S = 1.0  # for start-up work to finish
-_TURN_S = 1.0  # of driving one robot before the next one
 _MEDIA_STARTUP_S = 1.0
-
-RoundPart = tuple[Tally, list[DriveSegment], list[Arrived], Mapping[str, int]]
-"""One robot's part of a round: its tally, what was driven, what arrived, and how much media flowed meanwhile."""
-
-
-def run(plan: BridgePlan, console: Console | None = None) -> int:
-    """Measure, show and write; 0 if everything has results and enough rounds are left. Raises PebbleError."""
-    console = console or Console()
-    plan.check()
-    watch = Stopwatch("bridge", plan.command(), plan.options())
-    tallies = [Tally(kind, UNLOADED) for kind in plan.kinds] + [Tally(kind, LOADED) for kind in plan.media_kinds]
-    tallies.append(Tally(HOP, reports=False))
-    rounds = Rounds(plan.rounds, console)
-    with interrupted_by_signals():
-        try:
-            _measure(plan, tallies, rounds, console)
-        finally:
-            sweep()  # Zenoh leaves files behind even after a regular end
-    cells = [cell for tally in tallies for cell in tally.cells()]
-    bridge_report.show(cells, console)
-    lines = [*rounds.notes(), *bridge_report.assessment(cells)]
-    finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
-    return rounds.code(cells)
+_PILOT_S = 2.0
+_MODES = ("with-media", "null", "profile")
 
 
-def _measure(plan: BridgePlan, tallies: Sequence[Tally], rounds: Rounds, console: Console) -> None:
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("", total=plan.rounds)
-        for number in range(plan.rounds):
-
-            def show_step(what: str, number: int = number) -> None:
-                progress.update(task, completed=number, description=f"round {number + 1} of {plan.rounds}: {what}")
-
-            with rounds.attempt(number):
-                for tally, segments, found, flowed in _round(plan, tallies, number, show_step):
-                    tally.add_round(segments, found, flowed)
+def conditions(run: Run) -> list[dict[str, Value]]:
+    return [{"load": load} for load in (UNLOADED, COMMANDS, *([LOADED] if run["with-media"] else []))]
 
 
-def _round(
-    plan: BridgePlan, tallies: Sequence[Tally], number: int, show_step: Callable[[str], None]
-) -> list[RoundPart]:
-    """Measures one round; its parts count only if all of them succeed. Raises PebbleError."""
-    by_name = {(tally.variant, tally.load): tally for tally in tallies}
-    parts: list[RoundPart] = []
-    with ExitStack() as stack:
-        show_step("starting the robots")
-        driven_robots = [stack.enter_context(DrivenRobot(kind, media=kind in plan.media_kinds)) for kind in plan.kinds]
-        hop = stack.enter_context(OneHop())
-        for driven_robot in driven_robots:
-            driven_robot.wait()
+def prepare(run: Run) -> None:
+    """Raises PebbleError if several modes are wanted."""
+    if len(named := [f"--{name}" for name in _MODES if run[name]]) > 1:
+        raise PebbleError(f"{' and '.join(named)} are different runs: give one of them")
+    turn_s = _NULL_TURN_S if run.comparison.is_null else _TURN_S
+    run.options["passes"] = max(1 + run.comparison.is_null, round(run["seconds"] / turn_s))
+
+
+def prepare_profile(run: Run) -> None:
+    """Raises PebbleError without permission to capture packets."""
+    prepare(run)
+    run.options["passes"] = 1
+    may_capture()
+
+
+def measure(round_: Round) -> Iterator[Cell]:
+    """Fresh robots that forward reports, also with media; and fresh ones that do not. In turn, the other way round."""
+    run = round_.run
+    for load in (COMMANDS, UNLOADED) if round_.number % 2 else (UNLOADED, COMMANDS):
+        with ExitStack() as stack:
+            run.show("starting the robots")
+            driven: dict[str, DrivenRobot | OneHop] = {
+                kind: stack.enter_context(
+                    DrivenRobot(kind, media=load == UNLOADED and _has_media(run, kind), reports=load == UNLOADED)
+                )
+                for kind in run["variants"]
+            }
+            if load == UNLOADED:
+                driven[HOP] = stack.enter_context(OneHop())
+            for one in driven.values():
+                one.wait()
+            time.sleep(_STARTUP_S)
+            yield from _in_turns(round_, load, driven)
+            if load == UNLOADED and run["with-media"]:
+                yield from _with_media(round_, driven)
+
+
+def _has_media(run: Run, kind: str) -> bool:
+    """The stand-in has none."""
+    return bool(run["with-media"]) and kind in KINDS
+
+
+def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot | OneHop]) -> Iterator[Cell]:
+    """Drives each of them for the seconds of a round, in as many turns as there are passes."""
+    turn_s = round_.run["seconds"] / round_.run["passes"]
+    cases = (case for case in round_.cases([{"load": load}]) if case.variant in driven)
+    turns = [(case, driven[case.variant].drive(turn_s)) for case in cases]
+    for name, one in driven.items():
+        own = [(case, segment) for case, segment in turns if case.variant == name]
+        found = one.match_arrivals([segment for _, segment in own])
+        for (case, segment), arrived in zip(own, found, strict=True):
+            yield from cells_of(case, segment, arrived)
+
+
+def _with_media(round_: Round, driven: Mapping[str, DrivenRobot | OneHop]) -> Iterator[Cell]:
+    """One robot after the other, while its own camera and microphone are in use."""
+    for case in round_.cases([{"load": LOADED}], 1):
+        robot = driven[case.variant]
+        if isinstance(robot, DrivenRobot) and _has_media(case.run, case.variant):
+            with MediaLoad(robot) as media_load:
+                time.sleep(_MEDIA_STARTUP_S)
+                before = media_load.counts()
+                segment = robot.drive(case.run["seconds"])
+                after = media_load.counts()
+            (arrived,) = robot.match_arrivals([segment])
+            yield from cells_of(case, segment, arrived, {name: after[name] - before[name] for name in after})
+
+
+def cells_of(
+    case: Case, segment: DriveSegment, arrived: Arrived, flowed: Mapping[str, int] | None = None
+) -> Iterator[Cell]:
+    """Of one turn; ``flowed`` counts the media received meanwhile."""
+    load, took_s = case.condition["load"], (segment.ended - segment.began) / 1e9
+    figures: dict[str, Any] = {"cpu_percent": 100 * segment.cpu_s / took_s} if segment.cpu_s else {}
+    figures |= {f"{name}_per_s": count / took_s for name, count in (flowed or {}).items()}
+    yield case.cell(DOWN, "ms", arrived.down, sent=arrived.sent, **figures)
+    if load != COMMANDS and case.variant != HOP:
+        yield case.cell(UP, "ms", arrived.up, sent=arrived.reports, **figures)
+    if load != LOADED:
+        for part, cpu_s in segment.parts_cpu_s.items():
+            each = [1e6 * cpu_s / arrived.forwarded] if arrived.forwarded else []
+            yield case.cell(CPU, "us", each, {"process": part})
+
+
+# -- the null test
+
+
+@contextmanager
+def _running_robot(run: Run) -> Iterator[DrivenRobot]:
+    """One for all roles and rounds: fresh robots would differ by more than the planted difference."""
+    (kind,) = run["variants"]
+    with DrivenRobot(kind) as driven:
+        driven.wait()
         time.sleep(_STARTUP_S)
-        show_step("driving in turns")
-        participants: list[DrivenRobot | OneHop] = [*driven_robots, hop]
-        for participant, segments in _in_turns(participants, plan.seconds, backwards=bool(number % 2)):
-            parts.append((by_name[participant.kind, UNLOADED], segments, participant.match_arrivals(segments), {}))
-        with_media = [one for one in driven_robots if one.kind in plan.media_kinds]
-        for driven_robot in with_media[::-1] if number % 2 else with_media:
-            show_step(f"{driven_robot.kind} with media")
-            parts.append(_drive_with_media(driven_robot, plan.seconds, by_name[driven_robot.kind, LOADED]))
-    return parts
+        yield driven
 
 
-def _in_turns(
-    participants: Sequence[DrivenRobot | OneHop], seconds: float, *, backwards: bool
-) -> list[tuple[DrivenRobot | OneHop, list[DriveSegment]]]:
-    """Drives each participant for ``seconds`` in total, reversing the order after each turn."""
-    turns = max(1, round(seconds / _TURN_S))
-    segments: dict[str, list[DriveSegment]] = {participant.kind: [] for participant in participants}
-    for turn in range(turns):
-        for participant in participants[::-1] if backwards != bool(turn % 2) else participants:
-            segments[participant.kind].append(participant.drive(seconds / turns))
-    return [(participant, segments[participant.kind]) for participant in participants]
+def pilot(case: Case) -> Iterator[Cell]:
+    """The usual latency. Raises PebbleError if no command arrives."""
+    (found,) = case.env.match_arrivals([case.env.drive(_PILOT_S, NULL_RATE_HZ)])
+    if not found.down:
+        raise PebbleError(f"{case.variant}: no command arrived\n{case.env.robot.log()}")
+    yield case.cell(DOWN, "ms", found.down)
 
 
-def _drive_with_media(driven_robot: DrivenRobot, seconds: float, tally: Tally) -> RoundPart:
-    with MediaLoad(driven_robot.robot, driven_robot.operator) as media_load:
-        time.sleep(_MEDIA_STARTUP_S)
-        before = media_load.counts()
-        segments = [driven_robot.drive(seconds)]
-        after = media_load.counts()
-    return tally, segments, driven_robot.match_arrivals(segments), {name: after[name] - before[name] for name in after}
+def in_roles(round_: Round) -> Iterator[Cell]:
+    """Very short turns, so that a disturbance of the machine hits all roles.
+
+    The operator works before every command; only in the slowed role it reads the clock before that work.
+    """
+    robot, run = round_.env, round_.run
+    turns = [
+        (case, robot.drive(
+            run["seconds"] / run["passes"], NULL_RATE_HZ, work_us=case.planted_us, slowed=case.slowed
+        ))
+        for case in round_.cases()
+    ]  # fmt: skip
+    found = robot.match_arrivals([segment for _, segment in turns])
+    run.notes[:] = [
+        f"Planted: {turns[0][0].planted_us:.0f} us, a fifth of the usual latency. All {run.rounds} rounds are turns of"
+        " one running robot, not fresh robots, and only commands to the wheels are assessed."
+    ]
+    for (case, _), arrived in zip(turns, found, strict=True):
+        yield case.cell(DOWN, "ms", arrived.down, sent=arrived.sent)
+
+
+# -- the aims
+
+
+def _aim(percent: int, measure_: str, load: str) -> Aim:
+    return Aim(
+        what=f"{{variant}}, {WAYS[measure_]}{suffix(load)}, p{percent} at most {{bound:g}} ms",
+        of=lambda cell: (cell.measure, cell.params["load"]) == (measure_, load) and cell.variant in KINDS,
+        value=with_lost(percent), at_most=AIMS_MS[percent], least=LEAST_SAMPLES[percent], least_rounds=LEAST_ROUNDS,
+        shown=with_excess(AIMS_MS[percent]), never="not within 1 s",
+    )  # fmt: skip
+
+
+def _command_aim(percent: int, kind: str, at_most: float) -> RatioAim:
+    return RatioAim(
+        what=f"{{variant}}, {WAYS[DOWN]}{suffix(COMMANDS)}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
+        of=lambda cell: (cell.variant, cell.measure, cell.params["load"]) == (kind, DOWN, COMMANDS),
+        to=STAND_IN, percent=percent, at_most=at_most, least=LEAST_IN_ROUND[percent],
+    )  # fmt: skip
+
+
+def _cpu_aim(process: str, kind: str, at_most: float) -> RatioAim:
+    return RatioAim(
+        what=f"{{variant}}, {CPU} of the {{process}}, commands and reports, at most {{bound:.2f}} of {STAND_IN}'s",
+        of=lambda cell: (
+            (cell.variant, cell.measure, cell.params["load"], cell.params.get("process"))
+            == (kind, CPU, UNLOADED, process)
+        ),
+        to=STAND_IN, at_most=at_most,
+    )  # fmt: skip
+
+
+def _options(known: Sequence[str]) -> tuple[Option, ...]:
+    return (
+        Option(name="with-media", kind=bool, help="Also with 1080p pictures and sound, and compare."),
+        rounds("How often robots are started."),
+        seconds("Driving time per robot and round, under each load."),
+        variants(known, "Some of paho, mqtt and zenoh. [--null: one of mqtt and zenoh, by default zenoh]"),
+        Option(
+            name="null", kind=bool, recorded=False,
+            help="One robot against itself, and against itself slowed down by a fifth.",
+        ),
+        Option(name="profile", kind=bool, recorded=False, help="Latency of a command hop by hop."),
+    )  # fmt: skip
+
+
+_UNSET = dict.fromkeys(_MODES, False)
+
+BRIDGE_NULL = Comparison(
+    name="bridge-null",
+    title="Operator to wheels: the null test",
+    what="One robot in three roles that take turns: plain, again, and with a fifth of the usual latency planted by "
+    "the operator. The first interval must include 1.00, the second must lie above it.",
+    options=_options(KINDS),
+    full=Budget(150, **{**_UNSET, "null": True}, rounds=10, seconds=4.0, fresh_every=10_000),
+    quick=Budget(14, rounds=4, seconds=0.5),
+    constants={"rate_hz": NULL_RATE_HZ},
+    is_null=True,
+    variants=KINDS[1:],
+    conditions=lambda _run: [{"load": UNLOADED}],
+    prepare=prepare,
+    environment=_running_robot,
+    measure=pilot,
+    measure_round=in_roles,
+    tables=(tables,),
+    assessment=(null.assessment,),
+    words=("bench", "bridge"),
+    reported=("--null",),
+    pictures=(null_ratios("Null test of bridge"), ecdf("Null test of bridge")),
+)
+BRIDGE_PROFILE = Comparison(
+    name="bridge-profile",
+    title="Operator to wheels: where the time goes",
+    what="The same path of a command, hop by hop, from the time stamps of its packets on loopback: for a typical "
+    "command, and for the slowest ones.",
+    options=_options(KINDS),
+    full=Budget(60, **{**_UNSET, "profile": True}, rounds=3, seconds=10.0),
+    quick=Budget(12, rounds=1, seconds=2.0),
+    constants={"rate_hz": RATE_HZ},
+    variants=KINDS,
+    prepare=prepare_profile,
+    measure=trace_commands,
+    tables=(profile_tables,),
+    assessment=(profile_assessment,),
+    root=True,
+    words=("bench", "bridge"),
+    reported=("--profile",),
+    pictures=(ecdf("Operator to wheels, hop by hop"),),
+)
+BRIDGE = Comparison(
+    name="bridge",
+    title="Operator to wheels, and back",
+    what="A whole robot of each kind, with a stock broker between it and the operator. Down is from the operator's "
+    "publish call to the last byte of the command's line at the MCU's pty; up is from the MCU's report to the "
+    "operator. Under “commands” robots forward no reports. CPU is that of the process that bridges, and of the one "
+    "that owns the serial line, for each command and report that they forwarded.",
+    help="""Drive commands from an operator to the wheels of a whole simulated robot, and its telemetry back.
+
+    Latency at 20 commands and 50 reports a second, and at 20 commands alone, on MQTT, on Zenoh and of a robot of plain
+    paho, compared with one hop through a stock broker. With --with-media also while a program on the robot reads
+    1920x1080 frames at 30 Hz and an operator receives video and audio. Needs mosquitto.
+
+    \b
+        pebble bench bridge
+        pebble bench bridge --with-media --output results
+        pebble bench bridge --rounds 10 --seconds 25
+        pebble bench bridge --profile
+    """,
+    options=_options((STAND_IN, *KINDS)),
+    full=Budget(480, **_UNSET, rounds=10, seconds=4.0),
+    quick=Budget(45, rounds=4, seconds=0.5),
+    constants={"rate_hz": RATE_HZ},
+    variants=(STAND_IN, *KINDS),
+    references=(HOP,),
+    conditions=conditions,
+    prepare=prepare,
+    measure_round=measure,
+    measures=(DOWN, UP, CPU),
+    figures=dict.fromkeys(("cpu_percent", "frames_per_s", "video_per_s", "audio_per_s"), of_known(fmean, 1)),
+    tables=(tables,),
+    legend=legend,
+    assessment=(
+        assessment,
+        *(_aim(percent, *where) for where in AIMED for percent in AIMS_MS),
+        *(_command_aim(percent, *one) for percent, aims in AIMS_COMMANDS.items() for one in aims.items()),
+        *(_cpu_aim(process, *one) for process, aims in AIMS_CPU.items() for one in aims.items()),
+    ),
+    modes={"null": BRIDGE_NULL, "profile": BRIDGE_PROFILE},
+    summary_lines=3,
+    reported_full=("--with-media",),
+    pictures=(
+        ecdf("Operator to wheels and back", measures=(DOWN, UP)),
+        ratios("Operator to wheels and back", "mqtt", measures=(DOWN, UP)),
+        bars("Operator to wheels and back", measures=(CPU,), panel="load", group="process"),
+    ),
+)  # fmt: skip

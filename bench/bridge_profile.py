@@ -1,4 +1,4 @@
-"""Shows where a command spends its time between the operator and the wheels, hop by hop.
+"""Shows where a command spends its time between the operator and the wheels, hop by hop. Linux, root only.
 
 Between the operator's publish call and the MCU's pty, the kernel records when the command's packets pass on loopback.
 Zenoh's traffic inside the robot uses other sockets, so that part counts as one hop.
@@ -6,24 +6,25 @@ Zenoh's traffic inside the robot uses other sockets, so that part counts as one 
 
 from __future__ import annotations
 
+import ctypes
+import re
+import socket
+import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
+from typing import Self
 
-from rich.console import Console
-from rich.progress import track
+from rich.table import Table
 
-from pebble.bench.bridge_capture import PacketCapture, PassageTimes
-from pebble.bench.bridge_drive import arrivals
-from pebble.bench.bridge_driven_robot import DrivenRobot
-from pebble.bench.bridge_operator import Wheels
-from pebble.bench.bridge_plan import BridgePlan
-from pebble.bench.engine import finish
-from pebble.bench.results import Cell, Stopwatch, percentile
+from pebble.bench.bridge_operator import Wheels, arrivals, wheels_of
+from pebble.bench.bridge_robots import DrivenRobot
+from pebble.bench.comparison import Case
+from pebble.bench.results import Cell, percentile
 from pebble.bench.tables import figure, plain_table
+from pebble.errors import PebbleError
 from pebble.rig.robot import Robot
-from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports.segments import sweep
 
 #: By transport, in order: the component that holds the command. Results are compared by these names.
 HOPS = {
@@ -38,39 +39,38 @@ _LEAST = 5  # commands among the slowest; fewer may be chance
 Times = list[tuple[float, ...]]
 """For each command the time of each hop, ms."""
 
+_ETH_P_IP = 0x0800
+_SO_ATTACH_FILTER, _SO_RCVBUFFORCE, _SO_TIMESTAMPNS = 26, 33, 35  # asm-generic/socket.h
+_INSTRUCTION = struct.Struct("HBBI")  # of linux/filter.h: code, jump if true, jump if false, k
+_LOAD_HEADER_LENGTH, _LOAD_HALF_AFTER, _JUMP_IF_EQUAL, _RETURN = 0xB1, 0x48, 0x15, 0x06
+_BUFFER = 64 * 1024 * 1024  # bytes: the traffic of a minute
+_LARGEST = 65_536
+_ETHERNET, _TCP = 14, 6
+_TIMESPEC = struct.Struct("qq")
+_COMMAND = re.compile(rb'/drive-values.{0,3}?(\{"x": [-+.0-9e]+, "z": [-+.0-9e]+\})', re.DOTALL)  # a packet's number
 
-def run(plan: BridgePlan, console: Console | None = None) -> int:
-    """Returns 0 if commands were traced all the way on every robot. Raises PebbleError."""
-    console = console or Console()
-    plan.check()
-    watch = Stopwatch("bridge-profile", plan.command(), plan.options())
-    found: dict[str, list[Times]] = {kind: [] for kind in plan.kinds}
-    with interrupted_by_signals():
-        try:
-            for number in track(range(plan.rounds), "rounds", console=console, transient=True):
-                for kind in plan.kinds[:: -1 if number % 2 else 1]:
-                    found[kind].append(_trace_commands(kind, plan.seconds))
-        finally:
-            sweep()  # Zenoh leaves files behind even after a regular end
-    cells = [cell for kind, rounds in found.items() for cell in cells_of(kind, rounds)]
-    for kind, rounds in found.items():
-        _show(kind, [times for one in rounds for times in one], console)
-    lines = [
-        line for kind, rounds in found.items() for line in assessment(kind, [hops for one in rounds for hops in one])
-    ]
-    finish(watch.results(cells, lines, quick=plan.quick), plan.output, console)
-    return 0 if all(cell.samples for cell in cells) else 1
+PassageTimes = dict[tuple[int, int], dict[Wheels, int]]
+"""By source and destination port: when (CLOCK_MONOTONIC, ns) each command first passed."""
 
 
-def _trace_commands(kind: str, seconds: float) -> Times:
-    with DrivenRobot(kind) as driven_robot, PacketCapture(driven_robot.robot.broker_ports) as wire:
+def may_capture() -> None:
+    """Raises PebbleError without permission to capture."""
+    with PacketCapture(()):
+        pass
+
+
+def trace_commands(case: Case) -> Iterator[Cell]:
+    """Drives a fresh robot and follows each command. Raises PebbleError."""
+    with DrivenRobot(case.variant) as driven_robot, PacketCapture(driven_robot.robot.broker_ports) as wire:
         driven_robot.wait()
         time.sleep(_STARTUP_S)
         wire.passed()
-        segment = driven_robot.drive(seconds)
+        segment = driven_robot.drive(case.run["seconds"])
         driven_robot.match_arrivals([segment])  # waits for the last ones
         pty = arrivals(driven_robot.robot.lines(segment.began))
-        return hops(segment.sent, [*_stations(wire.passed(), driven_robot.robot), pty])
+        times = hops(segment.sent, [*_stations(wire.passed(), driven_robot.robot), pty])
+    for number, name in enumerate((*HOPS[case.variant], ALL)):
+        yield case.cell("hop", "ms", [(*one, sum(one))[number] for one in times], {"hop": name})
 
 
 def _stations(passed: PassageTimes, robot: Robot) -> list[Mapping[Wheels, int]]:
@@ -109,43 +109,124 @@ def slowest(times: Times) -> Times:
     return [one for one in times if sum(one) >= limit]
 
 
-def cells_of(kind: str, rounds: Sequence[Times]) -> list[Cell]:
-    return [
-        Cell(
-            variant=kind,
-            params={"hop": name},
-            measure="hop",
-            unit="ms",
-            rounds=[[(*one, sum(one))[number] for one in times] for times in rounds],
+def _times_by_kind(cells: Sequence[Cell]) -> dict[str, Times]:
+    return {
+        kind: list(
+            zip(*(cell.samples for cell in cells if cell.variant == kind and cell.params["hop"] != ALL), strict=True)
         )
-        for number, name in enumerate((*HOPS[kind], ALL))
-    ]
+        for kind in dict.fromkeys(cell.variant for cell in cells)
+    }
 
 
-def assessment(kind: str, times: Times) -> list[str]:
+def profile_tables(cells: Sequence[Cell]) -> Iterator[Table]:
+    for kind, times in _times_by_kind(cells).items():
+        table = plain_table(f"{kind}: {len(times)} commands, mean of each hop, ms", ["hop", "typical", "slowest 1 %"])
+        if times:
+            rows = [(*_means(few), sum(_means(few))) for few in (typical(times), slowest(times))]
+            for number, name in enumerate((*HOPS[kind], ALL)):
+                table.add_row(name, *(figure(row[number]) for row in rows))
+        yield table
+
+
+def profile_assessment(cells: Sequence[Cell]) -> Iterator[str]:
+    for kind, times in _times_by_kind(cells).items():
+        yield explanation(kind, times)
+
+
+def explanation(kind: str, times: Times) -> str:
     """Names the hop in which the slowest commands lose their time, if there are enough of them."""
     if not times:
-        return [f"{kind}: no command was traced all the way"]
+        return f"{kind}: no command was traced all the way"
     late = slowest(times)
     if len(late) < _LEAST:
-        return [f"{kind}: {len(times)} commands are too few to tell where the slowest lose their time."]
+        return f"{kind}: {len(times)} commands are too few to tell where the slowest lose their time."
     more = [slow - usual for slow, usual in zip(_means(late), _means(typical(times)), strict=True)]
     worst = max(range(len(HOPS[kind])), key=lambda number: more[number])
     share = 100 * more[worst] / sum(more) if sum(more) > 0 else 0.0
-    return [
+    return (
         f"{kind}: of what the slowest {len(late)} of {len(times)} commands take longer than a typical one"
         f" ({sum(more):.2f} ms), {share:.0f} % is spent in: {HOPS[kind][worst]}."
-    ]
+    )
 
 
 def _means(times: Times) -> list[float]:
     return [sum(hop) / len(times) for hop in zip(*times, strict=True)]
 
 
-def _show(kind: str, times: Times, console: Console) -> None:
-    table = plain_table(f"{kind}: {len(times)} commands, mean of each hop, ms", ["hop", "typical", "slowest 1 %"])
-    if times:
-        rows = [(*_means(few), sum(_means(few))) for few in (typical(times), slowest(times))]
-        for number, name in enumerate((*HOPS[kind], ALL)):
-            table.add_row(name, *(figure(row[number]) for row in rows))
-    console.print(table)
+# -- packets on loopback
+
+
+class PacketCapture:
+    """Captures from ``with`` on; packets are read only in :meth:`passed`, which keeps the measurement undisturbed."""
+
+    def __init__(self, ports: Sequence[int]) -> None:
+        self._ports = ports
+
+    def __enter__(self) -> Self:
+        """Raises PebbleError without permission to capture."""
+        try:
+            self._socket = socket.socket(
+                socket.AF_PACKET, socket.SOCK_RAW
+            )  # without a protocol: it receives nothing yet
+        except PermissionError:
+            raise PebbleError("--profile captures packets on loopback, which requires root: run it with sudo") from None
+        try:
+            self._listen()
+        except OSError as error:
+            self._socket.close()
+            raise PebbleError(f"--profile cannot capture on loopback: {error.strerror}; run it with sudo") from None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def _listen(self) -> None:
+        program = port_filter(self._ports)  # otherwise other programs' traffic fills the buffer
+        code = ctypes.create_string_buffer(program, len(program))
+        short = struct.pack("HL", len(program) // _INSTRUCTION.size, ctypes.addressof(code))
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, short)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._socket.setblocking(False)
+        self._socket.bind(("lo", _ETH_P_IP))
+
+    def passed(self) -> PassageTimes:
+        """All commands since the last call."""
+        offset = time.time_ns() - time.monotonic_ns()  # the kernel stamps packets by the wall clock
+        found: PassageTimes = {}
+        with suppress(BlockingIOError):
+            while True:
+                frame, stamps, _, _ = self._socket.recvmsg(_LARGEST, 64)
+                ns = _stamp(stamps) - offset
+                for way, wheels in commands(frame):
+                    found.setdefault(way, {}).setdefault(wheels, ns)
+        return found
+
+
+def port_filter(ports: Sequence[int]) -> bytes:
+    """A BPF program that accepts only packets from or to these ports."""
+    passes = 1 + 2 * (1 + len(ports)) + 1  # index of the accepting instruction
+    program = [(_LOAD_HEADER_LENGTH, 0, 0, _ETHERNET)]
+    for offset in (0, 2):  # source, destination
+        program.append((_LOAD_HALF_AFTER, 0, 0, _ETHERNET + offset))
+        for port in ports:
+            program.append((_JUMP_IF_EQUAL, passes - len(program) - 1, 0, port))
+    program += [(_RETURN, 0, 0, 0), (_RETURN, 0, 0, _LARGEST)]
+    return b"".join(_INSTRUCTION.pack(*instruction) for instruction in program)
+
+
+def commands(frame: bytes) -> list[tuple[tuple[int, int], Wheels]]:
+    """The drive commands in an Ethernet frame: source and destination port, and the wheel speeds."""
+    packet = frame[_ETHERNET:]
+    if len(packet) < 40 or packet[9] != _TCP:
+        return []
+    segment = packet[4 * (packet[0] & 15) :]
+    source, destination = struct.unpack_from("!HH", segment)
+    return [((source, destination), wheels_of(found)) for found in _COMMAND.findall(segment)]
+
+
+def _stamp(stamps: list[tuple[int, int, bytes]]) -> int:
+    if len(stamps[0][2]) != _TIMESPEC.size:
+        raise PebbleError("--profile cannot read this kernel's time stamps: it requires a 64-bit Linux")
+    seconds, ns = _TIMESPEC.unpack(stamps[0][2])
+    return int(seconds) * 1_000_000_000 + int(ns)

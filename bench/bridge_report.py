@@ -1,56 +1,87 @@
-"""The tables and the assessment of the bridge comparison. Pure but for the printing."""
+"""The tables and the assessment of the bridge comparison. Pure."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
-from rich.console import Console
+from rich.table import Table
 
-from pebble.bench.aims import outcome
-from pebble.bench.bridge_driven_robot import STAND_IN
-from pebble.bench.bridge_one_hop import HOP
-from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP
+from pebble.bench.bridge_robots import FLOWS, HOP, STAND_IN
+from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell, Judged, Value, percentile
-from pebble.bench.tables import caveat, figure, latency_table, plain_table, sentence
+from pebble.bench.results import Cell, Value
+from pebble.bench.tables import (
+    Grid,
+    base_of,
+    caveat,
+    figure,
+    latency_table,
+    plain_table,
+    sentence,
+    single_column,
+    spread,
+)
 from pebble.rig.robot import KINDS
 
-AIMS_MS = {50: 0.7, 99: 2.0}
-LEAST_SAMPLES = {50: 1, 99: 300}  # to assess an aim: with fewer, hardly any lie beyond that percentile
+UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
+DOWN, UP, CPU = "down", "up", "CPU per message"
 _LEAST_IN_ROUND = 100  # samples to compare p99 by rounds: with fewer it is the maximum
 _LOSS_SHOWN = 0.005
 WAYS = {DOWN: "command to the wheels", UP: "report to the operator"}
-_FLOWS = {"frames_per_s": "frames/s", "video_per_s": "video/s", "audio_per_s": "audio/s"}
+_SUFFIXES = {COMMANDS: ", commands only", LOADED: ", media flowing"}
+_MEANWHILE = Grid(
+    title="Meanwhile", rows=("variant", "load"), heads=("robot", "load"),
+    columns=(
+        single_column("CPU %", "cpu_percent", ".1f"),
+        *(single_column(f"{name}/s", f"{name}_per_s", ".1f") for name in FLOWS),
+    ),
+    of=lambda cell: cell.measure == DOWN and "cpu_percent" in cell.figures,
+)  # fmt: skip
 
 
-def show(cells: Sequence[Cell], console: Console) -> None:
-    """Prints the latencies, then CPU and media rates of the same time."""
-    ordered = sorted(cells, key=lambda cell: (list(WAYS).index(cell.measure), cell.params["load"] == LOADED))
-    title = "Commands down, reports up; and the load on the robot"
-    baseline = STAND_IN if any(cell.variant == STAND_IN for cell in cells) else KINDS[0]
-    console.print(latency_table(title, ordered, baseline))
-    cost = plain_table("Meanwhile", ["robot", "load", "CPU %", *_FLOWS.values()], left=2)
-    for cell in ordered:
-        if cell.measure == DOWN and cell.variant != HOP:
-            flows = [_number(cell, name) for name in _FLOWS]
-            cost.add_row(cell.variant, str(cell.params["load"]), _number(cell, "cpu_percent"), *flows)
-    console.print(cost)
+def legend(cells: Sequence[Cell]) -> Iterator[str]:
+    if cells:
+        yield f"{UNLOADED}: 20 commands and 50 reports a second; {COMMANDS}: the robots forward no reports"
 
 
-def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
-    """One sentence for each comparison, and one for each aim."""
-    lines = [*_transports(cells), *_media(cells), *_floor(cells), *_lost(cells)]
-    plain = [cell for way in WAYS for cell in _robots(cells, way, UNLOADED)]
-    return [*lines, *caveat(plain), *(line for cell in plain for line in _aims(cell))]
+def tables(cells: Sequence[Cell]) -> Iterator[Table]:
+    """The latencies, CPU for each message, then CPU and media rates of the same time."""
+    if some := [cell for cell in cells if cell.measure in WAYS]:
+        baseline = STAND_IN if any(cell.variant == STAND_IN for cell in some) else variant_of(some[0].variant)
+        yield latency_table("Commands down, reports up; and the load on the robot", some, baseline)
+    if some := [cell for cell in cells if cell.measure == CPU]:
+        yield _cpu_table(some)
+    if any(map(_MEANWHILE.of, cells)):
+        yield from _MEANWHILE(cells)
+
+
+def _cpu_table(cells: Sequence[Cell]) -> Table:
+    heads = ["load", "process", "robot", "us (minimum to maximum of rounds)", "turns", f"/ {STAND_IN}"]
+    table, before = plain_table("CPU for each forwarded message", heads, left=3), None
+    places = list(dict.fromkeys((cell.params["load"], cell.params["process"]) for cell in cells))
+    for cell in sorted(cells, key=lambda cell: places.index((cell.params["load"], cell.params["process"]))):
+        base, place = base_of(cell, cells, STAND_IN), [str(value) for value in cell.params.values()]
+        ratio = "" if base is None or base is cell else str(paired(cell.rounds, base.rounds))
+        if before not in (None, place):
+            table.add_section()
+        shown = ["", ""] if place == before else place
+        table.add_row(*shown, cell.variant, spread(cell), str(len(cell.samples)), ratio)
+        before = place
+    return table
+
+
+def assessment(cells: Sequence[Cell]) -> list[str]:
+    """One sentence for each comparison."""
+    lines = [*_transports(cells), *_media(cells), *_cpu(cells), *_floor(cells), *_lost(cells)]
+    return [*lines, *caveat([cell for way in WAYS for cell in _robots(cells, way, UNLOADED)])]
 
 
 def _transports(cells: Sequence[Cell]) -> list[str]:
     """Compares the robots' medians, then each with the stand-in."""
     lines = []
-    for load in (UNLOADED, LOADED):
+    for load in (UNLOADED, COMMANDS, LOADED):
         for way, words in WAYS.items():
-            what = f"Median, {words}{_media_suffix(load)}"
+            what = f"Median, {words}{suffix(load)}"
             if robots := _robots(cells, way, load):
                 lines.append(sentence(what, robots, quantity="time"))
             lines += [
@@ -95,31 +126,30 @@ def _floor(cells: Sequence[Cell]) -> list[str]:
 def _lost(cells: Sequence[Cell]) -> list[str]:
     """Reports losses above a threshold."""
     lines = []
-    for cell in cells:
+    for cell in (cell for cell in cells if cell.measure in WAYS):
         lost, sent = cell.lost or 0, len(cell.samples) + (cell.lost or 0)
         if lost > _LOSS_SHOWN * sent:
-            what = f"{cell.variant}, {WAYS[cell.measure]}{_media_suffix(cell.params['load'])}"
+            what = f"{cell.variant}, {WAYS[cell.measure]}{suffix(cell.params['load'])}"
             lines.append(f"{what}: {100 * lost / sent:.1f} % of {sent} were overtaken, or did not arrive within 1 s.")
     return lines
 
 
-def _media_suffix(load: Value) -> str:
-    return ", media flowing" if load == LOADED else ""
+def _cpu(cells: Sequence[Cell]) -> Iterator[str]:
+    """Compares each robot with the stand-in."""
+    for cell in cells:
+        base = base_of(cell, cells, STAND_IN)
+        if cell.measure == CPU and base is not None and base is not cell:
+            load = "commands and reports" if cell.params["load"] == UNLOADED else "commands only"
+            yield sentence(f"{CPU}, {cell.params['process']}, {load}", [base, cell], quantity="CPU time")
 
 
-def _aims(cell: Cell) -> list[Judged]:
-    """Compares p50 and p99 with the aims; what did not arrive counts as infinitely late."""
-    found = []
-    for percent, aim in AIMS_MS.items():
-        times = [*cell.samples, *[math.inf] * (cell.lost or 0)]
-        judged = len(cell.rounds) >= LEAST_ROUNDS and len(times) >= LEAST_SAMPLES[percent]
-        took = percentile(times, percent)
-        what = f"{cell.variant}, {WAYS[cell.measure]}, p{percent} at most {aim:g} ms"
-        took_text = "not within 1 s" if math.isinf(took) else f"{figure(took)} ms"
-        if judged and aim < took < math.inf:
-            took_text += f", by {took - aim:.2f} ms"
-        found.append(Judged(what=what, outcome=outcome(took <= aim, judged=judged), measured=took_text))
-    return found
+def suffix(load: Value) -> str:
+    return _SUFFIXES.get(str(load), "")
+
+
+def with_excess(aim: float) -> Callable[[float], str]:
+    """Formats a latency, with what it takes longer than an aim."""
+    return lambda ms: f"{figure(ms)} ms" + (f", by {ms - aim:.2f} ms" if ms > aim else "")
 
 
 def _robots(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
@@ -131,8 +161,3 @@ def _stand_ins(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
     """The stand-in's cell, if it was measured."""
     found = (cell for cell in cells if cell.variant == STAND_IN and cell.samples)
     return [cell for cell in found if (cell.measure, cell.params["load"]) == (measure, load)]
-
-
-def _number(cell: Cell, name: str) -> str:
-    value = cell.figures.get(name)
-    return f"{value:.1f}" if isinstance(value, float) else ""

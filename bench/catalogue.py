@@ -12,9 +12,9 @@ from pebble.errors import PebbleError
 MODULES: Final = {
     "control": "control",
     "control-null": "control",
-    "bridge": "unported",
-    "bridge-profile": "unported",
-    "bridge-null": "unported",
+    "bridge": "bridge",
+    "bridge-profile": "bridge",
+    "bridge-null": "bridge",
     "startup": "startup",
     "cost": "cost",
     "frames": "frames",
@@ -38,7 +38,7 @@ def find(name: str) -> Comparison:
 def commands() -> list[str]:
     """What follows ``pebble bench``: a mode such as ``control-null`` is an option of another one."""
     others = ("-null", "-profile", "impair")
-    return [name for name, module in MODULES.items() if module != "unported" and not name.endswith(others)]
+    return [name for name in MODULES if not name.endswith(others)]
 
 
 def reported() -> list[Comparison]:

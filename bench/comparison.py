@@ -136,6 +136,7 @@ class Comparison:
     constants: Mapping[str, Value | list[Value]] = field(default_factory=dict)  # recorded with the options
 
     variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
+    references: Sequence[str] = ()  # more of them, which are always measured
     conditions: Callable[[Run], Sequence[Mapping[str, Value]]] = lambda _run: ({},)
     prepare: Callable[[Run], None] = lambda _run: None  # checks what is needed, and notes; raises PebbleError
     missing: Callable[[str], str | None] = lambda _variant: None  # why a variant is left out
@@ -278,12 +279,15 @@ class Case:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Round:
-    """One round: all cases, in reverse order in every other round and pass."""
+    """One round: its cases are in reverse order in every other round and pass."""
 
     run: Run
     number: int  # from 0
     env: Any
-    plan: Callable[[Round], Iterator[Case]]
+    plan: Callable[[Round, Sequence[Mapping[str, Value]] | None, int | None], Iterator[Case]]
 
-    def cases(self) -> Iterator[Case]:
-        return self.plan(self)
+    def cases(
+        self, conditions: Sequence[Mapping[str, Value]] | None = None, passes: int | None = None
+    ) -> Iterator[Case]:
+        """Of all conditions, or only of these; ``passes`` replaces that of the options."""
+        return self.plan(self, conditions, passes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -84,7 +85,7 @@ def _named(run: Run) -> Sequence[str]:
 
 def roles_of(run: Run) -> Sequence[str]:
     """The variants, or the roles of the only one in a null test. Raises PebbleError if several are named."""
-    names = _named(run) or [""]
+    names = [*(_named(run) or [""]), *run.comparison.references]
     if not run.comparison.is_null:
         return names
     if len(names) != 1 or len(run.comparison.conditions(run)) != 1:
@@ -100,13 +101,14 @@ def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
         bar = progress.add_task("", total=run.rounds * cases)
         environment = stack.enter_context(_Environment(run))
         for number in range(run.rounds):
+            done = itertools.count(number * cases)
 
             def show(text: str, number: int = number) -> None:
                 progress.update(bar, description=f"round {number + 1} of {run.rounds}: {text}")
 
-            def plan(round_: Round, number: int = number) -> Iterator[Case]:
-                for done, case in enumerate(_cases(round_, collected)):
-                    progress.update(bar, completed=number * cases + done)
+            def plan(round_: Round, *some: Any, done: Iterator[int] = done) -> Iterator[Case]:
+                for case in _cases(round_, collected, *some):
+                    progress.update(bar, completed=next(done))
                     run.show(str(case))
                     yield case
 
@@ -133,11 +135,13 @@ def _round(round_: Round) -> Iterator[Cell]:
                 yield from (case.cell(measure, "", []) for measure in about.measures)
 
 
-def _cases(round_: Round, collected: Collected) -> Iterator[Case]:
+def _cases(
+    round_: Round, collected: Collected, some: Sequence[Mapping[str, Value]] | None, passes: int | None
+) -> Iterator[Case]:
     """Roles of each condition one after another, so that a temporary disturbance affects all of them."""
     run, number = round_.run, round_.number
-    conditions = list(run.comparison.conditions(run))
-    for pass_ in range(run.options.get("passes", 1)):
+    conditions = list(run.comparison.conditions(run) if some is None else some)
+    for pass_ in range(run.options.get("passes", 1) if passes is None else passes):
         step = -1 if (number + pass_) % 2 else 1
         for condition in conditions[::step]:
             for role in collected.roles[::step]:

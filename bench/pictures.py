@@ -25,14 +25,14 @@ class Drawn:
         return found
 
 
-def ecdf(title: str) -> Drawn:
+def ecdf(title: str, *, measures: tuple[str, ...] = ()) -> Drawn:
     """For each measure the share of messages within a time; one panel for each condition."""
-    return Drawn("pebble.bench.plots_latency:distributions", (title,))
+    return Drawn("pebble.bench.plots_latency:distributions", (title, measures))
 
 
-def ratios(title: str, baseline: str) -> Drawn:
+def ratios(title: str, baseline: str, *, measures: tuple[str, ...] = ()) -> Drawn:
     """The medians as ratios to the baseline's, with their intervals."""
-    return Drawn("pebble.bench.plots_latency:ratios", (title, baseline))
+    return Drawn("pebble.bench.plots_latency:ratios", (title, baseline, measures))
 
 
 def null_ratios(title: str) -> Drawn:

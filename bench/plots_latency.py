@@ -43,10 +43,12 @@ _ITSELF = "itself"
 _WHOLE = "all the way"  # drawn after its parts
 
 
-def distributions(results: Results, title: str) -> list[Picture]:
-    """One picture per measure: the share of messages within a time, one panel per condition."""
+def distributions(results: Results, title: str, measures: Sequence[str] = ()) -> list[Picture]:
+    """One picture per measure, or for each of ``measures``: the share of messages within a time, by condition."""
     found = []
     for measure, cells in by_measure(results.cells, least=LEAST).items():
+        if measures and measure not in measures:
+            continue
         about = title if measure in title.lower() else f"{title}: {measure}"
         caption = f"{about}. Share of all messages within the time on the x-axis"
         if any(_lost_count(cell) for cell in cells):
@@ -56,12 +58,12 @@ def distributions(results: Results, title: str) -> list[Picture]:
     return found
 
 
-def ratios(results: Results, title: str, baseline: str) -> list[Picture]:
+def ratios(results: Results, title: str, baseline: str, measures: Sequence[str] = ()) -> list[Picture]:
     """The medians as ratios to the baseline's; no picture without a baseline."""
     found = []
     for cell in results.cells:
         base = base_of(cell, results.cells, baseline)
-        if base is not None and base is not cell:
+        if base is not None and base is not cell and (not measures or cell.measure in measures):
             found.append((cell, paired(cell.rounds, base.rounds)))
     return _picture(results, found, f"{title}: median latency as a ratio to {baseline}'s", baseline)
 

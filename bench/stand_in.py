@@ -21,9 +21,9 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.contract import DRIVE, INCOMING, ONLINE, OUTGOING, STATUS, TOUCH_SENSORS
 
+_BAUD = 460_800
 _HEARTBEAT_S = 0.25  # as a robot of ours, so that both carry the same
 _STATUS_EVERY = 4  # heartbeats
-_BAUD = 460_800
 _READ_S = 1.0
 _PIECE = 4096  # bytes
 _TOUCH = ("a0", "a1", "a2")
@@ -81,15 +81,15 @@ def serial_bridge(local_port: int, base: str, device: str, *, reports: bool) -> 
 
 
 def _lines(port: serial.Serial) -> Iterator[bytes]:
-    """Without pyserial's own ``readline``, which reads byte by byte: nobody who measured it would keep that."""
+    """Without pyserial's own ``readline``, which reads byte by byte."""
     rest = b""
     while True:
         *lines, rest = (rest + port.read(max(1, min(port.in_waiting, _PIECE)))).split(b"\n")
         yield from lines
 
 
-def main(part: str, local: str, remote: str, base: str, device: str, *reports: str) -> None:
-    """Ports of the two brokers, the base of the robot's topics, its serial line; ``reports`` if it sends them."""
+def main(part: str, local: str, remote: str, base: str, device: str, reports: str = "") -> None:
+    """Ports of the two brokers, the base of the robot's topics, its serial line; ``--reports`` publishes reports."""
     if part == "bridge":
         bridge(int(remote), int(local), base)
     else:

@@ -57,7 +57,7 @@ class Robot:
         self.run_dir, self.config = self.folder / "run", self.folder / "robot.json"
         self.port, self._trace = self.folder / "mcu", self.folder / "trace.jsonl"
         self.local_broker: Broker | None = None
-        self.running, self._services, self._reports, self._wrap = running, services or {}, reports, wrap
+        self.running, self._services, self.reports, self._wrap = running, services or {}, reports, wrap
         self._mcu: Program | None = None
         self._started: list[Program] = []
 
@@ -69,7 +69,7 @@ class Robot:
             if self._wrap is unchanged:  # else it is in another network
                 self.local_broker.wait()
         self._trace.touch()
-        options = ["--link", self.port, "--trace", self._trace, *(["--trace-said"] if self._reports else [])]
+        options = ["--link", self.port, "--trace", self._trace, *(["--trace-said"] if self.reports else [])]
         command = python("pebble.simulation.mcu", "--kind", "goob", *options)
         self._mcu = self.running.add(Program("MCU", command, self.folder / "mcu.log"), MCUS)
         self._mcu.wait_until(self.port.exists, _MCU_START_S)
@@ -154,8 +154,8 @@ class Robot:
             "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": host, "port": port}},
             "serial_mcu_bridge": {"enabled": True, "serial": {"port": str(self.port), "baud": 460_800}},
         }
-        if self._reports is not None:
-            services["serial_mcu_bridge"]["telemetry"] = {"publish_touch_sensors": self._reports}
+        if self.reports is not None:
+            services["serial_mcu_bridge"]["telemetry"] = {"publish_touch_sensors": self.reports}
         for service, fields in self._services.items():
             services[service] = {**services.get(service, {"enabled": True}), **fields}
         folders = {"run_dir": str(self.run_dir), "state_dir": str(self.run_dir)}

@@ -1,6 +1,6 @@
 """``pebble bench``: comparisons, side by side in one run on this machine.
 
-The command of a comparison follows from its declaration; those that do not run on the engine yet have functions here.
+The command of a comparison follows from its declaration.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import typer
 from typer.core import TyperGroup
 
 from pebble.bench.comparison import FOLDER, Comparison, Option, as_word
-from pebble.commands import bench_robot
 from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
 
@@ -191,6 +190,6 @@ def _python(option: Option) -> str:
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (*bench_robot.COMMANDS, compare, echo, report):
+    for command in (compare, echo, report):
         group.command(command.__name__)(command)
     app.add_typer(group, name="bench")

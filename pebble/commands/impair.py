@@ -5,15 +5,19 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer.core import TyperCommand
 
 from pebble.bench import catalogue
 from pebble.client.connection import Target
 from pebble.commands.bench import command_of, with_parameters
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from typer._click.core import Context, Parameter
 
 _INTO: Final = Path("impair")
 _SECONDS: Final = 120.0
@@ -119,8 +123,8 @@ def _print_table(into: Path) -> int:
     return 0
 
 
-def register(app: typer.Typer) -> None:
-    """The options of the comparison, and then those of a real robot."""
+def _declared() -> Callable[..., int]:
+    """The command with the options of the comparison, and then those of a real robot."""
 
     def run(context: typer.Context, **given: Any) -> int:
         return impair(context, **given)
@@ -128,4 +132,24 @@ def register(app: typer.Typer) -> None:
     declared, own = inspect.signature(_simulated()), inspect.signature(impair, eval_str=True)
     context, *real, _ = own.parameters.values()
     run.__doc__ = impair.__doc__
-    app.command("impair")(with_parameters(run, [context, *declared.parameters.values(), *real]))
+    return with_parameters(run, [context, *declared.parameters.values(), *real])
+
+
+class _Command(TyperCommand):
+    """Imports the comparison when its options are needed: not for the list of all commands, which any system shows."""
+
+    def get_params(self, ctx: Context) -> list[Parameter]:
+        if not self.params:
+            app = typer.Typer(rich_markup_mode=None, add_completion=False)
+            app.command("impair")(_declared())
+            whole = typer.main.get_command(app)
+            self.params, self.callback = whole.params, whole.callback
+        return super().get_params(ctx)
+
+
+def register(app: typer.Typer) -> None:
+    def listed() -> None:
+        """Replaced with its options by :class:`_Command`."""
+
+    listed.__doc__ = impair.__doc__
+    app.command("impair", cls=_Command)(listed)

@@ -1,23 +1,35 @@
-"""The bridge comparison without robots: matching, cells, plans, assessment and profile."""
+"""The bridge comparison without robots: matching, cells, options, assessment and profile."""
 
 import io
 import json
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, bridge_null, bridge_profile, bridge_report
-from pebble.bench.bridge_capture import _stamp, commands
-from pebble.bench.bridge_drive import Arrived, DriveSegment, all_arrived, arrivals, arrived_of, matched
-from pebble.bench.bridge_one_hop import HOP
-from pebble.bench.bridge_operator import wheels, wheels_of
-from pebble.bench.bridge_plan import BridgePlan, Mode, plan
-from pebble.bench.bridge_tally import DOWN, LOADED, UNLOADED, UP, Tally
-from pebble.bench.results import Cell, Value
+from pebble.bench import bridge, bridge_profile, engine
+from pebble.bench.bridge import BRIDGE, BRIDGE_NULL, BRIDGE_PROFILE, cells_of
+from pebble.bench.bridge_operator import (
+    Arrived,
+    DriveSegment,
+    all_arrived,
+    arrivals,
+    arrived_of,
+    matched,
+    wheels,
+    wheels_of,
+)
+from pebble.bench.bridge_profile import _stamp, commands
+from pebble.bench.bridge_report import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
+from pebble.bench.bridge_robots import BRIDGE as FORWARDER
+from pebble.bench.bridge_robots import HOP, SERIAL, STAND_IN
+from pebble.bench.comparison import Case, Comparison
+from pebble.bench.results import Cell, Judged, Value, load
 from pebble.errors import PebbleError
 from pebble.rig.processes import Processes
 from pebble.rig.robot import Robot
@@ -28,7 +40,7 @@ MS = 1_000_000
 
 
 def lines_of(cells: list[Cell]) -> list[str]:
-    return [str(one) for one in bridge_report.assessment(cells)]
+    return [str(one) for one in BRIDGE.assessed(cells)]
 
 
 def test_no_two_commands_are_alike_within_hours() -> None:
@@ -58,7 +70,7 @@ def test_a_command_counts_once_and_when_it_came_first() -> None:
         Entry(900 * MS, "line", "M 0.000 0.000"),
     ]
     found = arrived_of(DriveSegment(0, 200 * MS, sent), arrivals(trace), [])
-    assert (found.down, found.sent) == ([1.0, 2.0], 3)
+    assert (found.down, found.sent, found.forwarded) == ([1.0, 2.0], 3, 2)
 
 
 def test_a_report_is_identified_by_values_that_occur_once() -> None:
@@ -79,6 +91,8 @@ def test_a_report_is_identified_by_values_that_occur_once() -> None:
     ]
     found = arrived_of(segment, {}, matched(trace, received))
     assert (found.up, found.reports) == ([2.0, 3.0], 3)
+    found = arrived_of(segment, {}, matched(trace, received), received)
+    assert found.forwarded == 3  # all that were received meanwhile
 
 
 def test_a_report_received_before_it_was_sent_is_another_one() -> None:
@@ -99,64 +113,172 @@ def test_waiting_ends_when_the_last_ones_have_arrived() -> None:
 # -- cells
 
 
+def case_of(variant: str, load_: str) -> Case:
+    run = BRIDGE.run_of()
+    return Case(run=run, number=0, variant=variant, role=variant, condition={"load": load_})
+
+
+def collected(rounds: Sequence[Sequence[Cell]]) -> list[Cell]:
+    joined = engine.Collected(BRIDGE, BRIDGE.variants)
+    for cells in rounds:
+        joined.add(cells)
+    return joined.cells()
+
+
 def test_cells_have_a_list_of_samples_for_each_round() -> None:
-    tally = Tally("zenoh", LOADED)
-    segments = [DriveSegment(0, 500 * MS, {}, cpu_s=0.1), DriveSegment(600 * MS, 1100 * MS, {}, cpu_s=0.1)]
-    tally.add_round(segments, [Arrived([1.0], [2.0], 1, 1), Arrived([1.5], [], 1, 1)], {"frames": 30, "video": 15})
-    tally.add_round(segments, [Arrived([3.0], [2.5], 2, 1)], {"frames": 28, "video": 15})
-    down, up = tally.cells()
+    segment, case = DriveSegment(0, 500 * MS, {}, cpu_s=0.1), case_of("zenoh", LOADED)
+    first = [
+        *cells_of(case, segment, Arrived([1.0], [2.0], 1, 1), {"frames": 15, "video": 8}),
+        *cells_of(case, segment, Arrived([1.5], [], 1, 1), {"frames": 15, "video": 7}),
+    ]
+    down, up = collected([first, [*cells_of(case, segment, Arrived([3.0], [2.5], 2, 1), {"frames": 14, "video": 8})]])
     assert (down.variant, down.measure, down.params, down.unit) == ("zenoh", DOWN, {"load": "media"}, "ms")
     assert (down.rounds, down.lost) == ([[1.0, 1.5], [3.0]], 1)
     assert (up.measure, up.rounds, up.lost) == (UP, [[2.0], [2.5]], 1)
-    assert down.figures == {"sent": 4, "cpu_percent": 20.0, "frames_per_s": 29.0, "video_per_s": 15.0}
+    assert down.figures == {"sent": 4, "cpu_percent": 20.0, "frames_per_s": 29.3, "video_per_s": 15.3}
 
 
 def test_without_reports_there_is_one_cell() -> None:
-    tally = Tally(HOP, reports=False)
-    tally.add_round([DriveSegment(0, MS, {})], [Arrived([0.2], sent=1)])
-    (cell,) = tally.cells()
+    (cell,) = cells_of(case_of(HOP, UNLOADED), DriveSegment(0, MS, {}), Arrived([0.2], sent=1))
     assert (cell.rounds, cell.figures) == ([[0.2]], {"sent": 1})
+    (cell,) = cells_of(case_of("mqtt", COMMANDS), DriveSegment(0, MS, {}), Arrived([0.2], sent=1))
+    assert (cell.measure, cell.params) == (DOWN, {"load": "commands"})
 
 
-# -- the plan
+def test_cpu_is_divided_by_what_was_forwarded_in_each_turn() -> None:
+    segment = DriveSegment(0, MS, {}, parts_cpu_s={FORWARDER: 0.007, SERIAL: 0.014})
+    case, none = case_of("mqtt", UNLOADED), Arrived(sent=20)
+    turns = [*cells_of(case, segment, Arrived(forwarded=70)), *cells_of(case, segment, Arrived(forwarded=35))]
+    *_, bridge_, serial = collected([turns, [*cells_of(case, segment, none)]])
+    assert (bridge_.measure, bridge_.unit, bridge_.params) == (CPU, "us", {"load": "none", "process": "bridge"})
+    assert [*bridge_.rounds, *serial.rounds] == [pytest.approx([100, 200]), [], pytest.approx([200, 400]), []]
+
+
+class FakeRobot:
+    """In place of a robot or the one hop: remembers when it was driven."""
+
+    started: ClassVar[list[tuple[str, bool, bool]]] = []
+    driven: ClassVar[list[str]] = []
+
+    def __init__(self, kind: str = HOP, *, media: bool = False, reports: bool = False) -> None:
+        self.kind, self.robot = kind, self
+        self.started.append((kind, media, reports))
+
+    def __enter__(self) -> "FakeRobot":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def wait(self) -> None:
+        pass
+
+    def log(self) -> str:
+        return ""
+
+    def counts(self) -> dict[str, int]:
+        return {"frames": len(self.driven)}
+
+    def drive(self, seconds: float, rate_hz: float = 20, **_work: Any) -> DriveSegment:
+        self.driven.append(f"{self.kind} {seconds:g}")
+        return DriveSegment(0, MS, {}, parts_cpu_s={} if self.kind == HOP else {FORWARDER: 0.1, SERIAL: 0.1})
+
+    def match_arrivals(self, segments: Sequence[DriveSegment]) -> list[Arrived]:
+        return [Arrived([1.0], [1.0], 1, 1, 2) for _ in segments]
+
+
+@pytest.fixture(autouse=True)
+def _fakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeRobot, "started", [])
+    monkeypatch.setattr(FakeRobot, "driven", [])
+    for name in ("DrivenRobot", "OneHop"):
+        monkeypatch.setattr(bridge, name, FakeRobot)
+    monkeypatch.setattr(bridge, "MediaLoad", lambda driven: driven)
+    for name in ("_STARTUP_S", "_MEDIA_STARTUP_S"):
+        monkeypatch.setattr(bridge, name, 0.0)
+    monkeypatch.setattr(engine, "find_spec", lambda _name: None)
+
+
+def ran(about: Comparison, folder: Path, code: int = 0, **given: Any) -> list[Cell]:
+    assert engine.run(about.run_of(output=folder, console=Console(file=io.StringIO()), **given)) == code
+    return load(folder / f"{about.name}.json").cells
+
+
+def test_every_load_has_robots_of_its_own_that_take_turns(tmp_path: Path) -> None:
+    cells = ran(BRIDGE, tmp_path, rounds=2, seconds=2.0, variants=[STAND_IN, "mqtt"], **{"with-media": True})
+    reporting = [(STAND_IN, False, True), ("mqtt", True, True), (HOP, False, False)]
+    silent = [(STAND_IN, False, False), ("mqtt", False, False)]
+    assert FakeRobot.started == [*reporting, *silent, *silent, *reporting]
+    there, back = ["paho 1", "mqtt 1", "one hop 1"], ["one hop 1", "mqtt 1", "paho 1"]
+    assert FakeRobot.driven[:11] == [*there, *back, "mqtt 2", *there[:2], *back[1:]]
+    assert FakeRobot.driven[11:] == [*back[1:], *there[:2], *back, *there, "mqtt 2"]
+    assert {len(cell.rounds) for cell in cells} == {2}
+    found = {(cell.variant, cell.measure, *cell.params.values()) for cell in cells}
+    processes = [(CPU, load_, part) for load_ in (UNLOADED, COMMANDS) for part in (FORWARDER, SERIAL)]
+    wanted = [(DOWN, UNLOADED), (DOWN, COMMANDS), (UP, UNLOADED), *processes]
+    assert found == {
+        *((kind, *one) for kind in (STAND_IN, "mqtt") for one in wanted),
+        *(("mqtt", DOWN, LOADED), ("mqtt", UP, LOADED), (HOP, DOWN, UNLOADED)),
+    }
+    assert [cell.figures["sent"] for cell in cells if cell.params["load"] == COMMANDS and cell.measure == DOWN] == [
+        4,
+        4,
+    ]
+
+
+def test_the_null_test_drives_one_robot_in_short_turns(tmp_path: Path) -> None:
+    cells = ran(BRIDGE_NULL, tmp_path, rounds=2, seconds=0.1)
+    assert FakeRobot.started == [("zenoh", False, False)]
+    assert FakeRobot.driven == ["zenoh 2", *12 * ["zenoh 0.05"]]  # the pilot, then three roles in two rounds
+    assert [(cell.variant, cell.rounds) for cell in cells] == [
+        (role, [[1.0, 1.0]] * 2) for role in ("zenoh", "zenoh again", "zenoh +20 %")
+    ]
+    (line,) = (line for line in load(tmp_path / "bridge-null.json").assessment if line.startswith("Planted"))
+    assert line.startswith("Planted: 200 us, a fifth of the usual latency. All 2 rounds are turns of one running robot")
+
+
+# -- the options
 
 
 @pytest.mark.parametrize(
-    "nonsense",
+    ("about", "nonsense"),
     [
-        BridgePlan(kinds=["carrier-pigeon"]),
-        BridgePlan(kinds=[]),
-        BridgePlan(kinds=["mqtt", "mqtt"]),
-        BridgePlan(seconds=0.0),
-        BridgePlan(rounds=0),
-        BridgePlan(seconds=math.inf),
-        BridgePlan(mode=Mode.NULL),
-        BridgePlan(output=Path("/dev/null/there")),
+        (BRIDGE, {"variants": ["carrier-pigeon"]}),
+        (BRIDGE, {"variants": []}),
+        (BRIDGE, {"variants": ["mqtt", "mqtt"]}),
+        (BRIDGE, {"seconds": 0.0}),
+        (BRIDGE, {"rounds": 0}),
+        (BRIDGE, {"seconds": math.inf}),
+        (BRIDGE, {"with-media": True, "null": True}),
+        (BRIDGE_NULL, {"variants": ["mqtt", "zenoh"]}),
+        (BRIDGE_NULL, {"variants": [STAND_IN]}),
+        (BRIDGE_PROFILE, {"variants": [STAND_IN]}),
+        (BRIDGE_PROFILE, {"with-media": True}),
+        (BRIDGE, {"output": Path("/dev/null/there")}),
     ],
 )
 def test_invalid_options_are_refused_before_anything_starts(
-    nonsense: BridgePlan, monkeypatch: pytest.MonkeyPatch
+    about: Comparison, nonsense: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (bridge, bridge_null, bridge_profile):
-        monkeypatch.setattr(module, "DrivenRobot", None)
-        with pytest.raises(PebbleError):
-            module.run(nonsense, Console(file=io.StringIO()))
+    monkeypatch.setattr(bridge, "DrivenRobot", None)
+    with pytest.raises(PebbleError):
+        engine.run(about.run_of(**{"output": tmp_path, "console": Console(file=io.StringIO()), **nonsense}))
 
 
-@pytest.mark.parametrize(
-    ("module", "mode"), [(bridge, Mode.COMPARE), (bridge_null, Mode.NULL), (bridge_profile, Mode.PROFILE)]
-)
+@pytest.mark.parametrize("about", [BRIDGE, BRIDGE_NULL, BRIDGE_PROFILE])
 def test_shared_memory_is_swept_however_it_ends(
-    module: ModuleType, mode: Mode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    about: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> None:
         raise PebbleError("no robot today")
 
     swept: list[bool] = []
-    monkeypatch.setattr(module, "DrivenRobot", fail)
-    monkeypatch.setattr(module, "sweep", lambda: swept.append(True))
+    for module in (bridge, bridge_profile):
+        monkeypatch.setattr(module, "DrivenRobot", fail)
+    monkeypatch.setattr(bridge, "may_capture", lambda: None)
+    monkeypatch.setattr(engine, "sweep", lambda: swept.append(True))
     with pytest.raises(PebbleError, match="no robot today"):
-        module.run(plan(mode, rounds=1, output=tmp_path), Console(file=io.StringIO()))
+        engine.run(about.run_of(rounds=1, output=tmp_path, console=Console(file=io.StringIO())))
     assert swept == [True]
 
 
@@ -168,13 +290,12 @@ def test_the_local_broker_counts_as_part_of_the_robot(monkeypatch: pytest.Monkey
     assert robot.pids() == [-3, -2]
 
 
-def test_a_quick_plan_is_shorter_and_given_options_replace_it() -> None:
-    assert plan(Mode.MEDIA, quick=True).seconds < plan(Mode.MEDIA).seconds
-    assert plan(Mode.NULL).kinds == ("zenoh",)
-    assert plan(Mode.NULL, kinds=["mqtt"], rounds=3).command() == [
-        *("pebble", "bench", "bridge", "--null", "--rounds", "3", "--seconds", "4", "--variants", "mqtt")
-    ]
-    assert plan(Mode.COMPARE, quick=True).command()[-1] == "--quick"
+def test_a_quick_run_is_shorter_and_given_options_replace_it() -> None:
+    assert BRIDGE.run_of(quick=True)["seconds"] < BRIDGE.run_of()["seconds"]
+    assert BRIDGE_NULL.run_of()["variants"] == ["zenoh"]
+    command = BRIDGE_NULL.run_of(variants=["mqtt"], rounds=3).command
+    assert " ".join(command) == "pebble bench bridge --rounds 3 --seconds 4 --variants mqtt --null"
+    assert BRIDGE.run_of(quick=True).command[-1] == "--quick"
 
 
 # -- the assessment
@@ -243,10 +364,87 @@ def test_a_percentile_is_judged_only_where_something_lies_beyond_it() -> None:
 
 
 def test_the_tables_have_the_robots_cost() -> None:
-    printed = io.StringIO()
-    bridge_report.show([cell("mqtt", 0.6), cell(HOP, 0.1)], Console(file=printed, width=120))
-    assert "one hop" in printed.getvalue()
-    assert "12.5" in printed.getvalue()
+    text = shown([cell("mqtt", 0.6), cell(HOP, 0.1)])
+    assert "one hop" in text
+    assert "12.5" in text
+    assert "forwarded message" not in text
+
+
+def test_the_tables_have_the_cpu_of_each_process_beside_that_of_the_stand_in() -> None:
+    lines = shown([cpu(kind, us, part) for kind, us in ((STAND_IN, 400.0), ("mqtt", 300.0)) for part in PARTS])
+    rows = [line.split() for line in lines.splitlines() if "(" in line][1:]
+    assert rows[0] == ["none", "bridge", "paho", "400", "(400", "to", "400)", "8"]
+    assert rows[1] == ["mqtt", "300", "(300", "to", "300)", "8", "0.75", "(0.75", "to", "0.75)"]
+    assert rows[2][:3] == ["none", "serial", "bridge"]
+
+
+# -- ratios to the stand-in
+
+
+PARTS = (FORWARDER, SERIAL)
+
+
+def cpu(kind: str, us: float, part: str = FORWARDER, load: str = UNLOADED, rounds: int = 8) -> Cell:
+    params: dict[str, Value] = {"load": load, "process": part}
+    return Cell(variant=kind, params=params, measure=CPU, unit="us", rounds=[[us] for _ in range(rounds)])
+
+
+def shown(cells: list[Cell]) -> str:
+    printed = Console(file=io.StringIO(), width=120, record=True)
+    for table in BRIDGE.shown(cells):
+        printed.print(table)
+    return printed.export_text()
+
+
+def aims(cells: list[Cell]) -> dict[str, str]:
+    """Those that are ratios: what was measured, by outcome and aim."""
+    found = [line for line in BRIDGE.assessed(cells) if isinstance(line, Judged) and line.what.endswith("paho's")]
+    return {f"{line.outcome}: {line.what}": line.measured for line in found}
+
+
+def test_commands_alone_are_judged_beside_the_stand_in() -> None:
+    plain, ours = cell(STAND_IN, 1.0, load=COMMANDS), cell("zenoh", 1.02, load=COMMANDS)
+    assert aims([plain, ours, cell(STAND_IN, 50.0), cell("zenoh", 1.0)]) == {
+        "met: zenoh, command to the wheels, commands only, p50 at most 1.05 of paho's": "1.02 (1.02 to 1.02)",
+        "missed: zenoh, command to the wheels, commands only, p99 at most 0.50 of paho's": "1.02 (1.02 to 1.02)",
+    }
+    text = "\n".join(lines_of([plain, ours]))
+    assert "Median, command to the wheels, commands only: zenoh takes 1.02× the time of paho" in text
+    assert "aim: zenoh, command to the wheels, commands only, p50 at most 0.7 ms: missed (1.02 ms, by 0.32 ms)" in text
+
+
+def test_cpu_is_judged_by_process_and_only_with_reports() -> None:
+    cells = [cpu(STAND_IN, 400.0), cpu("mqtt", 300.0), cpu(STAND_IN, 400.0, SERIAL), cpu("mqtt", 500.0, SERIAL)]
+    assert aims([*cells, *(cpu(kind, 400.0, load=COMMANDS) for kind in (STAND_IN, "mqtt"))]) == {
+        "met: mqtt, CPU per message of the bridge, commands and reports, at most 1.00 of paho's": "0.75 (0.75 to 0.75)",
+        "missed: mqtt, CPU per message of the serial bridge, commands and reports, at most 1.10 of paho's": (
+            "1.25 (1.25 to 1.25)"
+        ),
+    }
+    assert any(
+        "CPU per message, bridge, commands and reports: mqtt takes 0.75× the CPU time of paho" in line
+        for line in lines_of(cells)
+    )
+
+
+def test_a_ratio_is_judged_by_its_interval() -> None:
+    noisy = cpu("mqtt", 400.0)
+    noisy.rounds = [[400.0 + 40 * (-1) ** number] for number in range(8)]
+    (how,) = aims([cpu(STAND_IN, 400.0), noisy])
+    assert how.startswith("not judged: mqtt, CPU")
+    assert aims([cpu(STAND_IN, 400.0), noisy])[how].endswith(", the interval includes the bound")
+    few = aims([cpu(STAND_IN, 400.0, rounds=7), cpu("mqtt", 300.0, rounds=7)])
+    assert list(few.values()) == ["0.75, 7 of 8 rounds"]
+    small = aims([cell(kind, 1.0, load=COMMANDS, each=98) for kind in (STAND_IN, "mqtt")])
+    assert list(small.values()) == ["1.00 (1.00 to 1.00)", "1.00 (1.00 to 1.00), too few samples in a round"]
+
+
+def test_commands_that_are_lost_are_infinitely_late_in_a_ratio() -> None:
+    found = aims([cell(STAND_IN, 9.0, load=COMMANDS), cell("mqtt", 1.0, load=COMMANDS, each=98, lost=16)])
+    assert list(found) == [
+        "met: mqtt, command to the wheels, commands only, p50 at most 1.00 of paho's",
+        "missed: mqtt, command to the wheels, commands only, p99 at most 0.50 of paho's",
+    ]
 
 
 # -- the profile
@@ -261,14 +459,31 @@ def test_hops_are_the_times_between_stations() -> None:
 def test_the_profile_names_the_hop_that_makes_the_slowest_slow() -> None:
     times: bridge_profile.Times = [*(395 * [(0.1, 0.1, 0.3)]), *(5 * [(0.1, 3.1, 1.3)])]
     assert bridge_profile.slowest(times) == 5 * [(0.1, 3.1, 1.3)]
-    (line,) = bridge_profile.assessment("zenoh", times)
+    (line,) = bridge_profile.profile_assessment(cells_of_hops("zenoh", times))
     assert line.startswith(
         "zenoh: of what the slowest 5 of 400 commands take longer than a typical one (4.00 ms), 75 %"
     )
     assert line.endswith("is spent in: remote broker.")
-    (line,) = bridge_profile.assessment("zenoh", times[1:300] + times[-4:])
+    (line,) = bridge_profile.profile_assessment(cells_of_hops("zenoh", times[1:300] + times[-4:]))
     assert line == "zenoh: 303 commands are too few to tell where the slowest lose their time."
-    assert bridge_profile.assessment("zenoh", []) == ["zenoh: no command was traced all the way"]
+    nothing = cells_of_hops("zenoh", [])
+    assert list(bridge_profile.profile_assessment(nothing)) == ["zenoh: no command was traced all the way"]
+    assert [table.row_count for table in bridge_profile.profile_tables(nothing)] == [0]
+
+
+def cells_of_hops(kind: str, times: bridge_profile.Times) -> list[Cell]:
+    return [
+        Cell(variant=kind, params={"hop": name}, measure="hop", unit="ms",
+             rounds=[[(*one, sum(one))[at] for one in times]])
+        for at, name in enumerate((*bridge_profile.HOPS[kind], bridge_profile.ALL))
+    ]  # fmt: skip
+
+
+def test_the_table_of_a_profile_has_a_row_for_each_hop() -> None:
+    (table,) = bridge_profile.profile_tables(cells_of_hops("mqtt", 10 * [(0.1, 0.2, 0.3, 0.4, 0.5)]))
+    assert table.title == "mqtt: 10 commands, mean of each hop, ms"
+    assert list(table.columns[0].cells) == [*bridge_profile.HOPS["mqtt"], "all the way"]
+    assert list(table.columns[1].cells)[-1] == "1.50"
 
 
 def test_stamps_of_another_form_are_refused() -> None:

@@ -212,6 +212,21 @@ def test_values_that_a_round_lacks_are_left_out() -> None:
     assert join([None]) is None
 
 
+def test_references_are_measured_with_the_chosen_variants(tmp_path: Path) -> None:
+    results = measured(declared(references=("memcpy",)), tmp_path, variants=["socket"])
+    assert {cell.variant for cell in results.cells} == {"socket", "memcpy"}
+    assert results.command[-2:] == ["--variants", "socket"]
+
+
+def test_a_round_may_have_some_conditions_and_other_passes(tmp_path: Path) -> None:
+    def measure(round_: Round) -> Iterator[Cell]:
+        for case in round_.cases(SIZES[1:], 3):
+            yield case.cell("way", "us", [1.0])
+
+    (cell, _) = measured(declared(measure=None, measure_round=measure), tmp_path).cells
+    assert (cell.params, cell.rounds) == ({"size": "1 KB"}, [[1.0, 1.0, 1.0]] * 2)
+
+
 # -- the command line
 
 

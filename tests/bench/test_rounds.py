@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, cost, startup
-from pebble.bench.bridge_drive import Arrived, DriveSegment
-from pebble.bench.bridge_plan import BridgePlan
-from pebble.bench.comparison import Case
+from pebble.bench import cost, startup
+from pebble.bench.bridge import BRIDGE
+from pebble.bench.comparison import Case, Round
 from pebble.bench.cost import COST, IDLE, Reading
 from pebble.bench.engine import Rounds, run
 from pebble.bench.results import Cell, load
@@ -103,14 +103,15 @@ def test_cost_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert results.assessment[0] == "1 of 3 rounds failed and were left out; round 2: mqtt: a process ended"
 
 
-def test_the_bridge_goes_on_and_counts_no_half_of_a_round(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def round_(_plan: object, tallies: list[bridge.Tally], number: int, _write_line: object) -> list[bridge.Played]:
-        if number == 1:
-            raise PebbleError("zenoh: the robot is not up after 30 s")
-        return [(tally, [DriveSegment(0, 1, {})], [Arrived([1.0], [1.0], 1, 1)], {}) for tally in tallies]
+def test_the_bridge_goes_on_and_counts_no_half_of_a_round(tmp_path: Path) -> None:
+    def measure(round_: Round) -> Iterator[Cell]:
+        for case in round_.cases():
+            if (round_.number, case.variant) == (1, "zenoh"):
+                raise PebbleError("zenoh: the robot is not up after 30 s")
+            yield case.cell("down", "ms", [1.0], sent=1)
 
-    monkeypatch.setattr(bridge, "_round", round_)
-    assert bridge.run(BridgePlan(rounds=3, output=tmp_path), Console(file=io.StringIO())) == 0
+    about = replace(BRIDGE, measure_round=measure)
+    assert run(about.run_of(rounds=3, output=tmp_path, console=Console(file=io.StringIO()))) == 0
     results = load(tmp_path / "bridge.json")
     assert {len(cell.rounds) for cell in results.cells} == {2}
     assert results.assessment[0].startswith("1 of 3 rounds failed and were left out; round 2: zenoh: ")

@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, bridge_null, bridge_profile
-from pebble.bench.bridge_media import FLOWS
-from pebble.bench.bridge_plan import Mode, plan
+from pebble.bench import bridge, bridge_profile
+from pebble.bench.bridge import BRIDGE, BRIDGE_NULL, BRIDGE_PROFILE
+from pebble.bench.bridge_robots import BRIDGE as FORWARDER
+from pebble.bench.bridge_robots import FLOWS, HOP, SERIAL, STAND_IN
+from pebble.bench.engine import run
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig.programs import children
@@ -28,18 +30,23 @@ def _hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # pictures have tests of their own
     monkeypatch.setattr(bridge, "_STARTUP_S", 0.2)
     monkeypatch.setattr(bridge, "_MEDIA_STARTUP_S", 0.0)
-    monkeypatch.setattr(bridge_null, "_STARTUP_S", 0.5)  # the serial port is open, and the pilot quick
-    monkeypatch.setattr(bridge_null, "_PILOT_S", 0.2)
+    monkeypatch.setattr(bridge, "_PILOT_S", 0.2)
     monkeypatch.setattr(bridge_profile, "_STARTUP_S", 0.2)
 
 
 def test_both_robots_are_driven_also_with_media_and_leave_nothing(tmp_path: Path) -> None:
     printed = io.StringIO()
-    wanted = plan(Mode.MEDIA, quick=True, rounds=1, seconds=0.4, output=tmp_path)
-    assert bridge.run(wanted, Console(file=printed, width=120)) == 0
+    console = Console(file=printed, width=120)
+    wanted = BRIDGE.run_of(quick=True, rounds=1, seconds=0.4, output=tmp_path, console=console, **{"with-media": True})
+    assert run(wanted) == 0
     results = load(tmp_path / "bridge.json")
     robots = {(kind, load_, way) for kind in KINDS for load_ in ("none", "media") for way in ("down", "up")}
-    assert {_name(cell) for cell in results.cells} == {*robots, ("one hop", "none", "down")}
+    stand_in = {(STAND_IN, "none", way) for way in ("down", "up")}
+    commands = {(kind, "commands", "down") for kind in (STAND_IN, *KINDS)}
+    each = {(kind, load_, "CPU per message") for kind in (STAND_IN, *KINDS) for load_ in ("none", "commands")}
+    wanted_cells = {*robots, *stand_in, *commands, *each, (HOP, "none", "down")}
+    assert {_name(cell) for cell in results.cells} == wanted_cells
+    assert {cell.params["process"] for cell in results.cells if "process" in cell.params} == {FORWARDER, SERIAL}
     assert {cell.figures["sent"] for cell in results.cells if cell.measure == "down"} == {8}
     assert all(min(cell.samples) > 0 for cell in results.cells)
     assert all(cell.figures[f"{flow}_per_s"] for cell in results.cells if _name(cell)[1] == "media" for flow in FLOWS)
@@ -53,9 +60,10 @@ def _name(cell: Cell) -> tuple[str, object, str]:
     return cell.variant, cell.params["load"], cell.measure
 
 
-def test_one_robot_is_compared_with_itself(tmp_path: Path) -> None:
-    wanted = plan(Mode.NULL, rounds=2, seconds=0.1, output=tmp_path)
-    assert bridge_null.run(wanted, Console(file=io.StringIO())) == 0
+def test_one_robot_is_compared_with_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bridge, "_STARTUP_S", 0.5)  # the serial port is open, and the pilot quick
+    wanted = BRIDGE_NULL.run_of(rounds=2, seconds=0.1, output=tmp_path, console=Console(file=io.StringIO()))
+    assert run(wanted) == 0
     results = load(tmp_path / "bridge-null.json")
     assert [cell.variant for cell in results.cells] == ["zenoh", "zenoh again", "zenoh +20 %"]
     assert [len(cell.rounds) for cell in results.cells] == [2, 2, 2]
@@ -64,12 +72,13 @@ def test_one_robot_is_compared_with_itself(tmp_path: Path) -> None:
 
 def test_commands_are_traced_hop_by_hop(tmp_path: Path) -> None:
     printed = io.StringIO()
-    wanted = plan(Mode.PROFILE, rounds=1, seconds=0.3, output=tmp_path)
+    console = Console(file=printed, width=100)
+    wanted = BRIDGE_PROFILE.run_of(rounds=1, seconds=0.3, output=tmp_path, console=console)
     if os.geteuid() != 0:
-        with pytest.raises(PebbleError, match="listens on loopback, which takes root: run it with sudo"):
-            bridge_profile.run(wanted, Console(file=printed, width=100))
+        with pytest.raises(PebbleError, match="captures packets on loopback, which requires root: run it with sudo"):
+            run(wanted)
         return
-    assert bridge_profile.run(wanted, Console(file=printed, width=100)) == 0
+    assert run(wanted) == 0
     results = load(tmp_path / "bridge-profile.json")
     assert "robot's broker" in printed.getvalue()
     for cell in results.cells:

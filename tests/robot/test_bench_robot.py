@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, cost, startup
-from pebble.bench.bridge_driven_robot import STAND_IN
-from pebble.bench.bridge_plan import Mode, plan
-from pebble.bench.bridge_tally import DOWN, UNLOADED, UP
+from pebble.bench import cost, startup
+from pebble.bench.bridge import BRIDGE
+from pebble.bench.bridge_report import COMMANDS, CPU, DOWN, UNLOADED, UP
+from pebble.bench.bridge_robots import STAND_IN
 from pebble.bench.engine import run
 from pebble.bench.results import load
 from pebble.rig.programs import children
@@ -86,14 +86,21 @@ def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_the_stand_in_carries_commands_and_reports(tmp_path: Path) -> None:
-    short = plan(Mode.COMPARE, quick=True, rounds=1, seconds=1.0, kinds=[STAND_IN, "mqtt"], output=tmp_path)
-    assert bridge.run(short, Console(file=io.StringIO())) == 0
+    short = BRIDGE.run_of(
+        quick=True, rounds=1, seconds=1.0, variants=[STAND_IN, "mqtt"], output=tmp_path,
+        console=Console(file=io.StringIO()),
+    )  # fmt: skip
+    assert run(short) == 0
     results = load(tmp_path / "bridge.json")
-    for measure in (DOWN, UP):
+    for measure, load_ in ((DOWN, UNLOADED), (UP, UNLOADED), (DOWN, COMMANDS)):
         for kind in (STAND_IN, "mqtt"):
-            cell = results.find(kind, measure, load=UNLOADED)
+            cell = results.find(kind, measure, load=load_)
             assert cell is not None
             assert len(cell.samples) >= 10
+    assert results.find("mqtt", UP, load=COMMANDS) is None
+    each = [cell for cell in results.cells if cell.measure == CPU]
+    assert len(each) == 8
+    assert all(10 < cell.samples[0] < 100_000 for cell in each)
     assert children(os.getpid()) == []
 
 

@@ -93,7 +93,7 @@ class TestMosquitto:
         Quiet(robot.local, robot.remote).wait(0.2)
         assert len(errors(caplog)) == 1
         other_way.cut()
-        assert until(lambda: not robot.bridge._forwarder._cycles._closed)
+        assert until(lambda: not robot.bridge._forwarder._cycles.closed_ways)
         before = moves(robot.local)
         robot.remote.publish(DRIVE, MOVE)
         assert until(lambda: moves(robot.local) == before + 1)

@@ -173,10 +173,12 @@ def test_a_retained_stop_and_a_retained_reset_do_nothing(bench: Bench) -> None:
 
 def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(bench: Bench) -> None:
     """The service is busy while a drive command, a stop and another drive command arrive."""
+    delivered = bench.service.transport.counters["delivered"]
     with bench.occupied():
         bench.send("incoming/drive-values", {"z": 0.25})
         bench.send("incoming/estop", STOP)
         bench.send("incoming/drive-values", {"z": 0.5})
+        assert until(lambda: bench.service.transport.counters["delivered"] == delivered + 3)
     assert stopped(bench)
     bench.send("incoming/lights-solid", {"r": 1})
     assert bench.line("L 0.000 0.000 1.000")
