@@ -293,8 +293,8 @@ BRIDGE = Comparison(
         pebble bench bridge --profile
     """,
     options=_options((STAND_IN, *KINDS)),
-    full=Budget(480, **_UNSET, rounds=10, seconds=4.0),
-    quick=Budget(45, rounds=4, seconds=0.5),
+    full=Budget(560, **_UNSET, rounds=10, seconds=4.0),
+    quick=Budget(22, rounds=2, seconds=0.5),
     constants={"rate_hz": RATE_HZ},
     variants=(STAND_IN, *KINDS),
     references=(HOP,),

@@ -56,8 +56,11 @@ def tables(cells: Sequence[Cell]) -> Iterator[Table]:
 
 
 def _cpu_table(cells: Sequence[Cell]) -> Table:
-    heads = ["load", "process", "robot", "us (minimum to maximum of rounds)", "turns", f"/ {STAND_IN}"]
-    table, before = plain_table("CPU for each forwarded message", heads, left=3), None
+    heads = ["load", "process", "robot", "us", "turns", f"/ {STAND_IN}"]
+    table, before = (
+        plain_table("CPU for each forwarded message: median (minimum to maximum) of the rounds", heads, left=3),
+        None,
+    )
     places = list(dict.fromkeys((cell.params["load"], cell.params["process"]) for cell in cells))
     for cell in sorted(cells, key=lambda cell: places.index((cell.params["load"], cell.params["process"]))):
         base, place = base_of(cell, cells, STAND_IN), [str(value) for value in cell.params.values()]

@@ -104,10 +104,17 @@ def bridge() -> Results:
     cells = [
         Cell(variant=variant, params={"load": load}, measure=measure, unit="ms",
              rounds=latencies(middle * (1.6 if load == "media" else 1), 80), figures={"sent": 800})
-        for load in ("none", "media")
-        for measure in ("down", "up")
-        for variant, middle in {"mqtt": 0.9, "zenoh": 0.6, "one hop": 0.25}.items()
-        if variant != "one hop" or measure == "down"
+        for measure, loads in (("down", ("none", "commands", "media")), ("up", ("none", "media")))
+        for load in loads
+        for variant, middle in {"paho": 1.1, "mqtt": 0.9, "zenoh": 0.6, "one hop": 0.25}.items()
+        if (variant, load) != ("paho", "media") and (variant != "one hop" or (measure, load) == ("down", "none"))
+    ]  # fmt: skip
+    cells += [
+        Cell(variant=variant, params={"load": load, "process": process}, measure="CPU per message", unit="us",
+             rounds=latencies(middle, 4))
+        for load in ("none", "commands")
+        for process in ("bridge", "serial bridge")
+        for variant, middle in {"paho": 400.0, "mqtt": 300.0, "zenoh": 350.0}.items()
     ]  # fmt: skip
     return _results("bridge", cells, [_aim("mqtt, p50 at most 0.7 ms", "missed", "0.9 ms")])
 

@@ -372,7 +372,7 @@ def test_the_tables_have_the_robots_cost() -> None:
 
 def test_the_tables_have_the_cpu_of_each_process_beside_that_of_the_stand_in() -> None:
     lines = shown([cpu(kind, us, part) for kind, us in ((STAND_IN, 400.0), ("mqtt", 300.0)) for part in PARTS])
-    rows = [line.split() for line in lines.splitlines() if "(" in line][1:]
+    rows = [line.split() for line in lines.splitlines() if "(" in line and "median" not in line]
     assert rows[0] == ["none", "bridge", "paho", "400", "(400", "to", "400)", "8"]
     assert rows[1] == ["mqtt", "300", "(300", "to", "300)", "8", "0.75", "(0.75", "to", "0.75)"]
     assert rows[2][:3] == ["none", "serial", "bridge"]
