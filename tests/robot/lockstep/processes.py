@@ -99,6 +99,8 @@ class ServiceProcess(Process):
         self.lives += 1
         self.started_at = self.scheduler.now
         self.service = self._make(self)
+        # Here all work waits for a turn of the process: a frozen one gets messages, and does nothing.
+        self.service.run_if_idle = lambda _job: False  # type: ignore[method-assign]
         self.service._set_up()
         self.wake()
 
