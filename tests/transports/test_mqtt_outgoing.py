@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from pebble.transports import Message, QoS
-from pebble.transports.mqtt.outgoing import BACKLOG_BYTES, BACKLOG_MESSAGES, Backlog, InFlightTable, PendingAck
+from pebble.transports.mqtt.outgoing import (
+    BACKLOG_BYTES,
+    BACKLOG_MESSAGES,
+    Backlog,
+    InFlightTable,
+    PendingAck,
+    RefusedMessages,
+)
 
 
 def drain(backlog: Backlog) -> list[bytes]:
@@ -148,3 +155,9 @@ def test_answers_complete_their_request_only() -> None:
     in_flight.complete()
     assert ping.done
     in_flight.pong(1.0)  # one more than there were pings
+
+
+def test_a_small_message_is_never_refused_however_often_the_broker_hangs_up() -> None:
+    refused, heartbeat = RefusedMessages(), Message("online", b'{"t":1795465907428}', retain=True)
+    assert [refused.note_loss([heartbeat], now) for now in range(10)] == [None] * 10
+    assert not refused.has(heartbeat, 10.0)

@@ -30,6 +30,7 @@ BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
 LOSSES = 3  # in a row with a message in flight, after which it counts as refused
 REFUSED_S = 3600.0
+_SMALL = 256  # bytes that every broker takes: what hangs up with nothing larger in flight has another reason
 _REFUSED = 1000  # topics
 ROUND_TRIPS = 8  # answer times that are remembered
 
@@ -132,7 +133,8 @@ class RefusedMessages:
     def note_loss(self, in_flight: Collection[Message], now: float) -> Message | None:
         """The broker has hung up with ``in_flight`` unconfirmed; returns the message that is refused from now on."""
         self._losses = {message.topic: self._losses.get(message.topic, 0) + 1 for message in in_flight}
-        suspects = [message for message in in_flight if self._losses[message.topic] >= LOSSES]
+        often = [message for message in in_flight if self._losses[message.topic] >= LOSSES]
+        suspects = [message for message in often if len(message.payload) > _SMALL]
         if not suspects:
             return None
         largest = max(suspects, key=lambda message: len(message.payload))
