@@ -1,7 +1,7 @@
 """The recorder beside the operator page and four robots: ``python -m tests.recordings.endurance --minutes 60 DIR``.
 
 A reference subscriber receives the same. Afterwards: is each of its messages in the recording, byte for byte and in
-order; what did the recorder cost, and did it grow?
+order; what did the recorder cost, beside a plain logger that receives the same, and did it grow?
 """
 
 from __future__ import annotations
@@ -116,37 +116,48 @@ def main() -> int:
         recorder = subprocess.Popen([*command, "--into", str(options.folder)])
         assert until((options.folder / "recorder.json").exists, 30), "the recorder did not start"
         time.sleep(2.0)  # it is subscribed by then
+        plain = subprocess.Popen([sys.executable, "-m", "tests.recordings.plain_logger", str(stage.broker_port)])
         reference = Reference(stage.broker_port)
         operator = Operator(stage.broker_port, [stage.ref(name) for name in ROBOTS])
         try:
-            cpu, memory = _observe(recorder.pid, operator, 60 * options.minutes)
+            cpu, plain_cpu, memory = _observe(recorder.pid, plain.pid, operator, 60 * options.minutes)
             operator.close()
             reference.transport.close()
             time.sleep(2.0)
         finally:
+            plain.kill()
+            plain.wait()
             recorder.send_signal(signal.SIGTERM)
             recorder.wait(20)
     total, lacking = missing(options.folder, reference)
     sys.stdout.write(
-        f"{total} messages, {lacking} of topics that differ; {cpu:.2f} % of a core; MB, medians of the quarters: "
+        f"{total} messages, {lacking} of topics that differ; {cpu:.2f} % of a core, "
+        f"{cpu / plain_cpu:.2f} of the plain logger's {plain_cpu:.2f}; MB, medians of the quarters: "
         f"{' '.join(f'{value:.1f}' for value in quarters(memory))}, highest {max(memory):.1f}\n"
     )
     return 1 if lacking else 0
 
 
-def _observe(pid: int, operator: Operator, seconds: float) -> tuple[float, list[float]]:
-    """The recorder's share of a processor in percent, and what it has allocated now and then, MB."""
-    began, before, memory, due = time.monotonic(), cpu_s([pid]), list[float](), 0.0
+def _observe(recorder: int, plain: int, operator: Operator, seconds: float) -> tuple[float, float, list[float]]:
+    """The share of a processor of both, percent, and what the recorder has allocated now and then, MB."""
+    began, memory, due = time.monotonic(), list[float](), 0.0
+    before = {pid: cpu_s([pid]) for pid in (recorder, plain)}
+
+    def share(pid: int) -> float:
+        return 100 * (cpu_s([pid]) - before[pid]) / max(1.0, time.monotonic() - began)
+
     while (passed := time.monotonic() - began) < seconds:
         operator.step()
         if passed >= due:
-            memory.append(own_mb(pid))
+            memory.append(own_mb(recorder))
             due += _SAMPLE_S
-            share = 100 * (cpu_s([pid]) - before) / max(1.0, passed)
-            sys.stdout.write(f"{passed / 60:5.1f} min: {share:.2f} % of a core, {memory[-1]:.1f} MB\n")
+            sys.stdout.write(
+                f"{passed / 60:5.1f} min: {share(recorder):.2f} % of a core, {memory[-1]:.1f} MB; "
+                f"plain logger {share(plain):.2f} %\n"
+            )
             sys.stdout.flush()
         time.sleep(_PERIOD_S)
-    return 100 * (cpu_s([pid]) - before) / (time.monotonic() - began), memory
+    return share(recorder), share(plain), memory
 
 
 if __name__ == "__main__":

@@ -229,15 +229,16 @@ class Connection:
         message is never delivered later than the confirmation of its subscription. Whether a subscription is refused is
         known before both.
         """
-        readable, client = self._wait(timeout), self._client
+        readable, now = self._wait(timeout)
+        client = self._client
         with self._lock:
             # Before reading: messages queued during a silence must not arrive as if they were fresh (T19).
-            self._check_silence()
+            self._check_silence(now)
             if readable or self._more:
-                self._read()
+                self._read(now)
             if client.waiting or self._backlog.waiting:
                 self._write()
-            if clock.since_boot() >= self._ping_due_at:
+            if now >= self._ping_due_at:
                 self._ping()
             owes = client.owes
             if not owes:
@@ -259,19 +260,19 @@ class Connection:
         if self._in_flight.answered:
             self._in_flight.complete()
 
-    def _wait(self, timeout: float) -> bool:
-        with self._lock:
-            sock = self._client.socket
-            if sock is None:
-                raise Lost(self._closed)
-            blocked = bool(self._client.waiting)
-            poll = self._poll = self._poll or _Poll(sock.fileno(), self._wake_read.fileno())
-        began = clock.since_boot()
+    def _wait(self, timeout: float) -> tuple[bool, float]:
+        """Whether there is something to read, and when that was known: what follows goes by that one time."""
+        poll = self._poll or self._make_poll()
+        if self._client.socket is None:
+            raise Lost(self._closed)
+        blocked = bool(self._client.waiting)
+        began = now = clock.since_boot()
         wait = min(timeout, self._ping_due_at - began)
         readable = writable = woken = False
         is_fresh = not self._more and began - self._waiting.checked_at <= _FRESH_S
         if not is_fresh:
             readable, writable, woken = poll.wait(0.0, write=blocked)
+            now = clock.since_boot()
         if not (readable or writable or woken or self._more):
             if not is_fresh:
                 self._waiting.empty(began)
@@ -281,13 +282,20 @@ class Connection:
         if woken:
             self._wake_read.recv(4096)
         if writable:
-            self._answered_at = clock.since_boot()  # the other side's TCP accepted some: slow, but alive
-        return readable
+            self._answered_at = now  # the other side's TCP accepted some: slow, but alive
+        return readable, now
 
-    def _check_silence(self) -> None:
+    def _make_poll(self) -> _Poll:
+        with self._lock:
+            if self._client.socket is None:
+                raise Lost(self._closed)
+            self._poll = _Poll(self._client.socket.fileno(), self._wake_read.fileno())
+        return self._poll
+
+    def _check_silence(self, now: float) -> None:
         if not self._accepted:
             return  # `connect` has its own deadline, and gives the first round trip
-        silence_s = clock.since_boot() - max(self._answered_at, self.arriving_at)
+        silence_s = now - max(self._answered_at, self.arriving_at)
         if silence_s > self._settings.silence_s and silence_s > (limit := self._silence_limit_s):
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
@@ -296,52 +304,52 @@ class Connection:
     def _silence_limit_s(self) -> float:
         return max(self._settings.silence_s, 4 * _LEAST_PING_S, 4 * self._in_flight.round_trip_s)
 
-    @property
-    def _waiting_since(self) -> float:
+    def _waiting_since(self, now: float) -> float:
         """Since when what is read now may have waited, here or at the broker."""
-        now, sock = clock.since_boot(), self._client.socket
+        sock = self._client.socket
         waited = self._delay.seconds(now, lambda: 0.0 if sock is None else present_round_trip_s(sock))
         return min(self._waiting.since, now - waited) if waited > 0 else self._waiting.since
 
     def _note_copies(self) -> None:
         self.arriving_at = clock.since_boot()
 
-    def _read(self) -> None:
-        """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks."""
+    def _read(self, now: float) -> None:
+        """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks.
+
+        ``now``: a time before anything is read.
+        """
         client, first, size = self._client, self._packets, 0
         unread = client.unread if self._more else 0
         self._more = True
         while self._more and self._packets - first < _BATCH:
             before = self._packets
             if not unread:
-                self._received_at = began = clock.since_boot()
-                if began - self._waiting.checked_at > _OVERSLEPT_S and self._accepted:
-                    self._ping_after_stall(began)
+                self._received_at = now
+                if now - self._waiting.checked_at > _OVERSLEPT_S and self._accepted:
+                    self._ping_after_stall(now)
                 unread = client.receive()
-                self._waiting.found(unread if client.drained else unread + self._readable, began)
-            self._since = self._waiting_since
-            left = self._read_some(_BATCH - (before - first))
-            self._waiting.read(unread - left)
-            size, unread = size + unread - left, left
+                self._waiting.found(unread if client.drained else unread + self._readable, now)
+            self._since = self._waiting_since(now)
+            try:
+                left = client.read(_BATCH - (before - first))
+            except MalformedError as error:
+                raise Lost(f"{self.where} does not speak MQTT: {error}") from None
+            if self._refusal is not None:
+                raise self._refusal
+            size += unread - left
             self._more = left > 0 or not client.drained
+            if not self._more:
+                break
+            self._waiting.read(unread - left)
             if self._packets == before:
                 break
+            unread, now = left, clock.since_boot()
         if size and self._packets == first:
             self.arriving_at = clock.since_boot()  # a piece of a long message
         if self._copies:
             self._note_copies()
         if not self._more:
             self._waiting.empty(self._received_at)
-
-    def _read_some(self, most: int) -> int:
-        """Returns how many bytes are still to be read."""
-        try:
-            left = self._client.read(most)
-        except MalformedError as error:
-            raise Lost(f"{self.where} does not speak MQTT: {error}") from None
-        if self._refusal is not None:
-            raise self._refusal
-        return left
 
     @property
     def _readable(self) -> int:

@@ -222,7 +222,9 @@ class Reader:
                     self._data, self._at = b"", 0
                 break
             size, start = data[at + 1], at + 2
-            if size > 127:
+            if size > 127 and start < end and (more := data[start]) < 128:
+                size, start = size & 127 | more << 7, start + 1
+            elif size > 127:
                 size, start = _read_variable(data, at + 1)
                 if size < 0:
                     self._keep(end - at + 1)
