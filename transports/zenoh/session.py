@@ -20,10 +20,10 @@ from pebble.errors import TransportError
 from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.zenoh import wire
 
-# Zenoh reads this once, before the first session. By default connections are accepted, opened and read on separate
-# runtimes: a received message wakes a thread that only wakes another one. Measured with 1.10.2 (40 B at 200 Hz, round
-# trip, two cores): 9.6 wake-ups instead of 14, and 0.9 of the time. Sending has its own runtime: a callback may send.
-os.environ.setdefault("ZENOH_RUNTIME", "(acc: (handover: rx), net: (handover: rx))")
+# By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
+# wakes another one. Measured with 1.10.2 (40 B at 200 Hz, round trip, two cores): 9.6 wake-ups instead of 14, and 0.9
+# of the time. Sending has its own runtime: a callback may send.
+_RUNTIME = "(acc: (handover: rx), net: (handover: rx))"
 
 HUB_SOCKET = "hub.sock"
 
@@ -75,6 +75,8 @@ def session_config(settings: ZenohSettings, mode: str, *, listen: list[Path], co
 def open_session(config: str) -> zenoh.Session:
     """Open a session. Raises ZError if that fails now, TransportError in a process forked from one with a session."""
     _refuse_fork()
+    # Read once, before the first session; here, because a forked service has another environment than this module's.
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     # Zenoh's threads inherit this. A signal that the kernel gave to one of them would not wake the main thread, which
     # runs Python's handlers (measured: 5 of 200 hubs on a busy machine did not end).
     before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())

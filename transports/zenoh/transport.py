@@ -354,7 +354,7 @@ class ZenohTransport(Transport):
             self.counters.add("received")
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            if self._is_late(sample, stamp):
+            if self._is_late(sample, stamp, read_at):
                 return
             message = _live_message(sample, stamp, subscription.qos, read_at)
             if subscription.direct and self._putting == threading.get_ident():
@@ -366,14 +366,14 @@ class ZenohTransport(Transport):
             filter_to_key(subscription.filter), _direct(take), allowed_origin=origin
         )
 
-    def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp) -> bool:
+    def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp, now: float) -> bool:
         """Whether it waited in a socket while this process was stopped, longer than the lease of a connection (T19).
 
         Retained messages are accepted in any case, because they are not sent again.
         """
         if not stamp.boot:
             return False
-        age_s = self._message_ages.age_s(stamp.boot, stamp.sent_ns / 1e9, wire.since_boot_ns() / 1e9)
+        age_s = self._message_ages.age_s(stamp.boot, stamp.sent_ns / 1e9, now)
         if stamp.retain_requested or age_s <= self._late_s:
             return False
         self.counters.add("late")
