@@ -86,7 +86,7 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
         if not contents.end_at:
             raise RecordingError(f"{path}: nothing in it can be read")
         contents.complete(Summary.of(data))
-        covers = sorted(contents.wrong + damage.spans)
+        covers = _joined(contents.wrong + damage.spans)
         damaged = max(contents.covered, contents.damaged_before) + sum(end - begin for begin, end in covers)
         torn = contents.torn + (0 if damage.finished else len(data) - contents.end_at)
     finished = Finished(contents.messages, contents.missing, damaged, torn)
@@ -107,6 +107,16 @@ def _finish(file: BinaryIO, path: Path) -> Finished:
         contents.end_at += len(about.pack())
     _write(file, contents.end(contents.end_at, len(contents.chunks), b"".join(contents.chunks)))
     return finished
+
+
+def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Sorted, those that touch each other as one: where an index became the begin of a chunk, only both have room."""
+    joined: list[tuple[int, int]] = []
+    for begin, end in sorted(spans):
+        if joined and joined[-1][1] == begin:
+            begin = joined.pop()[0]
+        joined.append((begin, end))
+    return joined
 
 
 def _cover(file: BinaryIO, spans: list[tuple[int, int]], contents: _Contents) -> None:

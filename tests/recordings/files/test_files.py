@@ -15,9 +15,9 @@ from typing import BinaryIO
 import pytest
 
 from pebble.recordings.files.finish import Finished, finish
-from pebble.recordings.files.mcap import FILE_TOPIC, Packer
+from pebble.recordings.files.mcap import FILE_TOPIC, HEAD, Op, Packer
 from pebble.recordings.files.reader import RecordingError, Summary, mapped
-from pebble.recordings.files.scan import Damage
+from pebble.recordings.files.scan import Damage, blocks
 from pebble.recordings.files.writer import McapWriter
 from tests.recordings.files.other_readers import Counted, by_mcap, by_mcap_core
 from tests.recordings.messages import START_NS, STEP_NS, contents, is_part_of, write
@@ -88,6 +88,17 @@ def lose_a_part(raw: bytearray, rng: random.Random) -> None:
 DAMAGES = [cut, flip, zero_a_page, end_in_garbage, end_in_zeros, lose_a_part]
 
 
+def _indexes(data: bytes) -> list[int]:
+    """Where the records begin that index chunks."""
+    found = []
+    for block in blocks(data, Damage()):
+        at = block.record_end
+        while at < block.end:
+            found.append(at)
+            at += HEAD.size + HEAD.unpack_from(data, at)[1]
+    return found
+
+
 class TestDamaged:
     @pytest.mark.parametrize("level", [0, 3])
     @pytest.mark.parametrize("finished", [False, True])
@@ -123,6 +134,21 @@ class TestDamaged:
                 assert made.missing == len(written) - len(read)
         if damage is not lose_a_part:  # where bytes are gone a chunk's index may have no room, which this reader needs
             assert by_mcap_core(list(again)) == list(again.values())
+
+    @pytest.mark.parametrize("op", [Op.CHUNK, Op.DATA_END, Op.METADATA, Op.PADDING])
+    def test_an_index_that_became_another_record_is_written_anew(self, tmp_path: Path, op: Op) -> None:
+        written = write(tmp_path / "a.mcap", finish=False)
+        whole = (tmp_path / "a.mcap").read_bytes()
+        made = []
+        for at in _indexes(whole)[::37]:
+            raw, path = bytearray(whole), tmp_path / f"{at}.mcap"
+            raw[at] = op
+            path.write_bytes(raw)
+            finish(path)
+            assert contents(path) == written
+            made.append(path)
+        assert len(made) > 3
+        assert by_mcap_core(made) == [Counted(MESSAGES, MESSAGES, MESSAGES)] * len(made)
 
     @pytest.mark.parametrize("level", [0, 3])
     def test_one_bit_costs_two_chunks_at_most(self, tmp_path: Path, level: int) -> None:
