@@ -123,11 +123,8 @@ def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Pa
                     ha="center", va="bottom",
                 )  # fmt: skip
         axes.set_xlim(-0.6, len(trials) - 0.4)
-        axes.set_xticks(range(len(trials)), trials if axes is every[-1] else [""] * len(trials))
-    every[-1].tick_params(axis="x", labelrotation=40)
-    for label in every[-1].get_xticklabels():
-        label.set_horizontalalignment("right")
-        label.set_rotation_mode("anchor")
+        named = trials if axes is every[-1] else [""] * len(trials)
+        axes.set_xticks(range(len(trials)), named, rotation=40, ha="right", rotation_mode="anchor")
     every[-1].set_xlabel("trial: condition of the network, in the order of the run")
     legend(figure, styles(subjects), more=[_QUOTED] if any(panel.crosses for panel in shown) else [])
     return figure

@@ -9,8 +9,8 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -94,8 +94,7 @@ def measure(plan: Plan, progress: Progress) -> Measurement:
             if plan.media:
                 viewer.wait_for_capabilities(_CAPABILITIES_S)
             _make_folder(plan)
-            with _recording(plan, viewer) as (recorder, source):
-                return _Course(plan, recorder, source, viewer, progress).run()
+            return _Course(plan, viewer, progress).run()
 
 
 def _check(plan: Plan) -> None:
@@ -157,29 +156,26 @@ class _Recorder(Recorder):
         super().receive(topic, payload, *about, retained=retained, **more)
 
 
-@contextmanager
-def _recording(plan: Plan, viewer: Viewer) -> Iterator[tuple[_Recorder, Source]]:
-    kind, settings, _, _ = resolve(plan.target)
-    if kind == "mqtt":
-        settings = replace(settings, protocol="5")
-    recorder = _Recorder(plan, viewer)
-    recorder.start()
-    try:
-        with closing(Source(recorder, kind, settings, [f"{viewer.base}/#"])) as source:
-            source.start()
-            yield recorder, source
-    finally:
-        recorder.stop()
-
-
 class _Course:
     """The course of one measurement."""
 
-    def __init__(self, plan: Plan, recorder: _Recorder, source: Source, viewer: Viewer, progress: Progress) -> None:
-        self._plan, self._recorder, self._source = plan, recorder, source
-        self._viewer, self._progress = viewer, progress
+    def __init__(self, plan: Plan, viewer: Viewer, progress: Progress) -> None:
+        self._plan, self._viewer, self._progress = plan, viewer, progress
+        kind, settings, _, _ = resolve(plan.target)
+        settings = replace(settings, protocol="5") if kind == "mqtt" else settings
+        self._recorder = _Recorder(plan, viewer)
+        self._source = Source(self._recorder, kind, settings, [f"{viewer.base}/#"])
 
     def run(self) -> Measurement:
+        self._recorder.start()
+        try:
+            with closing(self._source):
+                self._source.start()
+                return self._measured()
+        finally:
+            self._recorder.stop()
+
+    def _measured(self) -> Measurement:
         measurement = Measurement(label=self._plan.label, robot=self._viewer.base, since_ns=self._recorder.clock.now())
         measurement.save(self._plan.folder)
         try:

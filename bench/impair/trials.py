@@ -7,7 +7,6 @@ import time
 import wave
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -205,11 +204,9 @@ def conditions(run: Run) -> list[Condition]:
     return chosen(run["trials"], run["both_ways"])
 
 
-@contextmanager
-def test_bed(run: Run) -> Iterator[TestBed]:
+def test_bed(run: Run) -> TestBed:
     run.show("starting the robots")
-    with TestBed([one for one in SUBJECTS if one.name in run["variants"]], run["link"]) as bed:
-        yield bed
+    return TestBed([one for one in SUBJECTS if one.name in run["variants"]], run["link"])
 
 
 def groups(run: Run, robots: Sequence[ImpairedRobot]) -> list[list[ImpairedRobot]]:
@@ -234,10 +231,12 @@ def measure(round_: Round) -> Iterator[Cell]:
                 turn = slice(None, None, -1 if number % 2 else 1)
                 for place, group in enumerate(groups(run, bed.robots)[turn]):
                     run.show(f"{condition.name}: {', '.join(robot.subject.name for robot in group)}")
-                    at_once(group[turn], partial(_recover, run=run))
+                    at_once(group[turn], partial(_recover, run))
                     if not place:
                         marks.append(f"{condition.name}@{(time.monotonic_ns() - began_ns) / 1e9:.1f}")
-                    trials += _tried(run, condition, group[turn], at_once)
+                    at_once(group[turn], partial(_apply, condition))
+                    trials += at_once(group[turn], partial(_trial, run, condition.name))
+                    at_once(group[turn], partial(_apply, CLEAN))
         except PebbleError as error:
             if not trials:
                 raise
@@ -257,24 +256,16 @@ def _at_once(pool: ThreadPoolExecutor, robots: Sequence[ImpairedRobot], act: Cal
     return [future.result() for future in futures]
 
 
-def _tried(
-    run: Run,
-    condition: Condition,
-    robots: Sequence[ImpairedRobot],
-    at_once: Callable[..., list[Trial]],
-) -> list[Trial]:
-    at_once(robots, lambda robot: robot.network.apply(condition))
-    trials = at_once(robots, lambda robot: _trial(run, robot, condition.name))
-    at_once(robots, lambda robot: robot.network.apply(CLEAN))
-    return trials
-
-
-def _recover(robot: ImpairedRobot, run: Run) -> None:
+def _recover(run: Run, robot: ImpairedRobot) -> None:
     robot.send(RecoveryRequest(quiet_s=run["quiet_s"]))
     robot.next_report(_RECOVERED_S)
 
 
-def _trial(run: Run, robot: ImpairedRobot, name: str) -> Trial:
+def _apply(condition: Condition, robot: ImpairedRobot) -> None:
+    robot.network.apply(condition)
+
+
+def _trial(run: Run, name: str, robot: ImpairedRobot) -> Trial:
     began_ns, subject = time.monotonic_ns(), robot.subject
     lengths = {phase: run[phase] for phase in ("alone_s", "window_s", "grace_s", "off_s", "clip_s")}
     robot.send(TrialRequest(video=subject.video, audio=subject.audio, **lengths))
