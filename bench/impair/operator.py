@@ -116,9 +116,9 @@ class TrialOperator:
         driver.start()
         try:
             alone = self._measure_phase("alone", request.alone_s)
-            seen, video = self._watch("video", request.video, request.window_s)
+            seen, video = self._watch("video", request, enough)
             video_off = self._measure_phase("video off", request.off_s)
-            received, audio = self._watch("audio", request.audio, request.window_s, enough, request.grace_s)
+            received, audio = self._watch("audio", request, enough)
         finally:
             enough.set()
             driver.join()
@@ -142,28 +142,18 @@ class TrialOperator:
 
     # -- phases
 
-    def _watch(
-        self,
-        medium: Medium,
-        encoding: str | None,
-        window_s: float,
-        over: threading.Event | None = None,
-        grace_s: float = 0.0,
-    ) -> tuple[MediaSubscriber, Window]:
-        """Requests a medium, waits for its first message, records a window; then sets ``over``, waits ``grace_s``."""
-        subscriber = MediaSubscriber(self._media, self._base)
-        try:
+    def _watch(self, medium: Medium, request: TrialRequest, enough: threading.Event) -> tuple[MediaSubscriber, Window]:
+        """Requests a medium, waits for its first message, records a window. Audio, which is last, ends the driving."""
+        with closing(MediaSubscriber(self._media, self._base)) as subscriber:
             subscriber.wait_for_capabilities(_KNOWN_S)
             asked = time.monotonic()
-            subscriber.viewer.request(medium, encoding)
+            subscriber.viewer.request(medium, request.video if medium == "video" else request.audio)
             started = self._wait(lambda: subscriber.has_received(medium), _FIRST_S, subscriber)
             first_s = time.monotonic() - asked if started else None
-            window = self._measure_phase(medium, window_s, subscriber)
-            if over is not None:
-                over.set()
-            self._wait(lambda: False, grace_s, subscriber)
-        finally:
-            subscriber.close()
+            window = self._measure_phase(medium, request.window_s, subscriber)
+            if medium == "audio":
+                enough.set()
+                self._wait(lambda: False, request.grace_s, subscriber)
         return subscriber, Window(window.began_ns, window.ended_ns, first_s)
 
     def _play_clip(self, seconds: float) -> ClipCommand:
