@@ -16,7 +16,7 @@ import struct
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ import msgspec
 from pebble.bench.impair.conditions import Condition, Schedule, Shape
 from pebble.rig import worker_end
 
-TIMED = "timed"  # the device whose packets pass through this process
+WIRE, TIMED = "wire", "timed"  # the devices; packets of the second one pass through this process
+ETHERNET = 14  # bytes of header that packets of a TUN device lack, but would have on a wire
 _TUN = Path("/dev/net/tun")
 _CLONE_NEWNET = 0x40000000
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
@@ -91,9 +92,9 @@ class NamespaceForwarder:
         self.down = Direction(remote_tun, robot_tun, "down")
         self._sources = {robot_tun: self.up, remote_tun: self.down}
 
-    def serve(self, requests: int) -> None:
-        """Forwards and answers requests until ``orders`` closes."""
-        asked = b""
+    def serve(self) -> None:
+        """Forwards, and answers requests until standard input closes; each waits for the answer to the one before."""
+        requests = sys.stdin.fileno()
         while True:
             ready, _, _ = select.select([requests, *self._sources], [], [], self._idle_s())
             for source in ready:
@@ -102,17 +103,15 @@ class NamespaceForwarder:
             self.up.deliver()
             self.down.deliver()
             if requests in ready:
-                received = os.read(requests, 4096)
-                if not received:
+                if not (line := sys.stdin.buffer.readline()):
                     return
-                *lines, asked = (asked + received).split(b"\n")
-                for line in lines:
-                    worker_end.answer(self._answer(line))
+                worker_end.answer(self._answer(line.strip()))
 
     def _answer(self, line: bytes) -> dict[str, Any]:
         if line == b"count":
-            counts = {side: _transmitted(space) for side, space in (("up", self.robot), ("down", self.remote))}
-            return {**counts, "lost_up": self.up.lost, "lost_down": self.down.lost}
+            up, down = _transmitted(self.robot), _transmitted(self.remote)
+            sent = {"bytes_up": up[0], "packets_up": up[1], "bytes_down": down[0], "packets_down": down[1]}
+            return {**sent, "dropped_up": self.up.lost, "dropped_down": self.down.lost}
         condition = msgspec.json.decode(line, type=Condition)
         self.up.apply(condition.up)
         self.down.apply(condition.down)
@@ -132,17 +131,13 @@ def _namespace() -> tuple[int, int]:
     return space, tun
 
 
-def _transmitted(space: int) -> dict[str, tuple[int, int]]:
-    """Bytes and packets sent by each device of a namespace."""
+def _transmitted(space: int) -> tuple[int, int]:
+    """Bytes and packets sent by both devices of a namespace, as on a wire."""
     _checked(_libc.setns, space, _CLONE_NEWNET)
-    return dict(_devices(Path("/proc/thread-self/net/dev").read_text()))
-
-
-def _devices(text: str) -> Iterator[tuple[str, tuple[int, int]]]:
-    for line in text.splitlines()[2:]:
-        name, _, figures = line.partition(":")
-        columns = figures.split()
-        yield name.strip(), (int(columns[8]), int(columns[9]))
+    lines = (line.partition(":") for line in Path("/proc/thread-self/net/dev").read_text().splitlines())
+    sent = {name.strip(): [int(column) for column in columns.split()[8:10]] for name, _, columns in lines if columns}
+    (wire_bytes, wire_packets), (timed_bytes, timed_packets) = sent[WIRE], sent[TIMED]
+    return wire_bytes + timed_bytes + timed_packets * ETHERNET, wire_packets + timed_packets
 
 
 def _checked(call: Callable[..., int], *arguments: int) -> None:
@@ -180,7 +175,7 @@ def main() -> int:
         worker_end.answer(_refusal(error))
         return 1
     worker_end.answer({"robot": forwarder.robot, "remote": forwarder.remote})
-    forwarder.serve(sys.stdin.fileno())
+    forwarder.serve()
     return 0
 
 

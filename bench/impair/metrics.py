@@ -7,18 +7,19 @@ before the trial's end; its delay is in the latencies.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import msgspec
 
+from pebble.bench.bridge_operator import arrivals
 from pebble.client.discovery import Liveness
-from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
 
 ON_TIME_S = 1.0  # older sound is useless in a conversation
 FROZEN_S = 1.0  # a picture shown for longer counts as frozen
-_POLL_S = 0.01  # interval at which the operator's page checks the heartbeat
+_POLL_NS = 10_000_000  # interval at which the operator's page checks the heartbeat
 _STOP = (0.0, 0.0)
 
 
@@ -53,6 +54,11 @@ class Heartbeat(msgspec.Struct, array_like=True, frozen=True):
     arrived_ns: int
     online: bool = True
 
+    @property
+    def ms(self) -> float:
+        """Its delay."""
+        return (self.arrived_ns - self.sent_ns) / 1e6
+
 
 class Picture(msgspec.Struct, array_like=True, frozen=True):
     """A decoded picture; ``captured_ns`` is None if its message did not contain it."""
@@ -68,6 +74,11 @@ class Sound(msgspec.Struct, array_like=True, frozen=True):
     arrived_ns: int
     seconds: float
     sequence: int
+
+    @property
+    def ms(self) -> float:
+        """Its latency."""
+        return (self.arrived_ns - self.captured_ns) / 1e6
 
 
 class Window(msgspec.Struct, frozen=True):
@@ -127,11 +138,8 @@ class OperatorReport(msgspec.Struct, kw_only=True, omit_defaults=True):
 
 def received(sounds: Iterable[Sound], window: Window) -> list[Sound]:
     """The packets with sound captured in the window, each once, ordered by sequence number."""
-    return [
-        sound
-        for _, sound in sorted({sound.sequence: sound for sound in sounds}.items())
-        if overlap_s(sound, window) > 0
-    ]
+    numbered = {sound.sequence: sound for sound in sounds}
+    return [sound for _, sound in sorted(numbered.items()) if overlap_s(sound, window) > 0]
 
 
 def overlap_s(sound: Sound, window: Window) -> float:
@@ -142,12 +150,9 @@ def overlap_s(sound: Sound, window: Window) -> float:
 
 def sound_percent(sounds: Iterable[Sound], window: Window, within_s: float | None = None) -> float:
     """Share of the window's sound that arrived, or arrived within that many seconds."""
-    arrived = [
-        overlap_s(sound, window)
-        for sound in received(sounds, window)
-        if within_s is None or sound.arrived_ns - sound.captured_ns <= 1e9 * within_s
-    ]
-    return min(100.0, 100 * sum(arrived) / window.seconds)
+    packets = received(sounds, window)
+    arrived_s = [overlap_s(one, window) for one in packets if within_s is None or one.ms <= 1e3 * within_s]
+    return min(100.0, 100 * sum(arrived_s) / window.seconds)
 
 
 def sent_packets(sounds: Sequence[Sound], percent: float) -> int | None:
@@ -164,46 +169,27 @@ def gaps_s(arrivals_ns: Sequence[int], window: Window) -> list[float]:
     return [(b - a) / 1e9 for a, b in pairwise([window.began_ns, *inside, window.ended_ns])]
 
 
-def seen(pictures: Iterable[Picture], window: Window) -> list[Picture]:
-    """The pictures that arrived in the window."""
-    return [picture for picture in pictures if window.holds(picture.arrived_ns)]
-
-
 def offline_s(heartbeats: Sequence[Heartbeat], window: Window) -> list[float]:
     """Durations for which an operator's page showed the robot offline; ``heartbeats`` may begin before the window."""
-    liveness, pending = Liveness(), sorted(heartbeats, key=lambda heartbeat: heartbeat.arrived_ns)
-    offline_periods, since = [], None
-    at, step_ns, number = window.began_ns, round(1e9 * _POLL_S), 0
-    while at < window.ended_ns:
-        while number < len(pending) and pending[number].arrived_ns <= at:
-            heartbeat = pending[number]
-            delay_s = (heartbeat.arrived_ns - heartbeat.sent_ns) / 1e9
-            liveness.heartbeat(heartbeat.arrived_ns / 1e9, delay_s, online=heartbeat.online)
-            number += 1
-        if liveness.online(at / 1e9) is False:
-            since = at if since is None else since
-        elif since is not None:
-            offline_periods.append((at - since) / 1e9)
-            since = None
-        at += step_ns
-    return offline_periods if since is None else [*offline_periods, (window.ended_ns - since) / 1e9]
+    liveness, pending = Liveness(), deque(sorted(heartbeats, key=lambda heartbeat: heartbeat.arrived_ns))
 
+    def is_offline(at_ns: int) -> bool:
+        while pending and pending[0].arrived_ns <= at_ns:
+            heartbeat = pending.popleft()
+            liveness.heartbeat(heartbeat.arrived_ns / 1e9, heartbeat.ms / 1e3, online=heartbeat.online)
+        return liveness.online(at_ns / 1e9) is False
 
-# -- a clip
-
-
-def clip_ms(command: ClipCommand, playbacks: Iterable[Playback]) -> float | None:
-    """From the play command until the first sample was played; None if it was not."""
-    began_ns = min((one.began_ns for one in playbacks if one.began_ns >= command.sent_ns), default=None)
-    return None if began_ns is None else (began_ns - command.sent_ns) / 1e6
+    polls = range(window.began_ns, window.ended_ns, _POLL_NS)
+    periods = [list(period) for offline, period in groupby(polls, is_offline) if offline]
+    return [(min(period[-1] + _POLL_NS, window.ended_ns) - period[0]) / 1e9 for period in periods]
 
 
 # -- driving
 
 
-def driven_ms(commands: Sequence[Command], entries: Iterable[Entry]) -> list[tuple[Command, float]]:
+def driven_ms(commands: Sequence[Command], entries: Sequence[Entry]) -> list[tuple[Command, float]]:
     """Each command with the time until it, or a newer one that overtook it, reached the MCU; lost ones are left out."""
-    arrived = _arrivals(entries)
+    arrived = arrivals(entries)
     driven, soonest = [], math.inf
     for command in reversed(commands):
         soonest = min(soonest, arrived.get((command.left, command.right), math.inf))
@@ -212,24 +198,11 @@ def driven_ms(commands: Sequence[Command], entries: Iterable[Entry]) -> list[tup
     return driven[::-1]
 
 
-def overtaken(commands: Sequence[Command], entries: Iterable[Entry]) -> int:
+def overtaken(commands: Sequence[Command], entries: Sequence[Entry]) -> int:
     """The number of commands that did not reach the MCU although a newer one did."""
-    arrived = _arrivals(entries)
-    reached_mcu = [(command.left, command.right) in arrived for command in commands]
-    return reached_mcu[: len(reached_mcu) - reached_mcu[::-1].index(True)].count(False) if any(reached_mcu) else 0
-
-
-def _arrivals(entries: Iterable[Entry]) -> dict[tuple[float, float], int]:
-    """When each pair of wheel speeds first reached the MCU."""
-    arrived: dict[tuple[float, float], int] = {}
-    for entry in entries:
-        if entry.drive is not None:
-            arrived.setdefault(entry.drive, entry.ns)
-    return arrived
-
-
-def within(commands: Iterable[Command], window: Window) -> list[Command]:
-    return [command for command in commands if window.holds(command.sent_ns)]
+    arrived = arrivals(entries)
+    reached = [number for number, command in enumerate(commands, 1) if (command.left, command.right) in arrived]
+    return reached[-1] - len(reached) if reached else 0
 
 
 def trips(commands: Sequence[Command], entries: Iterable[Entry]) -> int:

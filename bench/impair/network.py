@@ -12,11 +12,10 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
@@ -24,17 +23,16 @@ from typing import Any, Self
 import msgspec
 
 from pebble.bench.impair.conditions import Condition, Shape
-from pebble.bench.impair.forwarder import TIMED
+from pebble.bench.impair.forwarder import ETHERNET, TIMED, WIRE
 from pebble.errors import PebbleError
+from pebble.rig.processes import python
 from pebble.rig.worker import Worker, end_workers
 
 KINDS = ("auto", "namespaces", "proxy")
 LOOPBACK = "127.0.0.1"
-WIRE = "wire"
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
 _PREFIX = 30
 _MTU = 1500
-_ETHERNET = 14  # bytes of header that packets of a TUN device lack, but would have on a wire
 _BURST = 1600  # bytes: one packet, so that the rate also holds over short times
 _QUEUE_S = 0.3  # the queue of a home router's modem, with tail drop
 _QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
@@ -70,32 +68,42 @@ class UnavailableError(PebbleError):
 
 
 class ImpairedNetwork(ABC):
-    """One robot's network, and ``python -m module``, the process that impairs it; thread-safe.
+    """One robot's network, and the process that impairs it; thread-safe. ``name`` is for messages.
 
     Several may be open at the same time, independent. Raises UnavailableError if the process cannot make one.
     """
 
     kind: str  # "namespaces" or "proxy"
     broker_host: str  # the address on which the broker must listen
+    module: str  # of the process
 
-    def __init__(self, name: str, module: str) -> None:
+    def __init__(self, name: str = "") -> None:
         self._log = os.memfd_create("link")  # the log is an unnamed file: nothing is left behind if we are killed
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         log = Path(f"/proc/self/fd/{self._log}")
-        self._worker = Worker(f"network {name}".strip(), [sys.executable, "-m", module], log)
+        self._worker = Worker(f"network {name}".strip(), python(self.module), log)
         self._open = True
         try:
-            self.greeting = self._greeting()
+            self.set_up()
         except BaseException:
             self.close()
             raise
+
+    def set_up(self) -> dict[str, Any]:
+        """The first answer. Raises PebbleError for ``{"error": …}``, UnavailableError for ``{"unavailable": …}``."""
+        answer = self._worker.answer(_ANSWER_S)
+        if "unavailable" in answer:
+            raise UnavailableError(str(answer["unavailable"]))
+        if "error" in answer:
+            raise PebbleError(str(answer["error"]))
+        return answer
 
     @abstractmethod
     def broker_address(self, port: int) -> tuple[str, int]:
         """The robot's address for a broker that listens on ``broker_host:port``."""
 
-    @abstractmethod
-    def traffic(self) -> Traffic: ...
+    def traffic(self) -> Traffic:
+        return msgspec.convert(self.ask("count"), Traffic)
 
     def on_robot(self, command: Sequence[str]) -> list[str]:
         """Wraps a command so that it runs on the robot's side. The process is replaced: pid and signals stay."""
@@ -121,28 +129,16 @@ class ImpairedNetwork(ABC):
             try:
                 return self._worker.ask(line, _ANSWER_S)
             except PebbleError:
-                self._close()
+                self.close()
                 raise
 
     def close(self) -> None:
         """Ends it, which cuts all connections of the network; may be called repeatedly."""
         with self._lock:
-            self._close()
-
-    def _close(self) -> None:
-        if self._open:
-            self._open = False
-            end_workers([self._worker])
-            os.close(self._log)
-
-    def _greeting(self) -> dict[str, Any]:
-        """The first answer. Raises PebbleError for ``{"error": …}``, UnavailableError for ``{"unavailable": …}``."""
-        answer = self._worker.answer(_ANSWER_S)
-        if "unavailable" in answer:
-            raise UnavailableError(str(answer["unavailable"]))
-        if "error" in answer:
-            raise PebbleError(str(answer["error"]))
-        return answer
+            if self._open:
+                self._open = False
+                end_workers([self._worker])
+                os.close(self._log)
 
     def __enter__(self) -> Self:
         return self
@@ -156,18 +152,10 @@ class ProxyNetwork(ImpairedNetwork):
 
     kind = "proxy"
     broker_host = LOOPBACK
-
-    def __init__(self, name: str = "") -> None:
-        super().__init__(name, "pebble.bench.impair.proxy_process")
-        self._ports: dict[int, int] = {}
+    module = "pebble.bench.impair.proxy_process"
 
     def broker_address(self, port: int) -> tuple[str, int]:
-        if port not in self._ports:
-            self._ports[port] = int(self.ask(f"listen {port}")["port"])
-        return LOOPBACK, self._ports[port]
-
-    def traffic(self) -> Traffic:
-        return msgspec.convert(self.ask("count"), Traffic)
+        return LOOPBACK, int(self.ask(f"listen {port}")["port"])
 
 
 class NamespaceNetwork(ImpairedNetwork):
@@ -175,20 +163,16 @@ class NamespaceNetwork(ImpairedNetwork):
 
     kind = "namespaces"
     broker_host = REMOTE_HOST
+    module = "pebble.bench.impair.forwarder"
 
-    def __init__(self, name: str = "") -> None:
-        super().__init__(name, "pebble.bench.impair.forwarder")
-        paths = {side: f"/proc/{self.pid}/fd/{self.greeting[side]}" for side in ("robot", "remote")}
-        self._robot = _Side(paths["robot"], ROBOT_HOST, REMOTE_HOST)
-        self._remote = _Side(paths["remote"], REMOTE_HOST, ROBOT_HOST)
-        self._dropped_before = {self._robot: 0, self._remote: 0}
-        try:
-            self._robot.ip(f"link add {WIRE} type veth peer name {WIRE} netns {paths['remote']}")
-            self._robot.set_up()
-            self._remote.set_up()
-        except BaseException:
-            self.close()
-            raise
+    def set_up(self) -> dict[str, Any]:
+        descriptors = super().set_up()
+        robot, remote = (f"/proc/{self.pid}/fd/{descriptors[side]}" for side in ("robot", "remote"))
+        self._robot, self._remote = _Side(robot, ROBOT_HOST, REMOTE_HOST), _Side(remote, REMOTE_HOST, ROBOT_HOST)
+        self._robot.batch("ip", f"link add {WIRE} type veth peer name {WIRE} netns {remote}")
+        self._robot.set_up()
+        self._remote.set_up()
+        return descriptors
 
     def broker_address(self, port: int) -> tuple[str, int]:
         return REMOTE_HOST, port
@@ -202,30 +186,18 @@ class NamespaceNetwork(ImpairedNetwork):
     def apply(self, condition: Condition) -> None:
         super().apply(condition)
         device = TIMED if condition.up.timed or condition.down.timed else WIRE
-        for side, shape in ((self._robot, condition.up), (self._remote, condition.down)):
-            before = side.dropped()
-            side.limit(shape.kbit)
-            self._dropped_before[side] += before - side.dropped()  # a new queue counts from 0
+        self._robot.limit(condition.up.kbit)
+        self._remote.limit(condition.down.kbit)
         self._remote.lose(condition.up.loss)
         self._robot.lose(condition.down.loss)
         self._robot.send_over(device)
         self._remote.send_over(device)
 
     def traffic(self) -> Traffic:
-        counts = self.ask("count")
-        bytes_up, packets_up = _on_the_wire(counts["up"])
-        bytes_down, packets_down = _on_the_wire(counts["down"])
-        return Traffic(
-            bytes_up,
-            bytes_down,
-            packets_up,
-            packets_down,
-            self._queue_drops(self._robot) + self._remote.lost() + counts["lost_up"],
-            self._queue_drops(self._remote) + self._robot.lost() + counts["lost_down"],
-        )
-
-    def _queue_drops(self, side: _Side) -> int:
-        return self._dropped_before[side] + side.dropped()
+        """The process counts what was sent, and what it dropped itself."""
+        count = super().traffic()
+        up, down = self._robot.dropped() + self._remote.lost(), self._remote.dropped() + self._robot.lost()
+        return replace(count, dropped_up=count.dropped_up + up, dropped_down=count.dropped_down + down)
 
 
 class _Side:
@@ -233,6 +205,7 @@ class _Side:
 
     def __init__(self, path: str, address: str, peer: str) -> None:
         self._path, self._address, self._peer = path, address, peer
+        self._dropped_before = 0  # by queues that were replaced
 
     def inside(self, command: Sequence[str]) -> list[str]:
         return [_program("nsenter"), f"--net={self._path}", "--", *command]
@@ -247,17 +220,18 @@ class _Side:
                 f"link set {device} up",
             )
         ]
-        self.ip("link set lo up", f"address add {self._address}/{_PREFIX} dev {WIRE}", *devices)
+        self.batch("ip", "link set lo up", f"address add {self._address}/{_PREFIX} dev {WIRE}", *devices)
         self.send_over(WIRE)
         self._run("nft", "-f", "-", stdin=_TABLE)
 
     def send_over(self, device: str) -> None:
-        self.ip(f"route replace {self._peer}/32 dev {device} src {self._address}")
+        self.batch("ip", f"route replace {self._peer}/32 dev {device} src {self._address}")
 
     def limit(self, kbit: float | None) -> None:
         """Limits the rate of outgoing packets on both devices: only one of them is in use."""
-        rule = {device: _queue(kbit, device) for device in (WIRE, TIMED)}
-        self._run("tc", "-batch", "-", stdin="".join(f"qdisc replace dev {d} root {q}\n" for d, q in rule.items()))
+        before = self.dropped()
+        self.batch("tc", *(f"qdisc replace dev {device} root {_queue(kbit, device)}" for device in (WIRE, TIMED)))
+        self._dropped_before += before - self.dropped()  # a new queue counts from 0
 
     def lose(self, share: float) -> None:
         """Drops a share of incoming packets."""
@@ -266,30 +240,24 @@ class _Side:
         self._run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
 
     def dropped(self) -> int:
-        """Packets dropped by the queues of this side since they were created."""
-        return sum(int(queue["drops"]) for queue in self._json("tc", "-s", "-j", "qdisc", "show"))
+        """Packets dropped by the queues of this side."""
+        queues = json.loads(self._run("tc", "-s", "-j", "qdisc", "show"))
+        return self._dropped_before + sum(int(queue["drops"]) for queue in queues)
 
     def lost(self) -> int:
-        listed = self._json("nft", "-j", "list", "counter", "ip", "impair", "lost")["nftables"]
+        listed = json.loads(self._run("nft", "-j", "list", "counter", "ip", "impair", "lost"))["nftables"]
         return sum(int(entry["counter"]["packets"]) for entry in listed if "counter" in entry)
 
-    def ip(self, *lines: str) -> None:
-        self._run("ip", "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
-
-    def _json(self, *command: str) -> Any:
-        return json.loads(self._run(*command))
+    def batch(self, program: str, *lines: str) -> None:
+        """Runs lines of ``ip`` or ``tc``."""
+        self._run(program, "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
 
     def _run(self, program: str, *arguments: str, stdin: str = "") -> str:
         command = self.inside([_program(program), *arguments])
+        env = {**os.environ, "LC_ALL": "C"}  # `_not_permitted` parses its messages
         try:
             done = subprocess.run(
-                command,
-                input=stdin,
-                capture_output=True,
-                text=True,
-                timeout=_COMMAND_S,
-                check=False,
-                env={**os.environ, "LC_ALL": "C"},  # `_not_permitted` parses its messages
+                command, input=stdin, capture_output=True, text=True, timeout=_COMMAND_S, check=False, env=env
             )
         except subprocess.TimeoutExpired:
             raise PebbleError(f"{program} did not end within {_COMMAND_S:.0f} s") from None
@@ -305,13 +273,8 @@ def _queue(kbit: float | None, device: str) -> str:
     if kbit is None:
         return "noqueue" if device == WIRE else "pfifo limit 1000"
     rate = kbit * 1000 / 8
-    limit = max(rate * _QUEUE_S, _QUEUE_PACKETS * (_MTU + _ETHERNET))
+    limit = max(rate * _QUEUE_S, _QUEUE_PACKETS * (_MTU + ETHERNET))
     return f"tbf rate {round(kbit * 1000)}bit burst {round(max(_BURST, rate * 0.005))} limit {round(limit)}"
-
-
-def _on_the_wire(devices: dict[str, tuple[int, int]]) -> tuple[int, int]:
-    (wire_bytes, wire_packets), (timed_bytes, timed_packets) = devices[WIRE], devices[TIMED]
-    return wire_bytes + timed_bytes + timed_packets * _ETHERNET, wire_packets + timed_packets
 
 
 def _program(name: str) -> str:
@@ -328,8 +291,7 @@ def _not_permitted(answer: str) -> bool:
 
 def open_network(kind: str = "auto", *, name: str = "") -> ImpairedNetwork:
     """Opens a network of a kind as in `resolved`; ``name`` is for messages. Raises PebbleError if it is unavailable."""
-    kind, _ = resolved(kind)
-    return ProxyNetwork(name) if kind == "proxy" else NamespaceNetwork(name)
+    return (ProxyNetwork if resolved(kind)[0] == "proxy" else NamespaceNetwork)(name)
 
 
 def resolved(kind: str) -> tuple[str, str | None]:

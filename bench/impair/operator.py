@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing, suppress
 
 import msgspec
 
@@ -29,7 +30,7 @@ from pebble.bench.impair.metrics import (
 )
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
-from pebble.contract import DRIVE, ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, codec
+from pebble.contract import DRIVE, ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
 from pebble.contract.payloads import Drive, SoundboardCommand
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
@@ -68,7 +69,7 @@ class MediaSubscriber(MediaReceiver):
 
 
 class TrialOperator:
-    """Drives over one connection and receives media over another; ``ended`` stops whatever it does."""
+    """Drives over one connection and receives media over another; SystemExit interrupts it when ``ended`` is set."""
 
     def __init__(self, host: str, port: int, base: str, ended: threading.Event) -> None:
         self._base, self._ended = base, ended
@@ -88,12 +89,11 @@ class TrialOperator:
         for connection in connections:
             connection.open(timeout=0.0)
         if not self._wait(lambda: all(connection.state is State.CONNECTED for connection in connections), _CONNECT_S):
-            raise PebbleError(
-                f"the operator cannot connect to the broker: {connections[0].problem or connections[1].problem}"
-            )
-        self._controls.subscribe(ONLINE.topic(self._base), self._on_heartbeat)
-        self._controls.subscribe(STATUS.topic(self._base), self._on_status)
-        self._controls.subscribe(SOUNDBOARD_STATUS.topic(self._base), self._on_clip_status)
+            problem = self._controls.problem or self._media.problem
+            raise PebbleError(f"the operator cannot connect to the broker: {problem}")
+        self._subscribe(ONLINE, self._on_heartbeat)
+        self._subscribe(STATUS, self._on_status)
+        self._subscribe(SOUNDBOARD_STATUS, self._on_clip_status)
         if not self._wait(self._is_ready, _UP_S):
             raise PebbleError(f"the robot is not ready after {_UP_S:.0f} s: {self._services or 'no status received'}")
 
@@ -101,14 +101,14 @@ class TrialOperator:
         self._controls.close()
         self._media.close()
 
-    def recover(self, quiet_s: float) -> None:
+    def recover(self, request: RecoveryRequest) -> OperatorReport:
         """Waits until the network delivers no old messages. Raises PebbleError if the robot does not recover."""
-        self._wait(lambda: time.monotonic() - self._over_at >= quiet_s, quiet_s)
+        self._wait(lambda: time.monotonic() - self._over_at >= request.quiet_s, request.quiet_s)
         if not self._wait(self._is_fresh, _STARTUP_S):
             raise PebbleError(f"no fresh heartbeat {_STARTUP_S:.0f} s after the network was restored")
+        return OperatorReport(ready=True)
 
-    def run_trial(self, request: TrialRequest) -> Record:
-        """Runs one trial."""
+    def run_trial(self, request: TrialRequest) -> OperatorReport:
         first_heartbeat = max(0, len(self._heartbeats) - _HEARTBEATS_BEFORE)
         self._commands.clear()
         enough = threading.Event()
@@ -116,16 +116,16 @@ class TrialOperator:
         driver.start()
         try:
             alone = self._measure_phase("alone", request.alone_s)
-            seen, video = self._watch("video", request.video, request.window_s)
+            seen, video = self._watch("video", request, enough)
             video_off = self._measure_phase("video off", request.off_s)
-            received, audio = self._watch("audio", request.audio, request.window_s, enough, request.grace_s)
+            received, audio = self._watch("audio", request, enough)
         finally:
             enough.set()
             driver.join()
         audio_off = self._measure_phase("audio off", request.off_s)
         clip = self._play_clip(request.clip_s)
         self._over_at = time.monotonic()
-        return Record(
+        record = Record(
             commands=list(self._commands),
             heartbeats=self._heartbeats[first_heartbeat:],
             pictures=seen.pictures_seen,
@@ -138,39 +138,29 @@ class TrialOperator:
             clip=clip,
             payloads=seen.pictures.count,
         )
+        return OperatorReport(record=record)
 
     # -- phases
 
-    def _watch(
-        self,
-        medium: Medium,
-        encoding: str | None,
-        window_s: float,
-        over: threading.Event | None = None,
-        grace_s: float = 0.0,
-    ) -> tuple[MediaSubscriber, Window]:
-        """Requests a medium, waits for its first message, records a window; then sets ``over``, waits ``grace_s``."""
-        subscriber = MediaSubscriber(self._media, self._base)
-        try:
+    def _watch(self, medium: Medium, request: TrialRequest, enough: threading.Event) -> tuple[MediaSubscriber, Window]:
+        """Requests a medium, waits for its first message, records a window. Audio, which is last, ends the driving."""
+        with closing(MediaSubscriber(self._media, self._base)) as subscriber:
             subscriber.wait_for_capabilities(_KNOWN_S)
             asked = time.monotonic()
-            subscriber.viewer.request(medium, encoding)
+            subscriber.viewer.request(medium, request.video if medium == "video" else request.audio)
             started = self._wait(lambda: subscriber.has_received(medium), _FIRST_S, subscriber)
             first_s = time.monotonic() - asked if started else None
-            window = self._measure_phase(medium, window_s, subscriber)
-            if over is not None:
-                over.set()
-            self._wait(lambda: False, grace_s, subscriber)
-        finally:
-            subscriber.close()
+            window = self._measure_phase(medium, request.window_s, subscriber)
+            if medium == "audio":
+                enough.set()
+                self._wait(lambda: False, request.grace_s, subscriber)
         return subscriber, Window(window.began_ns, window.ended_ns, first_s)
 
     def _play_clip(self, seconds: float) -> ClipCommand:
         """Commands it, and waits until it was played to its end, as far as the statuses arrive."""
         self._clip_statuses.clear()
         sent_ns = time.monotonic_ns()
-        command = SoundboardCommand(action="play", file=CLIP)
-        payload = codec.encode(SOUNDBOARD_COMMAND, command)
+        payload = codec.encode(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
         self._controls.publish(SOUNDBOARD_COMMAND.topic(self._base), payload, qos=QoS.DELIVERED)
 
         def playing_ns() -> int | None:
@@ -187,12 +177,12 @@ class TrialOperator:
         write_report(OperatorReport(phase=""))
         return Window(began, ended)
 
-    def _wait(self, condition: _Condition, seconds: float, subscriber: MediaSubscriber | None = None) -> bool:
+    def _wait(self, condition: Callable[[], bool], seconds: float, subscriber: MediaSubscriber | None = None) -> bool:
         """Waits for ``condition``; with a subscriber, keeps requesting its media meanwhile."""
         end = time.monotonic() + seconds
         while not (met := condition()) and (left := end - time.monotonic()) > 0:
             if self._ended.wait(min(left, _POLL_S)):
-                raise _EndedError
+                sys.exit()
             if subscriber is not None:
                 subscriber.poll()
         return met
@@ -203,12 +193,9 @@ class TrialOperator:
 
     def _is_fresh(self) -> bool:
         newest = self._heartbeats[-_FRESH_HEARTBEATS:]
-        limit_ns, now = _FRESH_MS * 1_000_000, time.monotonic_ns()
+        since_ns = time.monotonic_ns() - 2_000_000 * _FRESH_MS
         return len(newest) == _FRESH_HEARTBEATS and all(
-            heartbeat.online
-            and heartbeat.arrived_ns - heartbeat.sent_ns < limit_ns
-            and now - heartbeat.arrived_ns < 2 * limit_ns
-            for heartbeat in newest
+            heartbeat.online and heartbeat.ms < _FRESH_MS and heartbeat.arrived_ns > since_ns for heartbeat in newest
         )
 
     # -- the driver's thread
@@ -226,37 +213,26 @@ class TrialOperator:
 
     # -- the transports' threads
 
-    def _on_heartbeat(self, message: Message) -> None:
-        now = time.monotonic_ns()
-        if message.retain:
-            return  # a retained heartbeat is not current
-        try:
+    def _subscribe(self, channel: Channel, receive: Callable[[Message, int], None]) -> None:
+        """``receive`` is called with the time of arrival, and may raise PayloadError for a message to ignore."""
+
+        def on_message(message: Message) -> None:
+            with suppress(PayloadError):
+                receive(message, time.monotonic_ns())
+
+        self._controls.subscribe(channel.topic(self._base), on_message)
+
+    def _on_heartbeat(self, message: Message, now: int) -> None:
+        if not message.retain:  # a retained heartbeat is not current
             heartbeat = codec.decode(ONLINE, message.payload)
-        except PayloadError:
-            return
-        self._heartbeats.append(Heartbeat(_monotonic_ns(heartbeat.t), now, heartbeat.online is not False))
+            self._heartbeats.append(Heartbeat(_monotonic_ns(heartbeat.t), now, heartbeat.online is not False))
 
-    def _on_clip_status(self, message: Message) -> None:
-        now = time.monotonic_ns()
-        try:
-            status = codec.decode(SOUNDBOARD_STATUS, message.payload)
-        except PayloadError:
-            return
-        self._clip_statuses.append((now, status.playing))
+    def _on_clip_status(self, message: Message, now: int) -> None:
+        self._clip_statuses.append((now, codec.decode(SOUNDBOARD_STATUS, message.payload).playing))
 
-    def _on_status(self, message: Message) -> None:
-        try:
-            services = codec.decode(STATUS, message.payload).value.get("services", {})
-        except PayloadError:
-            return
+    def _on_status(self, message: Message, _now: int) -> None:
+        services = codec.decode(STATUS, message.payload).value.get("services", {})
         self._services = {name: service.get("state", "") for name, service in services.items()}
-
-
-_Condition = Callable[[], bool]
-
-
-class _EndedError(Exception):
-    """Standard input has closed."""
 
 
 def _monotonic_ns(epoch_ms: int) -> int:
@@ -271,29 +247,20 @@ def write_report(report: OperatorReport) -> None:
 def main(arguments: list[str]) -> int:
     host, port, base = arguments
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-    operator = TrialOperator(host, int(port), base, serve_on_thread(lines.put, lambda: lines.put("")))
+    ended = serve_on_thread(lines.put, lambda: lines.put(""))
     try:
-        operator.open()
-        write_report(OperatorReport(ready=True))
-        while line := lines.get():
-            _serve(operator, line)
-    except _EndedError:
-        return 0
+        with closing(TrialOperator(host, int(port), base, ended)) as operator:
+            operator.open()
+            write_report(OperatorReport(ready=True))
+            while line := lines.get():
+                request = msgspec.json.decode(line, type=TrialRequest | RecoveryRequest)
+                write_report(
+                    operator.recover(request) if isinstance(request, RecoveryRequest) else operator.run_trial(request)
+                )
     except PebbleError as error:
         write_report(OperatorReport(problem=str(error)))
         return 1
-    finally:
-        operator.close()
     return 0
-
-
-def _serve(operator: TrialOperator, line: str) -> None:
-    request = msgspec.json.decode(line, type=TrialRequest | RecoveryRequest)
-    if isinstance(request, RecoveryRequest):
-        operator.recover(request.quiet_s)
-        write_report(OperatorReport(ready=True))
-    else:
-        write_report(OperatorReport(record=operator.run_trial(request)))
 
 
 if __name__ == "__main__":

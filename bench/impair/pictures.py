@@ -14,27 +14,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from pebble.bench import paper
-from pebble.bench.aims import single
+from pebble.bench.aims import single, with_lost
+from pebble.bench.impair.report import arrived
 from pebble.bench.plots import Picture, around, finite, guide, legend, log_axis, panels, short, styles, unique
-from pebble.bench.results import OVER_TIME, Cell, Results, percentile
+from pebble.bench.results import OVER_TIME, Cell, Results
 
 _QUOTED = Line2D([], [], color="#1a1a1a", marker="x", linestyle="", markersize=7, markeredgewidth=2,
                  label="the original program itself, measured once elsewhere")  # fmt: skip
 _NARROW, _WORST = f"aim\nat {paper.NARROW}", f"aim at\n{paper.WORST}"
 _BANDS = ("#f3f0e7", "#ffffff")
-
-Value = Callable[[Cell], float]
-
-
-def p(percent: float, *, lost: bool = False) -> Value:
-    """Percentile of what arrived, or with lost messages as infinitely late; not drawn if that is infinite."""
-
-    def value(cell: Cell) -> float:
-        never = [math.inf] * max(0, cell.lost or 0) if lost else []
-        found = percentile([*finite(cell.samples), *never], percent)
-        return found if math.isfinite(found) else math.nan
-
-    return value
 
 
 def _original(value: Callable[[paper.Original], float | None], factor: float = 1.0) -> dict[str, float]:
@@ -48,7 +36,7 @@ class Panel:
 
     label: str
     measures: tuple[str, ...]
-    value: Value
+    value: Callable[[Cell], float]  # not drawn if it is infinite
     log: bool = False
     ends: tuple[float, float] | None = None  # of a linear axis; None: from 0 to the largest value
     least_top: float = 1.0  # of a linear axis from 0
@@ -60,7 +48,7 @@ class Panel:
 
 def _drive(what: str) -> Panel:
     label = f"drive p95\n{what.replace('during', 'with')}, ms"
-    return Panel(label=label, measures=(f"drive {what}",), value=p(95, lost=True), log=True,
+    return Panel(label=label, measures=(f"drive {what}",), value=with_lost(95), log=True,
                  aim=paper.WORST_DRIVE_P95_MS, aim_text=_WORST)  # fmt: skip
 
 
@@ -76,8 +64,8 @@ _OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
               crosses=_original(lambda one: one.on_time_percent)),
     )),
     "audio-latency": (_FIGURE_4_8, 3.3, (
-        Panel(label="audio latency p50, ms", measures=("audio latency",), value=p(50), log=True),
-        Panel(label="audio latency p95, ms", measures=("audio latency",), value=p(95), log=True,
+        Panel(label="audio latency p50, ms", measures=("audio latency",), value=arrived(50), log=True),
+        Panel(label="audio latency p95, ms", measures=("audio latency",), value=arrived(95), log=True,
               crosses=_original(lambda one: one.p95_s, 1000.0), aim=paper.NARROW_SOUND_P95_MS, aim_text=_NARROW),
     )),
     "video": ("Video over the trials: frame rate, and how long it froze", 2.7, (
@@ -135,11 +123,8 @@ def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Pa
                     ha="center", va="bottom",
                 )  # fmt: skip
         axes.set_xlim(-0.6, len(trials) - 0.4)
-        axes.set_xticks(range(len(trials)), trials if axes is every[-1] else [""] * len(trials))
-    every[-1].tick_params(axis="x", labelrotation=40)
-    for label in every[-1].get_xticklabels():
-        label.set_horizontalalignment("right")
-        label.set_rotation_mode("anchor")
+        named = trials if axes is every[-1] else [""] * len(trials)
+        axes.set_xticks(range(len(trials)), named, rotation=40, ha="right", rotation_mode="anchor")
     every[-1].set_xlabel("trial: condition of the network, in the order of the run")
     legend(figure, styles(subjects), more=[_QUOTED] if any(panel.crosses for panel in shown) else [])
     return figure

@@ -92,7 +92,8 @@ class Proxy:
     """Listeners for the requested ports, and their connections."""
 
     def __init__(self) -> None:
-        self._is_ready, self._down = Direction("up"), Direction("down")
+        self._up, self._down = Direction("up"), Direction("down")
+        self._ports: dict[int, int] = {}  # ours, by that of the broker
         self._tasks: set[asyncio.Task[None]] = set()
 
     def answer(self, line: str) -> dict[str, Any]:
@@ -100,27 +101,22 @@ class Proxy:
         if word == "listen":
             return {"port": self._listen(int(rest))}
         if word == "count":
-            up, down = self._is_ready, self._down
-            return {
-                "bytes_up": up.bytes,
-                "bytes_down": down.bytes,
-                "packets_up": up.packets,
-                "packets_down": down.packets,
-                "dropped_up": up.dropped,
-                "dropped_down": down.dropped,
-            }
+            both, counted = (("up", self._up), ("down", self._down)), ("bytes", "packets", "dropped")
+            return {f"{name}_{way}": getattr(direction, name) for way, direction in both for name in counted}
         condition = msgspec.json.decode(line, type=Condition)
         round_trip_s = (condition.up.delay_ms + condition.down.delay_ms) / 1000
-        self._is_ready.apply(condition.up, round_trip_s)
+        self._up.apply(condition.up, round_trip_s)
         self._down.apply(condition.down, round_trip_s)
         return {"applied": condition.name}
 
     def _listen(self, target: int) -> int:
-        listener = _socket()
-        listener.bind((_HOST, 0))
-        listener.listen(64)
-        self._start(self._accept(listener, target))
-        return int(listener.getsockname()[1])
+        if target not in self._ports:
+            listener = _socket()
+            listener.bind((_HOST, 0))
+            listener.listen(64)
+            self._start(self._accept(listener, target))
+            self._ports[target] = listener.getsockname()[1]
+        return self._ports[target]
 
     async def _accept(self, listener: socket.socket, target: int) -> None:
         while True:
@@ -135,7 +131,7 @@ class Proxy:
                 connecting = asyncio.get_running_loop().sock_connect(far, (_HOST, target))
                 await asyncio.wait_for(connecting, _CONNECT_S)
                 async with asyncio.TaskGroup() as group:
-                    for source, sink, direction in ((near, far, self._is_ready), (far, near, self._down)):
+                    for source, sink, direction in ((near, far, self._up), (far, near, self._down)):
                         in_flight: _InFlight = asyncio.Queue(_IN_FLIGHT_LIMIT)
                         group.create_task(_take(source, direction, in_flight))
                         group.create_task(_deliver(in_flight, sink))

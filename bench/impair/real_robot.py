@@ -9,8 +9,8 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -25,8 +25,7 @@ from pebble.bench.engine import check_folder
 from pebble.client.connection import Target, connected, resolve
 from pebble.client.names import id_of
 from pebble.client.viewer import Medium, Viewer
-from pebble.contract import AUDIO as AUDIO_CHANNEL
-from pebble.contract import CAMERA, ONLINE
+from pebble.contract import AUDIO, CAMERA, ONLINE
 from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError
 from pebble.recordings.files.reader import RecordingError
@@ -95,8 +94,7 @@ def measure(plan: Plan, progress: Progress) -> Measurement:
             if plan.media:
                 viewer.wait_for_capabilities(_CAPABILITIES_S)
             _make_folder(plan)
-            with _recording(plan, viewer) as (recorder, source):
-                return _Course(plan, recorder, source, viewer, progress).run()
+            return _Course(plan, viewer, progress).run()
 
 
 def _check(plan: Plan) -> None:
@@ -150,46 +148,34 @@ class _Recorder(Recorder):
         topics = {medium: viewer.capabilities.get(medium, {}).get("topic") for medium in _MEDIA}
         self._media = {topic: medium for medium, topic in topics.items() if isinstance(topic, str)}
 
-    def receive(
-        self,
-        topic: str,
-        payload: bytes,
-        qos: int | None,
-        retain: bool | None,
-        *,
-        retained: bool = False,
-        source: str = "",
-    ) -> None:
+    def receive(self, topic: str, payload: bytes, *about: Any, retained: bool = False, **more: Any) -> None:
         medium = self._media.get(topic)
         if medium is not None and not retained:
             self.arrived.add(medium)
             self._viewer.note_received(medium)
-        super().receive(topic, payload, qos, retain, retained=retained, source=source)
-
-
-@contextmanager
-def _recording(plan: Plan, viewer: Viewer) -> Iterator[tuple[_Recorder, Source]]:
-    kind, settings, _, _ = resolve(plan.target)
-    if kind == "mqtt":
-        settings = replace(settings, protocol="5")
-    recorder = _Recorder(plan, viewer)
-    recorder.start()
-    try:
-        with closing(Source(recorder, kind, settings, [f"{viewer.base}/#"])) as source:
-            source.start()
-            yield recorder, source
-    finally:
-        recorder.stop()
+        super().receive(topic, payload, *about, retained=retained, **more)
 
 
 class _Course:
     """The course of one measurement."""
 
-    def __init__(self, plan: Plan, recorder: _Recorder, source: Source, viewer: Viewer, progress: Progress) -> None:
-        self._plan, self._recorder, self._source = plan, recorder, source
-        self._viewer, self._progress = viewer, progress
+    def __init__(self, plan: Plan, viewer: Viewer, progress: Progress) -> None:
+        self._plan, self._viewer, self._progress = plan, viewer, progress
+        kind, settings, _, _ = resolve(plan.target)
+        settings = replace(settings, protocol="5") if kind == "mqtt" else settings
+        self._recorder = _Recorder(plan, viewer)
+        self._source = Source(self._recorder, kind, settings, [f"{viewer.base}/#"])
 
     def run(self) -> Measurement:
+        self._recorder.start()
+        try:
+            with closing(self._source):
+                self._source.start()
+                return self._measured()
+        finally:
+            self._recorder.stop()
+
+    def _measured(self) -> Measurement:
         measurement = Measurement(label=self._plan.label, robot=self._viewer.base, since_ns=self._recorder.clock.now())
         measurement.save(self._plan.folder)
         try:
@@ -293,7 +279,7 @@ def table(found: list[Column]) -> Table:
     made.add_column("", no_wrap=True)
     for column in found:
         made.add_column(Text(column.measurement.label), justify="right", no_wrap=True)
-    for group in _groups():
+    for group in _GROUPS:
         rows = [(name, [cell(column) for column in found]) for name, cell in group]
         shown = [(name, cells) for name, cells in rows if any(one != _NONE for one in cells)]
         for number, (name, cells) in enumerate(shown, 1):
@@ -304,44 +290,20 @@ def table(found: list[Column]) -> Table:
 _Row = tuple[str, Callable[[Column], str]]
 
 
-def _groups() -> list[list[_Row]]:
-    about: list[_Row] = [
-        ("robot", lambda column: id_of(column.measurement.robot)),
-        ("measured, s", lambda column: f"{column.seconds:.0f}"),
-    ]
-    heartbeats = [
-        (
-            "heartbeat latency p50, ms",
-            _of_robot(lambda robot: _ms(None if robot.latency is None else robot.latency.median_ms)),
-        ),
-        (
-            "heartbeat latency p95, ms",
-            _of_robot(lambda robot: _ms(None if robot.latency is None else robot.latency.p95_ms)),
-        ),
-        ("heartbeat intervals", _of_robot(lambda robot: str(robot.intervals.count if robot.intervals else 0))),
-        ("outages", _of_robot(lambda robot: str(len(robot.outages)))),
-        ("outage, median, ms", _of_robot(lambda robot: _outage(robot, median))),
-        ("outage, longest, ms", _of_robot(lambda robot: _outage(robot, max))),
-        ("offline, times", _of_robot(lambda robot: str(robot.offline) if robot.offline else _NONE)),
-    ]
-    pictures: list[_Row] = [("pictures a second", _rate), *_media("pictures", CAMERA.metric)]
-    bandwidths = [(f"{family}, kbit/s", _of_robot(_bandwidth(family))) for family in FAMILIES]
-    return [about, heartbeats, pictures, _media("sound", AUDIO_CHANNEL.metric), bandwidths]
+def _of_robot(name: str, text: Callable[[RobotTraffic], str]) -> _Row:
+    return name, lambda column: _NONE if column.robot is None else text(column.robot)
 
 
-def _media(name: str, metric: str) -> list[_Row]:
-    def cell(text: Callable[[Stream], str]) -> Callable[[Column], str]:
-        return lambda column: _NONE if (stream := column.stream(metric)) is None else text(stream)
-
-    return [
-        (f"{name} lost", cell(lambda stream: f"{stream.lost_share:.1%}")),
-        (f"{name}, jitter p50, ms", cell(lambda stream: _ms(stream.jitter_median_ms))),
-        (f"{name}, jitter p95, ms", cell(lambda stream: _ms(stream.jitter_p95_ms))),
-    ]
+def _of_stream(name: str, metric: str, text: Callable[[Stream], str]) -> _Row:
+    return name, lambda column: _NONE if (stream := column.stream(metric)) is None else text(stream)
 
 
-def _of_robot(text: Callable[[RobotTraffic], str]) -> Callable[[Column], str]:
-    return lambda column: _NONE if column.robot is None else text(column.robot)
+def _media(name: str, metric: str) -> tuple[_Row, ...]:
+    return (
+        _of_stream(f"{name} lost", metric, lambda stream: f"{stream.lost_share:.1%}"),
+        _of_stream(f"{name}, jitter p50, ms", metric, lambda stream: _ms(stream.jitter_median_ms)),
+        _of_stream(f"{name}, jitter p95, ms", metric, lambda stream: _ms(stream.jitter_p95_ms)),
+    )
 
 
 def _rate(column: Column) -> str:
@@ -349,17 +311,37 @@ def _rate(column: Column) -> str:
     return _NONE if stream is None or not column.seconds else f"{stream.messages / column.seconds:.1f}"
 
 
-def _outage(robot: RobotTraffic, which: Callable[[list[float]], Any]) -> str:
+def _outage(robot: RobotTraffic, which: Callable[[list[float]], float]) -> str:
     return _ms(which([one.length_ms for one in robot.outages])) if robot.outages else _NONE
 
 
-def _bandwidth(family: str) -> Callable[[RobotTraffic], str]:
+def _bandwidth(family: str) -> _Row:
     def text(robot: RobotTraffic) -> str:
         one = robot.of(family)
         return _NONE if one is None else f"{one.median_kbps:.1f}"
 
-    return text
+    return _of_robot(f"{family}, kbit/s", text)
 
 
 def _ms(value: float | None) -> str:
     return _NONE if value is None else f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
+
+
+_GROUPS: Final[tuple[tuple[_Row, ...], ...]] = (
+    (
+        ("robot", lambda column: id_of(column.measurement.robot)),
+        ("measured, s", lambda column: f"{column.seconds:.0f}"),
+    ),
+    (
+        _of_robot("heartbeat latency p50, ms", lambda robot: _ms(getattr(robot.latency, "median_ms", None))),
+        _of_robot("heartbeat latency p95, ms", lambda robot: _ms(getattr(robot.latency, "p95_ms", None))),
+        _of_robot("heartbeat intervals", lambda robot: str(robot.intervals.count if robot.intervals else 0)),
+        _of_robot("outages", lambda robot: str(len(robot.outages))),
+        _of_robot("outage, median, ms", lambda robot: _outage(robot, median)),
+        _of_robot("outage, longest, ms", lambda robot: _outage(robot, max)),
+        _of_robot("offline, times", lambda robot: str(robot.offline or _NONE)),
+    ),
+    (("pictures a second", _rate), *_media("pictures", CAMERA.metric)),
+    _media("sound", AUDIO.metric),
+    tuple(map(_bandwidth, FAMILIES)),
+)

@@ -29,7 +29,7 @@ _p95 = with_lost(95)
 # -- the tables
 
 
-def _arrived(percent: float) -> _Value:
+def arrived(percent: float) -> _Value:
     """A percentile of what arrived; the share that arrived is in another column."""
     return lambda cell: cell.percentile(percent)
 
@@ -45,8 +45,10 @@ def _column(head: str, measure: str, value: _Value, *, whole: bool = False) -> C
 
 
 def _grid(title: str, *columns: Column) -> Grid:
-    of_trials: Callable[[Cell], bool] = lambda cell: "trial" in cell.params  # noqa: E731
-    return Grid(title=title, rows=("trial", "variant"), heads=("trial", "subject"), columns=columns, of=of_trials)
+    return Grid(
+        title=title, rows=("trial", "variant"), heads=("trial", "subject"), columns=columns,
+        of=lambda cell: "trial" in cell.params,
+    )  # fmt: skip
 
 
 def _after(measure: str, what: str) -> tuple[Column, ...]:
@@ -61,7 +63,7 @@ TABLES = (
     _grid(
         "trials",
         _column("audio\n%", measures.SOUND, single("delivered_percent")),
-        _column("p95\nms", measures.SOUND, _arrived(95)),
+        _column("p95\nms", measures.SOUND, arrived(95)),
         _column("video\nfps", measures.PICTURES, single("fps")),
         _column("frozen\ns", measures.PICTURES, single("frozen_s")),
         _column("drive\np95 ms", measures.DRIVE, _p95),
@@ -73,7 +75,7 @@ TABLES = (
         _column("audio\nkbit/s", measures.SOUND, single("kbit_up")),
         _column("video\ndrops", measures.PICTURES, single("dropped_up"), whole=True),
         _column("audio\ndrops", measures.SOUND, single("dropped_up"), whole=True),
-        _column("audio\np50 ms", measures.SOUND, _arrived(50)),
+        _column("audio\np50 ms", measures.SOUND, arrived(50)),
     ),
     _grid(
         "details of driving, and a clip",
@@ -84,9 +86,7 @@ TABLES = (
         _column("clip\nms", measures.CLIP, with_lost(100)),
     ),
     _grid(
-        "after media were switched off",
-        *_after(measures.AFTER_VIDEO, "video"),
-        *_after(measures.AFTER_AUDIO, "audio"),
+        "after media were switched off", *_after(measures.AFTER_VIDEO, "video"), *_after(measures.AFTER_AUDIO, "audio")
     ),
 )
 
@@ -120,15 +120,15 @@ def _aim(
 def behind_media(cells: Sequence[Cell]) -> Iterator[Judged]:
     """The aim that commands do not wait behind media. Trials with loss or delay are excluded: they dominate the p95."""
     steady = {one.name for one in chosen() if not one.up.loss and not one.up.timed}
-    for subject in (one for one in _subjects(cells) if one.endswith(_OURS)):
-        alone = _by_trial(cells, subject, measures.DRIVE_ALONE)
+    for subject, trials in _found(cells, measures.DRIVE_ALONE).items():
+        alone_ms = {trial: _p95(cell) for trial, cell in trials.items() if trial in steady}
         waits = {
-            f"{measure.removeprefix('drive during ')} at {trial}": _p95(busy) - _p95(alone[trial])
+            f"{measure.removeprefix('drive during ')} at {trial}": _p95(busy) - alone_ms[trial]
             for measure in (measures.DRIVE_VIDEO, measures.DRIVE_AUDIO)
-            for trial, busy in _by_trial(cells, subject, measure).items()
-            if trial in steady and trial in alone and math.isfinite(_p95(alone[trial]))
+            for trial, busy in _found(cells, measure).get(subject, {}).items()
+            if math.isfinite(alone_ms.get(trial, math.nan))
         }
-        if waits:
+        if waits and subject.endswith(_OURS):
             longest = max(waits, key=lambda name: waits[name])
             most = f"most: {waits[longest]:+.0f} ms" if math.isfinite(waits[longest]) else "some were lost"
             yield Judged(
@@ -158,12 +158,10 @@ AIMS = (
 
 
 def encodings(cells: Sequence[Cell]) -> Iterator[str]:
+    share = single("on_time_percent")
     for trial in (paper.NARROW, paper.WORST):
-        shares = [
-            f"{subject} {figure(single('on_time_percent')(found[trial]))} %"
-            for subject in _subjects(cells)
-            if trial in (found := _by_trial(cells, subject, measures.SOUND))
-        ]
+        found = _found(cells, measures.SOUND).items()
+        shares = [f"{subject} {figure(share(trials[trial]))} %" for subject, trials in found if trial in trials]
         if len(shares) > 1:
             yield f"Sound that arrived within a second at {trial}: {', '.join(shares)}."
 
@@ -171,28 +169,26 @@ def encodings(cells: Sequence[Cell]) -> Iterator[str]:
 def trips(cells: Sequence[Cell]) -> Iterator[str]:
     """Stops by the robot, and rest times of the wheels: a robot that no command reaches never stops."""
     lines = []
-    for subject in _subjects(cells):
-        driven = _by_trial(cells, subject, measures.DRIVE).values()
-        times, rest_s, of_s = (sum(map(single(name), driven)) for name in ("trips", "rest_s", "window_s"))
+    for subject, trials in _found(cells, measures.DRIVE).items():
+        times, rest_s, of_s = (sum(map(single(name), trials.values())) for name in ("trips", "rest_s", "window_s"))
         lines.append(f"{subject} {times:.0f} (wheels at rest for {figure(rest_s)} of {figure(of_s)} s)")
     yield f"Stops by the robot while it was driven: {', '.join(lines)}."
 
 
 def clips(cells: Sequence[Cell]) -> Iterator[str]:
     lines = []
-    for subject in _subjects(cells):
-        found = _by_trial(cells, subject, measures.CLIP).values()
-        times = [sample for cell in found for sample in cell.samples]
+    for subject, trials in _found(cells, measures.CLIP).items():
+        times = [sample for cell in trials.values() for sample in cell.samples]
         took = f" (p50 {figure(percentile(times, 50))} ms, longest {figure(max(times))} ms)" if times else ""
-        lines.append(f"{subject} {len(times)} of {len(found)}{took}")
+        lines.append(f"{subject} {len(times)} of {len(trials)}{took}")
     yield f"Clips that the loudspeaker played when commanded: {', '.join(lines)}."
 
 
 def transports(cells: Sequence[Cell]) -> Iterator[str]:
     """Compares Zenoh and MQTT inside the robot, with trials as rounds: both ran at the same time."""
-    for form in dict.fromkeys(subject.partition(" ")[2] for subject in _subjects(cells)):
+    for form in dict.fromkeys(subject.partition(" ")[2] for subject in _found(cells, measures.DRIVE)):
         for what, measure in (("drive", measures.DRIVE), ("sound", measures.SOUND), ("video", measures.PICTURES)):
-            mqtt, zenoh = (_by_trial(cells, f"{kind} {form}", measure) for kind in ("mqtt", "zenoh"))
+            mqtt, zenoh = (_found(cells, measure).get(f"{kind} {form}", {}) for kind in ("mqtt", "zenoh"))
             common = [trial for trial in mqtt if trial in zenoh]
             if len(common) > 1:
                 interval = paired([zenoh[trial].samples for trial in common], [mqtt[trial].samples for trial in common])
@@ -202,10 +198,10 @@ def transports(cells: Sequence[Cell]) -> Iterator[str]:
 SENTENCES = (encodings, trips, clips, transports)
 
 
-def _by_trial(cells: Sequence[Cell], subject: str, measure: str) -> dict[str, Cell]:
-    found = [cell for cell in cells if (cell.variant, cell.measure) == (subject, measure)]
-    return {str(cell.params["trial"]): cell for cell in found}
-
-
-def _subjects(cells: Sequence[Cell]) -> list[str]:
-    return list(dict.fromkeys(cell.variant for cell in cells))
+def _found(cells: Sequence[Cell], measure: str) -> dict[str, dict[str, Cell]]:
+    """The cells of a measure by subject, then by trial."""
+    found: dict[str, dict[str, Cell]] = {}
+    for cell in cells:
+        if cell.measure == measure:
+            found.setdefault(cell.variant, {})[str(cell.params["trial"])] = cell
+    return found

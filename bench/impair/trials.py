@@ -2,36 +2,191 @@
 
 from __future__ import annotations
 
+import sys
 import time
+import wave
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
 
 from pebble.bench.comparison import Budget, Comparison, Option, Round, Run
 from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.conditions import TRIALS, Condition, chosen
-from pebble.bench.impair.metrics import RecoveryRequest, TrialRequest
-from pebble.bench.impair.network import KINDS, Traffic, resolved
+from pebble.bench.impair.metrics import OperatorReport, RecoveryRequest, TrialRequest
+from pebble.bench.impair.network import KINDS, Traffic, open_network, resolved
+from pebble.bench.impair.operator import CLIP
 from pebble.bench.impair.report import AIMS, QUOTED, SENTENCES, TABLES
-from pebble.bench.impair.robots import CLIP_S, FPS, HEIGHT, SUBJECTS, WIDTH, ImpairedRobot, TestBed
 from pebble.bench.pictures import Drawn
 from pebble.bench.results import LONGEST_S, Cell
 from pebble.errors import PebbleError
+from pebble.media.pcm import to_bytes
+from pebble.media.speech import Speech
+from pebble.rig.processes import Processes
+from pebble.rig.programs import Program
+from pebble.rig.robot import BASE, Config, Robot
+from pebble.rig.worker import Worker
+from pebble.simulation.loudspeaker import Playback, playbacks
+from pebble.simulation.trace import Entry
 
 _T = TypeVar("_T")
 
 CLEAN = Condition("clean")
 QUICK = ("base-start", "256k", "64k+5%", "base-end")
-NAMES = tuple(subject.name for subject in SUBJECTS)
+WIDTH, HEIGHT, FPS = 640, 480, 15  # as the original is configured
+CLIP_S = 0.5
+_AUDIO_RATE = 16_000
 _UP_S, _RECOVERED_S, _PHASE_S = 80.0, 30.0, 30.0  # limits for an operator's next report; its own limits are shorter
-_CLIP_S = 5.0  # at most
 _LINKS = {
     "namespaces": "network namespaces, {} impaired",
     "proxy": "a userspace proxy, loss modelled; {} impaired",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """One robot under test. Encodings are requested by the operator; None: as the robot is configured."""
+
+    name: str
+    transport: str  # inside the robot: "mqtt" or "zenoh"
+    video: str | None = None
+    audio: str | None = None
+
+    @property
+    def form(self) -> str:
+        """Its encodings: the second part of its name."""
+        return self.name.partition(" ")[2]
+
+
+#: The robots are configured with the original's settings: JSON pictures and PCM.
+SUBJECTS = (
+    Subject("mqtt original", "mqtt"),
+    Subject("zenoh original", "zenoh"),
+    Subject("mqtt h264 opus", "mqtt", "h264", "opus"),
+    Subject("zenoh h264 opus", "zenoh", "h264", "opus"),
+)
+NAMES = tuple(subject.name for subject in SUBJECTS)
+
+
+# -- the robots, as processes
+
+
+class ImpairedRobot:
+    """One subject. The local broker and the robot's processes are on its side of the network; the rest is beyond it."""
+
+    operator: Worker  # both since the start
+    _robot: Robot
+
+    def __init__(self, subject: Subject, kind: str, processes: Processes, folder: Path) -> None:
+        self.subject = subject
+        self.programs: list[Program] = []
+        self.network = open_network(kind, name=subject.name)
+        self._processes, self._folder, self._played = processes, folder, folder / "played"
+        self._folder.mkdir()
+
+    def start(self) -> None:
+        """Starts all processes; the robot is not yet ready. Raises PebbleError."""
+        host, beyond = self.network.broker_host, self.network.on_remote
+        remote = self._processes.broker("remote broker", folder=self._folder, host=host, wrap=beyond)
+        self._robot = Robot(
+            self._processes,
+            self.subject.transport,
+            self.network.broker_address(remote.port),
+            folder=self._folder,
+            services=self._services(),
+            reports=None,
+            wrap=self.network.on_robot,
+        )
+        self._robot.prepare()
+        self._robot.launch()
+        self.programs += [remote, *self._robot.programs]
+        module, name = "pebble.bench.impair.operator", f"the operator of {self.subject.name}"
+        self.operator = self._processes.worker(name, module, host, remote.port, BASE, wrap=beyond)
+
+    def send(self, request: TrialRequest | RecoveryRequest) -> None:
+        self.operator.send(msgspec.json.encode(request).decode())
+
+    def next_report(self, timeout: float) -> OperatorReport:
+        """The operator's next report. Raises PebbleError for a problem, a timeout, or if a process has ended."""
+        try:
+            report = msgspec.convert(self.operator.answer(timeout), OperatorReport)
+        except PebbleError as error:
+            report = OperatorReport(problem=str(error))
+        if ended := next((each for each in self.programs if each.ended), None):
+            raise PebbleError(f"{self.subject.name}: {ended.name} has ended\n{ended.tail()}".rstrip())
+        if report.problem is not None:
+            raise PebbleError(f"{self.subject.name}: {report.problem}\n{self._robot.log()}".rstrip())
+        return report
+
+    def entries(self, since_ns: int) -> list[Entry]:
+        """What the MCU received and did after ``since_ns``."""
+        return self._robot.lines(since_ns)
+
+    def playbacks(self) -> list[Playback]:
+        """All clips that the loudspeaker has played."""
+        return playbacks(self._played)
+
+    def _services(self) -> dict[str, Config]:
+        """The original's keys and values where it has them."""
+        video = {"publish_width": WIDTH, "publish_height": HEIGHT, "publish_fps": FPS, "keyframe_interval": 5}
+        audio: dict[str, Any] = {"rate": _AUDIO_RATE, "channels": 1}
+        loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self._played)]
+        sounds = _write_clip(self._folder / "sounds")
+        publishers = {"video_publisher": {**video, "jpeg_quality": 10}, "audio_publisher": {**audio, "chunk_ms": 20}}
+        return {
+            "mqtt_bridge": {"media": publishers},
+            "av_daemon": {
+                "video": {"backend": "synthetic", "width": WIDTH, "height": HEIGHT, "fps": FPS},
+                "audio": {"source": "synthetic", **audio},
+            },
+            "soundboard_handler": {"playback": {"directory": str(sounds), "player_command": loudspeaker}},
+        }
+
+
+class TestBed(Processes):
+    """All robots; they are not yet ready when the ``with`` block begins."""
+
+    def __init__(self, subjects: Sequence[Subject], kind: str) -> None:
+        super().__init__()
+        self.robots: list[ImpairedRobot] = []
+        self._subjects, self._kind = subjects, kind
+
+    def start(self) -> None:
+        """Raises PebbleError if something does not start."""
+        for number, subject in enumerate(self._subjects):
+            self.robots.append(ImpairedRobot(subject, self._kind, self, self.folder / str(number)))
+        for robot in self.robots:
+            robot.start()
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        for robot in self.robots:
+            robot.network.close()
+
+    def end_trials(self) -> None:
+        """Stops all operators."""
+        for operator in self.workers:
+            operator.ask_to_end()
+
+
+def _write_clip(folder: Path) -> Path:
+    """The folder, with the clip that is played at the end of each trial."""
+    folder.mkdir()
+    samples = Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))
+    with wave.open(str(folder / CLIP), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(_AUDIO_RATE)
+        file.writeframes(to_bytes(samples))
+    return folder
+
+
+# -- the course of the trials
 
 
 def prepare(run: Run) -> None:
@@ -49,11 +204,9 @@ def conditions(run: Run) -> list[Condition]:
     return chosen(run["trials"], run["both_ways"])
 
 
-@contextmanager
-def test_bed(run: Run) -> Iterator[TestBed]:
+def test_bed(run: Run) -> TestBed:
     run.show("starting the robots")
-    with TestBed([one for one in SUBJECTS if one.name in run["variants"]], run["link"]) as bed:
-        yield bed
+    return TestBed([one for one in SUBJECTS if one.name in run["variants"]], run["link"])
 
 
 def groups(run: Run, robots: Sequence[ImpairedRobot]) -> list[list[ImpairedRobot]]:
@@ -78,10 +231,12 @@ def measure(round_: Round) -> Iterator[Cell]:
                 turn = slice(None, None, -1 if number % 2 else 1)
                 for place, group in enumerate(groups(run, bed.robots)[turn]):
                     run.show(f"{condition.name}: {', '.join(robot.subject.name for robot in group)}")
-                    at_once(group[turn], partial(_recover, run=run))
+                    at_once(group[turn], partial(_recover, run))
                     if not place:
                         marks.append(f"{condition.name}@{(time.monotonic_ns() - began_ns) / 1e9:.1f}")
-                    trials += _tried(run, condition, group[turn], at_once)
+                    at_once(group[turn], partial(_apply, condition))
+                    trials += at_once(group[turn], partial(_trial, run, condition.name))
+                    at_once(group[turn], partial(_apply, CLEAN))
         except PebbleError as error:
             if not trials:
                 raise
@@ -101,24 +256,16 @@ def _at_once(pool: ThreadPoolExecutor, robots: Sequence[ImpairedRobot], act: Cal
     return [future.result() for future in futures]
 
 
-def _tried(
-    run: Run,
-    condition: Condition,
-    robots: Sequence[ImpairedRobot],
-    at_once: Callable[..., list[Trial]],
-) -> list[Trial]:
-    at_once(robots, lambda robot: robot.network.apply(condition))
-    trials = at_once(robots, lambda robot: _trial(run, robot, condition.name))
-    at_once(robots, lambda robot: robot.network.apply(CLEAN))
-    return trials
-
-
-def _recover(robot: ImpairedRobot, run: Run) -> None:
+def _recover(run: Run, robot: ImpairedRobot) -> None:
     robot.send(RecoveryRequest(quiet_s=run["quiet_s"]))
     robot.next_report(_RECOVERED_S)
 
 
-def _trial(run: Run, robot: ImpairedRobot, name: str) -> Trial:
+def _apply(condition: Condition, robot: ImpairedRobot) -> None:
+    robot.network.apply(condition)
+
+
+def _trial(run: Run, name: str, robot: ImpairedRobot) -> Trial:
     began_ns, subject = time.monotonic_ns(), robot.subject
     lengths = {phase: run[phase] for phase in ("alone_s", "window_s", "grace_s", "off_s", "clip_s")}
     robot.send(TrialRequest(video=subject.video, audio=subject.audio, **lengths))
@@ -151,7 +298,7 @@ IMPAIR = Comparison(
                help="Seconds of video, and of audio, per trial."),
     ),
     full=Budget(1300, trials=list(TRIALS), both_ways=False, link="auto", window_s=8.0, alone_s=3.0, grace_s=2.0,
-                off_s=2.0, quiet_s=2.0, clip_s=_CLIP_S, all_at_once=False),
+                off_s=2.0, quiet_s=2.0, clip_s=5.0, all_at_once=False),
     quick=Budget(85, trials=list(QUICK), window_s=4.0, alone_s=2.0, grace_s=1.0, off_s=1.0, quiet_s=1.0,
                  all_at_once=True),
     constants={

@@ -63,21 +63,13 @@ def impair(
     if robot is not None:
         target = Target(url=url, robot=robot, password_file=password_file, ca_cert=ca_cert)
         return _measure(target, label, into or _INTO, seconds or _SECONDS, media=not no_media, replace=replace)
-    return _simulated()(**simulated)
-
-
-def _simulated() -> Callable[..., int]:
-    """The command of the comparison, which measures simulated robots."""
-    return command_of(catalogue.find("impair"))
+    return command_of(catalogue.find("impair"))(**simulated)
 
 
 def _check_options(context: typer.Context, simulated: Collection[str]) -> None:
     """Raises PebbleError for options that do not belong together."""
-    given = []
-    for name in context.params:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE":
-            given.append(name)
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
     if "compare" in given:
         wrong, why = [name for name in given if name not in ("compare", "into")], "does not go with --compare"
     elif "robot" in given:
@@ -123,33 +115,30 @@ def _print_table(into: Path) -> int:
     return 0
 
 
-def _declared() -> Callable[..., int]:
-    """The command with the options of the comparison, and then those of a real robot."""
-
-    def run(context: typer.Context, **given: Any) -> int:
-        return impair(context, **given)
-
-    declared, own = inspect.signature(_simulated()), inspect.signature(impair, eval_str=True)
-    context, *real, _ = own.parameters.values()
-    run.__doc__ = impair.__doc__
-    return with_parameters(run, [context, *declared.parameters.values(), *real])
-
-
 class _Command(TyperCommand):
     """Imports the comparison when its options are needed: not for the list of all commands, which any system shows."""
 
     def get_params(self, ctx: Context) -> list[Parameter]:
+        """The options of the comparison, and then those of a real robot."""
         if not self.params:
+            simulated = inspect.signature(command_of(catalogue.find("impair"))).parameters.values()
+            context, *real, _ = inspect.signature(impair, eval_str=True).parameters.values()
             app = typer.Typer(rich_markup_mode=None, add_completion=False)
-            app.command("impair")(_declared())
+            app.command("impair")(with_parameters(_as_impair(), [context, *simulated, *real]))
             whole = typer.main.get_command(app)
             self.params, self.callback = whole.params, whole.callback
         return super().get_params(ctx)
 
 
-def register(app: typer.Typer) -> None:
-    def listed() -> None:
-        """Replaced with its options by :class:`_Command`."""
+def _as_impair() -> Callable[..., int]:
+    """The command, whose parameters may be declared anew."""
 
-    listed.__doc__ = impair.__doc__
-    app.command("impair", cls=_Command)(listed)
+    def run(**given: Any) -> int:
+        return impair(**given)
+
+    run.__doc__ = impair.__doc__
+    return run
+
+
+def register(app: typer.Typer) -> None:
+    app.command("impair", cls=_Command)(with_parameters(_as_impair(), []))

@@ -15,8 +15,7 @@ from pebble.bench.impair import cells, metrics
 from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.metrics import ClipCommand, Command, Heartbeat, Picture, Record, Sound, Window
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.robots import SUBJECTS, ImpairedRobot
-from pebble.bench.impair.trials import IMPAIR, NAMES, QUICK, conditions, groups
+from pebble.bench.impair.trials import IMPAIR, NAMES, QUICK, SUBJECTS, ImpairedRobot, conditions, groups
 from pebble.bench.results import Cell
 from pebble.errors import PebbleError
 from pebble.simulation.loudspeaker import Playback

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.impair.robots import SUBJECTS, ImpairedRobot
+from pebble.bench.impair.trials import SUBJECTS, ImpairedRobot
 from pebble.errors import PebbleError
 from pebble.rig.processes import BROKERS, Processes
 from pebble.rig.programs import Program

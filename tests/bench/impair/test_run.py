@@ -17,8 +17,7 @@ from pebble.bench.impair import trials as module
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.metrics import ClipCommand, OperatorReport, Record, RecoveryRequest, TrialRequest, Window
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.robots import Subject
-from pebble.bench.impair.trials import IMPAIR
+from pebble.bench.impair.trials import IMPAIR, Subject
 from pebble.bench.results import load
 from pebble.errors import PebbleError
 
@@ -80,7 +79,7 @@ class FakeRobot:
 
 
 class FakeTestBed:
-    """Replaces pebble.bench.impair.robots.TestBed."""
+    """Replaces pebble.bench.impair.trials.TestBed."""
 
     def __init__(self, log: list[str], trials: int) -> None:
         self._log, self._trials = log, trials
