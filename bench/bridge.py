@@ -32,7 +32,7 @@ from pebble.bench.bridge_report import (
     with_excess,
 )
 from pebble.bench.bridge_robots import BRIDGE as FORWARDER
-from pebble.bench.bridge_robots import HOP, SERIAL, STAND_IN, DrivenRobot, MediaLoad, OneHop
+from pebble.bench.bridge_robots import HOP, SERIAL, STAND_IN, DrivenRobot, OneHop, media_load
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.ratios import LEAST_ROUNDS
@@ -118,11 +118,11 @@ def _with_media(round_: Round, driven: Mapping[str, DrivenRobot | OneHop]) -> It
     for case in round_.cases([{"load": LOADED}], 1):
         robot = driven[case.variant]
         if isinstance(robot, DrivenRobot) and _has_media(case.run, case.variant):
-            with MediaLoad(robot) as media_load:
+            with media_load(robot) as counts:
                 time.sleep(_MEDIA_STARTUP_S)
-                before = media_load.counts()
+                before = counts()
                 segment = robot.drive(case.run["seconds"])
-                after = media_load.counts()
+                after = counts()
             (arrived,) = robot.match_arrivals([segment])
             yield from cells_of(case, segment, arrived, {name: after[name] - before[name] for name in after})
 

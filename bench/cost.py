@@ -8,7 +8,7 @@ that map them: nothing large is imported here, since that would reduce the robot
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -16,9 +16,10 @@ from pathlib import Path
 from statistics import median
 
 from pebble.bench.comparison import Budget, Case, Comparison, Run, rounds, seconds, variants
+from pebble.bench.drivers import RATE_HZ, driving
 from pebble.bench.pictures import bars
 from pebble.bench.results import Cell
-from pebble.bench.robot_subscriber import RobotSubscriber
+from pebble.bench.subscribers import RobotSubscriber
 from pebble.bench.tables import Claims, Grid, figure, median_column, medians
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
@@ -27,7 +28,6 @@ from pebble.rig.robot import BASE, BROKER, KINDS, LAUNCHER, MEDIA, Robot, one_ro
 ALL = "all"  # the processes of a robot together
 MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
 PICTURES, PER_PICTURE = "pictures", "CPU per picture"
-RATE_HZ = 20.0  # of driving
 IDLE, DRIVING = "idle", "driving"
 #: The encodings requested in each media phase, by the name of the phase.
 STREAMS = {"json+pcm": ("json", "pcm"), "h264+opus": ("h264", "opus")}
@@ -61,12 +61,13 @@ def read(kind: str, seconds: float) -> Iterator[Reading]:
         subscriber.wait()
         robot.launch()
         robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
-        yield _read(robot, subscriber, IDLE, lambda: time.sleep(seconds))
-        yield _read(robot, subscriber, DRIVING, lambda: subscriber.drive(seconds, RATE_HZ))
+        yield _read(robot, subscriber, IDLE, seconds)
+        with driving(robot.remote_port, BASE):
+            yield _read(robot, subscriber, DRIVING, seconds)
         for name in STREAMS:
             if name == _WITHOUT_AV or _has_av():
                 _start_streams(robot, subscriber, name)
-                yield _read(robot, subscriber, name, lambda: time.sleep(seconds))
+                yield _read(robot, subscriber, name, seconds)
 
 
 def _start_streams(robot: Robot, subscriber: RobotSubscriber, name: str) -> None:
@@ -79,13 +80,13 @@ def _start_streams(robot: Robot, subscriber: RobotSubscriber, name: str) -> None
     )
 
 
-def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, work: Callable[[], object]) -> Reading:
-    """Measures the robot's processes while ``work`` runs; memory is read afterwards."""
+def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, seconds: float) -> Reading:
+    """Measures the robot's processes for some seconds; memory is read afterwards."""
     time.sleep(_STARTUP_S)
     processes = robot.processes()
     before = {name: cpu_s([pid]) for name, pid in processes.items()}
     pictures, began = _pictures(subscriber, phase), time.monotonic()
-    work()
+    time.sleep(seconds)
     took = time.monotonic() - began
     cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in processes.items()}
     arrived = _pictures(subscriber, phase) - pictures

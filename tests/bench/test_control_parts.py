@@ -17,6 +17,7 @@ from pebble.bench.control import CONTROL, CONTROL_NULL
 from pebble.bench.control_ends import (
     REPLIES,
     REQUESTS,
+    Answer,
     Echo,
     Handler,
     Sender,
@@ -29,7 +30,6 @@ from pebble.bench.control_ends import (
 )
 from pebble.bench.control_participants import VARIANTS, Slice
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, tables
-from pebble.bench.control_worker import Answer
 from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
@@ -385,9 +385,6 @@ class Idle:
 
     def wait(self, _timeout: float) -> None:
         self.checks += 1
-
-    def write_count(self) -> None:
-        """No output."""
 
 
 def test_a_reader_that_is_off_still_runs_its_network_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
