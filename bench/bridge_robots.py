@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Final
+from contextlib import ExitStack, closing, contextmanager
+from typing import Final, Self
 
 from pebble.bench.bridge_operator import (
     RATE_HZ,
@@ -22,7 +22,7 @@ from pebble.bench.usage import cpu_s
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.rig.processes import Processes, python
-from pebble.rig.robot import BASE, Robot, synthetic_media
+from pebble.rig.robot import BASE, Robot, one_robot, synthetic_media
 from pebble.rig.worker import Worker
 
 STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
@@ -52,27 +52,28 @@ class StandIn(Robot):
         return {name: one.pid for name, one in zip(_SERVICES.values(), self._started, strict=False)}
 
 
-class DrivenRobot(Processes):
+class DrivenRobot:
     """A robot and its operator: starts both in ``with``; both are ready when :meth:`wait` returns.
 
     With ``reports`` it forwards those of its MCU.
     """
 
     def __init__(self, kind: str, *, media: bool = False, reports: bool = True) -> None:
-        super().__init__()
         self.kind, self._media, self._reports = kind, media, reports
         self._parts: Mapping[str, int] = {}
 
-    def start(self) -> None:
+    def __enter__(self) -> Self:
         """Raises PebbleError if something does not start."""
-        broker = self.broker("remote")
-        make, services = StandIn if self.kind == STAND_IN else Robot, _MEDIA if self._media else {}
-        self.robot = make(self, self.kind, ("127.0.0.1", broker.port), services=services, reports=self._reports)
-        broker.wait()
-        self.robot.prepare()
-        self.robot.launch()
-        self.operator = Operator(broker.port, BASE)
-        self.closing.callback(self.operator.close)
+        with ExitStack() as stack:
+            make, services = StandIn if self.kind == STAND_IN else Robot, _MEDIA if self._media else {}
+            self.robot = stack.enter_context(one_robot(self.kind, make, services=services, reports=self._reports))
+            self.robot.launch()
+            self.operator = stack.enter_context(closing(Operator(self.robot.remote_port, BASE)))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
 
     def wait(self) -> None:
         """Raises PebbleError with the robot's log if it does not become ready."""
@@ -172,8 +173,8 @@ def media_load(driven: DrivenRobot) -> Iterator[Callable[[], dict[str, int]]]:
         return {name: found.get(name, 0) for name in FLOWS}
 
     try:
-        workers.append(driven.worker("frame reader", _PROGRAMS, "frames", robot.run_dir))
-        workers.append(driven.worker("media operator", _PROGRAMS, "media", robot.remote_port, robot.base))
+        workers.append(robot.running.worker("frame reader", _PROGRAMS, "frames", robot.run_dir))
+        workers.append(robot.running.worker("media operator", _PROGRAMS, "media", robot.remote_port, robot.base))
         driven.operator.media(True)
         end = time.monotonic() + _START_S
         while missing := [name for name, count in counts().items() if not count]:
@@ -184,7 +185,7 @@ def media_load(driven: DrivenRobot) -> Iterator[Callable[[], dict[str, int]]]:
     finally:
         driven.operator.media(False)
         for worker in workers:
-            driven.end(worker)
+            robot.running.end(worker)
         end = time.monotonic() + _STOP_S
         while len(robot.pids()) > before and time.monotonic() < end:
             time.sleep(_POLL_S)

@@ -43,7 +43,7 @@ _ECHOED = struct.Struct("<qq")
 _ECHOED_AT = 16  # behind the number and the first stamp
 SMALLEST = _FORM.size
 
-Handler = Callable[[str, bytes], None]
+Handler = Callable[[str, bytes, int], None]  # topic, payload, and when the transport received it (ns)
 Clock = Callable[[], int]  # ns
 
 
@@ -101,10 +101,9 @@ def stamped(payload: bytes, t2: int, t3: int) -> bytes:
     return bytes(message)
 
 
-def parse(payload: bytes) -> tuple[int, int, int, int]:
+def parse(payload: bytes) -> tuple[int, ...]:
     """Number, t1, t2, t3. Raises struct.error for a foreign message."""
-    number, t1, t2, t3 = _FORM.unpack_from(payload)
-    return number, t1, t2, t3
+    return _FORM.unpack_from(payload)
 
 
 # -- connections, and the two ends
@@ -112,8 +111,6 @@ def parse(payload: bytes) -> tuple[int, int, int, int]:
 
 class Connection(Protocol):
     """The connection of one end."""
-
-    received_ns: int  # CLOCK_MONOTONIC: when the transport received the message being handled
 
     def subscribe(self, filter_: str, handler: Handler) -> None: ...
 
@@ -126,7 +123,6 @@ class TransportConnection:
     """Any of Pebble's transports, used through the same calls as in pebble.service.Service."""
 
     def __init__(self, transport: Transport, inbox: Inbox) -> None:
-        self.received_ns = 0
         self._transport, self._inbox = transport, inbox
         transport.open(_CONNECT_S)
         if transport.state is not State.CONNECTED:
@@ -137,11 +133,7 @@ class TransportConnection:
     def subscribe(self, filter_: str, handler: Handler) -> None:
         def on_message(message: Message) -> None:
             received_ns = time.monotonic_ns()
-            self._inbox.post(lambda: handle(message, received_ns))
-
-        def handle(message: Message, received_ns: int) -> None:
-            self.received_ns = received_ns
-            handler(message.topic, message.payload)
+            self._inbox.post(lambda: handler(message.topic, message.payload, received_ns))
 
         self._transport.subscribe(filter_, on_message, qos=QOS, direct=True)
 
@@ -158,14 +150,12 @@ class PahoConnection:
     def __init__(self, port: int) -> None:
         from pebble.rig.stock_client import StockClient  # only these ends import paho
 
-        self.received_ns = 0
         self._client = StockClient(at_once=False).open(port)
         self._client.wait()
 
     def subscribe(self, filter_: str, handler: Handler) -> None:
         def on_message(_client: Any, _data: Any, message: Any) -> None:
-            self.received_ns = time.monotonic_ns()
-            handler(message.topic, message.payload)
+            handler(message.topic, message.payload, time.monotonic_ns())
 
         self._client.paho.on_message = on_message
         self._client.subscribe(filter_, QOS)
@@ -192,7 +182,7 @@ class Echo:
         self._connection, self._clock = connection, clock
         connection.subscribe(f"{REQUESTS}/{who}", self._on_message)
 
-    def _on_message(self, topic: str, payload: bytes) -> None:
+    def _on_message(self, topic: str, payload: bytes, _transport_ns: int) -> None:
         received = self._clock()
         try:
             reply = stamped(payload, received, self._clock())
@@ -267,7 +257,7 @@ class Sender:
         while self._missing and time.monotonic() < end and not self.ended:
             work(self._inbox, _POLL_S)
 
-    def _on_message(self, _topic: str, payload: bytes) -> None:
+    def _on_message(self, _topic: str, payload: bytes, transport_ns: int) -> None:
         received = self._clock()
         try:
             number, t1, t2, t3 = parse(payload)
@@ -275,7 +265,7 @@ class Sender:
             return
         index = number - self._first
         if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
-            self._received[index] = Exchange(t1, t2, t3, received, self._connection.received_ns)
+            self._received[index] = Exchange(t1, t2, t3, received, transport_ns)
             self._missing -= 1
 
 

@@ -7,8 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from statistics import median_low
 
@@ -41,10 +40,13 @@ def wake_ups(pids: Iterable[int]) -> int:
 
 def _switches(task: Path) -> int:
     try:
-        lines = (task / "status").read_text().splitlines()
+        return _sum(task / "status", "voluntary_ctxt_switches:")
     except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
         return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt_switches:")), 0)
+
+
+def _sum(file: Path, *fields: str) -> int:
+    return sum(int(line.split()[1]) for line in file.read_text().splitlines() if line.startswith(fields))
 
 
 def pss_mb(pid: int) -> float:
@@ -66,14 +68,13 @@ def own_mb(pid: int) -> float:
 
 def _memory_mb(pid: int, *fields: str) -> float:
     try:
-        lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()
+        return _sum(_PROC / str(pid) / "smaps_rollup", *fields) / 1024
     except (FileNotFoundError, PermissionError) as error:
         if (_PROC / str(pid)).exists():
             raise PebbleError(f"{error.filename}: {error.strerror}: memory cannot be measured without it") from None
-        return 0.0
     except ProcessLookupError:
-        return 0.0
-    return sum(int(line.split()[1]) for line in lines if line.startswith(fields)) / 1024
+        pass
+    return 0.0
 
 
 # -- the time of a wake-up, which every message needs several times
@@ -85,12 +86,17 @@ def wake_up_us() -> tuple[float, float]:
     It is half of the median round trip of a byte through a socket to ``cat``: a round trip is two wake-ups and little
     else. Raises PebbleError without ``cat``.
     """
-    cores = sorted(os.sched_getaffinity(0)) if sys.platform == "linux" else [0]
-    with _on(cores[0]):
+    if sys.platform != "linux":  # cores cannot be chosen
+        return _wake_up_us(), _wake_up_us()
+    cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, cores[:1])  # only this thread, and processes that it starts meanwhile
+    try:
         return _wake_up_us(cores[0]), _wake_up_us(cores[-1])
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
-def _wake_up_us(core: int) -> float:
+def _wake_up_us(core: int | None = None) -> float:
     near, far = socket.socketpair()
     with near, far:
         try:
@@ -98,30 +104,14 @@ def _wake_up_us(core: int) -> float:
         except OSError as error:
             raise PebbleError(f"cat: {error.strerror}") from None
         with cat:
-            if sys.platform == "linux":
+            if core is not None:
                 os.sched_setaffinity(cat.pid, {core})
-            ways = [_there_and_back_ns(near) for _ in range(_PINGS)]
+            ways = []
+            for _ in range(_PINGS):
+                time.sleep(_PERIOD_S)
+                sent = time.monotonic_ns()
+                near.send(b".")
+                near.recv(1)
+                ways.append(time.monotonic_ns() - sent)
             near.shutdown(socket.SHUT_WR)  # it ends when its input closes
     return median_low(ways) / 2000
-
-
-def _there_and_back_ns(near: socket.socket) -> int:
-    time.sleep(_PERIOD_S)
-    sent = time.monotonic_ns()
-    near.send(b".")
-    near.recv(1)
-    return time.monotonic_ns() - sent
-
-
-@contextmanager
-def _on(core: int) -> Iterator[None]:
-    """Pins this thread to a core; processes started later are not affected."""
-    if sys.platform != "linux":
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {core})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)

@@ -51,8 +51,6 @@ def test_messages_have_the_size_that_was_asked_for_both_ways(size: int) -> None:
 class Loop:
     """A connection to an echo in this process; ``spoil`` changes the replies."""
 
-    received_ns = 0
-
     def __init__(self, spoil: Callable[[bytes], list[bytes]] = lambda payload: [payload]) -> None:
         self._handlers: dict[str, Handler] = {}
         self._spoil = spoil
@@ -64,7 +62,7 @@ class Loop:
     def publish(self, topic: str, payload: bytes) -> None:
         self.sizes.append(len(payload))
         for one in self._spoil(payload) if topic.startswith(f"{REPLIES}/") else [payload]:
-            self._handlers[topic](topic, one)
+            self._handlers[topic](topic, one, 0)
 
     def close(self) -> None:
         """Nothing is open."""
