@@ -165,7 +165,8 @@ def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
     Values that were sent more than once do not count.
     """
-    published = [(entry.ns, touch) for entry in entries if entry.event == "said" for touch in _touches(entry)]
+    said = [(entry.ns, one) for entry in entries if entry.event == "said" for one in parse(entry.line.encode())]
+    published = [(ns, touch) for ns, touch in said if isinstance(touch, Touch)]
     times = Counter(touch for _, touch in published)
     wanted = {touch: ns for ns, touch in published if times[touch] == 1}
     first = {touch: ns for ns, touch in reversed(received) if touch in wanted and ns >= wanted[touch]}
@@ -196,10 +197,6 @@ def arrived_of(
         reports=len(own),
         forwarded=len(arrived) + sum(segment.began <= ns <= segment.ended for ns, _ in received),
     )
-
-
-def _touches(entry: Entry) -> list[Touch]:
-    return [report for report in parse(entry.line.encode()) if isinstance(report, Touch)]
 
 
 # -- programs beside the robot

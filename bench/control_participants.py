@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -126,11 +125,19 @@ class Participants(Processes):
     def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
         """Runs one slice. Raises PebbleError if a process ended, or pictures do not flow."""
         participant = self._participants[role]
-        with self._loaded(participant, load):
-            before, began = self._pictures(participant, load), time.monotonic()
+        busy = {NONE: [], MEDIA: participant.media, HOG: self._hogs}[load]
+        try:
+            for worker in busy:
+                _switch_load(worker, "1")
+            if load != MEDIA:
+                return participant.run(spec)
+            before, began = _flowing(participant), time.monotonic()
             slice_ = participant.run(spec)
-            pictures, took = self._pictures(participant, load) - before, time.monotonic() - began
-        return replace(slice_, pictures_hz=pictures / took) if load == MEDIA else slice_
+            pictures, took = _switch_load(participant.media[0], "?") - before, time.monotonic() - began
+            return replace(slice_, pictures_hz=pictures / took)
+        finally:
+            for worker in reversed(busy):  # first the writer, then the reader
+                _switch_load(worker, "0")
 
     def start(self) -> None:
         for number, role in enumerate(self._roles):
@@ -144,35 +151,21 @@ class Participants(Processes):
         for worker in self.workers:
             worker.answer(_READY_S)
 
-    @contextmanager
-    def _loaded(self, participant: Participant, load: str) -> Iterator[None]:
-        busy = {NONE: [], MEDIA: participant.media, HOG: self._hogs}[load]
-        try:
-            for worker in busy:
-                _switch_load(worker, "1")
-            if load == MEDIA:
-                _wait_for_pictures(participant)
-            yield
-        finally:
-            for worker in reversed(busy):  # first the writer, then the reader
-                _switch_load(worker, "0")
-
-    def _pictures(self, participant: Participant, load: str) -> int:
-        return _switch_load(participant.media[0], "?") if load == MEDIA else 0
-
 
 def _switch_load(worker: Worker, line: str) -> int:
     """Sends a command to a load process; returns its count of pictures so far."""
     return int(worker.ask(line, _FLOW_S)["pictures"])
 
 
-def _wait_for_pictures(participant: Participant) -> None:
+def _flowing(participant: Participant) -> int:
+    """Waits until some pictures have arrived; returns their number so far. Raises PebbleError after a timeout."""
     reader = participant.media[0]
     enough, end = _switch_load(reader, "?") + _FLOWING, time.monotonic() + _FLOW_S
-    while _switch_load(reader, "?") < enough:
+    while (count := _switch_load(reader, "?")) < enough:
         if time.monotonic() > end:
             raise PebbleError(f"{participant.role}: no pictures flow after {_FLOW_S:.0f} s")
         time.sleep(_POLL_S)
+    return count
 
 
 def _json(what: MqttSettings | ZenohSettings | SliceSpec) -> str:

@@ -15,13 +15,13 @@ from pebble.bench.comparison import Budget, Case, Comparison, rounds, variants
 from pebble.bench.drivers import RATE_HZ, driving
 from pebble.bench.pictures import dots
 from pebble.bench.results import Cell
-from pebble.bench.subscribers import RobotSubscriber
+from pebble.bench.subscribers import UP_S, RobotSubscriber, ready_robot
 from pebble.bench.tables import SPREAD, Claims, Grid
 from pebble.client.media_receiver import MediaReceiver
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.errors import PebbleError
 from pebble.media.decode import Decoded
-from pebble.rig.robot import BASE, KINDS, MEDIA, Robot, one_robot
+from pebble.rig.robot import BASE, KINDS, Robot, one_robot
 from pebble.transports import MqttSettings, Transport, create
 
 PICTURES_EVERY = 5  # launches, the first of which is followed by one of a robot with a camera
@@ -30,7 +30,7 @@ PICTURES = tuple(f"picture, {encoding}, {state}" for state in (AT_REST, RUNNING)
 LATE = ("late operator", "late operator, paho", "late service")
 MEASURES = ("first heartbeat", "all ready", "first drive obeyed", *LATE, *PICTURES)
 _CAMERA = "camera_publisher"  # runs while it is requested
-_UP_S, _REST_S, _PICTURE_S = 20.0, 10.0, 15.0
+_REST_S, _PICTURE_S = 10.0, 15.0
 _ANSWER_S = 60.0
 _POLL_S = 0.02  # how often an operator looks whether a key frame is missing
 
@@ -64,9 +64,9 @@ def _start(robot: Robot, subscriber: RobotSubscriber) -> list[float]:
     with driving(robot.remote_port, BASE):
         began_ns = time.monotonic_ns()
         robot.launch()
-        robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", _UP_S)
-        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
-        robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", _UP_S)
+        robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
+        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
+        robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
     times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
     return [(time_ns - began_ns) / 1e9 for time_ns in times]
 
@@ -92,7 +92,7 @@ class _Operator(MediaReceiver):
 
     def wait_ms(self) -> float:
         """Milliseconds from the request to the first picture. Raises PebbleError if none comes."""
-        self.wait_for_capabilities(_UP_S)
+        self.wait_for_capabilities(UP_S)
         began_ns = time.monotonic_ns()
         self.request(self._encoding, sound=False)
         while not self._first_ns:
@@ -105,13 +105,7 @@ class _Operator(MediaReceiver):
 
 def first_pictures(case: Case) -> Iterator[Cell]:
     """The wait with the camera at rest, and that of a second operator, of a fresh robot in each encoding."""
-    with (
-        one_robot(case.variant, services=MEDIA) as robot,
-        closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber,
-    ):
-        subscriber.wait()
-        robot.launch()
-        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
+    with ready_robot(case.variant) as (robot, _):
         for encoding in ALL_VIDEO:
             robot.expect(lambda: _CAMERA not in robot.processes(), "the camera does not rest", _REST_S)
             with _operator(robot, encoding) as first, _operator(robot, encoding) as second:

@@ -12,8 +12,8 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Set
-from contextlib import closing
+from collections.abc import Iterator, Set
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +35,13 @@ from pebble.contract import (
 )
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.errors import PayloadError, PebbleError
+from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
 from pebble.rig.stock_client import StockClient
 from pebble.rig.worker_end import answer, serve
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, MqttSettings, Transport, create
 
+UP_S = 20.0  # for a robot to start
 _LIMIT_S = 10.0  # for one late subscriber
 _QUIET_S = 0.3  # without another retained message until all count as received
 _POLL_S = 0.5
@@ -78,6 +80,16 @@ class RobotSubscriber(StockClient):
             self.first_heartbeat_ns = now
         elif topic == STATUS.suffix and self.ready_ns is None and _all_ready(message.payload):
             self.ready_ns = now
+
+
+@contextmanager
+def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
+    """A robot with a camera and a microphone whose services are ready. Raises PebbleError with its log."""
+    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        subscriber.wait()
+        robot.launch()
+        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
+        yield robot, subscriber
 
 
 def encoding_of(raw: bytes) -> str:
