@@ -94,10 +94,14 @@ def assessment(cells: Sequence[Cell]) -> Iterator[str]:
     yield from caveat([cell for way in WAYS for cell in _found(cells, way, UNLOADED)])
 
 
+def matches(measure: str, variants: Sequence[str], **params: str) -> Callable[[Cell], bool]:
+    """Whether a cell has this measure, one of these variants and these parameters."""
+    return lambda cell: cell.measure == measure and cell.variant in variants and params.items() <= cell.params.items()
+
+
 def _found(cells: Sequence[Cell], measure: str, load: str, variants: Sequence[str] = KINDS) -> list[Cell]:
     """In the order of the variants."""
-    found = [cell for cell in cells if (cell.measure, cell.params["load"]) == (measure, load)]
-    return [cell for name in variants for cell in found if cell.variant == name]
+    return [cell for name in variants for cell in filter(matches(measure, [name], load=load), cells)]
 
 
 def _media_effect(loaded: Cell, free: Cell) -> str:

@@ -26,9 +26,9 @@ from pebble.rig.robot import BASE, Robot, one_robot, synthetic_media
 from pebble.rig.worker import Worker
 
 STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
-BRIDGE, SERIAL = "bridge", "serial bridge"
+FORWARDER, SERIAL = "bridge", "serial bridge"
 FLOWS = ("frames", "video", "audio")
-_SERVICES = {BRIDGE: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
+_SERVICES = {FORWARDER: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
 _PROGRAMS = "pebble.bench.bridge_operator"
 _MEDIA: Final = synthetic_media((1920, 1080, 30), (640, 360, 15))
 _HOP_BASE = "pebble/robots/one-hop"

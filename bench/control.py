@@ -44,10 +44,6 @@ def prepare(run: Run) -> None:
     run.recorded["loads"] = [*_loads(run)]
 
 
-def environment(run: Run) -> Participants:
-    return Participants(roles_of(run), _loads(run))
-
-
 def measure(case: Case) -> Iterator[Cell]:
     """One slice. The null test uses only the one-way times, since its slowdown is a fifth of them."""
     participants: Participants = case.env
@@ -154,7 +150,7 @@ _CONTROL = Comparison(
     variants=tuple(VARIANTS),
     conditions=conditions,
     prepare=prepare,
-    environment=environment,
+    environment=lambda run: Participants(roles_of(run), _loads(run)),
     measure=measure,
     measures=(ONE_WAY, ROUND_TRIP),
     figures=_JOINED,

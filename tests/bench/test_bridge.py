@@ -27,8 +27,7 @@ from pebble.bench.bridge_operator import (
 )
 from pebble.bench.bridge_profile import _stamp, commands
 from pebble.bench.bridge_report import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
-from pebble.bench.bridge_robots import BRIDGE as FORWARDER
-from pebble.bench.bridge_robots import HOP, SERIAL, STAND_IN
+from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.results import Cell, Judged, Value, load
 from pebble.errors import PebbleError
