@@ -124,8 +124,6 @@ class OneHop(Processes):
     Has the same methods as :class:`DrivenRobot`.
     """
 
-    kind = HOP
-
     def start(self) -> None:
         """Raises PebbleError if something does not start."""
         broker = self.broker("hop")
