@@ -165,8 +165,8 @@ def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
     Values that were sent more than once do not count.
     """
-    said = [(entry.ns, one) for entry in entries if entry.event == "said" for one in parse(entry.line.encode())]
-    published = [(ns, touch) for ns, touch in said if isinstance(touch, Touch)]
+    lines = [(entry.ns, entry.line.encode()) for entry in entries if entry.event == "said"]
+    published = [(ns, touch) for ns, line in lines for touch in parse(line) if isinstance(touch, Touch)]
     times = Counter(touch for _, touch in published)
     wanted = {touch: ns for ns, touch in published if times[touch] == 1}
     first = {touch: ns for ns, touch in reversed(received) if touch in wanted and ns >= wanted[touch]}

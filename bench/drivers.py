@@ -122,8 +122,8 @@ def _drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) 
         began = time.monotonic_ns()
         sent = operator.drive(seconds, rate_hz)
         ended = time.monotonic_ns()
-        beats = [[beat for beat in robot if began <= beat <= ended] for robot in operator.heartbeats]
-        answer({"began": began, "ended": ended, "late": operator.late, "sent": sent, "heartbeats": beats})
+        heartbeats = [[ns for ns in robot if began <= ns <= ended] for robot in operator.heartbeats]
+        answer({"began": began, "ended": ended, "late": operator.late, "sent": sent, "heartbeats": heartbeats})
 
 
 def main(port: str, *fleet: str) -> None:
