@@ -27,12 +27,12 @@ from pebble.bench.bridge_report import (
     WAYS,
     assessment,
     legend,
+    matches,
     suffix,
     tables,
     with_excess,
 )
-from pebble.bench.bridge_robots import BRIDGE as FORWARDER
-from pebble.bench.bridge_robots import HOP, SERIAL, STAND_IN, DrivenRobot, MediaLoad, OneHop
+from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN, DrivenRobot, OneHop, media_load
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.ratios import LEAST_ROUNDS
@@ -118,11 +118,11 @@ def _with_media(round_: Round, driven: Mapping[str, DrivenRobot | OneHop]) -> It
     for case in round_.cases([{"load": LOADED}], 1):
         robot = driven[case.variant]
         if isinstance(robot, DrivenRobot) and _has_media(case.run, case.variant):
-            with MediaLoad(robot) as media_load:
+            with media_load(robot) as counts:
                 time.sleep(_MEDIA_STARTUP_S)
-                before = media_load.counts()
+                before = counts()
                 segment = robot.drive(case.run["seconds"])
-                after = media_load.counts()
+                after = counts()
             (arrived,) = robot.match_arrivals([segment])
             yield from cells_of(case, segment, arrived, {name: after[name] - before[name] for name in after})
 
@@ -188,32 +188,29 @@ def in_roles(round_: Round) -> Iterator[Cell]:
 # -- the aims
 
 
-def _aim(percent: int, measure_: str, load: str) -> Aim:
-    return Aim(
-        what=f"{{variant}}, {WAYS[measure_]}{suffix(load)}, p{percent} at most {{bound:g}} ms",
-        of=lambda cell: (cell.measure, cell.params["load"]) == (measure_, load) and cell.variant in KINDS,
-        value=with_lost(percent), at_most=AIMS_MS[percent], least=LEAST_SAMPLES[percent], least_rounds=LEAST_ROUNDS,
-        shown=with_excess(AIMS_MS[percent]), never="not within 1 s",
-    )  # fmt: skip
-
-
-def _command_aim(percent: int, kind: str, at_most: float) -> RatioAim:
-    return RatioAim(
-        what=f"{{variant}}, {WAYS[DOWN]}{suffix(COMMANDS)}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
-        of=lambda cell: (cell.variant, cell.measure, cell.params["load"]) == (kind, DOWN, COMMANDS),
-        to=STAND_IN, percent=percent, at_most=at_most, least=LEAST_IN_ROUND[percent],
-    )  # fmt: skip
-
-
-def _cpu_aim(process: str, kind: str, at_most: float) -> RatioAim:
-    return RatioAim(
-        what=f"{{variant}}, {CPU} of the {{process}}, commands and reports, at most {{bound:.2f}} of {STAND_IN}'s",
-        of=lambda cell: (
-            (cell.variant, cell.measure, cell.params["load"], cell.params.get("process"))
-            == (kind, CPU, UNLOADED, process)
-        ),
-        to=STAND_IN, at_most=at_most,
-    )  # fmt: skip
+def _aims() -> Iterator[Aim | RatioAim]:
+    for measure_, load in AIMED:
+        for percent, at_most in AIMS_MS.items():
+            yield Aim(
+                what=f"{{variant}}, {WAYS[measure_]}{suffix(load)}, p{percent} at most {{bound:g}} ms",
+                of=matches(measure_, KINDS, load=load), value=with_lost(percent), at_most=at_most,
+                least=LEAST_SAMPLES[percent], least_rounds=LEAST_ROUNDS,
+                shown=with_excess(at_most), never="not within 1 s",
+            )  # fmt: skip
+    for percent, bounds in AIMS_COMMANDS.items():
+        for kind, at_most in bounds.items():
+            yield RatioAim(
+                what=f"{{variant}}, {WAYS[DOWN]}{suffix(COMMANDS)}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
+                of=matches(DOWN, [kind], load=COMMANDS), to=STAND_IN, percent=percent, at_most=at_most,
+                least=LEAST_IN_ROUND[percent],
+            )  # fmt: skip
+    for process, bounds in AIMS_CPU.items():
+        for kind, at_most in bounds.items():
+            what = f"{CPU} of the {process}, commands and reports"
+            yield RatioAim(
+                what=f"{{variant}}, {what}, at most {{bound:.2f}} of {STAND_IN}'s",
+                of=matches(CPU, [kind], load=UNLOADED, process=process), to=STAND_IN, at_most=at_most,
+            )  # fmt: skip
 
 
 def _options(known: Sequence[str]) -> tuple[Option, ...]:
@@ -305,12 +302,7 @@ BRIDGE = Comparison(
     figures=dict.fromkeys(("cpu_percent", "frames_per_s", "video_per_s", "audio_per_s"), of_known(fmean, 1)),
     tables=(tables,),
     legend=legend,
-    assessment=(
-        assessment,
-        *(_aim(percent, *where) for where in AIMED for percent in AIMS_MS),
-        *(_command_aim(percent, *one) for percent, aims in AIMS_COMMANDS.items() for one in aims.items()),
-        *(_cpu_aim(process, *one) for process, aims in AIMS_CPU.items() for one in aims.items()),
-    ),
+    assessment=(assessment, *_aims()),
     modes={"null": BRIDGE_NULL, "profile": BRIDGE_PROFILE},
     summary_lines=3,
     reported_full=("--with-media",),

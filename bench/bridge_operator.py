@@ -1,19 +1,29 @@
-"""An operator who drives at a steady rate over MQTT, and which of the commands and of the MCU's reports arrived."""
+"""An operator who drives at a steady rate over MQTT, and which of the commands and of the MCU's reports arrived.
+
+As processes beside the robot: ``python -m pebble.bench.bridge_operator WHAT …``. ``frames RUN_DIR`` reads a robot's
+frames and ``media PORT BASE`` receives its video and sound; both answer every line with the counts so far. ``hop PORT
+TOPIC`` is a stock client one hop from the operator: it writes one line once it is subscribed, and answers every line
+with the commands since the last one.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from paho.mqtt.client import Client, MQTTMessage
 
 from pebble.bench.null import spin
 from pebble.contract import (
+    AUDIO,
     AUDIO_CONTROL,
+    CAMERA,
     DRIVE,
     MQTT_AUDIO,
     MQTT_VIDEO,
@@ -24,6 +34,7 @@ from pebble.contract import (
 )
 from pebble.errors import PebbleError
 from pebble.rig.stock_client import StockClient, steadily
+from pebble.rig.worker_end import answer, serve, serve_on_thread
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 from pebble.simulation.trace import Entry
 
@@ -36,6 +47,8 @@ _STEPS = 800  # wheel values 0.100 … 0.899
 _UP_S = 30.0
 _POLL_S = 0.02
 _REPORTS_LIMIT = 400_000  # reports; a robot sends 50 a second
+_READ_S = 0.2
+_EVERY = 16  # bytes: one in so many of a picture's is read
 
 
 class Operator(StockClient):
@@ -152,7 +165,8 @@ def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> 
     A report is identified by its values: while the wheels turn, the sensors never report the same values for long.
     Values that were sent more than once do not count.
     """
-    published = [(entry.ns, touch) for entry in entries if entry.event == "said" for touch in _touches(entry)]
+    lines = [(entry.ns, entry.line.encode()) for entry in entries if entry.event == "said"]
+    published = [(ns, touch) for ns, line in lines for touch in parse(line) if isinstance(touch, Touch)]
     times = Counter(touch for _, touch in published)
     wanted = {touch: ns for ns, touch in published if times[touch] == 1}
     first = {touch: ns for ns, touch in reversed(received) if touch in wanted and ns >= wanted[touch]}
@@ -185,5 +199,54 @@ def arrived_of(
     )
 
 
-def _touches(entry: Entry) -> list[Touch]:
-    return [report for report in parse(entry.line.encode()) if isinstance(report, Touch)]
+# -- programs beside the robot
+
+
+def frames(run_dir: str) -> None:
+    from pebble.transports.frames import FrameReader  # only here: it needs numpy
+
+    counts: Counter[str] = Counter()
+    ended = serve_on_thread(lambda _line: dict(counts))
+    with FrameReader(Path(run_dir), "camera", views=True) as reader:
+        while not ended.is_set():
+            frame = reader.read(_READ_S)
+            if frame is not None:
+                counts["frames"] += bool(frame.data[::_EVERY].any())
+                frame.release()
+
+
+def media(port: str, base: str) -> None:
+    names = {CAMERA.topic(base): "video", AUDIO.topic(base): "audio"}
+    counts: Counter[str] = Counter()
+
+    def count(message: MQTTMessage) -> None:
+        counts[names[message.topic]] += 1
+
+    client = StockClient(count, [(topic, 0) for topic in names], at_once=False).open(int(port))
+    serve(lambda _line: dict(counts))
+    client.close()
+
+
+def hop(port: str, topic: str) -> None:
+    received: list[tuple[int, bytes]] = []
+
+    def receive(message: MQTTMessage) -> None:
+        if not message.payload.isspace():  # else a bridge's probe
+            received.append((time.monotonic_ns(), bytes(message.payload)))
+
+    def take(_line: str) -> dict[str, Any]:
+        new = received.copy()
+        del received[: len(new)]
+        return {"received": [[*wheels_of(payload), ns] for ns, payload in new]}
+
+    client = StockClient(receive, [(topic, DRIVE.default_qos)], at_once=False).open(int(port))
+    client.wait()
+    answer({"subscribed": True})
+    serve(take)
+    client.close()
+
+
+_PROGRAMS: Mapping[str, Callable[..., None]] = {"frames": frames, "media": media, "hop": hop}
+
+if __name__ == "__main__":
+    _PROGRAMS[sys.argv[1]](*sys.argv[2:])

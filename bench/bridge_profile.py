@@ -24,7 +24,6 @@ from pebble.bench.comparison import Case
 from pebble.bench.results import Cell, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
-from pebble.rig.robot import Robot
 
 #: By transport, in order: the component that holds the command. Results are compared by these names.
 HOPS = {
@@ -49,8 +48,9 @@ _ETHERNET, _TCP = 14, 6
 _TIMESPEC = struct.Struct("qq")
 _COMMAND = re.compile(rb'/drive-values.{0,3}?(\{"x": [-+.0-9e]+, "z": [-+.0-9e]+\})', re.DOTALL)  # a packet's number
 
+_SOURCE, _DESTINATION = 0, 1
 PassageTimes = dict[tuple[int, int], dict[Wheels, int]]
-"""By source and destination port: when (CLOCK_MONOTONIC, ns) each command first passed."""
+"""By a port and whether it was the source or the destination: when (CLOCK_MONOTONIC, ns) each command first passed."""
 
 
 def may_capture() -> None:
@@ -67,24 +67,11 @@ def trace_commands(case: Case) -> Iterator[Cell]:
         wire.passed()
         segment = driven_robot.drive(case.run["seconds"])
         driven_robot.match_arrivals([segment])  # waits for the last ones
-        pty = arrivals(driven_robot.robot.lines(segment.began))
-        times = hops(segment.sent, [*_stations(wire.passed(), driven_robot.robot), pty])
+        pty, passed = arrivals(driven_robot.robot.lines(segment.began)), wire.passed()
+        ends = [(port, end) for port in driven_robot.robot.broker_ports for end in (_DESTINATION, _SOURCE)]
+        times = hops(segment.sent, [*(passed.get(end, {}) for end in ends), pty])
     for number, name in enumerate((*HOPS[case.variant], ALL)):
         yield case.cell("hop", "ms", [(*one, sum(one))[number] for one in times], {"hop": name})
-
-
-def _stations(passed: PassageTimes, robot: Robot) -> list[Mapping[Wheels, int]]:
-    """The times at which commands went into and out of each broker, in order."""
-    return [_first(passed, port, side) for port in robot.broker_ports for side in (1, 0)]
-
-
-def _first(passed: PassageTimes, port: int, side: int) -> dict[Wheels, int]:
-    """When each command first passed with this port as its source (``side`` 0) or destination (1)."""
-    found: dict[Wheels, int] = {}
-    for way, commands in passed.items():
-        if way[side] == port:
-            found |= {wheels: min(ns, found.get(wheels, ns)) for wheels, ns in commands.items()}
-    return found
 
 
 def hops(sent: Mapping[Wheels, int], stations: Sequence[Mapping[Wheels, int]]) -> Times:
@@ -110,12 +97,11 @@ def slowest(times: Times) -> Times:
 
 
 def _times_by_kind(cells: Sequence[Cell]) -> dict[str, Times]:
-    return {
-        kind: list(
-            zip(*(cell.samples for cell in cells if cell.variant == kind and cell.params["hop"] != ALL), strict=True)
-        )
-        for kind in dict.fromkeys(cell.variant for cell in cells)
-    }
+    hops: dict[str, list[list[float]]] = {}
+    for cell in cells:
+        if cell.params["hop"] != ALL:
+            hops.setdefault(cell.variant, []).append(cell.samples)
+    return {kind: list(zip(*each, strict=True)) for kind, each in hops.items()}
 
 
 def profile_tables(cells: Sequence[Cell]) -> Iterator[Table]:
@@ -129,24 +115,21 @@ def profile_tables(cells: Sequence[Cell]) -> Iterator[Table]:
 
 
 def profile_assessment(cells: Sequence[Cell]) -> Iterator[str]:
-    for kind, times in _times_by_kind(cells).items():
-        yield explanation(kind, times)
-
-
-def explanation(kind: str, times: Times) -> str:
     """Names the hop in which the slowest commands lose their time, if there are enough of them."""
-    if not times:
-        return f"{kind}: no command was traced all the way"
-    late = slowest(times)
-    if len(late) < _LEAST:
-        return f"{kind}: {len(times)} commands are too few to tell where the slowest lose their time."
-    more = [slow - usual for slow, usual in zip(_means(late), _means(typical(times)), strict=True)]
-    worst = max(range(len(HOPS[kind])), key=lambda number: more[number])
-    share = 100 * more[worst] / sum(more) if sum(more) > 0 else 0.0
-    return (
-        f"{kind}: of what the slowest {len(late)} of {len(times)} commands take longer than a typical one"
-        f" ({sum(more):.2f} ms), {share:.0f} % is spent in: {HOPS[kind][worst]}."
-    )
+    for kind, times in _times_by_kind(cells).items():
+        late = slowest(times)
+        if not times:
+            yield f"{kind}: no command was traced all the way"
+        elif len(late) < _LEAST:
+            yield f"{kind}: {len(times)} commands are too few to tell where the slowest lose their time."
+        else:
+            more = [slow - usual for slow, usual in zip(_means(late), _means(typical(times)), strict=True)]
+            most, hop = max(zip(more, HOPS[kind], strict=True), key=lambda one: one[0])
+            share = 100 * most / sum(more) if sum(more) > 0 else 0.0
+            yield (
+                f"{kind}: of what the slowest {len(late)} of {len(times)} commands take longer than a typical one"
+                f" ({sum(more):.2f} ms), {share:.0f} % is spent in: {hop}."
+            )
 
 
 def _means(times: Times) -> list[float]:
@@ -165,9 +148,7 @@ class PacketCapture:
     def __enter__(self) -> Self:
         """Raises PebbleError without permission to capture."""
         try:
-            self._socket = socket.socket(
-                socket.AF_PACKET, socket.SOCK_RAW
-            )  # without a protocol: it receives nothing yet
+            self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW)  # no protocol: it receives nothing yet
         except PermissionError:
             raise PebbleError("--profile captures packets on loopback, which requires root: run it with sudo") from None
         try:
@@ -198,8 +179,9 @@ class PacketCapture:
             while True:
                 frame, stamps, _, _ = self._socket.recvmsg(_LARGEST, 64)
                 ns = _stamp(stamps) - offset
-                for way, wheels in commands(frame):
-                    found.setdefault(way, {}).setdefault(wheels, ns)
+                for (source, destination), wheels in commands(frame):
+                    found.setdefault((source, _SOURCE), {}).setdefault(wheels, ns)
+                    found.setdefault((destination, _DESTINATION), {}).setdefault(wheels, ns)
         return found
 
 

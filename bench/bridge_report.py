@@ -56,57 +56,56 @@ def tables(cells: Sequence[Cell]) -> Iterator[Table]:
 
 
 def _cpu_table(cells: Sequence[Cell]) -> Table:
-    heads = ["load", "process", "robot", "us", "turns", f"/ {STAND_IN}"]
-    table, before = (
-        plain_table("CPU for each forwarded message: median (minimum to maximum) of the rounds", heads, left=3),
-        None,
-    )
-    places = list(dict.fromkeys((cell.params["load"], cell.params["process"]) for cell in cells))
-    for cell in sorted(cells, key=lambda cell: places.index((cell.params["load"], cell.params["process"]))):
-        base, place = base_of(cell, cells, STAND_IN), [str(value) for value in cell.params.values()]
-        ratio = "" if base is None or base is cell else str(paired(cell.rounds, base.rounds))
-        if before not in (None, place):
-            table.add_section()
-        shown = ["", ""] if place == before else place
-        table.add_row(*shown, cell.variant, spread(cell), str(len(cell.samples)), ratio)
-        before = place
+    title = "CPU for each forwarded message: median (minimum to maximum) of the rounds"
+    table = plain_table(title, ["load", "process", "robot", "us", "turns", f"/ {STAND_IN}"], left=3)
+    places: dict[tuple[Value, ...], list[Cell]] = {}
+    for cell in cells:
+        places.setdefault(tuple(cell.params.values()), []).append(cell)
+    for place, some in places.items():
+        table.add_section()
+        for number, cell in enumerate(some):
+            base = base_of(cell, cells, STAND_IN)
+            ratio = "" if base is None or base is cell else str(paired(cell.rounds, base.rounds))
+            shown = ("", "") if number else map(str, place)
+            table.add_row(*shown, cell.variant, spread(cell), str(len(cell.samples)), ratio)
     return table
 
 
-def assessment(cells: Sequence[Cell]) -> list[str]:
+def assessment(cells: Sequence[Cell]) -> Iterator[str]:
     """One sentence for each comparison."""
-    lines = [*_transports(cells), *_media(cells), *_cpu(cells), *_floor(cells), *_lost(cells)]
-    return [*lines, *caveat([cell for way in WAYS for cell in _robots(cells, way, UNLOADED)])]
-
-
-def _transports(cells: Sequence[Cell]) -> list[str]:
-    """Compares the robots' medians, then each with the stand-in."""
-    lines = []
     for load in (UNLOADED, COMMANDS, LOADED):
         for way, words in WAYS.items():
-            what = f"Median, {words}{suffix(load)}"
-            if robots := _robots(cells, way, load):
-                lines.append(sentence(what, robots, quantity="time"))
-            lines += [
-                sentence(what, [plain, one], quantity="time")
-                for plain in _stand_ins(cells, way, load)
-                for one in robots
-            ]
-    return lines
-
-
-def _media(cells: Sequence[Cell]) -> list[str]:
-    """Compares p99 with and without media."""
-    lines = []
+            what, robots = f"Median, {words}{suffix(load)}", _found(cells, way, load)
+            if robots:
+                yield sentence(what, robots, quantity="time")
+            for plain in _found(cells, way, load, [STAND_IN]):
+                yield from (sentence(what, [plain, one], quantity="time") for one in robots if plain.samples)
     for way, words in WAYS.items():
-        for loaded in _robots(cells, way, LOADED):
-            for free in _robots(cells, way, UNLOADED):
-                if free.variant == loaded.variant:
-                    lines.append(f"{free.variant}, {words}, p99: {_media_effect(loaded, free)}")
-    return lines
+        for loaded in _found(cells, way, LOADED):
+            for free in _found(cells, way, UNLOADED, [loaded.variant]):
+                yield f"{free.variant}, {words}, p99: {_media_effect(loaded, free)}"
+    for cell in cells:
+        base = base_of(cell, cells, STAND_IN)
+        if cell.measure == CPU and base is not None and base is not cell:
+            load = "commands and reports" if cell.params["load"] == UNLOADED else "commands only"
+            yield sentence(f"{CPU}, {cell.params['process']}, {load}", [base, cell], quantity="CPU time")
+    yield from _floor(cells)
+    yield from _lost(cells)
+    yield from caveat([cell for way in WAYS for cell in _found(cells, way, UNLOADED)])
+
+
+def matches(measure: str, variants: Sequence[str], **params: str) -> Callable[[Cell], bool]:
+    """Whether a cell has this measure, one of these variants and these parameters."""
+    return lambda cell: cell.measure == measure and cell.variant in variants and params.items() <= cell.params.items()
+
+
+def _found(cells: Sequence[Cell], measure: str, load: str, variants: Sequence[str] = KINDS) -> list[Cell]:
+    """In the order of the variants."""
+    return [cell for name in variants for cell in filter(matches(measure, [name], load=load), cells)]
 
 
 def _media_effect(loaded: Cell, free: Cell) -> str:
+    """Compares p99 with and without media."""
     times = f"{figure(free.percentile(99))} ms, with media {figure(loaded.percentile(99))} ms"
     rounds = [*loaded.rounds, *free.rounds]
     if min(len(loaded.rounds), len(free.rounds)) < LEAST_ROUNDS or min(map(len, rounds)) < _LEAST_IN_ROUND:
@@ -115,35 +114,22 @@ def _media_effect(loaded: Cell, free: Cell) -> str:
     return f"{times}; {ratio.words('the robot with media', 'the one without')}"
 
 
-def _floor(cells: Sequence[Cell]) -> list[str]:
+def _floor(cells: Sequence[Cell]) -> Iterator[str]:
     """The time a robot adds to one hop through a broker."""
-    hop = next((cell for cell in cells if cell.variant == HOP), None)
-    robots = _robots(cells, DOWN, UNLOADED)
-    if hop is None or not hop.samples or not robots:
-        return []
-    more = ", ".join(f"{cell.variant} {figure(cell.percentile(50) - hop.percentile(50))} ms more" for cell in robots)
-    floor = f"{figure(hop.percentile(50))} ms"
-    return [f"One hop, operator to a stock client through a broker of their own, takes {floor}; {more}."]
+    robots = _found(cells, DOWN, UNLOADED)
+    for hop in (cell for cell in cells if cell.variant == HOP and cell.samples and robots):
+        floor = hop.percentile(50)
+        more = ", ".join(f"{cell.variant} {figure(cell.percentile(50) - floor)} ms more" for cell in robots)
+        yield f"One hop, operator to a stock client through a broker of their own, takes {figure(floor)} ms; {more}."
 
 
-def _lost(cells: Sequence[Cell]) -> list[str]:
+def _lost(cells: Sequence[Cell]) -> Iterator[str]:
     """Reports losses above a threshold."""
-    lines = []
     for cell in (cell for cell in cells if cell.measure in WAYS):
         lost, sent = cell.lost or 0, len(cell.samples) + (cell.lost or 0)
         if lost > _LOSS_SHOWN * sent:
             what = f"{cell.variant}, {WAYS[cell.measure]}{suffix(cell.params['load'])}"
-            lines.append(f"{what}: {100 * lost / sent:.1f} % of {sent} were overtaken, or did not arrive within 1 s.")
-    return lines
-
-
-def _cpu(cells: Sequence[Cell]) -> Iterator[str]:
-    """Compares each robot with the stand-in."""
-    for cell in cells:
-        base = base_of(cell, cells, STAND_IN)
-        if cell.measure == CPU and base is not None and base is not cell:
-            load = "commands and reports" if cell.params["load"] == UNLOADED else "commands only"
-            yield sentence(f"{CPU}, {cell.params['process']}, {load}", [base, cell], quantity="CPU time")
+            yield f"{what}: {100 * lost / sent:.1f} % of {sent} were overtaken, or did not arrive within 1 s."
 
 
 def suffix(load: Value) -> str:
@@ -153,14 +139,3 @@ def suffix(load: Value) -> str:
 def with_excess(aim: float) -> Callable[[float], str]:
     """Formats a latency, with what it takes longer than an aim."""
     return lambda ms: f"{figure(ms)} ms" + (f", by {ms - aim:.2f} ms" if ms > aim else "")
-
-
-def _robots(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
-    found = [cell for cell in cells if (cell.measure, cell.params["load"]) == (measure, load) and cell.variant in KINDS]
-    return sorted(found, key=lambda cell: KINDS.index(cell.variant))
-
-
-def _stand_ins(cells: Sequence[Cell], measure: str, load: str) -> list[Cell]:
-    """The stand-in's cell, if it was measured."""
-    found = (cell for cell in cells if cell.variant == STAND_IN and cell.samples)
-    return [cell for cell in found if (cell.measure, cell.params["load"]) == (measure, load)]

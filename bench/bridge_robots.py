@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from typing import Final, Self
 
 from pebble.bench.bridge_operator import (
@@ -26,10 +26,10 @@ from pebble.rig.robot import BASE, Robot, one_robot, synthetic_media
 from pebble.rig.worker import Worker
 
 STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
-BRIDGE, SERIAL = "bridge", "serial bridge"
+FORWARDER, SERIAL = "bridge", "serial bridge"
 FLOWS = ("frames", "video", "audio")
-_SERVICES = {BRIDGE: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
-_PROGRAMS = "pebble.bench.bridge_programs"
+_SERVICES = {FORWARDER: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
+_PROGRAMS = "pebble.bench.bridge_operator"
 _MEDIA: Final = synthetic_media((1920, 1080, 30), (640, 360, 15))
 _HOP_BASE = "pebble/robots/one-hop"
 _START_S, _STOP_S = 20.0, 10.0
@@ -124,8 +124,6 @@ class OneHop(Processes):
     Has the same methods as :class:`DrivenRobot`.
     """
 
-    kind = HOP
-
     def start(self) -> None:
         """Raises PebbleError if something does not start."""
         broker = self.broker("hop")
@@ -156,48 +154,36 @@ class OneHop(Processes):
             time.sleep(_HOP_POLL_S)
 
 
-class MediaLoad:
+@contextmanager
+def media_load(driven: DrivenRobot) -> Iterator[Callable[[], dict[str, int]]]:
     """Puts a robot's camera and microphone in use: a program on the robot reads frames, an operator gets both.
 
-    Starts all media in ``with`` and waits until they flow; stops them at the end.
+    All media flow as the ``with`` block begins, and stop with it. It is given what counts the received frames and
+    packets so far, by flow. Raises PebbleError naming what does not flow.
     """
+    robot, before = driven.robot, len(driven.robot.pids())
+    workers: list[Worker] = []
 
-    def __init__(self, driven: DrivenRobot) -> None:
-        self._robot, self._operator = driven.robot, driven.operator
-        self._workers: list[Worker] = []
-        self._before = 0  # processes of the robot without media
-
-    def __enter__(self) -> Self:
-        """Raises PebbleError naming what does not flow."""
-        self._before, start = len(self._robot.pids()), self._robot.running.worker
-        try:
-            self._workers.append(start("frame reader", _PROGRAMS, "frames", self._robot.run_dir))
-            self._workers.append(start("media operator", _PROGRAMS, "media", self._robot.remote_port, self._robot.base))
-            self._operator.media(True)
-            self._wait()
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._operator.media(False)
-        for worker in self._workers:
-            self._robot.running.end(worker)
-        end = time.monotonic() + _STOP_S
-        while len(self._robot.pids()) > self._before and time.monotonic() < end:
-            time.sleep(_POLL_S)
-
-    def counts(self) -> dict[str, int]:
-        """Counts of received frames and packets so far, by flow."""
-        for worker in self._workers:
+    def counts() -> dict[str, int]:
+        for worker in workers:
             worker.send("")
-        found = {name: count for worker in self._workers for name, count in worker.answer(_ANSWER_S).items()}
+        found = {name: count for worker in workers for name, count in worker.answer(_ANSWER_S).items()}
         return {name: found.get(name, 0) for name in FLOWS}
 
-    def _wait(self) -> None:
+    try:
+        workers.append(robot.running.worker("frame reader", _PROGRAMS, "frames", robot.run_dir))
+        workers.append(robot.running.worker("media operator", _PROGRAMS, "media", robot.remote_port, robot.base))
+        driven.operator.media(True)
         end = time.monotonic() + _START_S
-        while missing := [name for name, count in self.counts().items() if not count]:
+        while missing := [name for name, count in counts().items() if not count]:
             if time.monotonic() > end:
-                raise PebbleError(f"no {', '.join(missing)} after {_START_S:.0f} s\n{self._robot.log()}")
+                raise PebbleError(f"no {', '.join(missing)} after {_START_S:.0f} s\n{robot.log()}")
+            time.sleep(_POLL_S)
+        yield counts
+    finally:
+        driven.operator.media(False)
+        for worker in workers:
+            robot.running.end(worker)
+        end = time.monotonic() + _STOP_S
+        while len(robot.pids()) > before and time.monotonic() < end:
             time.sleep(_POLL_S)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
@@ -17,8 +17,6 @@ from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, legend,
 from pebble.bench.engine import roles_of
 from pebble.bench.pictures import ecdf, null_ratios, ratios
 from pebble.bench.results import Cell, Value, percentile, rounded
-from pebble.bench.wake_up import wake_up_us
-from pebble.errors import PebbleError
 
 SIZES = (40, 1024)
 RATES = (20.0, 200.0, 1000.0)
@@ -46,10 +44,6 @@ def prepare(run: Run) -> None:
     run.recorded["loads"] = [*_loads(run)]
 
 
-def environment(run: Run) -> Participants:
-    return Participants(roles_of(run), _loads(run))
-
-
 def measure(case: Case) -> Iterator[Cell]:
     """One slice. The null test uses only the one-way times, since its slowdown is a fifth of them."""
     participants: Participants = case.env
@@ -70,13 +64,6 @@ def measure(case: Case) -> Iterator[Cell]:
     yield case.cell(ONE_WAY, "us", answer.one_way, **figures)
     if not case.run.comparison.is_null:
         yield case.cell(ROUND_TRIP, "us", answer.round_trip, **figures)
-
-
-def wake_ups(cells: Sequence[Cell]) -> Iterator[str]:
-    try:
-        yield from wake_up_cost(cells, *wake_up_us())
-    except PebbleError as error:
-        yield str(error)
 
 
 _JOINED: Mapping[str, Combine] = {
@@ -163,13 +150,13 @@ _CONTROL = Comparison(
     variants=tuple(VARIANTS),
     conditions=conditions,
     prepare=prepare,
-    environment=environment,
+    environment=lambda run: Participants(roles_of(run), _loads(run)),
     measure=measure,
     measures=(ONE_WAY, ROUND_TRIP),
     figures=_JOINED,
     tables=(tables,),
     legend=legend,
-    assessment=(wake_ups, assessment),
+    assessment=(wake_up_cost, assessment),
     summary_lines=5,
     pictures=(ecdf("Service to service"), ratios("Service to service", "mqtt")),
 )

@@ -2,14 +2,19 @@
 
 A service's handlers run on its one thread, fed by an inbox to which the transport's thread posts; these do the same.
 Only stock paho calls its handler on its network thread, as programs written for it expect.
+
+As a process: ``python -m pebble.bench.control_ends echo|sender paho|mqtt|zenoh SETTINGS`` (JSON, of the transport). It
+writes ``{"ready": true}``. A sender receives slices as JSON and answers each.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
@@ -17,8 +22,9 @@ import msgspec
 from pebble.bench.null import spin
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
+from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.runtime.inbox import Inbox
-from pebble.transports import Message, QoS, State, Transport
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
 
 if TYPE_CHECKING:
     from pebble.bench.comparison import Case
@@ -29,13 +35,15 @@ _LEAD_S = 0.1  # messages at the start of a slice do not count: caches are cold 
 _LAST_S = 1.0  # how long to wait for the last replies of a slice
 _POLL_S = 0.01
 _CONNECT_S = 10.0
+_WHO = "bench"  # the sender's name
+_WARM_UP, _WARM_UP_S = 20, 15.0  # messages
 
 _FORM = struct.Struct("<Qqqq")
 _ECHOED = struct.Struct("<qq")
 _ECHOED_AT = 16  # behind the number and the first stamp
 SMALLEST = _FORM.size
 
-Handler = Callable[[str, bytes], None]
+Handler = Callable[[str, bytes, int], None]  # topic, payload, and when the transport received it (ns)
 Clock = Callable[[], int]  # ns
 
 
@@ -93,10 +101,9 @@ def stamped(payload: bytes, t2: int, t3: int) -> bytes:
     return bytes(message)
 
 
-def parse(payload: bytes) -> tuple[int, int, int, int]:
+def parse(payload: bytes) -> tuple[int, ...]:
     """Number, t1, t2, t3. Raises struct.error for a foreign message."""
-    number, t1, t2, t3 = _FORM.unpack_from(payload)
-    return number, t1, t2, t3
+    return _FORM.unpack_from(payload)
 
 
 # -- connections, and the two ends
@@ -104,8 +111,6 @@ def parse(payload: bytes) -> tuple[int, int, int, int]:
 
 class Connection(Protocol):
     """The connection of one end."""
-
-    received_ns: int  # CLOCK_MONOTONIC: when the transport received the message being handled
 
     def subscribe(self, filter_: str, handler: Handler) -> None: ...
 
@@ -118,7 +123,6 @@ class TransportConnection:
     """Any of Pebble's transports, used through the same calls as in pebble.service.Service."""
 
     def __init__(self, transport: Transport, inbox: Inbox) -> None:
-        self.received_ns = 0
         self._transport, self._inbox = transport, inbox
         transport.open(_CONNECT_S)
         if transport.state is not State.CONNECTED:
@@ -129,11 +133,7 @@ class TransportConnection:
     def subscribe(self, filter_: str, handler: Handler) -> None:
         def on_message(message: Message) -> None:
             received_ns = time.monotonic_ns()
-            self._inbox.post(lambda: handle(message, received_ns))
-
-        def handle(message: Message, received_ns: int) -> None:
-            self.received_ns = received_ns
-            handler(message.topic, message.payload)
+            self._inbox.post(lambda: handler(message.topic, message.payload, received_ns))
 
         self._transport.subscribe(filter_, on_message, qos=QOS, direct=True)
 
@@ -150,14 +150,12 @@ class PahoConnection:
     def __init__(self, port: int) -> None:
         from pebble.rig.stock_client import StockClient  # only these ends import paho
 
-        self.received_ns = 0
         self._client = StockClient(at_once=False).open(port)
         self._client.wait()
 
     def subscribe(self, filter_: str, handler: Handler) -> None:
         def on_message(_client: Any, _data: Any, message: Any) -> None:
-            self.received_ns = time.monotonic_ns()
-            handler(message.topic, message.payload)
+            handler(message.topic, message.payload, time.monotonic_ns())
 
         self._client.paho.on_message = on_message
         self._client.subscribe(filter_, QOS)
@@ -169,6 +167,13 @@ class PahoConnection:
         self._client.close()
 
 
+def work(inbox: Inbox, timeout: float | None = None) -> None:
+    """Does the next job, waiting up to ``timeout`` seconds for one."""
+    job = inbox.take(timeout)
+    if job is not None:
+        job()
+
+
 class Echo:
     """Returns every message for ``who`` (``+`` for all) at once, with its own time stamps."""
 
@@ -177,7 +182,7 @@ class Echo:
         self._connection, self._clock = connection, clock
         connection.subscribe(f"{REQUESTS}/{who}", self._on_message)
 
-    def _on_message(self, topic: str, payload: bytes) -> None:
+    def _on_message(self, topic: str, payload: bytes, _transport_ns: int) -> None:
         received = self._clock()
         try:
             reply = stamped(payload, received, self._clock())
@@ -225,7 +230,7 @@ class Sender:
         sent = late = 0
         due = time.monotonic() + period
         while sent < lead + counting and not self.ended:
-            self._work(max(0.0, due - time.monotonic()))
+            work(self._inbox, max(0.0, due - time.monotonic()))
             behind = time.monotonic() - due
             if behind >= 0:
                 late += sent >= lead and behind > period / 2
@@ -240,11 +245,9 @@ class Sender:
         self._received, self._missing, self._calls = [None] * count, count, []
 
     def _send(self, number: int, spec: SliceSpec) -> None:
-        if not spec.slowed:
-            spin(spec.work_us)
+        spin(0.0 if spec.slowed else spec.work_us)
         message = request(number, self._clock(), spec.size)
-        if spec.slowed:
-            spin(spec.work_us)
+        spin(spec.work_us if spec.slowed else 0.0)
         called = time.monotonic_ns()
         self._connection.publish(self._topic, message)
         self._calls.append(time.monotonic_ns() - called)
@@ -252,14 +255,9 @@ class Sender:
     def _collect(self, timeout: float) -> None:
         end = time.monotonic() + timeout
         while self._missing and time.monotonic() < end and not self.ended:
-            self._work(_POLL_S)
+            work(self._inbox, _POLL_S)
 
-    def _work(self, timeout: float) -> None:
-        job = self._inbox.take(timeout)
-        if job is not None:
-            job()
-
-    def _on_message(self, _topic: str, payload: bytes) -> None:
+    def _on_message(self, _topic: str, payload: bytes, transport_ns: int) -> None:
         received = self._clock()
         try:
             number, t1, t2, t3 = parse(payload)
@@ -267,5 +265,79 @@ class Sender:
             return
         index = number - self._first
         if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
-            self._received[index] = Exchange(t1, t2, t3, received, self._connection.received_ns)
+            self._received[index] = Exchange(t1, t2, t3, received, transport_ns)
             self._missing -= 1
+
+
+# -- one of them as a process
+
+
+class Answer(msgspec.Struct, frozen=True, kw_only=True):
+    """The results of a slice, µs."""
+
+    trips: int  # all messages sent
+    sent: int  # counted messages
+    late: int
+    one_way: list[float]
+    round_trip: list[float]
+    call: list[float]  # durations of this end's publish calls
+    transport_times: list[float]  # from the echo's publish call until this end's transport received the reply
+    inbox: list[float]  # from then until its handler ran
+
+
+def _echo(connection: Connection, inbox: Inbox) -> None:
+    Echo(connection, _WHO, time.monotonic_ns)
+    ended = serve_on_thread(lambda _line: None, inbox.wake)
+    answer({"ready": True})
+    while not ended.is_set():
+        work(inbox)
+    connection.close()
+
+
+def _send(connection: Connection, inbox: Inbox) -> None:
+    sender = Sender(connection, _WHO, time.monotonic_ns, inbox)
+
+    def run(line: str) -> None:
+        inbox.post_internal(lambda: answer(msgspec.json.encode(_run(sender, line))))
+
+    def end() -> None:
+        sender.ended = True
+        inbox.wake()
+
+    serve_on_thread(run, end)
+    if not sender.warm_up(_WARM_UP, _WARM_UP_S):
+        raise PebbleError("the echo does not answer")
+    answer({"ready": True})
+    while not sender.ended:
+        work(inbox)
+    connection.close()
+
+
+def _run(sender: Sender, line: str) -> Answer:
+    sent, late, exchanges = sender.run(msgspec.json.decode(line, type=SliceSpec))
+    return Answer(
+        trips=sender.trips,
+        sent=sent,
+        late=late,
+        one_way=[(exchange.t2 - exchange.t1) / 1000 for exchange in exchanges],
+        round_trip=[(exchange.t4 - exchange.t1) / 1000 for exchange in exchanges],
+        call=[ns / 1000 for ns in sender.calls_ns],
+        transport_times=[(exchange.transport_ns - exchange.t3) / 1000 for exchange in exchanges],
+        inbox=[(exchange.t4 - exchange.transport_ns) / 1000 for exchange in exchanges],
+    )
+
+
+def main(role: str, kind: str, settings: str) -> None:
+    inbox, form = Inbox(), ZenohSettings if kind == "zenoh" else MqttSettings
+    where: Any = msgspec.json.decode(settings, type=form, dec_hook=lambda _kind, text: Path(text))
+    try:
+        connection = (
+            PahoConnection(where.port) if kind == "paho" else TransportConnection(create(kind, role, where), inbox)
+        )
+        (_echo if role == "echo" else _send)(connection, inbox)
+    except PebbleError as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

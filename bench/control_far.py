@@ -1,4 +1,10 @@
-"""Between two machines: round trips to an echo, and one-way times as precise as the two clocks allow."""
+"""Between two machines: round trips to an echo, and one-way times as precise as the two clocks allow.
+
+The offset between the clocks, and its error, is estimated from the messages. None can arrive before it is sent. So the
+far clock is ahead by at most t2 - t1 (if the way there took no time) and by at least t3 - t4 (if the way back took
+none). Each exchange gives these bounds; the fastest ones give the tightest. How the remaining time is divided between
+the two ways is unknown: that is the error.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +13,7 @@ import secrets
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -15,9 +22,18 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from pebble.bench.aims import single
-from pebble.bench.clock import estimate, one_way_ns
 from pebble.bench.comparison import Case, Combine, Run, of_known
-from pebble.bench.control_ends import Clock, Echo, Sender, SliceSpec, TransportConnection, rate_name, size_name
+from pebble.bench.control_ends import (
+    Clock,
+    Echo,
+    Exchange,
+    Sender,
+    SliceSpec,
+    TransportConnection,
+    rate_name,
+    size_name,
+    work,
+)
 from pebble.bench.control_report import ROUND_TRIP
 from pebble.bench.results import Cell, Value
 from pebble.bench.tables import Column, Grid, figure
@@ -29,6 +45,9 @@ from pebble.transports import MqttSettings, create
 VARIANT = "mqtt"
 THERE, BACK = "one-way there", "one-way back"
 MEASURES = (ROUND_TRIP, THERE, BACK)
+#: The largest relative drift: quartz is within 50 ppm on each side unless NTP slews it.
+DRIFT = 100e-6
+LEAST = 8  # exchanges, to compare two clocks
 _SIZES, _RATES = (40, 1024), (20.0, 200.0)
 _WARM_UP = 10  # messages
 _ANSWER_S = 10.0  # to exchange these with the echo
@@ -56,27 +75,56 @@ def _quartz_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
 
-def serve(settings: MqttSettings, clock: Clock | None = None, console: Console | None = None) -> int:
+def serve(settings: MqttSettings, clock: Clock | None = None) -> int:
     """Runs an echo until Ctrl-C. Raises PebbleError without a broker."""
-    console, inbox = console or Console(), Inbox()
+    console, inbox = Console(), Inbox()
     with interrupted_by_signals(), closing(_connection(settings, "echo", inbox)) as connection:
-        echo = Echo(connection, "+", clock or wall_clock())
-        console.print(f"Echo through {settings.host}:{settings.port}, until Ctrl-C", highlight=False)
+        echo, through = Echo(connection, "+", clock or wall_clock()), f"through {settings.host}:{settings.port}"
+        console.print(f"Echo {through}, until Ctrl-C", highlight=False)
         with console.status("") as status:
             while True:
-                status.update(
-                    f"echo through {settings.host}:{settings.port}, {echo.count} messages so far; Ctrl-C ends it"
-                )
+                status.update(f"echo {through}, {echo.count} messages so far; Ctrl-C ends it")
                 end = time.monotonic() + _POLL_S
                 while (left := end - time.monotonic()) > 0:
-                    job = inbox.take(left)
-                    if job is not None:
-                        job()
+                    work(inbox, left)
 
 
 def _connection(settings: MqttSettings, what: str, inbox: Inbox) -> TransportConnection:
     """Opens a connection with a client id of its own: several runs may share one broker."""
     return TransportConnection(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings), inbox)
+
+
+# -- the offset of the clocks
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """The far clock is ahead of ours by ``ns`` ± ``error_ns`` during all of the exchanges."""
+
+    ns: int
+    error_ns: int
+
+
+def estimate(exchanges: Sequence[Exchange]) -> Offset:
+    """Works best over some seconds: drift adds to the error with time.
+
+    Raises PebbleError for fewer than ``LEAST`` exchanges, or if a clock was set meanwhile.
+    """
+    if len(exchanges) < LEAST:
+        raise PebbleError(f"{len(exchanges)} messages came back: comparing two clocks needs at least {LEAST}")
+    begin, end = min(one.t1 for one in exchanges), max(one.t4 for one in exchanges)
+    middle = (begin + end) // 2
+    most = min(one.t2 - one.t1 + DRIFT * abs(one.t1 - middle) for one in exchanges)
+    least = max(one.t3 - one.t4 - DRIFT * abs(one.t4 - middle) for one in exchanges)
+    if least > most:
+        raise PebbleError("the two clocks are inconsistent: one of them was set during the measurement; measure again")
+    error = (most - least) / 2 + DRIFT * (end - begin) / 2
+    return Offset(round((most + least) / 2), round(error) + 1)  # 1: for rounding
+
+
+def one_way_ns(exchange: Exchange, offset: Offset) -> tuple[int, int]:
+    """The times there and back, each ± the offset's error."""
+    return exchange.t2 - exchange.t1 - offset.ns, exchange.t4 - exchange.t3 + offset.ns
 
 
 # -- the side that measures
@@ -126,17 +174,17 @@ def measure(case: Case) -> Iterator[Cell]:
     sent, late, exchanges = sender.run(SliceSpec.of(case))
     trips = [(one.t4 - one.t1 - (one.t3 - one.t2)) / 1e6 for one in exchanges]
     yield case.cell(ROUND_TRIP, "ms", trips, sent=sent, late=late)
+    ways: list[tuple[int, int]] = []
+    clocks: dict[str, Any] = {"clock_offset_ms": None, "clock_error_ms": None}
     try:
         offset = estimate(exchanges)
     except PebbleError:  # too few, or a clock was set: the round trips are still valid
-        offset = None
-    clocks: dict[str, Any] = {
-        "clock_offset_ms": None if offset is None else offset.ns / 1e6,
-        "clock_error_ms": None if offset is None else offset.error_ns / 1e6,
-    }
+        pass
+    else:
+        ways = [one_way_ns(one, offset) for one in exchanges]
+        clocks = {"clock_offset_ms": offset.ns / 1e6, "clock_error_ms": offset.error_ns / 1e6}
     for which, name in enumerate((THERE, BACK)):
-        times = [] if offset is None else [one_way_ns(one, offset)[which] / 1e6 for one in exchanges]
-        yield case.cell(name, "ms", times, sent=sent, late=late, **clocks)
+        yield case.cell(name, "ms", [way[which] / 1e6 for way in ways], sent=sent, late=late, **clocks)
 
 
 JOINED: Mapping[str, Combine] = {
@@ -188,17 +236,13 @@ def assessment(cells: Sequence[Cell]) -> Iterator[str]:
     """One sentence for each result."""
     for trip in (cell for cell in cells if cell.measure == ROUND_TRIP):
         ways = [cell for cell in cells if cell is not trip and trip.params.items() <= cell.params.items()]
-        yield from _sentences(trip, ways)
-
-
-def _sentences(trip: Cell, ways: Sequence[Cell]) -> Iterator[str]:
-    what, error_ms = f"{trip.params['size']} at {trip.params['rate']}", _ERROR_MS(ways[0])
-    error = f"± {figure(error_ms)} ms"
-    yield f"{what}: {_both(trip)} ms there and back (p50/p99)"
-    if math.isnan(error_ms):
-        yield f"{what}: too few replies to compare the clocks: one-way times are unknown"
-        return
-    yield f"{what}: the far clock is {_OFFSET_MS(ways[0]):+.3f} ms from ours, {error}"
-    for way in ways:
-        unknown = f"unknown: below the clock error of {error}"
-        yield f"{what}: {way.measure}: {f'{_both(way)} ms {error}' if way.samples else unknown}"
+        what, error_ms = f"{trip.params['size']} at {trip.params['rate']}", _ERROR_MS(ways[0])
+        error = f"± {figure(error_ms)} ms"
+        yield f"{what}: {_both(trip)} ms there and back (p50/p99)"
+        if math.isnan(error_ms):
+            yield f"{what}: too few replies to compare the clocks: one-way times are unknown"
+            continue
+        yield f"{what}: the far clock is {_OFFSET_MS(ways[0]):+.3f} ms from ours, {error}"
+        for way in ways:
+            unknown = f"unknown: below the clock error of {error}"
+            yield f"{what}: {way.measure}: {f'{_both(way)} ms {error}' if way.samples else unknown}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from typing import Any
 
 import numpy as np
 
@@ -33,19 +34,17 @@ class Switch:
         self.ended = False
         self._changed = threading.Condition()
         serve_on_thread(self._handle, lambda: self._set(on=False, ended=True))
+        answer({"pictures": 0})  # it is ready
 
     def wait(self, timeout: float | None = None) -> None:
         """Waits until it is on, or standard input closes."""
         with self._changed:
             self._changed.wait_for(lambda: self.on or self.ended, timeout)
 
-    def write_count(self) -> None:
-        answer({"pictures": self.pictures})
-
-    def _handle(self, line: str) -> None:
+    def _handle(self, line: str) -> dict[str, Any]:
         if line in ("0", "1"):
             self._set(on=line == "1")
-        self.write_count()
+        return {"pictures": self.pictures}
 
     def _set(self, *, on: bool, ended: bool = False) -> None:
         with self._changed:
@@ -53,19 +52,16 @@ class Switch:
             self._changed.notify_all()
 
 
-def main(arguments: list[str]) -> int:
-    role, kind, where = (*arguments, "", "")[:3]
+def main(role: str, kind: str = "", where: str = "") -> None:
     if role == "hog":
         _hog(Switch())
     elif role == "writer":
         _write(frames_worker.writer(kind, where, SIZE), Switch())
     else:
         _read(frames_worker.reader(kind, where), Switch())
-    return 0
 
 
 def _hog(switch: Switch) -> None:
-    switch.write_count()
     while not switch.ended:
         switch.wait()
         while switch.on:
@@ -74,7 +70,6 @@ def _hog(switch: Switch) -> None:
 
 def _write(writer: Writer, switch: Switch) -> None:
     picture = np.random.default_rng(1).integers(0, 256, SIZE, dtype=np.uint8)
-    switch.write_count()
     while not switch.ended:
         switch.wait()
         due = time.monotonic()
@@ -91,7 +86,6 @@ def _write(writer: Writer, switch: Switch) -> None:
 
 
 def _read(reader: Reader, switch: Switch) -> None:
-    switch.write_count()
     while not switch.ended:
         switch.wait(_REST_S)
         frame = reader.read(_READ_S if switch.on else _ALIVE_S)
@@ -103,4 +97,4 @@ def _read(reader: Reader, switch: Switch) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(*sys.argv[1:])

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 
-from pebble.bench.control_ends import SliceSpec
-from pebble.bench.control_worker import Answer, Endpoint
+from pebble.bench.control_ends import Answer, SliceSpec
 from pebble.bench.null import variant_of
 from pebble.bench.usage import cpu_s, wake_ups
 from pebble.errors import PebbleError
@@ -19,7 +17,7 @@ from pebble.rig.broker import Broker
 from pebble.rig.processes import BROKERS, Processes, python
 from pebble.rig.programs import Program
 from pebble.rig.worker import Worker
-from pebble.transports.settings import ZenohSettings
+from pebble.transports.settings import MqttSettings, ZenohSettings
 
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
 _READY_S = 40.0
@@ -39,10 +37,6 @@ class Variant:
     broker: tuple[str, ...] = ()
     client: bool = False  # Zenoh client mode: everything goes through the hub
 
-    @property
-    def on_zenoh(self) -> bool:
-        return self.kind == "zenoh"
-
 
 _NODELAY = ("set_tcp_nodelay true",)
 VARIANTS = {
@@ -55,7 +49,7 @@ VARIANTS = {
 }
 BASELINE = "mqtt"
 P2P, HUB = "zenoh-p2p", "zenoh-hub"
-MQTT = tuple(name for name, variant in VARIANTS.items() if not variant.on_zenoh)
+MQTT = tuple(name for name, variant in VARIANTS.items() if variant.kind != "zenoh")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,78 +64,53 @@ class Slice:
     pictures_hz: float | None = None
 
 
-def _used(pids: Sequence[int]) -> tuple[float, int]:
-    """CPU seconds and wake-ups so far."""
-    return cpu_s(pids), wake_ups(pids)
-
-
-class Backbone:
-    """The broker of an MQTT variant or the hub of a Zenoh one."""
-
-    def __init__(self, variant: Variant, folder: Path, processes: Processes) -> None:
-        self._variant, self._run_dir = variant, folder / "z"
-        self._broker: Broker | None = None
-        self.program: Program
-        if variant.on_zenoh:
-            settings = msgspec.json.encode(ZenohSettings(run_dir=self._run_dir), enc_hook=str).decode()
-            hub = Program("hub", python("pebble.runtime.hub", settings), folder / "hub.log")
-            self.program = processes.add(hub, BROKERS)
-        else:
-            self.program = self._broker = processes.broker(extra=variant.broker, folder=folder)
-
-    def wait(self) -> None:
-        if self._broker is not None:
-            self._broker.wait()
-        else:
-            self.program.wait_until((self._run_dir / "hub.sock").exists, _READY_S)
-
-    @property
-    def endpoint(self) -> Endpoint:
-        variant = self._variant
-        if self._broker is None:
-            return Endpoint(kind=variant.kind, run_dir=str(self._run_dir), client=variant.client)
-        return Endpoint(kind=variant.kind, port=self._broker.port, protocol=variant.protocol)
-
-    @property
-    def stream(self) -> list[str]:
-        """Arguments that let pictures flow through the same broker or hub."""
-        return ["zenoh-shm", str(self._run_dir)] if self._broker is None else ["mqtt", str(self._broker.port)]
-
-
 class Participant:
-    """The processes of one role."""
+    """The processes of one role: the broker of an MQTT variant or the hub of a Zenoh one, two ends, and a stream."""
 
     def __init__(self, role: str, folder: Path, processes: Processes) -> None:
         self.role, self._processes = role, processes
-        self.backbone = Backbone(VARIANTS[variant_of(role)], folder, processes)
+        self._variant, self._run_dir = VARIANTS[variant_of(role)], folder / "z"
+        self._broker: Broker | None = None
+        if self._variant.kind == "zenoh":
+            command = python("pebble.runtime.hub", _json(ZenohSettings(run_dir=self._run_dir)))
+            self._backbone = processes.add(Program("hub", command, folder / "hub.log"), BROKERS)
+        else:
+            self._backbone = self._broker = processes.broker(extra=self._variant.broker, folder=folder)
         self.ends: list[Worker] = []  # echo, sender
         self.media: list[Worker] = []  # reader, writer
 
     def start(self, *, media: bool) -> None:
-        """Starts the processes; the backbone must be ready."""
-        endpoint = msgspec.json.encode(self.backbone.endpoint).decode()
-        for end in ("echo", "sender"):
-            self.ends.append(self._worker(end, "pebble.bench.control_worker", end, endpoint))
+        """Starts the other processes as soon as the broker or hub is ready."""
+        settings: MqttSettings | ZenohSettings
+        if self._broker is None:
+            self._backbone.wait_until((self._run_dir / "hub.sock").exists, _READY_S)
+            settings = ZenohSettings(run_dir=self._run_dir, client=self._variant.client)
+            stream = ("zenoh-shm", str(self._run_dir))
+        else:
+            self._broker.wait()
+            settings = MqttSettings(host="127.0.0.1", port=self._broker.port, protocol=self._variant.protocol)
+            stream = ("mqtt", str(self._broker.port))
+        where = (self._variant.kind, _json(settings))
+        self.ends = [self._worker(end, "control_ends", *where) for end in ("echo", "sender")]
         if media:
-            for end in ("reader", "writer"):
-                self.media.append(self._worker(end, "pebble.bench.control_load", end, *self.backbone.stream))
+            self.media = [self._worker(end, "control_load", *stream) for end in ("reader", "writer")]
 
     def run(self, spec: SliceSpec) -> Slice:
         """Runs one slice; returns the sender's answer and the resource usage of the ends and the backbone."""
-        every = ([worker.pid for worker in self.ends], [self.backbone.program.pid])
-        began, before = time.monotonic(), [_used(pids) for pids in every]
-        line = msgspec.json.encode(spec).decode()
-        answer = msgspec.convert(self.ends[1].ask(line, spec.seconds + _ANSWER_S), Answer)
+        every = ([worker.pid for worker in self.ends], [self._backbone.pid])
+        began, before = time.monotonic(), [(cpu_s(pids), wake_ups(pids)) for pids in every]
+        answer = msgspec.convert(self.ends[1].ask(_json(spec), spec.seconds + _ANSWER_S), Answer)
         took = time.monotonic() - began
-        after = [_used(pids) for pids in every]
-        cpu, backbone_cpu = (100 * (now[0] - then[0]) / took for now, then in zip(after, before, strict=True))
-        woken, backbone_woken = ((now[1] - then[1]) / answer.trips for now, then in zip(after, before, strict=True))
+        (cpu, woken), (backbone_cpu, backbone_woken) = (
+            (100 * (cpu_s(pids) - cpu_before) / took, (wake_ups(pids) - woken_before) / answer.trips)
+            for pids, (cpu_before, woken_before) in zip(every, before, strict=True)
+        )
         return Slice(
             answer=answer, cpu=cpu, backbone_cpu=backbone_cpu, wake_ups=woken, backbone_wake_ups=backbone_woken
         )
 
     def _worker(self, end: str, module: str, *arguments: str) -> Worker:
-        return self._processes.worker(f"{self.role}: {end}", module, *arguments)
+        return self._processes.worker(f"{self.role}: {end}", f"pebble.bench.{module}", end, *arguments)
 
 
 class Participants(Processes):
@@ -151,16 +120,24 @@ class Participants(Processes):
         super().__init__()
         self._roles, self._loads = roles, loads
         self._participants: dict[str, Participant] = {}
-        self._hog: Worker | None = None
+        self._hogs: list[Worker] = []
 
     def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
         """Runs one slice. Raises PebbleError if a process ended, or pictures do not flow."""
         participant = self._participants[role]
-        with self._loaded(participant, load):
-            before, began = self._pictures(participant, load), time.monotonic()
+        busy = {NONE: [], MEDIA: participant.media, HOG: self._hogs}[load]
+        try:
+            for worker in busy:
+                _switch_load(worker, "1")
+            if load != MEDIA:
+                return participant.run(spec)
+            before, began = _flowing(participant), time.monotonic()
             slice_ = participant.run(spec)
-            pictures, took = self._pictures(participant, load) - before, time.monotonic() - began
-        return replace(slice_, pictures_hz=pictures / took) if load == MEDIA else slice_
+            pictures, took = _switch_load(participant.media[0], "?") - before, time.monotonic() - began
+            return replace(slice_, pictures_hz=pictures / took)
+        finally:
+            for worker in reversed(busy):  # first the writer, then the reader
+                _switch_load(worker, "0")
 
     def start(self) -> None:
         for number, role in enumerate(self._roles):
@@ -168,31 +145,11 @@ class Participants(Processes):
             folder.mkdir()
             self._participants[role] = Participant(role, folder, self)
         for participant in self._participants.values():
-            participant.backbone.wait()
             participant.start(media=MEDIA in self._loads)
         if HOG in self._loads:
-            self._hog = self.worker("hog", "pebble.bench.control_load", "hog")
+            self._hogs = [self.worker("hog", "pebble.bench.control_load", "hog")]
         for worker in self.workers:
             worker.answer(_READY_S)
-
-    @contextmanager
-    def _loaded(self, participant: Participant, load: str) -> Iterator[None]:
-        if load == NONE:
-            yield
-            return
-        busy = participant.media if load == MEDIA else [self._hog] if self._hog is not None else []
-        try:
-            for worker in busy:
-                _switch_load(worker, "1")
-            if load == MEDIA:
-                _wait_for_pictures(participant)
-            yield
-        finally:
-            for worker in reversed(busy):  # first the writer, then the reader
-                _switch_load(worker, "0")
-
-    def _pictures(self, participant: Participant, load: str) -> int:
-        return _switch_load(participant.media[0], "?") if load == MEDIA else 0
 
 
 def _switch_load(worker: Worker, line: str) -> int:
@@ -200,10 +157,16 @@ def _switch_load(worker: Worker, line: str) -> int:
     return int(worker.ask(line, _FLOW_S)["pictures"])
 
 
-def _wait_for_pictures(participant: Participant) -> None:
+def _flowing(participant: Participant) -> int:
+    """Waits until some pictures have arrived; returns their number so far. Raises PebbleError after a timeout."""
     reader = participant.media[0]
     enough, end = _switch_load(reader, "?") + _FLOWING, time.monotonic() + _FLOW_S
-    while _switch_load(reader, "?") < enough:
+    while (count := _switch_load(reader, "?")) < enough:
         if time.monotonic() > end:
             raise PebbleError(f"{participant.role}: no pictures flow after {_FLOW_S:.0f} s")
         time.sleep(_POLL_S)
+    return count
+
+
+def _json(what: MqttSettings | ZenohSettings | SliceSpec) -> str:
+    return msgspec.json.encode(what, enc_hook=str).decode()

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from msgspec.structs import replace
 from rich.table import Table
 
-from pebble.bench.aims import MISSED, NOT_JUDGED, outcome, single
+from pebble.bench.aims import MISSED, NOT_JUDGED, outcome, rounds_with_lost, single
 from pebble.bench.control_participants import BASELINE, HOG, HUB, MEDIA, MQTT, NONE, P2P, VARIANTS
 from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Judged
 from pebble.bench.tables import Column, Grid, base_of, figure, plain_table
+from pebble.bench.usage import wake_up_us
+from pebble.errors import PebbleError
 
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
 RATE_HZ = 30.0  # of the pictures, as in bench/frames_loop.py
@@ -21,9 +23,12 @@ _LONG_US = 995.0
 _MUCH_LATE, _MUCH_LOST = 0.05, 0.005
 _FEWER = 0.9 * RATE_HZ  # pictures: the load is lighter than intended
 AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
+_PICTURES_HZ = single("pictures_hz")
+_BETTER = " (the better MQTT variant)"
 _JUDGED = {"size": "40 B", "rate": "200 Hz"}
 
-_CellsByVariant = dict[tuple[str, str], Cell]  # by variant and load
+_Key = tuple[str | None, str]  # variant and load
+_ByKey = Mapping[_Key, Cell]
 
 
 def legend(cells: Sequence[Cell]) -> list[str]:
@@ -79,41 +84,6 @@ def _ratio(cell: Cell, base: Cell | None) -> str:
     return f"{figure(interval.ratio)}\n{figure(interval.low)}–{figure(interval.high)}"
 
 
-def wake_up_cost(cells: Sequence[Cell], same_us: float, other_us: float) -> list[str]:
-    """The cost of one wake-up on this machine, on the same core and another one, and the wake-ups per message."""
-    by_variant, shown = _judged(cells), []
-    for name in (_better(by_variant, NONE, 50), P2P):
-        figures = by_variant[name, NONE].figures if name and (name, NONE) in by_variant else {}
-        ends, backbone = (float(figures.get(key) or 0) for key in ("wake_ups", "broker_wake_ups"))
-        if ends:
-            shown.append(f"{ends + backbone:.1f} with {name}")
-    if not shown:
-        return []
-    return [
-        f"Waking up a waiting process takes {same_us:.0f} us on the same core, {other_us:.0f} us on another; "
-        f"a round trip takes {' and '.join(shown)} such wake-ups, including brokers."
-    ]
-
-
-def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
-    """One sentence for each comparison that was measured, warnings, and the aims."""
-    by_variant = _judged(cells)
-    lines = ["40 B at 200 Hz, one way, medians unless p99 is named; with the 99 % interval of the ratio."]
-    lines += _against_mqtt(by_variant, NONE, 50) + _against_mqtt(by_variant, MEDIA, 99) + _pictures(by_variant)
-    lines += _pair(by_variant, (HUB, NONE), (P2P, NONE), 50)
-    lines += [line for name in (P2P, _better(by_variant, NONE, 50)) for line in _with_hog(by_variant, name)]
-    for slow in ("paho", "mqtt"):
-        for percent in (50, 99):
-            lines += _pair(by_variant, (slow, NONE), ("mqtt-nodelay", NONE), percent, why="Nagle: ")
-    lines += _pair(by_variant, ("mqtt5", NONE), ("mqtt-nodelay", NONE), 50)
-    lines = lines if len(lines) > 1 else []
-    return [*lines, *_warnings(cells), *_aims({key: _with_lost(cell) for key, cell in by_variant.items()})]
-
-
-def _judged(cells: Sequence[Cell]) -> _CellsByVariant:
-    return {(cell.variant, str(cell.params["load"])): cell for cell in cells if _is_judged(cell)}
-
-
 def _is_judged(cell: Cell) -> bool:
     return cell.measure == ONE_WAY and all(cell.params.get(name) == value for name, value in _JUDGED.items())
 
@@ -136,123 +106,123 @@ _HOPS = Grid(
 )
 
 
-def _better(by_variant: _CellsByVariant, load: str, percent: float) -> str | None:
-    """The MQTT variant with the lowest percentile."""
-    there = [name for name in MQTT if (name, load) in by_variant and by_variant[name, load].samples]
-    return min(there, key=lambda name: by_variant[name, load].percentile(percent), default=None)
+# -- the assessment
 
 
-def _compared(
-    by_variant: _CellsByVariant, ours: tuple[str | None, str], theirs: tuple[str | None, str], percent: float
-) -> Interval | None:
-    a, b = by_variant.get((ours[0] or "", ours[1])), by_variant.get((theirs[0] or "", theirs[1]))
-    return None if a is None or b is None else paired(a.rounds, b.rounds, percent)
-
-
-def _pair(
-    by_variant: _CellsByVariant,
-    ours: tuple[str, str],
-    theirs: tuple[str, str],
-    percent: float,
-    *,
-    why: str = "",
-    aside: str = "",
-) -> list[str]:
-    interval = _compared(by_variant, ours, theirs, percent)
-    if interval is None:
-        return []
-    load = "" if ours[1] == NONE else f"with {ours[1]}, "
-    return [f"{why}{load}{_percent(percent)}{interval.words(ours[0], theirs[0] + aside)}"]
-
-
-def _against_mqtt(by_variant: _CellsByVariant, load: str, percent: float) -> list[str]:
-    best = _better(by_variant, load, percent)
-    return (
-        []
-        if best is None
-        else _pair(by_variant, (P2P, load), (best, load), percent, aside=" (the better MQTT variant)")
-    )
-
-
-def _pictures(by_variant: _CellsByVariant) -> list[str]:
-    """The rate of pictures meanwhile: a variant that carries fewer has a lighter load."""
-    rates = {name: cell.figures.get("pictures_hz") for (name, load), cell in by_variant.items() if load == MEDIA}
-    known = {name: rate for name, rate in rates.items() if isinstance(rate, (int, float))}
-    if not known:
-        return []
-    shown = ", ".join(f"{name} {figure(rate)}" for name, rate in known.items())
-    lines = [f"With media, pictures received per second, of {RATE_HZ:g}: {shown}"]
-    fewer = [name for name, rate in known.items() if rate < _FEWER]
-    if fewer:
-        lines.append(
-            f"With media, {', '.join(fewer)}: fewer than {_FEWER:g} pictures per second, so the load was lighter."
+def wake_up_cost(cells: Sequence[Cell]) -> Iterator[str]:
+    """The cost of one wake-up on this machine, on the same core and another one, and the wake-ups per message."""
+    by_key, shown = _judged(cells), []
+    for name in (_better(by_key, NONE, 50), P2P):
+        figures = by_key[name, NONE].figures if (name, NONE) in by_key else {}
+        ends, backbone = (float(figures.get(key) or 0) for key in ("wake_ups", "broker_wake_ups"))
+        if ends:
+            shown.append(f"{ends + backbone:.1f} with {name}")
+    if not shown:
+        return
+    try:
+        same_us, other_us = wake_up_us()
+    except PebbleError as error:
+        yield str(error)
+    else:
+        yield (
+            f"Waking up a waiting process takes {same_us:.0f} us on the same core, {other_us:.0f} us on another; "
+            f"a round trip takes {' and '.join(shown)} such wake-ups, including brokers."
         )
-    return lines
 
 
-def _with_hog(by_variant: _CellsByVariant, name: str | None) -> list[str]:
-    found = []
-    for percent in (50, 99):
-        interval = _compared(by_variant, (name, HOG), (name, NONE), percent)
-        if interval is not None:
-            words = interval.words(f"{name} beside a busy process", f"{name} alone")
-            found.append(f"{_percent(percent)}{words}")
-    return found
+def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
+    """One sentence for each comparison that was measured, warnings, and the aims."""
+    by_key = _judged(cells)
+    best, best_loaded = _better(by_key, NONE, 50), _better(by_key, MEDIA, 99)
+
+    def compare(percent: float, ours: _Key, theirs: _Key, before: str = "", names: Sequence[str] = ()) -> list[str]:
+        interval = _ratio_of(by_key, ours, theirs, percent)
+        if interval is None:
+            return []
+        one, other = names or (str(ours[0]), str(theirs[0]))
+        return [f"{before}{'' if percent == 50 else f'p{percent:g}: '}{interval.words(one, other)}"]
+
+    lines = [
+        *compare(50, (P2P, NONE), (best, NONE), names=(P2P, f"{best}{_BETTER}")),
+        *compare(99, (P2P, MEDIA), (best_loaded, MEDIA), f"with {MEDIA}, ", (P2P, f"{best_loaded}{_BETTER}")),
+        *_pictures(by_key),
+        *compare(50, (HUB, NONE), (P2P, NONE)),
+    ]
+    for name in (P2P, best):
+        for percent in (50, 99):
+            names = (f"{name} beside a busy process", f"{name} alone")
+            lines += compare(percent, (name, HOG), (name, NONE), names=names)
+    for slow in ("paho", "mqtt"):
+        for percent in (50, 99):
+            lines += compare(percent, (slow, NONE), ("mqtt-nodelay", NONE), "Nagle: ")
+    lines += compare(50, ("mqtt5", NONE), ("mqtt-nodelay", NONE))
+    what = "40 B at 200 Hz, one way, medians unless p99 is named; with the 99 % interval of the ratio."
+    return [*([what, *lines] if lines else []), *_warnings(cells), *_aims(by_key)]
 
 
-def _percent(percent: float) -> str:
-    return "" if percent == 50 else f"p{percent:g}: "
+def _judged(cells: Sequence[Cell]) -> _ByKey:
+    return {(cell.variant, str(cell.params["load"])): cell for cell in cells if _is_judged(cell)}
 
 
-def _warnings(cells: Sequence[Cell]) -> list[str]:
+def _better(by_key: _ByKey, load: str, percent: float) -> str | None:
+    """The MQTT variant with the lowest percentile."""
+    there = [cell for name in MQTT if (cell := by_key.get((name, load))) is not None and cell.samples]
+    best = min(there, key=lambda cell: cell.percentile(percent), default=None)
+    return None if best is None else best.variant
+
+
+def _ratio_of(by_key: _ByKey, ours: _Key, theirs: _Key, percent: float) -> Interval | None:
+    """None if one of the two was not measured."""
+    if ours not in by_key or theirs not in by_key:
+        return None
+    return paired(by_key[ours].rounds, by_key[theirs].rounds, percent)
+
+
+def _pictures(by_key: _ByKey) -> Iterator[str]:
+    """The rate of pictures meanwhile: a variant that carries fewer has a lighter load."""
+    rates = {str(name): _PICTURES_HZ(cell) for (name, load), cell in by_key.items() if load == MEDIA}
+    known = {name: rate for name, rate in rates.items() if not math.isnan(rate)}
+    if known:
+        shown = ", ".join(f"{name} {figure(rate)}" for name, rate in known.items())
+        yield f"With media, pictures received per second, of {RATE_HZ:g}: {shown}"
+    if fewer := [name for name, rate in known.items() if rate < _FEWER]:
+        yield f"With media, {', '.join(fewer)}: fewer than {_FEWER:g} pictures per second, so the load was lighter."
+
+
+def _warnings(cells: Sequence[Cell]) -> Iterator[str]:
     """Reasons to distrust the results: too few rounds, late or lost messages."""
-    rounds = min((len(cell.rounds) for cell in cells), default=0)
-    lines = [f"A 99 % interval needs {LEAST_ROUNDS} rounds."] if rounds < LEAST_ROUNDS else []
+    if min((len(cell.rounds) for cell in cells), default=0) < LEAST_ROUNDS:
+        yield f"A 99 % interval needs {LEAST_ROUNDS} rounds."
     for rate in dict.fromkeys(str(cell.params["rate"]) for cell in cells):
-        ours = [cell.figures for cell in cells if cell.measure == ONE_WAY and cell.params["rate"] == rate]
-        late, sent = (sum(int(figures.get(name) or 0) for figures in ours) for name in ("late", "sent"))
+        ours = [cell for cell in cells if cell.measure == ONE_WAY and cell.params["rate"] == rate]
+        late, sent = _total(ours, "late"), _total(ours, "sent")
         if late > _MUCH_LATE * sent:
-            lines.append(
-                f"At {rate} {late / sent:.0%} of the messages were sent late: this machine cannot keep that rate."
-            )
-        lines += _lost([cell for cell in cells if cell.measure == ONE_WAY and cell.params["rate"] == rate], rate)
-    return lines
+            yield f"At {rate} {late / sent:.0%} of the messages were sent late: this machine cannot keep that rate."
+        shares = {}
+        for name in dict.fromkeys(cell.variant for cell in ours):
+            own = [cell for cell in ours if cell.variant == name]
+            shares[name] = sum(cell.lost or 0 for cell in own) / max(1, _total(own, "sent"))
+        if lost := ", ".join(f"{share:.1%} of {name}" for name, share in shares.items() if share > _MUCH_LOST):
+            yield f"At {rate} messages were lost: {lost}. Percentiles exclude them, aims count them as infinitely late."
 
 
-def _lost(cells: Sequence[Cell], rate: str) -> list[str]:
-    shares = {
-        name: sum(cell.lost or 0 for cell in cells if cell.variant == name)
-        / max(1, sum(int(cell.figures.get("sent") or 0) for cell in cells if cell.variant == name))
-        for name in dict.fromkeys(cell.variant for cell in cells)
-    }
-    shown = ", ".join(f"{share:.1%} of {name}" for name, share in shares.items() if share > _MUCH_LOST)
-    return (
-        [f"At {rate} messages were lost: {shown}. Percentiles exclude them, aims count them as infinitely late."]
-        if shown
-        else []
-    )
+def _total(cells: Sequence[Cell], name: str) -> int:
+    return sum(int(cell.figures.get(name) or 0) for cell in cells)
 
 
-def _with_lost(cell: Cell) -> Cell:
-    """Adds the lost messages as infinitely late; each round sends equally many."""
-    each = int(cell.figures.get("sent") or 0) // max(1, len(cell.rounds))
-    return replace(cell, rounds=[[*one, *[math.inf] * (each - len(one))] for one in cell.rounds])
-
-
-def _aims(by_variant: _CellsByVariant) -> list[Judged]:
+def _aims(by_key: _ByKey) -> Iterator[Judged]:
     """The aim for p50 applies to the upper end of the interval, the one for p99 to the ratio, as they were set.
 
     If too many messages were lost in total, the aim is missed even if few rounds lost them.
     """
-    lines = []
-    without = _compared(by_variant, (P2P, NONE), (_better(by_variant, NONE, 50), NONE), 50)
+    by_key = {key: replace(cell, rounds=rounds_with_lost(cell)) for key, cell in by_key.items()}
+    without = _ratio_of(by_key, (P2P, NONE), (_better(by_key, NONE, 50), NONE), 50)
     if without is not None:
-        lines.append(_aim(f"{P2P} / better MQTT, p50, upper end of the interval", without.high, AIM_P50, without))
-    media = _compared(by_variant, (P2P, MEDIA), (_better(by_variant, MEDIA, 99), MEDIA), 99)
+        yield _aim(f"{P2P} / better MQTT, p50, upper end of the interval", without.high, AIM_P50, without)
+    media = _ratio_of(by_key, (P2P, MEDIA), (_better(by_key, MEDIA, 99), MEDIA), 99)
     if media is not None:
-        value = media.ratio if math.isfinite(by_variant[P2P, MEDIA].percentile(99)) else math.inf
-        lines.append(_aim(f"{P2P} / better MQTT with media, p99", value, AIM_MEDIA_P99, media))
-    return lines
+        value = media.ratio if math.isfinite(by_key[P2P, MEDIA].percentile(99)) else math.inf
+        yield _aim(f"{P2P} / better MQTT with media, p99", value, AIM_MEDIA_P99, media)
 
 
 def _aim(what: str, value: float, aim: float, interval: Interval) -> Judged:

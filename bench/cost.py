@@ -8,33 +8,32 @@ that map them: nothing large is imported here, since that would reduce the robot
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 
 from pebble.bench.comparison import Budget, Case, Comparison, Run, rounds, seconds, variants
+from pebble.bench.drivers import RATE_HZ, driving
 from pebble.bench.pictures import bars
 from pebble.bench.results import Cell
-from pebble.bench.robot_subscriber import RobotSubscriber
+from pebble.bench.subscribers import RobotSubscriber, ready_robot
 from pebble.bench.tables import Claims, Grid, figure, median_column, medians
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.rig.robot import BASE, BROKER, KINDS, LAUNCHER, MEDIA, Robot, one_robot
+from pebble.rig.robot import BASE, BROKER, KINDS, LAUNCHER, Robot
 
 ALL = "all"  # the processes of a robot together
 MEMORY, CPU, THREADS = "PSS", "CPU", "threads"
 PICTURES, PER_PICTURE = "pictures", "CPU per picture"
-RATE_HZ = 20.0  # of driving
 IDLE, DRIVING = "idle", "driving"
 #: The encodings requested in each media phase, by the name of the phase.
 STREAMS = {"json+pcm": ("json", "pcm"), "h264+opus": ("h264", "opus")}
 _WITHOUT_AV = "json+pcm"
 #: The measures that are compared, and their names.
 _COMPARED = {MEMORY: "memory", CPU: "CPU", PER_PICTURE: "CPU per delivered picture"}
-_UP_S = _FLOW_S = 20.0
+_FLOW_S = 20.0
 _STARTUP_S = 0.5  # for start-up work, or a change of the streams, to finish
 _FIRST = 5  # pictures and sound packets until a stream counts as flowing
 
@@ -57,16 +56,14 @@ def measure(case: Case) -> Iterator[Cell]:
 
 
 def read(kind: str, seconds: float) -> Iterator[Reading]:
-    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
-        subscriber.wait()
-        robot.launch()
-        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
-        yield _read(robot, subscriber, IDLE, lambda: time.sleep(seconds))
-        yield _read(robot, subscriber, DRIVING, lambda: subscriber.drive(seconds, RATE_HZ))
+    with ready_robot(kind) as (robot, subscriber):
+        yield _read(robot, subscriber, IDLE, seconds)
+        with driving(robot.remote_port, BASE):
+            yield _read(robot, subscriber, DRIVING, seconds)
         for name in STREAMS:
             if name == _WITHOUT_AV or _has_av():
                 _start_streams(robot, subscriber, name)
-                yield _read(robot, subscriber, name, lambda: time.sleep(seconds))
+                yield _read(robot, subscriber, name, seconds)
 
 
 def _start_streams(robot: Robot, subscriber: RobotSubscriber, name: str) -> None:
@@ -79,16 +76,17 @@ def _start_streams(robot: Robot, subscriber: RobotSubscriber, name: str) -> None
     )
 
 
-def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, work: Callable[[], object]) -> Reading:
-    """Measures the robot's processes while ``work`` runs; memory is read afterwards."""
+def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, seconds: float) -> Reading:
+    """Measures the robot's processes for some seconds; memory is read afterwards."""
     time.sleep(_STARTUP_S)
     processes = robot.processes()
     before = {name: cpu_s([pid]) for name, pid in processes.items()}
-    pictures, began = _pictures(subscriber, phase), time.monotonic()
-    work()
+    form, *_ = STREAMS.get(phase, ("no pictures",))
+    pictures, began = subscriber.arrived[form], time.monotonic()
+    time.sleep(seconds)
     took = time.monotonic() - began
     cpu = {name: 100 * (cpu_s([pid]) - before[name]) / took for name, pid in processes.items()}
-    arrived = _pictures(subscriber, phase) - pictures
+    arrived = subscriber.arrived[form] - pictures
     if robot.processes() != processes:
         raise PebbleError(f"{phase}: processes of the robot ended or started meanwhile\n{robot.log()}")
     return Reading(
@@ -98,10 +96,6 @@ def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, work: Callable[
         threads={name: len(list(Path(f"/proc/{pid}/task").glob("*"))) for name, pid in processes.items()},
         pictures_per_s=arrived / took if phase in STREAMS else None,
     )
-
-
-def _pictures(subscriber: RobotSubscriber, phase: str) -> int:
-    return subscriber.arrived[STREAMS[phase][0]] if phase in STREAMS else 0
 
 
 def cells_of(case: Case, reading: Reading) -> Iterator[Cell]:

@@ -10,12 +10,11 @@ import os
 import random
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from typing import NamedTuple
 
 from pebble.bench.aims import Aim, outcome, with_lost
 from pebble.bench.comparison import Budget, Comparison, Option, Round, Run, rounds
-from pebble.bench.estop_driver import RATE_HZ
+from pebble.bench.drivers import RATE_HZ
 from pebble.bench.estop_operator import StopOperator
 from pebble.bench.fleet import read_moves
 from pebble.bench.pictures import ecdf
@@ -70,7 +69,7 @@ class Robots(Processes):
 
     def __init__(self, boards: int) -> None:
         super().__init__()
-        self._boards = [identity for _, identity in members(boards)] if boards else []
+        self._boards = {identity.id: identity.base for _, identity in members(boards)} if boards else {}
         self._linux: dict[str, Robot] = {}
         self._trace = self.folder / "trace.jsonl"
 
@@ -84,36 +83,31 @@ class Robots(Processes):
             robot = Robot(self, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
             robot.prepare()
             self._linux[kind] = robot
-        self._driver = self.worker("driver", "pebble.bench.estop_driver", broker.port)
+        self._driver = self.worker("driver", "pebble.bench.drivers", broker.port)
 
     def hold_linux(self) -> Iterator[Cell]:
         """Launch the Linux robots, one after the other, while a stop of all robots is held."""
-        with self._operator.sending(None, hold=True) as sending:
+        with self._operator.stop(None, hold=True) as stop:
             for kind, robot in self._linux.items():
                 robot.launch()
-                sending.wait_until_confirmed([robot.base], _STARTED_S)
-                stop = sending.stop
+                stop.wait_until_confirmed([robot.base], _STARTED_S)
                 yield sample(HOLD, kind, STOP, stop.received[robot.base], stop.latched[robot.base])
-        self._reset(self._linux_bases())
+        self._reset(self._linux_bases)
 
     def hold_boards(self) -> Iterator[Cell]:
         """Start all boards while a stop of all robots is held."""
-        boards = [board.base for board in self._boards]
-        with self._operator.sending(None, hold=True) as sending:
-            self._start_fleet()
-            sending.wait_until_confirmed([*boards, *self._linux_bases()], _STARTED_S)
-            stop = sending.stop
-            yield from (sample(HOLD, BOARD, STOP, stop.received[base], stop.latched[base]) for base in boards)
-        self._reset([*boards, *self._linux_bases()])
+        with self._operator.stop(None, hold=True) as stop:
+            where = ("--broker", f"127.0.0.1:{self._port}", "--trace", self._trace)
+            self.robot("the fleet", "pebble.simulation.fleet_program", "--robots", len(self._boards), *where)
+            stop.wait_until_confirmed(self._bases, _STARTED_S)
+            for base in self._boards.values():
+                yield sample(HOLD, BOARD, STOP, stop.received[base], stop.latched[base])
+        self._reset(self._bases)
 
     def stop_one(self, kind: str) -> Iterator[Cell]:
         """Stop a driven robot by an emergency stop, and by a plain zero."""
         base = self._linux[kind].base
-        self._drive([base])
-        stop = self._operator.stop([base], every=False, timeout=_CONFIRMED_S)
-        yield self._rest(kind, STOP, [base], stop.began)
-        yield sample(CONFIRMED, kind, STOP, stop.began, stop.confirmed[base])
-        self._reset([base])
+        yield from self._stop(kind, [base], [base])
         self._drive([base])
         yield self._rest(kind, ZERO, [base], self._operator.zero(base))
         self._release([base])
@@ -130,19 +124,24 @@ class Robots(Processes):
 
     def stop_all(self) -> Iterator[Cell]:
         """Stop all robots, which are driven, by one emergency stop."""
-        bases = [*self._linux_bases(), *(board.base for board in self._boards)]
+        yield from self._stop(ALL, self._bases, None)
+
+    def _stop(self, robot: str, bases: Sequence[str], named: Sequence[str] | None) -> Iterator[Cell]:
+        """Stop these driven robots by one emergency stop that names them, or all."""
         self._drive(bases)
-        stop = self._operator.stop(bases, every=True, timeout=_CONFIRMED_S)
-        yield self._rest(ALL, STOP, bases, stop.began)
-        yield sample(CONFIRMED, ALL, STOP, stop.began, max(stop.confirmed[base] for base in bases))
+        with self._operator.stop(named) as stop:
+            stop.wait_until_confirmed(bases, _CONFIRMED_S)
+        yield self._rest(robot, STOP, bases, stop.began)
+        yield sample(CONFIRMED, robot, STOP, stop.began, max(stop.confirmed[base] for base in bases))
         self._reset(bases)
 
+    @property
     def _linux_bases(self) -> list[str]:
         return [robot.base for robot in self._linux.values()]
 
-    def _start_fleet(self) -> None:
-        where = ("--broker", f"127.0.0.1:{self._port}", "--trace", self._trace)
-        self.robot("the fleet", "pebble.simulation.fleet_program", "--robots", len(self._boards), *where)
+    @property
+    def _bases(self) -> list[str]:
+        return [*self._linux_bases, *self._boards.values()]
 
     def _drive(self, bases: Sequence[str]) -> None:
         """Drive these robots from now on; returns at a random moment after all of them move."""
@@ -183,15 +182,9 @@ class Robots(Processes):
             for robot in self._linux.values()
             if robot.base in bases
         }
-        boards = {board.id: board.base for board in self._boards if board.base in bases}
+        boards = {name: base for name, base in self._boards.items() if base in bases}
         changes = read_moves(self._trace) if boards else {}
         return moves | {base: changes.get(name, []) for name, base in boards.items()}
-
-
-@contextmanager
-def robots(run: Run) -> Iterator[Robots]:
-    with Robots(run["boards"]) as robots:
-        yield robots
 
 
 def measure(round_: Round) -> Iterator[Cell]:
@@ -268,7 +261,7 @@ ESTOP = Comparison(
     quick=Budget(90, rounds=2, stops=3, all_stops=2),
     constants={"rate_hz": RATE_HZ},
     prepare=prepare,
-    environment=robots,
+    environment=lambda run: Robots(run["boards"]),
     measure_round=measure,
     measures=MEASURES,
     figures={"again": sum},

@@ -7,9 +7,8 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
-from pebble.bench.estop_driver import ZERO
+from pebble.bench.drivers import ZERO
 from pebble.client.connection import Listener, Target, connected
 from pebble.client.discovery import ALL_OUTGOING
 from pebble.client.estop import StopSender, new_name
@@ -26,24 +25,20 @@ _POLL_S = 0.005
 _LONGEST_WAIT_S = 0.25
 
 
-@dataclass(slots=True)
 class Stop:
-    """One emergency stop; times are CLOCK_MONOTONIC, ns. A robot that has not confirmed it is missing."""
+    """One emergency stop over a connection that is open, from its construction on.
 
-    began: int
-    received: dict[str, int] = field(default_factory=dict)  # when each robot's first message arrived
-    latched: dict[str, int] = field(default_factory=dict)  # when the first state arrived that says so
-    confirmed: dict[str, int] = field(default_factory=dict)
-
-
-class SendingStop:
-    """Sends one stop over a connection that is open, from its construction on."""
+    Times are CLOCK_MONOTONIC, ns. A robot that has not confirmed it is missing.
+    """
 
     def __init__(self, transport: Transport, robots: Collection[str] | None, *, hold: bool = False) -> None:
         """``robots`` None: all, as ``--all``."""
         self._transport = transport
-        self.stop = Stop(time.monotonic_ns())
-        now = self.stop.began / 1e9
+        self.received: dict[str, int] = {}  # when each robot's first message arrived
+        self.latched: dict[str, int] = {}  # when the first state arrived that says so
+        self.confirmed: dict[str, int] = {}
+        self.began = time.monotonic_ns()
+        now = self.began / 1e9
         self._sender = StopSender(new_name(), by=_BY, why="", now=now, robots=robots, hold=hold)
         self._publish()
         channels = (ESTOP_STATE, CAPABILITIES)
@@ -53,14 +48,12 @@ class SendingStop:
     def wait_until_confirmed(self, robots: Collection[str], timeout: float) -> None:
         """Send and receive until these robots have confirmed it. Raises PebbleError after ``timeout`` seconds."""
         end = time.monotonic() + timeout
-        while not self.stop.confirmed.keys() >= {*robots}:
+        while not self.confirmed.keys() >= {*robots}:
             if time.monotonic() > end:
-                raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(self._missing())}")
+                missing = [f"{base}: {robot.why}" for base, robot in self._sender.robots.items() if robot.why]
+                raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(missing)}")
             self._receive()
             self._publish()
-
-    def _missing(self) -> list[str]:
-        return [f"{base}: {robot.why}" for base, robot in self._sender.robots.items() if robot.why]
 
     def _receive(self) -> None:
         """Handle what has arrived; wait for something if nothing has, until something is due."""
@@ -77,11 +70,11 @@ class SendingStop:
         robot = self._sender.robots.get(base)
         if robot is None:
             return
-        self.stop.received.setdefault(base, now)
+        self.received.setdefault(base, now)
         if robot.estop.latched:
-            self.stop.latched.setdefault(base, now)
+            self.latched.setdefault(base, now)
         if robot.confirmed_s is not None:
-            self.stop.confirmed.setdefault(base, now)
+            self.confirmed.setdefault(base, now)
 
     def _publish(self) -> None:
         for message in self._sender.tick(time.monotonic()):
@@ -96,16 +89,10 @@ class StopOperator:
         self._url = f"mqtt://127.0.0.1:{port}"
 
     @contextmanager
-    def sending(self, robots: Collection[str] | None, *, hold: bool = False) -> Iterator[SendingStop]:
-        """Begin a stop."""
+    def stop(self, robots: Collection[str] | None, *, hold: bool = False) -> Iterator[Stop]:
+        """Begin a stop of these robots; None: of all, which are found as ``--all`` finds them."""
         with self._connected() as transport:
-            yield SendingStop(transport, robots, hold=hold)
-
-    def stop(self, robots: Collection[str], *, every: bool, timeout: float) -> Stop:
-        """Stop these robots until all have confirmed it; with ``every`` they are found as ``--all`` finds them."""
-        with self.sending(None if every else robots) as sending:
-            sending.wait_until_confirmed(robots, timeout)
-            return sending.stop
+            yield Stop(transport, robots, hold=hold)
 
     def zero(self, base: str) -> int:
         """Send a zero as a stock client does; returns when."""

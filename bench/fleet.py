@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
-from pebble.bench.fleet_operator import STEPS
+from pebble.bench.drivers import STEPS
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell, percentile, rounded
 from pebble.bench.tables import COUNT, Grid, percentile_column, single_column
@@ -39,7 +39,7 @@ def measure(case: Case) -> Iterator[Cell]:
         where = ("--kinds", ",".join(KINDS), "--broker", f"127.0.0.1:{broker.port}", "--trace", trace)
         fleet = processes.robot("fleet", "pebble.simulation.fleet_program", "--robots", count, *where)
         how = (broker.port, run["seconds"], run["rate"])
-        operator = processes.worker("operator", "pebble.bench.fleet_operator", *how, *ids)
+        operator = processes.worker("operator", "pebble.bench.drivers", *how, *ids)
         run.show(f"{count} robots are connecting")
         online = operator.answer(_ONLINE_S)["online"]
         run.show(f"{online} robots are online and being driven for {run['seconds']:.0f} s")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urldefrag, urlsplit
 
-from pebble.bench.estop_driver import Driver
+from pebble.bench.drivers import Driver
 from pebble.bench.page_rig import Rig, monotonic
 from pebble.bench.usage import cpu_s
 from pebble.contract.encodings import ALL_VIDEO

@@ -6,33 +6,31 @@ broker; for the first pictures another one, with a camera.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
-from pebble.bench import late_subscriber
+from pebble.bench import subscribers
 from pebble.bench.comparison import Budget, Case, Comparison, rounds, variants
+from pebble.bench.drivers import RATE_HZ, driving
 from pebble.bench.pictures import dots
 from pebble.bench.results import Cell
-from pebble.bench.robot_subscriber import RobotSubscriber
+from pebble.bench.subscribers import UP_S, RobotSubscriber, ready_robot
 from pebble.bench.tables import SPREAD, Claims, Grid
 from pebble.client.media_receiver import MediaReceiver
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.errors import PebbleError
 from pebble.media.decode import Decoded
-from pebble.rig.robot import BASE, KINDS, MEDIA, Robot, one_robot
+from pebble.rig.robot import BASE, KINDS, Robot, one_robot
 from pebble.transports import MqttSettings, Transport, create
 
 PICTURES_EVERY = 5  # launches, the first of which is followed by one of a robot with a camera
-RATE_HZ = 20.0  # of the operator, who drives from the start
 AT_REST, RUNNING = "at rest", "running"  # the camera
 PICTURES = tuple(f"picture, {encoding}, {state}" for state in (AT_REST, RUNNING) for encoding in ALL_VIDEO)
 LATE = ("late operator", "late operator, paho", "late service")
 MEASURES = ("first heartbeat", "all ready", "first drive obeyed", *LATE, *PICTURES)
 _CAMERA = "camera_publisher"  # runs while it is requested
-_UP_S, _REST_S, _PICTURE_S = 20.0, 10.0, 15.0
-_SLICE_S = 0.2  # of driving between two checks whether to stop
+_REST_S, _PICTURE_S = 10.0, 15.0
 _ANSWER_S = 60.0
 _POLL_S = 0.02  # how often an operator looks whether a key frame is missing
 
@@ -47,7 +45,7 @@ def measure(case: Case) -> Iterator[Cell]:
 def launch(case: Case) -> Iterator[Cell]:
     """Measures one robot from its start to its end. Seconds count from just before its launcher is started."""
     with one_robot(case.variant) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
-        service = robot.running.worker("late service", "pebble.bench.late_subscriber", robot.config)
+        service = robot.running.worker("late service", "pebble.bench.subscribers", robot.config)
         service.answer(_ANSWER_S)  # it is started beforehand, so that its imports do not disturb the launch
         subscriber.wait()
         for measure_, seconds in zip(MEASURES, _start(robot, subscriber), strict=False):
@@ -56,19 +54,19 @@ def launch(case: Case) -> Iterator[Cell]:
         service.send(str(len(joins)))  # it first counts the retained messages, which gives start-up time to finish
         answer = service.answer(_ANSWER_S)
         port, retained = robot.remote_port, set(subscriber.retained)
-        for measure_, join in zip(LATE, (late_subscriber.operator_ms, late_subscriber.stock_operator_ms), strict=False):
+        for measure_, join in zip(LATE, (subscribers.operator_ms, subscribers.stock_operator_ms), strict=False):
             yield case.cell(measure_, "ms", [join(port, BASE, retained) for _ in joins], topics=len(retained))
         yield case.cell(LATE[-1], "ms", answer["ms"], topics=len(answer["retained"]))
 
 
 def _start(robot: Robot, subscriber: RobotSubscriber) -> list[float]:
     """Seconds to the first heartbeat, to all services ready, and to the first command that moves the wheels."""
-    with _driving(subscriber):
+    with driving(robot.remote_port, BASE):
         began_ns = time.monotonic_ns()
         robot.launch()
-        robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", _UP_S)
-        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
-        robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", _UP_S)
+        robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
+        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
+        robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
     times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
     return [(time_ns - began_ns) / 1e9 for time_ns in times]
 
@@ -78,24 +76,6 @@ def _obeyed(robot: Robot, since_ns: int) -> list[int]:
     return [line.ns for line in robot.lines(since_ns) if line.drive is not None and any(line.drive)]
 
 
-@contextmanager
-def _driving(operator: RobotSubscriber) -> Iterator[None]:
-    """Sends commands at a steady rate during the ``with`` block, whether or not the robot receives them."""
-    enough = threading.Event()
-
-    def drive() -> None:
-        while not enough.is_set():
-            operator.drive(_SLICE_S, RATE_HZ)
-
-    thread = threading.Thread(target=drive, name="driver", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        enough.set()
-        thread.join()
-
-
 # -- the first picture
 
 
@@ -103,21 +83,20 @@ class _Operator(MediaReceiver):
     """An operator who waits for the first picture in one encoding."""
 
     def __init__(self, transport: Transport, encoding: str) -> None:
-        self._encoding, self._first_ns = encoding, 0
-        self._shown = threading.Event()
+        self._encoding, self._first_ns = encoding, 0  # not yet
         super().__init__(transport, BASE)
 
     def on_picture(self, picture: Decoded) -> None:
-        if picture.encoding == self._encoding and not self._shown.is_set():
+        if picture.encoding == self._encoding and not self._first_ns:
             self._first_ns = time.monotonic_ns()
-            self._shown.set()
 
     def wait_ms(self) -> float:
         """Milliseconds from the request to the first picture. Raises PebbleError if none comes."""
-        self.wait_for_capabilities(_UP_S)
+        self.wait_for_capabilities(UP_S)
         began_ns = time.monotonic_ns()
         self.request(self._encoding, sound=False)
-        while not self._shown.wait(_POLL_S):
+        while not self._first_ns:
+            time.sleep(_POLL_S)
             self.poll()
             if time.monotonic_ns() - began_ns > 1e9 * _PICTURE_S:
                 raise PebbleError(f"no picture as {self._encoding} within {_PICTURE_S:.0f} s")
@@ -126,13 +105,7 @@ class _Operator(MediaReceiver):
 
 def first_pictures(case: Case) -> Iterator[Cell]:
     """The wait with the camera at rest, and that of a second operator, of a fresh robot in each encoding."""
-    with (
-        one_robot(case.variant, services=MEDIA) as robot,
-        closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber,
-    ):
-        subscriber.wait()
-        robot.launch()
-        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", _UP_S)
+    with ready_robot(case.variant) as (robot, _):
         for encoding in ALL_VIDEO:
             robot.expect(lambda: _CAMERA not in robot.processes(), "the camera does not rest", _REST_S)
             with _operator(robot, encoding) as first, _operator(robot, encoding) as second:

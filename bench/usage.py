@@ -1,14 +1,21 @@
-"""Resource usage of processes, read from the kernel."""
+"""Resource usage of processes, read from the kernel, and the time in which this machine wakes up a process."""
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from statistics import median_low
 
 from pebble.errors import PebbleError
 
 _PROC = Path("/proc")
+_PINGS = 60
+_PERIOD_S = 0.005  # as messages at 200 Hz: cores go idle in between
 
 
 def cpu_s(pids: Iterable[int]) -> float:
@@ -33,10 +40,13 @@ def wake_ups(pids: Iterable[int]) -> int:
 
 def _switches(task: Path) -> int:
     try:
-        lines = (task / "status").read_text().splitlines()
+        return _sum(task / "status", "voluntary_ctxt_switches:")
     except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
         return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt_switches:")), 0)
+
+
+def _sum(file: Path, *fields: str) -> int:
+    return sum(int(line.split()[1]) for line in file.read_text().splitlines() if line.startswith(fields))
 
 
 def pss_mb(pid: int) -> float:
@@ -58,11 +68,50 @@ def own_mb(pid: int) -> float:
 
 def _memory_mb(pid: int, *fields: str) -> float:
     try:
-        lines = (_PROC / str(pid) / "smaps_rollup").read_text().splitlines()
+        return _sum(_PROC / str(pid) / "smaps_rollup", *fields) / 1024
     except (FileNotFoundError, PermissionError) as error:
         if (_PROC / str(pid)).exists():
             raise PebbleError(f"{error.filename}: {error.strerror}: memory cannot be measured without it") from None
-        return 0.0
     except ProcessLookupError:
-        return 0.0
-    return sum(int(line.split()[1]) for line in lines if line.startswith(fields)) / 1024
+        pass
+    return 0.0
+
+
+# -- the time of a wake-up, which every message needs several times
+
+
+def wake_up_us() -> tuple[float, float]:
+    """The time to wake up a waiting process on the same core and on another one, us; equal if there is only one core.
+
+    It is half of the median round trip of a byte through a socket to ``cat``: a round trip is two wake-ups and little
+    else. Raises PebbleError without ``cat``.
+    """
+    if sys.platform != "linux":  # cores cannot be chosen
+        return _wake_up_us(), _wake_up_us()
+    cores = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, cores[:1])  # only this thread, and processes that it starts meanwhile
+    try:
+        return _wake_up_us(cores[0]), _wake_up_us(cores[-1])
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def _wake_up_us(core: int | None = None) -> float:
+    near, far = socket.socketpair()
+    with near, far:
+        try:
+            cat = subprocess.Popen(["cat"], stdin=far.fileno(), stdout=far.fileno())
+        except OSError as error:
+            raise PebbleError(f"cat: {error.strerror}") from None
+        with cat:
+            if core is not None:
+                os.sched_setaffinity(cat.pid, {core})
+            ways = []
+            for _ in range(_PINGS):
+                time.sleep(_PERIOD_S)
+                sent = time.monotonic_ns()
+                near.send(b".")
+                near.recv(1)
+                ways.append(time.monotonic_ns() - sent)
+            near.shutdown(socket.SHUT_WR)  # it ends when its input closes
+    return median_low(ways) / 2000

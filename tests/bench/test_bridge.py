@@ -5,6 +5,7 @@ import json
 import math
 import struct
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -26,8 +27,7 @@ from pebble.bench.bridge_operator import (
 )
 from pebble.bench.bridge_profile import _stamp, commands
 from pebble.bench.bridge_report import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
-from pebble.bench.bridge_robots import BRIDGE as FORWARDER
-from pebble.bench.bridge_robots import HOP, SERIAL, STAND_IN
+from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.results import Cell, Judged, Value, load
 from pebble.errors import PebbleError
@@ -193,7 +193,7 @@ def _fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeRobot, "driven", [])
     for name in ("DrivenRobot", "OneHop"):
         monkeypatch.setattr(bridge, name, FakeRobot)
-    monkeypatch.setattr(bridge, "MediaLoad", lambda driven: driven)
+    monkeypatch.setattr(bridge, "media_load", lambda driven: nullcontext(driven.counts))
     for name in ("_STARTUP_S", "_MEDIA_STARTUP_S"):
         monkeypatch.setattr(bridge, name, 0.0)
     monkeypatch.setattr(engine, "find_spec", lambda _name: None)

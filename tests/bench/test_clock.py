@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from pebble.bench.clock import DRIFT, LEAST, estimate, one_way_ns
 from pebble.bench.control_ends import Exchange
+from pebble.bench.control_far import DRIFT, LEAST, estimate, one_way_ns
 from pebble.errors import PebbleError
 
 SECOND = 10**9

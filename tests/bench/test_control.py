@@ -13,11 +13,10 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import control_far, engine
-from pebble.bench.clock import Offset
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.control import CONTROL, CONTROL_FAR
 from pebble.bench.control_ends import Exchange, SliceSpec
-from pebble.bench.control_far import BACK, THERE
+from pebble.bench.control_far import BACK, THERE, Offset
 from pebble.bench.control_participants import VARIANTS, Participants
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP
 from pebble.bench.results import Cell, load

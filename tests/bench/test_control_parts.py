@@ -17,6 +17,7 @@ from pebble.bench.control import CONTROL, CONTROL_NULL
 from pebble.bench.control_ends import (
     REPLIES,
     REQUESTS,
+    Answer,
     Echo,
     Handler,
     Sender,
@@ -29,7 +30,6 @@ from pebble.bench.control_ends import (
 )
 from pebble.bench.control_participants import VARIANTS, Slice
 from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, tables
-from pebble.bench.control_worker import Answer
 from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
@@ -51,8 +51,6 @@ def test_messages_have_the_size_that_was_asked_for_both_ways(size: int) -> None:
 class Loop:
     """A connection to an echo in this process; ``spoil`` changes the replies."""
 
-    received_ns = 0
-
     def __init__(self, spoil: Callable[[bytes], list[bytes]] = lambda payload: [payload]) -> None:
         self._handlers: dict[str, Handler] = {}
         self._spoil = spoil
@@ -64,7 +62,7 @@ class Loop:
     def publish(self, topic: str, payload: bytes) -> None:
         self.sizes.append(len(payload))
         for one in self._spoil(payload) if topic.startswith(f"{REPLIES}/") else [payload]:
-            self._handlers[topic](topic, one)
+            self._handlers[topic](topic, one, 0)
 
     def close(self) -> None:
         """Nothing is open."""
@@ -385,9 +383,6 @@ class Idle:
 
     def wait(self, _timeout: float) -> None:
         self.checks += 1
-
-    def write_count(self) -> None:
-        """No output."""
 
 
 def test_a_reader_that_is_off_still_runs_its_network_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from pebble.bench.comparison import Case
 from pebble.bench.cost import COST, IDLE, Reading, legend
 from pebble.bench.engine import Collected
 from pebble.bench.results import Cell
-from pebble.bench.robot_subscriber import encoding_of
+from pebble.bench.subscribers import encoding_of
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 
 

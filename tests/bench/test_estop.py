@@ -164,9 +164,7 @@ def test_the_driver_sends_a_zero_before_and_after_its_commands(broker: Broker, t
     def note(message: Message) -> None:
         received.append((message.topic.split("/")[2], json.loads(message.payload)["z"]))
 
-    driver = Worker(
-        "driver", [sys.executable, "-m", "pebble.bench.estop_driver", str(broker.port)], tmp_path / "driver.log"
-    )
+    driver = Worker("driver", [sys.executable, "-m", "pebble.bench.drivers", str(broker.port)], tmp_path / "driver.log")
     with create("mqtt", "test", MqttSettings(host="127.0.0.1", port=broker.port)) as transport:
         try:
             transport.subscribe("+/+/+/incoming/drive-values", note, qos=QoS.DELIVERED, direct=True)

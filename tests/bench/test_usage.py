@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.bench import usage
-from pebble.bench.usage import cpu_s, own_mb, pss_mb, wake_ups
-from pebble.bench.wake_up import wake_up_us
+from pebble.bench.usage import cpu_s, own_mb, pss_mb, wake_up_us, wake_ups
 from pebble.errors import PebbleError
 from pebble.rig.programs import children
 from pebble.rig.worker import Worker

@@ -18,8 +18,8 @@ from rich.console import Console
 from pebble import cli
 from pebble.bench import engine
 from pebble.bench.comparison import Case
+from pebble.bench.drivers import STEPS
 from pebble.bench.fleet import FLEET, cell_of, latencies_ms, longest_gap_s, measure
-from pebble.bench.fleet_operator import STEPS
 from pebble.bench.results import load
 from pebble.errors import ConfigError, PebbleError
 from pebble.simulation.fleet import MOST, Moved, members
