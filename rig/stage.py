@@ -9,8 +9,7 @@ from typing import Any
 
 from pebble.errors import PebbleError
 from pebble.rig.operator import Operator
-from pebble.rig.page import PageServer
-from pebble.rig.testbed import ROBOTS, Testbed
+from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.simulation.trace import Entry
 
 _DRIVABLE_S = 30.0

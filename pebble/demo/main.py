@@ -29,12 +29,11 @@ from pebble.rig.emergency import NAME as EMERGENCY_STOP
 from pebble.rig.emergency import CompletedStop
 from pebble.rig.machine import Machine
 from pebble.rig.operator import Operator
-from pebble.rig.page import PageServer
 from pebble.rig.steps import ROUND_S, SCRIPT, CompletedStep
 from pebble.rig.takeover import DURATION_S as TAKEOVER_S
 from pebble.rig.takeover import NAME as BY_ITSELF
 from pebble.rig.takeover import CompletedFollow
-from pebble.rig.testbed import ROBOTS, Testbed
+from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT
 
