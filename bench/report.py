@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -23,12 +19,14 @@ from pebble.bench.engine import check_folder
 from pebble.bench.report_text import HEADING, HUNG, INTERRUPTED, Outcome, Run, Section, text
 from pebble.bench.results import load, pack
 from pebble.errors import PebbleError
-from pebble.runtime.parent import tied_to_parent
+from pebble.rig.processes import python
+from pebble.rig.programs import Program, end_all
 from pebble.runtime.signals import interrupted_by_signals
 
 NAME = "README.md"
 _ENDED = "report.json"
-_WIDTH = 120  # characters of the comparisons' tables
+#: Before a command: its tables are plain text of this width.
+_PLAIN = ("env", "-u", "FORCE_COLOR", "-u", "TTY_COMPATIBLE", "COLUMNS=120", "NO_COLOR=1", "PYTHONUNBUFFERED=1")
 _POLL_S = 0.2
 _TIMEOUT_FACTOR = 4  # a comparison that takes this many times the expected time,
 _TIMEOUT_EXTRA_S = 60.0  # and this in addition, is ended
@@ -128,9 +126,7 @@ def _section(comparison: Comparison, folder: Path, known: Run, redraw: bool) -> 
     except PebbleError as error:  # of another version: the other sections are still written
         return replace(found, output=str(error))
     named = [(f"{picture.name}.png", picture.caption) for picture in pictures(results)]
-    if redraw or not all(
-        (folder / name).exists() for name, _ in named
-    ):  # a comparison that ran just now has drawn its own
+    if redraw or not all((folder / name).exists() for name, _ in named):  # one that ran just now has drawn its own
         draw(results, folder)
     return replace(found, results=results, pictures=named)
 
@@ -164,44 +160,17 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
 
 def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[float], None]) -> int:
     """Runs a comparison's command line and returns its exit code. The process ends with this one."""
-    words = [*comparison.arguments(quick), "--output", str(folder)]
-    began, longest = time.monotonic(), _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
-    path = folder / f"{comparison.name}.txt"
-    with path.open("wb") as output:
-        process = subprocess.Popen(
-            tied_to_parent([sys.executable, "-m", "pebble.cli", *words], signal.SIGTERM),
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,  # only this process handles Ctrl-C
-            env=_plain(os.environ),
-        )
-        try:
-            while process.poll() is None and time.monotonic() - began < longest:
-                tick(time.monotonic() - began)
-                time.sleep(_POLL_S)
-            hung = process.poll() is None
-        finally:
-            _end(process)
-    return HUNG if hung else process.returncode
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Terminates the process, which ends its own processes; kills the group after a timeout."""
-    if process.poll() is not None:
-        return
-    process.terminate()
+    words = python("pebble.cli", *comparison.arguments(quick), "--output", folder)
+    longest = _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
+    program = Program(comparison.name, [*_PLAIN, *words], folder / f"{comparison.name}.txt")
+    began = time.monotonic()
     try:
-        process.wait(_END_S)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-def _plain(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment for plain-text tables of a fixed width."""
-    retained = {name: value for name, value in environment.items() if name not in ("FORCE_COLOR", "TTY_COMPATIBLE")}
-    return {**retained, "COLUMNS": str(_WIDTH), "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
+        while program.code is None and (since_s := time.monotonic() - began) < longest:
+            tick(since_s)
+            time.sleep(_POLL_S)
+        return HUNG if program.code is None else program.code
+    finally:
+        end_all([program], _END_S)
 
 
 def _delete_results(comparison: Comparison, folder: Path) -> None:
