@@ -11,16 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final
 
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench.results import LONGEST_S, Cell, Judged, Results, Value
+from pebble.bench.pictures import Drawn
+from pebble.bench.results import LONGEST_S, Cell, Judged, Value
 from pebble.errors import PebbleError
-
-if TYPE_CHECKING:
-    from pebble.bench.plots import Picture
 
 FOLDER: Final = Path("bench-results")
 
@@ -112,12 +110,6 @@ class Budget(dict[str, Any]):
         self.takes_s = takes_s
 
 
-class Drawing(Protocol):
-    """One of the kinds of pictures in :mod:`pebble.bench.pictures`."""
-
-    def pictures(self, results: Results) -> list[Picture]: ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
     """The engine calls ``measure`` for each case, or ``measure_round`` for each round, which calls :meth:`Round.cases`.
@@ -153,7 +145,7 @@ class Comparison:
     legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
-    pictures: Sequence[Drawing] = ()
+    pictures: Sequence[Drawn] = ()
 
     folder: Path = FOLDER  # of the results, by default
     is_null: bool = False  # one variant in three roles: see pebble.bench.null

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from pebble.bench import null
 from pebble.bench.comparison import Case, Combine, Comparison, Round, Run
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import OVER_TIME, Cell, Judged, Results, Value, begin, grouped, percentile
+from pebble.bench.results import OVER_TIME, Cell, Judged, Results, Value, begin, grouped, named, percentile
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
@@ -272,11 +272,9 @@ class Rounds:
 
 def check_folder(folder: Path) -> None:
     """Raises PebbleError if the folder cannot be written: before an hour of measuring, not after it."""
-    try:
+    with named(folder):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise PebbleError(f"{folder}: {error.strerror}") from None
 
 
 def _finish(results: Results, folder: Path, console: Console) -> None:

@@ -21,8 +21,7 @@ from PIL import Image
 
 from pebble.bench import catalogue
 from pebble.bench.pictures import ecdf
-from pebble.bench.results import Cell, Results
-from pebble.errors import PebbleError
+from pebble.bench.results import Cell, Results, named
 
 _DPI = 150
 _COLOURS = 255  # of the palette, which reduces files to a third
@@ -204,10 +203,8 @@ def save(picture: Picture, path: Path, results: Results) -> None:
         figure.savefig(buffer, format="png", dpi="figure")
     drawn = Image.open(buffer).convert("RGB")
     image = drawn.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    try:
+    with named(path):
         image.save(path, optimize=True, dpi=(_DPI, _DPI))
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
 
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:

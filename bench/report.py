@@ -17,7 +17,7 @@ from pebble.bench import catalogue
 from pebble.bench.comparison import Comparison
 from pebble.bench.engine import check_folder
 from pebble.bench.report_text import HEADING, HUNG, INTERRUPTED, Outcome, Run, Section, text
-from pebble.bench.results import load, pack
+from pebble.bench.results import load, named, pack
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
 from pebble.rig.programs import Program, end_all
@@ -89,10 +89,8 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
     if not sections:
         raise PebbleError(f"{folder} has no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME
-    try:
+    with named(path):
         path.write_text(text(sections, known))
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
     return path
 
 
@@ -104,10 +102,8 @@ def _require_matplotlib() -> None:
 def _check_not_foreign(folder: Path) -> None:
     """Raises PebbleError if README.md is not one of our reports, which would be overwritten."""
     path = folder / NAME
-    try:
+    with named(path):
         ours = not path.exists() or path.read_text(errors="replace").startswith(HEADING)
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
     if not ours:
         raise PebbleError(f"{path} is not a report of pebble bench and would be overwritten: name another folder")
 
@@ -191,10 +187,8 @@ def _delete_results(comparison: Comparison, folder: Path) -> None:
 
 def _save(known: Run, folder: Path) -> None:
     path = folder / _ENDED
-    try:
+    with named(path):
         path.write_bytes(msgspec.json.format(msgspec.json.encode(known)) + b"\n")
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
 
 
 def _known(folder: Path) -> Run:

@@ -9,8 +9,8 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TypeVar
@@ -30,7 +30,8 @@ _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "a
 _DIGITS = 3  # decimal places of a sample
 
 Value = str | int | float | bool | None
-T, K = TypeVar("T"), TypeVar("K", bound=Hashable)
+T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 
 
 class Cell(msgspec.Struct, kw_only=True):
@@ -127,10 +128,17 @@ class Results(msgspec.Struct, kw_only=True):
         """Raises PebbleError if the file cannot be written."""
         for cell in self.cells:
             cell.rounds = [[round(sample, _DIGITS) for sample in one] for one in cell.rounds]
-        try:
+        with named(path):
             path.write_bytes(msgspec.json.encode(self) + b"\n")
-        except OSError as error:
-            raise PebbleError(f"{path}: {error.strerror}") from None
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Raises PebbleError with the path for an OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise PebbleError(f"{path}: {error.strerror}") from None
 
 
 def _thinned(samples: Sequence[float], most: int) -> list[float]:
@@ -175,9 +183,8 @@ def _unpack(results: Results, path: Path) -> None:
 def load(path: Path) -> Results:
     """Raises PebbleError if the file holds no results."""
     try:
-        results = msgspec.json.decode(path.read_bytes(), type=Results)
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
+        with named(path):
+            results = msgspec.json.decode(path.read_bytes(), type=Results)
     except msgspec.DecodeError as error:
         raise PebbleError(f"{path} holds no results of pebble bench: {error}") from None
     if results.format != FORMAT:
