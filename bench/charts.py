@@ -70,7 +70,7 @@ def ratios(results: Results, title: str, baseline: str, measures: Sequence[str] 
         (cell, paired(cell.rounds, base.rounds))
         for cell in results.cells
         if not measures or cell.measure in measures
-        if (base := base_of(cell, results.cells, baseline)) is not None and base is not cell
+        if (base := base_of(cell, results.cells, baseline)) is not None
     ]
     return _ratios(results, found, f"{title}: median latency as a ratio to {baseline}'s", baseline)
 

@@ -126,7 +126,7 @@ def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
 def _alone(cell: Cell, kind: Kind) -> Finding:
     figure = _figure(cell, _PERCENTS[0])
     a, b = (math.nan, figure) if kind is Kind.ONLY_B else (figure, math.nan)
-    return Finding(cell, _PERCENTS[0], a, b, Interval(math.nan, math.nan, math.nan), kind)
+    return Finding(cell, _PERCENTS[0], a, b, Interval(), kind)
 
 
 def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float) -> Finding:
@@ -150,8 +150,8 @@ def _lost(one: Cell, other: Cell, level: float) -> Finding:
         error = math.sqrt(sum(statistics.variance(shares) / len(shares) for shares in (a, b)))
         changed = abs(grown) > max(_LOSS, student(level, rounds) * error)
         kind = Kind.EQUAL if not changed else Kind.WORSE if grown > 0 else Kind.BETTER
-    unknown = Interval(math.nan, math.nan, math.nan, level, rounds)
-    return Finding(other, None, 100 * statistics.fmean(a), 100 * statistics.fmean(b), unknown, kind)
+    shares = (100 * statistics.fmean(a), 100 * statistics.fmean(b))
+    return Finding(other, None, *shares, Interval(level=level, rounds=rounds), kind)
 
 
 def _counts(cell: Cell) -> bool:
