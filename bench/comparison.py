@@ -187,8 +187,7 @@ class Comparison:
         if self.variants:
             values.setdefault("variants", list(self.variants))
         values |= {name: value for name, value in given.items() if value is not None}
-        run = Run(self, values, quick, output)
-        run.console = console or Console()
+        run = Run(self, values, quick, output, console=console or Console())
         for option in self.options:
             if run.options.get(option.key) is not None:
                 option.check(run.options[option.key])
@@ -206,10 +205,8 @@ class Run:
     notes: list[str] = field(default_factory=list)  # sentences at the end of the assessment
     recorded: dict[str, Value | list[Value]] = field(default_factory=dict)  # more options of the results
     problem: PebbleError | None = None  # ended the run early, and is raised when the results are written
-
-    def __post_init__(self) -> None:
-        self.console = Console()
-        self.show: Callable[[str], None] = lambda _text: None  # what is being done
+    console: Console = field(default_factory=Console)
+    show: Callable[[str], None] = lambda _text: None  # what is being done
 
     def __getitem__(self, name: str) -> Any:
         return self.options[name]
