@@ -83,7 +83,7 @@ def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Findin
         _alone(before[key], Kind.NO_SAMPLES if key in silent else Kind.ONLY_A) for key in before if key not in after
     ]
     findings += [_alone(after[key], Kind.ONLY_B) for key in after if key not in before]
-    return sorted(findings, key=_order)
+    return sorted(findings, key=lambda one: (list(Kind).index(one.kind), -one.ratio.ratio if one.ratio.known else 0.0))
 
 
 def certainty(figures: int) -> float:
@@ -93,19 +93,16 @@ def certainty(figures: int) -> float:
 
 def differences(a: Results, b: Results) -> list[str]:
     """Other differences between two runs, one line each: the program may then not be the only cause."""
-    return [
-        *_differing("machine", a.machine, b.machine),
-        *_differing("option", a.options, b.options),
-        *_differing("", {"pebble": a.pebble, "quick": a.quick}, {"pebble": b.pebble, "quick": b.quick}),
+    of = [
+        {**_named("machine ", one.machine), **_named("option ", one.options), "pebble": one.pebble, "quick": one.quick}
+        for one in (a, b)
     ]
+    names = {name: [one.get(name) for one in of] for name in {**of[0], **of[1]}}
+    return [f"{name}: {one} in A, {other} in B" for name, (one, other) in names.items() if one != other]
 
 
-def _differing(what: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    return [
-        f"{what} {name}: {one.get(name)} in A, {other.get(name)} in B".strip()
-        for name in {**one, **other}
-        if one.get(name) != other.get(name)
-    ]
+def _named(what: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{what}{name}": value for name, value in values.items()}
 
 
 def _by_key(cells: Sequence[Cell]) -> dict[Hashable, Cell]:
@@ -171,16 +168,11 @@ def _figure(cell: Cell, percent: int) -> float:
 
 
 def _kind(ratio: Interval, threshold: float, unit: str) -> Kind:
-    if math.isnan(ratio.ratio):  # of values that are 0
+    if not ratio.known:  # of values that are 0
         return Kind.UNKNOWN
     if ratio.equal or 1 / threshold < ratio.ratio < threshold:
         return Kind.EQUAL
     return Kind.WORSE if (ratio.ratio > 1) != (unit in _MORE_IS_BETTER) else Kind.BETTER
-
-
-def _order(finding: Finding) -> tuple[int, float]:
-    size = finding.ratio.ratio
-    return list(Kind).index(finding.kind), 0.0 if math.isnan(size) else -size
 
 
 def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
@@ -197,8 +189,8 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
             f" 1.00; random variation within the runs shows any change with a chance of about {100 * CHANCE:g} %, and"
             " variation between runs adds to that"
         )
-    if widths := [_width(finding.ratio) for finding in judged if finding.percent == _PERCENTS[0]]:
-        seen = max(threshold, statistics.median(widths))
+    if ratios := [one.ratio for one in judged if one.percent == _PERCENTS[0]]:
+        seen = max(threshold, statistics.median(max(one.high / one.ratio, one.ratio / one.low) for one in ratios))
         lines.append(f"Half of the medians would have shown a change by a factor of {seen:.2f}")
     notes = {
         Kind.NO_SAMPLES: "without samples in B: counted as worse",
@@ -209,19 +201,11 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
     return [*lines, *(f"{count[kind]} {note}" for kind, note in notes.items() if count[kind])]
 
 
-def _width(ratio: Interval) -> float:
-    return max(ratio.high / ratio.ratio, ratio.ratio / ratio.low)
-
-
 # -- what is printed
 
 _COLOURS = {
-    Kind.NO_SAMPLES: "red",
-    Kind.WORSE: "red",
-    Kind.ONLY_A: "yellow",
-    Kind.ONLY_B: "yellow",
-    Kind.BETTER: "green",
-}
+    Kind.NO_SAMPLES: "red", Kind.WORSE: "red", Kind.ONLY_A: "yellow", Kind.ONLY_B: "yellow", Kind.BETTER: "green",
+}  # fmt: skip
 
 
 def run(
