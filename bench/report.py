@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -83,9 +84,8 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
     _require_matplotlib()
     _check_not_foreign(folder)
     known = _known(folder)
-    sections = [
-        section for one in catalogue.reported() if (section := _section(one, folder, known, redraw)) is not None
-    ]
+    every = (_section(one, folder, known, redraw) for one in catalogue.reported())
+    sections = [section for section in every if section is not None]
     if not sections:
         raise PebbleError(f"{folder} has no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME
@@ -133,19 +133,19 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task("", total=sum(expected))
+
+        def tick(number: int, since_s: float) -> None:
+            name, expected_s = comparisons[number].name, expected[number]
+            text = f"{number + 1} of {len(comparisons)}: {name}, {since_s:.0f} s of about {expected_s}"
+            progress.update(bar, description=text, completed=sum(expected[:number]) + min(since_s, expected_s))
+
         for number, one in enumerate(comparisons):
-
-            def tick(since_s: float, number: int = number, name: str = one.name) -> None:
-                text = f"{number + 1} of {len(comparisons)}: {name}, {since_s:.0f} s of about {expected[number]}"
-                done = sum(expected[:number]) + min(since_s, expected[number])
-                progress.update(bar, description=text, completed=done)
-
             _delete_results(one, folder)
             known.ended[one.name] = Outcome(code=INTERRUPTED, took_s=0.0)  # until it ends
             known.interrupted = f"in {one.name}, after {number} of {len(comparisons)}"
             _save(known, folder)
             began = time.monotonic()
-            code = _run(one, folder, quick, tick)
+            code = _run(one, folder, quick, partial(tick, number))
             left = (folder / f"{one.name}.json").exists()
             ended = Outcome(code=code, took_s=round(time.monotonic() - began, 1), results=left)
             known.ended[one.name], known.interrupted = ended, ""
@@ -195,8 +195,6 @@ def _known(folder: Path) -> Run:
     """The state of a folder; empty without the file. Raises PebbleError for an invalid file."""
     path = folder / _ENDED
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Run)
-    except FileNotFoundError:
-        return Run()
+        return msgspec.json.decode(path.read_bytes(), type=Run) if path.exists() else Run()
     except (OSError, msgspec.DecodeError) as error:
         raise PebbleError(f"{path} cannot be read: {error}") from None
