@@ -25,6 +25,7 @@ _TAIL = 12  # lines of a failed command's output
 
 
 HUNG, INTERRUPTED = -1, -2
+_WHY = {HUNG: "hung and was ended", INTERRUPTED: "was interrupted"}
 
 
 class Outcome(msgspec.Struct, kw_only=True):
@@ -37,12 +38,8 @@ class Outcome(msgspec.Struct, kw_only=True):
     @property
     def problem(self) -> str:
         """Why it failed; empty if it did not."""
-        if self.code == HUNG:
-            return "hung and was ended"
-        if self.code == INTERRUPTED:
-            return "was interrupted"
         if self.code:
-            return f"ended with code {self.code}"
+            return _WHY.get(self.code, f"ended with code {self.code}")
         return "" if self.results else "measured nothing"
 
 

@@ -66,12 +66,15 @@ SCRIPT = (
 ROUND_S = sum(step.drive_s + step.rest_s for step in SCRIPT)
 
 
-def repeat(send: Callable[[], None], wait: Wait, seconds: float) -> None:
-    """Send a drive command again and again, as a held stick does."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+def repeat(send: Callable[[], None], wait: Wait, seconds: float) -> float:
+    """Send a drive command again and again, as a held stick does; returns when it was last sent (monotonic)."""
+    began = due = sent = time.monotonic()
+    while due < began + seconds:
         send()
-        wait(COMMAND_PERIOD_S)
+        sent = time.monotonic()
+        due += COMMAND_PERIOD_S
+        wait(max(0.0, due - sent))
+    return sent
 
 
 # -- all robots are stopped, driven in vain, and reset

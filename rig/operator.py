@@ -166,13 +166,9 @@ class Operator:
         return [robot for robot in robots if self._mine(robot)]
 
     def _perform(self, step: Step, robots: list[DiscoveredRobot]) -> None:
-        began = due = released = time.monotonic()
+        began = time.monotonic()
         self._switch_lights(step, robots)
-        while due < began + step.drive_s:
-            self._send(step.drive, robots)
-            released = time.monotonic()
-            due += COMMAND_PERIOD_S
-            self._wait(max(0.0, due - released))
+        released = repeat(lambda: self._send(step.drive, robots), self._wait, step.drive_s)
         if step.sends_stop:
             self._send(STOP, robots)
             released = time.monotonic()
