@@ -255,7 +255,6 @@ class Case:
         params: Mapping[str, Value] | None = None,
         **figures: Value,
     ) -> Cell:
-        """The cell of this round."""
         return Cell(
             variant=self.role,
             params={**self.condition, **(params or {})},

@@ -112,17 +112,8 @@ class Results(msgspec.Struct, kw_only=True):
     aims: list[Judged] = []
 
     def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
-        """The first cell that matches."""
-        return next(
-            (
-                cell
-                for cell in self.cells
-                if cell.variant == variant
-                and measure in (None, cell.measure)
-                and all(cell.params.get(name) == value for name, value in params.items())
-            ),
-            None,
-        )
+        same = (one for one in self.cells if one.variant == variant and params.items() <= one.params.items())
+        return next((one for one in same if measure in (None, one.measure)), None)
 
     def save(self, path: Path) -> None:
         """Raises PebbleError if the file cannot be written."""

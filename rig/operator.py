@@ -89,7 +89,6 @@ class Operator:
             time.sleep(_POLL_S)
 
     def show(self, event: str) -> None:
-        """Add a line to the events."""
         self.events.append((time.monotonic(), f"operator {event}"))
 
     @property
@@ -180,7 +179,6 @@ class Operator:
         )
 
     def _stop_all(self, robots: list[DiscoveredRobot]) -> None:
-        """Stop all robots, try to drive them, and reset them."""
         robots = self._begin(EMERGENCY_STOP, robots)
         emergency = EmergencyStop(self._transport, lambda drive: self._send(drive, robots), self._wait, by=NAME)
         with closing(self._transport.subscribe(ALL_OUTGOING, emergency.receive)):  # brings retained capabilities again

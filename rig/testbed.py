@@ -68,7 +68,6 @@ class LinuxRobot(Robot):
         self.start(self.name, python("pebble.cli", "up", self.config))
 
     def relays(self) -> list[Entry]:
-        """As its station's trace has them."""
         trace = self._trace_of(OUTLETS)
         return [entry for entry in read_trace(trace) if entry.event == "relay"] if OUTLETS in self._devices else []
 
