@@ -214,8 +214,8 @@ class Robot(SimulatedRobot):
         self._started.append(self._add(name, self._wrap(command), ROBOTS, "robot.log"))
 
     def _start_motors(self) -> Program:
-        said = ["--trace-said"] if self.reports else []
-        return self._start_mcu("pebble.simulation.mcu", *board("goob", self.port, self._trace), *said, reports=False)
+        options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
+        return self._start_mcu("pebble.simulation.mcu", *options, reports=False)
 
     def _contents(self) -> dict[str, Any]:
         """Of its config file."""
