@@ -93,16 +93,17 @@ def certainty(figures: int) -> float:
 
 def differences(a: Results, b: Results) -> list[str]:
     """Other differences between two runs, one line each: the program may then not be the only cause."""
-    of = [
-        {**_named("machine ", one.machine), **_named("option ", one.options), "pebble": one.pebble, "quick": one.quick}
-        for one in (a, b)
+    groups: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
+        "machine ": (a.machine, b.machine),
+        "option ": (a.options, b.options),
+        "": ({"pebble": a.pebble, "quick": a.quick}, {"pebble": b.pebble, "quick": b.quick}),
+    }
+    return [
+        f"{what}{name}: {one.get(name)} in A, {other.get(name)} in B"
+        for what, (one, other) in groups.items()
+        for name in {**one, **other}
+        if one.get(name) != other.get(name)
     ]
-    names = {name: [one.get(name) for one in of] for name in {**of[0], **of[1]}}
-    return [f"{name}: {one} in A, {other} in B" for name, (one, other) in names.items() if one != other]
-
-
-def _named(what: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    return {f"{what}{name}": value for name, value in values.items()}
 
 
 def _by_key(cells: Sequence[Cell]) -> dict[Hashable, Cell]:
