@@ -1,6 +1,5 @@
 """Results of two robots in words: what is claimed, and what is not."""
 
-
 from pebble.bench.results import Cell
 from pebble.bench.tables import against, caveat, sentence, spread
 
