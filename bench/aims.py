@@ -96,7 +96,7 @@ class RatioAim:
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Judged]:
         for cell in filter(self.of, cells):
             base = base_of(cell, cells, self.to)
-            if base is not None and base is not cell:
+            if base is not None:
                 yield self._judged(cell, base)
 
     def _judged(self, cell: Cell, base: Cell) -> Judged:

@@ -83,7 +83,7 @@ def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Findin
         _alone(before[key], Kind.NO_SAMPLES if key in silent else Kind.ONLY_A) for key in before if key not in after
     ]
     findings += [_alone(after[key], Kind.ONLY_B) for key in after if key not in before]
-    return sorted(findings, key=_order)
+    return sorted(findings, key=lambda one: (list(Kind).index(one.kind), -one.ratio.ratio if one.ratio.known else 0.0))
 
 
 def certainty(figures: int) -> float:
@@ -93,16 +93,14 @@ def certainty(figures: int) -> float:
 
 def differences(a: Results, b: Results) -> list[str]:
     """Other differences between two runs, one line each: the program may then not be the only cause."""
+    groups: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
+        "machine ": (a.machine, b.machine),
+        "option ": (a.options, b.options),
+        "": ({"pebble": a.pebble, "quick": a.quick}, {"pebble": b.pebble, "quick": b.quick}),
+    }
     return [
-        *_differing("machine", a.machine, b.machine),
-        *_differing("option", a.options, b.options),
-        *_differing("", {"pebble": a.pebble, "quick": a.quick}, {"pebble": b.pebble, "quick": b.quick}),
-    ]
-
-
-def _differing(what: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    return [
-        f"{what} {name}: {one.get(name)} in A, {other.get(name)} in B".strip()
+        f"{what}{name}: {one.get(name)} in A, {other.get(name)} in B"
+        for what, (one, other) in groups.items()
         for name in {**one, **other}
         if one.get(name) != other.get(name)
     ]
@@ -126,7 +124,7 @@ def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
 def _alone(cell: Cell, kind: Kind) -> Finding:
     figure = _figure(cell, _PERCENTS[0])
     a, b = (math.nan, figure) if kind is Kind.ONLY_B else (figure, math.nan)
-    return Finding(cell, _PERCENTS[0], a, b, Interval(math.nan, math.nan, math.nan), kind)
+    return Finding(cell, _PERCENTS[0], a, b, Interval(), kind)
 
 
 def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float) -> Finding:
@@ -150,8 +148,8 @@ def _lost(one: Cell, other: Cell, level: float) -> Finding:
         error = math.sqrt(sum(statistics.variance(shares) / len(shares) for shares in (a, b)))
         changed = abs(grown) > max(_LOSS, student(level, rounds) * error)
         kind = Kind.EQUAL if not changed else Kind.WORSE if grown > 0 else Kind.BETTER
-    unknown = Interval(math.nan, math.nan, math.nan, level, rounds)
-    return Finding(other, None, 100 * statistics.fmean(a), 100 * statistics.fmean(b), unknown, kind)
+    shares = (100 * statistics.fmean(a), 100 * statistics.fmean(b))
+    return Finding(other, None, *shares, Interval(level=level, rounds=rounds), kind)
 
 
 def _counts(cell: Cell) -> bool:
@@ -171,16 +169,11 @@ def _figure(cell: Cell, percent: int) -> float:
 
 
 def _kind(ratio: Interval, threshold: float, unit: str) -> Kind:
-    if math.isnan(ratio.ratio):  # of values that are 0
+    if not ratio.known:  # of values that are 0
         return Kind.UNKNOWN
     if ratio.equal or 1 / threshold < ratio.ratio < threshold:
         return Kind.EQUAL
     return Kind.WORSE if (ratio.ratio > 1) != (unit in _MORE_IS_BETTER) else Kind.BETTER
-
-
-def _order(finding: Finding) -> tuple[int, float]:
-    size = finding.ratio.ratio
-    return list(Kind).index(finding.kind), 0.0 if math.isnan(size) else -size
 
 
 def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
@@ -197,8 +190,8 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
             f" 1.00; random variation within the runs shows any change with a chance of about {100 * CHANCE:g} %, and"
             " variation between runs adds to that"
         )
-    if widths := [_width(finding.ratio) for finding in judged if finding.percent == _PERCENTS[0]]:
-        seen = max(threshold, statistics.median(widths))
+    if ratios := [one.ratio for one in judged if one.percent == _PERCENTS[0]]:
+        seen = max(threshold, statistics.median(max(one.high / one.ratio, one.ratio / one.low) for one in ratios))
         lines.append(f"Half of the medians would have shown a change by a factor of {seen:.2f}")
     notes = {
         Kind.NO_SAMPLES: "without samples in B: counted as worse",
@@ -209,19 +202,11 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
     return [*lines, *(f"{count[kind]} {note}" for kind, note in notes.items() if count[kind])]
 
 
-def _width(ratio: Interval) -> float:
-    return max(ratio.high / ratio.ratio, ratio.ratio / ratio.low)
-
-
 # -- what is printed
 
 _COLOURS = {
-    Kind.NO_SAMPLES: "red",
-    Kind.WORSE: "red",
-    Kind.ONLY_A: "yellow",
-    Kind.ONLY_B: "yellow",
-    Kind.BETTER: "green",
-}
+    Kind.NO_SAMPLES: "red", Kind.WORSE: "red", Kind.ONLY_A: "yellow", Kind.ONLY_B: "yellow", Kind.BETTER: "green",
+}  # fmt: skip
 
 
 def run(

@@ -11,16 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final
 
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench.results import LONGEST_S, Cell, Judged, Results, Value
+from pebble.bench.pictures import Drawn
+from pebble.bench.results import LONGEST_S, Cell, Judged, Value
 from pebble.errors import PebbleError
-
-if TYPE_CHECKING:
-    from pebble.bench.plots import Picture
 
 FOLDER: Final = Path("bench-results")
 
@@ -112,12 +110,6 @@ class Budget(dict[str, Any]):
         self.takes_s = takes_s
 
 
-class Drawing(Protocol):
-    """One of the kinds of pictures in :mod:`pebble.bench.pictures`."""
-
-    def pictures(self, results: Results) -> list[Picture]: ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
     """The engine calls ``measure`` for each case, or ``measure_round`` for each round, which calls :meth:`Round.cases`.
@@ -153,7 +145,7 @@ class Comparison:
     legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
-    pictures: Sequence[Drawing] = ()
+    pictures: Sequence[Drawn] = ()
 
     folder: Path = FOLDER  # of the results, by default
     is_null: bool = False  # one variant in three roles: see pebble.bench.null
@@ -195,8 +187,7 @@ class Comparison:
         if self.variants:
             values.setdefault("variants", list(self.variants))
         values |= {name: value for name, value in given.items() if value is not None}
-        run = Run(self, values, quick, output)
-        run.console = console or Console()
+        run = Run(self, values, quick, output, console=console or Console())
         for option in self.options:
             if run.options.get(option.key) is not None:
                 option.check(run.options[option.key])
@@ -214,10 +205,8 @@ class Run:
     notes: list[str] = field(default_factory=list)  # sentences at the end of the assessment
     recorded: dict[str, Value | list[Value]] = field(default_factory=dict)  # more options of the results
     problem: PebbleError | None = None  # ended the run early, and is raised when the results are written
-
-    def __post_init__(self) -> None:
-        self.console = Console()
-        self.show: Callable[[str], None] = lambda _text: None  # what is being done
+    console: Console = field(default_factory=Console)
+    show: Callable[[str], None] = lambda _text: None  # what is being done
 
     def __getitem__(self, name: str) -> Any:
         return self.options[name]
@@ -266,7 +255,6 @@ class Case:
         params: Mapping[str, Value] | None = None,
         **figures: Value,
     ) -> Cell:
-        """The cell of this round."""
         return Cell(
             variant=self.role,
             params={**self.condition, **(params or {})},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import tempfile
+import time
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
@@ -17,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from pebble.bench import null
 from pebble.bench.comparison import Case, Combine, Comparison, Round, Run
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import OVER_TIME, Cell, Results, Stopwatch, Value, percentile
+from pebble.bench.results import OVER_TIME, Cell, Judged, Results, Value, begin, grouped, named, percentile
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
@@ -33,7 +34,7 @@ def run(run: Run) -> int:
     check_folder(run.output)
     about.prepare(run)
     _leave_out_missing(run)
-    watch = Stopwatch(about.name, run.command, {})
+    results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
     collected, rounds = Collected(about, roles_of(run), about.conditions(run)), Rounds(run.rounds, console)
     with interrupted_by_signals():
         try:
@@ -48,9 +49,10 @@ def run(run: Run) -> int:
     for line in about.legend(cells):
         console.print(line, style="dim", highlight=False, soft_wrap=True)
     lines = [*_early(run), *rounds.notes(), *about.assessed(cells), *run.notes]
-    results = watch.results(cells, lines, quick=run.quick)
-    results.options = run.records()
-    finish(results, run.output, console)
+    results.assessment = [line for line in lines if isinstance(line, str)]
+    results.aims = [line for line in lines if isinstance(line, Judged)]
+    results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
+    _finish(results, run.output, console)
     if run.problem is not None:
         raise run.problem
     return int(not (rounds.enough and about.complete(cells)))
@@ -96,10 +98,9 @@ def roles_of(run: Run) -> Sequence[str]:
 def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
     about = run.comparison
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=run.console, transient=True) as progress, ExitStack() as stack:
+    with Progress(*columns, console=run.console, transient=True) as progress, _Environment(run) as environment:
         cases = len(collected.roles) * len(about.conditions(run)) * run.options.get("passes", 1)
         bar = progress.add_task("", total=run.rounds * cases)
-        environment = stack.enter_context(_Environment(run))
         for number in range(run.rounds):
             done = itertools.count(number * cases)
 
@@ -151,33 +152,29 @@ def _cases(
                 )  # fmt: skip
 
 
-class _Environment:
+class _Environment(ExitStack):
     """What the rounds share: a new one every ``fresh_every`` rounds, and after a round that failed."""
 
     def __init__(self, run: Run) -> None:
-        self._run, self._stack = run, ExitStack()
-        self._open = False
-        self._env: Any = None
-
-    def __enter__(self) -> _Environment:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open = False
-        self._stack.close()
+        super().__init__()
+        self._run = run
+        self._current: list[Any] = []  # at most one
 
     @contextmanager
     def of(self, number: int) -> Iterator[Any]:
         if number % self._run.options.get("fresh_every", 1) == 0:
-            self.__exit__()
-        if not self._open:
-            self._env = self._stack.enter_context(self._run.comparison.environment(self._run))
-            self._open = True
+            self._leave()
+        if not self._current:
+            self._current.append(self.enter_context(self._run.comparison.environment(self._run)))
         try:
-            yield self._env
+            yield self._current[0]
         except BaseException:
-            self.__exit__()
+            self._leave()
             raise
+
+    def _leave(self) -> None:
+        self._current.clear()
+        self.close()
 
 
 class Collected:
@@ -194,10 +191,7 @@ class Collected:
 
     def add(self, cells: Iterable[Cell]) -> None:
         """Adds a round: all of it, or nothing if an error is raised meanwhile. Passes of a round are one."""
-        found: dict[Hashable, list[Cell]] = {}
-        for cell in cells:
-            found.setdefault(_key(cell), []).append(cell)
-        for key, parts in sorted(found.items(), key=lambda one: self._place(one[1][0])):
+        for key, parts in sorted(grouped(cells, _key).items(), key=lambda one: self._place(one[1][0])):
             cell = self._cells.setdefault(key, msgspec.structs.replace(parts[0], rounds=[], figures={}))
             cell.unit = cell.unit or parts[0].unit  # a case that failed has none
             if cell.measure.endswith(OVER_TIME):
@@ -275,21 +269,15 @@ class Rounds:
         """Whether enough rounds to judge are left, if so many were requested."""
         return self._done >= LEAST_ROUNDS or self._asked < LEAST_ROUNDS
 
-    def code(self, cells: Sequence[Cell]) -> int:
-        """The exit code: 1 if a cell has no samples, or too few of enough requested rounds are left."""
-        return int(not (self.enough and all(cell.samples for cell in cells)))
-
 
 def check_folder(folder: Path) -> None:
     """Raises PebbleError if the folder cannot be written: before an hour of measuring, not after it."""
-    try:
+    with named(folder):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise PebbleError(f"{folder}: {error.strerror}") from None
 
 
-def finish(results: Results, folder: Path, console: Console) -> None:
+def _finish(results: Results, folder: Path, console: Console) -> None:
     """Prints the assessment, writes ``<bench>.json`` and, if matplotlib is installed, the plots."""
     for line in (*results.assessment, *results.aims):
         console.print(str(line), highlight=False, soft_wrap=True)

@@ -54,11 +54,15 @@ def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
     """One line for each role, ``MISSED`` where the comparison was wrong, and the aim. Few rounds are not judged."""
     found = intervals(cells)
     few = any(interval.few for _, interval in found)
-    how = outcome(passed(cells), judged=not few)
-    shown = ", ".join(f"{cell.variant} {interval}" for cell, interval in found)
-    lines = [_ratio(cell, interval) if few else _line(cell, interval) for cell, interval in found]
+    lines: list[str | Judged] = []
+    for cell, interval in found:
+        expected = "the planted 20 % were found" if is_slowed(cell.variant) else "equal, as expected"
+        judged = "" if few else f": {expected if _as_expected(cell, interval) else 'MISSED'}"
+        ratio = f"{cell.variant} / {variant_of(cell.variant)} = {interval}"
+        lines.append(f"{cell.measure}, {cell.conditions()}: {ratio}{judged}")
     what = "no difference found where there is none, and the planted 20 % found"
-    return [*lines, Judged(what=what, outcome=how, measured=shown)]
+    shown = ", ".join(f"{cell.variant} {interval}" for cell, interval in found)
+    return [*lines, Judged(what=what, outcome=outcome(passed(cells), judged=not few), measured=shown)]
 
 
 def passed(cells: Sequence[Cell]) -> bool:
@@ -69,12 +73,3 @@ def passed(cells: Sequence[Cell]) -> bool:
 
 def _as_expected(cell: Cell, interval: Interval) -> bool:
     return interval.low > 1.0 if is_slowed(cell.variant) else interval.equal
-
-
-def _line(cell: Cell, interval: Interval) -> str:
-    expected = "the planted 20 % were found" if is_slowed(cell.variant) else "equal, as expected"
-    return f"{_ratio(cell, interval)}: {expected if _as_expected(cell, interval) else 'MISSED'}"
-
-
-def _ratio(cell: Cell, interval: Interval) -> str:
-    return f"{cell.measure}, {cell.conditions()}: {cell.variant} / {variant_of(cell.variant)} = {interval}"

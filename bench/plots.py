@@ -21,8 +21,7 @@ from PIL import Image
 
 from pebble.bench import catalogue
 from pebble.bench.pictures import ecdf
-from pebble.bench.results import Cell, Results
-from pebble.errors import PebbleError
+from pebble.bench.results import Cell, Results, named
 
 _DPI = 150
 _COLOURS = 255  # of the palette, which reduces files to a third
@@ -75,23 +74,16 @@ class Picture:
 
 def draw(results: Results, folder: Path) -> list[Path]:
     """Draws the pictures of a comparison; returns the files. Raises PebbleError if they cannot be written."""
-    return [_file(picture, results, folder) for picture in pictures(results)]
+    found = {folder / f"{picture.name}.png": picture for picture in pictures(results)}
+    for path, picture in found.items():
+        save(picture, path, results)
+    return list(found)
 
 
 def pictures(results: Results) -> list[Picture]:
-    """The pictures that :func:`draw` draws, with captions; names are file names without their endings."""
     known = results.bench in catalogue.MODULES
     drawn = catalogue.find(results.bench).pictures if known else (ecdf(results.bench.replace("-", " ").capitalize()),)
     return [picture for one in drawn for picture in one.pictures(results)]
-
-
-def _file(picture: Picture, results: Results, folder: Path) -> Path:
-    path = folder / f"{picture.name}.png"
-    try:
-        save(picture, path, results)
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
-    return path
 
 
 _BLUES = ("#0072B2", "#2AA198", "#56B4E9", "#1B3A6B")
@@ -159,7 +151,8 @@ def finite(samples: Sequence[float | None]) -> list[float]:
 
 def place(cell: Cell) -> str:
     """The conditions of a cell as text: ``40 B, 200 Hz, with media``."""
-    return ", ".join(filter(None, (_answers(*one) for one in cell.params.items()))) or _unloaded(cell)
+    words = ", ".join(filter(None, (_answers(*one) for one in cell.params.items())))
+    return words or ("unloaded" if "load" in cell.params else "")
 
 
 def _answers(name: str, value: object) -> str:
@@ -168,10 +161,6 @@ def _answers(name: str, value: object) -> str:
     if value is None or isinstance(value, str):
         return value or ""
     return f"{value} {name.removesuffix('s') if value == 1 else name}"
-
-
-def _unloaded(cell: Cell) -> str:
-    return "unloaded" if "load" in cell.params else ""
 
 
 def short(text: str, width: int = 30) -> str:
@@ -190,11 +179,11 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
     return figure, [figure.add_subplot(rows, columns, number + 1) for number in range(count)]
 
 
-def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] = (), lines: bool = True) -> None:
+def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] = ()) -> None:
     """Adds a legend below the panels."""
     handles = [
         Line2D(
-            [], [], color=style.colour, label=short(name, 40), linestyle=style.dash if lines else "",
+            [], [], color=style.colour, label=short(name, 40), linestyle=style.dash,
             marker=style.marker, markersize=5, markerfacecolor=_BACKGROUND if style.hollow else style.colour,
         )
         for name, style in entries.items()
@@ -205,7 +194,7 @@ def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] 
 
 
 def save(picture: Picture, path: Path, results: Results) -> None:
-    """Draws a PNG with a palette; a quick run is marked in the corner."""
+    """Draws a PNG with a palette; a quick run is marked in the corner. Raises PebbleError if it cannot be written."""
     buffer = io.BytesIO()
     with mpl.rc_context(_SETTINGS):
         figure = picture.make()
@@ -214,24 +203,22 @@ def save(picture: Picture, path: Path, results: Results) -> None:
         figure.savefig(buffer, format="png", dpi="figure")
     drawn = Image.open(buffer).convert("RGB")
     image = drawn.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    image.save(path, optimize=True, dpi=(_DPI, _DPI))
+    with named(path):
+        image.save(path, optimize=True, dpi=(_DPI, _DPI))
 
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
     """Sets a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
+    limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high)}
+    axes.set(**limits)
     axis: Axis = axes.xaxis if which == "x" else axes.yaxis
-    if which == "x":
-        axes.set_xscale("log")
-        axes.set_xlim(low, high)
-    else:
-        axes.set_yscale("log")
-        axes.set_ylim(low, high)
     decades = math.log10(high / low)
-    steps = (1.0,) if decades > _FEW_DECADES[which] else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
+    few = decades <= _FEW_DECADES[which]
+    steps = (1.0,) if not few else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
     axis.set_major_locator(LogLocator(subs=steps, numticks=20))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}"))
     axis.set_minor_formatter(NullFormatter())
-    if decades <= _FEW_DECADES[which]:
+    if few:
         axis.set_minor_locator(NullLocator())
     axis.set_label_text(label)
 

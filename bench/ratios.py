@@ -35,18 +35,22 @@ class Interval:
     With fewer than ``LEAST_ROUNDS`` the interval is not meaningful.
     """
 
-    ratio: float
-    low: float
-    high: float
+    ratio: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
     level: float = LEVEL
     rounds: int = LEAST_ROUNDS
 
     def __str__(self) -> str:
-        if math.isnan(self.ratio):
+        if not self.known:
             return "–"
         if self.few:
             return _digits(self.ratio)
         return f"{_digits(self.ratio)} ({_digits(self.low)} to {_digits(self.high)})"
+
+    @property
+    def known(self) -> bool:
+        return not math.isnan(self.ratio)
 
     @property
     def few(self) -> bool:
@@ -60,7 +64,7 @@ class Interval:
 
     def words(self, ours: str, theirs: str, quantity: str = "time") -> str:
         """``zenoh takes 0.55× the time of mqtt (99 % interval 0.51–0.58)``, or that both are equal within noise."""
-        if math.isnan(self.ratio):
+        if not self.known:
             return f"{ours} and {theirs}: nothing was measured"
         if self.few:
             return f"{ours} / {theirs} = {self}, from {self.rounds} rounds: too few to judge"
@@ -70,12 +74,7 @@ class Interval:
         return f"{ours} takes {_digits(self.ratio)}× the {quantity} of {theirs} ({interval})"
 
 
-def paired(
-    ours: Sequence[Sequence[float]],
-    theirs: Sequence[Sequence[float]],
-    percent: float = 50,
-    level: float = LEVEL,
-) -> Interval:
+def paired(ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], percent: float = 50) -> Interval:
     """The median, over rounds run in turn, of the ratio of their percentiles.
 
     A sample may be infinite: a message that never arrived. Rounds without samples, or both infinite, do not count.
@@ -83,19 +82,15 @@ def paired(
     pairs = [(percentile(a, percent), percentile(b, percent)) for a, b in zip(ours, theirs, strict=False) if a and b]
     ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
     if not ratios:
-        return Interval(math.nan, math.nan, math.nan, level, 0)
+        return Interval(rounds=0)
     import numpy as np
 
     logs = np.log(ratios)
-    picked = _generator().integers(0, len(logs), (_RESAMPLES, len(logs)))
-    return _interval(float(np.median(logs)), np.median(logs[picked], axis=1), len(logs), level)
+    return _interval(float(np.median(logs)), _medians(logs, np.random.default_rng(_SEED)), len(logs), LEVEL)
 
 
 def unpaired(
-    ours: Sequence[Sequence[float]],
-    theirs: Sequence[Sequence[float]],
-    percent: float = 50,
-    level: float = LEVEL,
+    ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], percent: float = 50, level: float = LEVEL
 ) -> Interval:
     """The same for two runs at different times: the ratio of the medians of their rounds' percentiles."""
     import numpy as np
@@ -105,10 +100,18 @@ def unpaired(
         for rounds in (ours, theirs)
     )
     if not len(a) or not len(b):
-        return Interval(math.nan, math.nan, math.nan, level, 0)
-    generator = _generator()
-    resampled = [np.median(logs[generator.integers(0, len(logs), (_RESAMPLES, len(logs)))], axis=1) for logs in (a, b)]
-    return _interval(float(np.median(a) - np.median(b)), resampled[0] - resampled[1], min(len(a), len(b)), level)
+        return Interval(level=level, rounds=0)
+    random = np.random.default_rng(_SEED)
+    resampled = _medians(a, random) - _medians(b, random)
+    return _interval(float(np.median(a) - np.median(b)), resampled, min(len(a), len(b)), level)
+
+
+def _medians(logs: _Floats, random: np.random.Generator) -> _Floats:
+    """Of many samples of as many rounds, drawn with replacement."""
+    import numpy as np
+
+    medians: _Floats = np.median(logs[random.integers(0, len(logs), (_RESAMPLES, len(logs)))], axis=1)
+    return medians
 
 
 def _interval(ratio: float, resampled: _Floats, rounds: int, level: float) -> Interval:
@@ -132,9 +135,3 @@ def _digits(ratio: float) -> str:
     if ratio >= _LARGEST:
         return "∞"
     return f"{ratio:.2f}" if ratio >= 0.1 else f"{ratio:.2g}" if ratio > 1 / _LARGEST else "0"
-
-
-def _generator() -> np.random.Generator:
-    import numpy as np
-
-    return np.random.default_rng(_SEED)

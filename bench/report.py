@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -21,14 +18,16 @@ from pebble.bench import catalogue
 from pebble.bench.comparison import Comparison
 from pebble.bench.engine import check_folder
 from pebble.bench.report_text import HEADING, HUNG, INTERRUPTED, Outcome, Run, Section, text
-from pebble.bench.results import load, pack
+from pebble.bench.results import load, named, pack
 from pebble.errors import PebbleError
-from pebble.runtime.parent import tied_to_parent
+from pebble.rig.processes import python
+from pebble.rig.programs import Program, end_all
 from pebble.runtime.signals import interrupted_by_signals
 
 NAME = "README.md"
 _ENDED = "report.json"
-_WIDTH = 120  # characters of the comparisons' tables
+#: Before a command: its tables are plain text of this width.
+_PLAIN = ("env", "-u", "FORCE_COLOR", "-u", "TTY_COMPATIBLE", "COLUMNS=120", "NO_COLOR=1", "PYTHONUNBUFFERED=1")
 _POLL_S = 0.2
 _TIMEOUT_FACTOR = 4  # a comparison that takes this many times the expected time,
 _TIMEOUT_EXTRA_S = 60.0  # and this in addition, is ended
@@ -85,16 +84,13 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
     _require_matplotlib()
     _check_not_foreign(folder)
     known = _known(folder)
-    sections = [
-        section for one in catalogue.reported() if (section := _section(one, folder, known, redraw)) is not None
-    ]
+    every = (_section(one, folder, known, redraw) for one in catalogue.reported())
+    sections = [section for section in every if section is not None]
     if not sections:
         raise PebbleError(f"{folder} has no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME
-    try:
+    with named(path):
         path.write_text(text(sections, known))
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
     return path
 
 
@@ -106,10 +102,8 @@ def _require_matplotlib() -> None:
 def _check_not_foreign(folder: Path) -> None:
     """Raises PebbleError if README.md is not one of our reports, which would be overwritten."""
     path = folder / NAME
-    try:
+    with named(path):
         ours = not path.exists() or path.read_text(errors="replace").startswith(HEADING)
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
     if not ours:
         raise PebbleError(f"{path} is not a report of pebble bench and would be overwritten: name another folder")
 
@@ -128,9 +122,7 @@ def _section(comparison: Comparison, folder: Path, known: Run, redraw: bool) -> 
     except PebbleError as error:  # of another version: the other sections are still written
         return replace(found, output=str(error))
     named = [(f"{picture.name}.png", picture.caption) for picture in pictures(results)]
-    if redraw or not all(
-        (folder / name).exists() for name, _ in named
-    ):  # a comparison that ran just now has drawn its own
+    if redraw or not all((folder / name).exists() for name, _ in named):  # one that ran just now has drawn its own
         draw(results, folder)
     return replace(found, results=results, pictures=named)
 
@@ -141,19 +133,19 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task("", total=sum(expected))
+
+        def tick(number: int, since_s: float) -> None:
+            name, expected_s = comparisons[number].name, expected[number]
+            text = f"{number + 1} of {len(comparisons)}: {name}, {since_s:.0f} s of about {expected_s}"
+            progress.update(bar, description=text, completed=sum(expected[:number]) + min(since_s, expected_s))
+
         for number, one in enumerate(comparisons):
-
-            def tick(since_s: float, number: int = number, name: str = one.name) -> None:
-                text = f"{number + 1} of {len(comparisons)}: {name}, {since_s:.0f} s of about {expected[number]}"
-                done = sum(expected[:number]) + min(since_s, expected[number])
-                progress.update(bar, description=text, completed=done)
-
             _delete_results(one, folder)
             known.ended[one.name] = Outcome(code=INTERRUPTED, took_s=0.0)  # until it ends
             known.interrupted = f"in {one.name}, after {number} of {len(comparisons)}"
             _save(known, folder)
             began = time.monotonic()
-            code = _run(one, folder, quick, tick)
+            code = _run(one, folder, quick, partial(tick, number))
             left = (folder / f"{one.name}.json").exists()
             ended = Outcome(code=code, took_s=round(time.monotonic() - began, 1), results=left)
             known.ended[one.name], known.interrupted = ended, ""
@@ -164,44 +156,17 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
 
 def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[float], None]) -> int:
     """Runs a comparison's command line and returns its exit code. The process ends with this one."""
-    words = [*comparison.arguments(quick), "--output", str(folder)]
-    began, longest = time.monotonic(), _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
-    path = folder / f"{comparison.name}.txt"
-    with path.open("wb") as output:
-        process = subprocess.Popen(
-            tied_to_parent([sys.executable, "-m", "pebble.cli", *words], signal.SIGTERM),
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,  # only this process handles Ctrl-C
-            env=_plain(os.environ),
-        )
-        try:
-            while process.poll() is None and time.monotonic() - began < longest:
-                tick(time.monotonic() - began)
-                time.sleep(_POLL_S)
-            hung = process.poll() is None
-        finally:
-            _end(process)
-    return HUNG if hung else process.returncode
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Terminates the process, which ends its own processes; kills the group after a timeout."""
-    if process.poll() is not None:
-        return
-    process.terminate()
+    words = python("pebble.cli", *comparison.arguments(quick), "--output", folder)
+    longest = _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
+    program = Program(comparison.name, [*_PLAIN, *words], folder / f"{comparison.name}.txt")
+    began = time.monotonic()
     try:
-        process.wait(_END_S)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-def _plain(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment for plain-text tables of a fixed width."""
-    retained = {name: value for name, value in environment.items() if name not in ("FORCE_COLOR", "TTY_COMPATIBLE")}
-    return {**retained, "COLUMNS": str(_WIDTH), "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
+        while program.code is None and (since_s := time.monotonic() - began) < longest:
+            tick(since_s)
+            time.sleep(_POLL_S)
+        return HUNG if program.code is None else program.code
+    finally:
+        end_all([program], _END_S)
 
 
 def _delete_results(comparison: Comparison, folder: Path) -> None:
@@ -222,18 +187,14 @@ def _delete_results(comparison: Comparison, folder: Path) -> None:
 
 def _save(known: Run, folder: Path) -> None:
     path = folder / _ENDED
-    try:
+    with named(path):
         path.write_bytes(msgspec.json.format(msgspec.json.encode(known)) + b"\n")
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
 
 
 def _known(folder: Path) -> Run:
     """The state of a folder; empty without the file. Raises PebbleError for an invalid file."""
     path = folder / _ENDED
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Run)
-    except FileNotFoundError:
-        return Run()
+        return msgspec.json.decode(path.read_bytes(), type=Run) if path.exists() else Run()
     except (OSError, msgspec.DecodeError) as error:
         raise PebbleError(f"{path} cannot be read: {error}") from None

@@ -25,6 +25,7 @@ _TAIL = 12  # lines of a failed command's output
 
 
 HUNG, INTERRUPTED = -1, -2
+_WHY = {HUNG: "hung and was ended", INTERRUPTED: "was interrupted"}
 
 
 class Outcome(msgspec.Struct, kw_only=True):
@@ -37,12 +38,8 @@ class Outcome(msgspec.Struct, kw_only=True):
     @property
     def problem(self) -> str:
         """Why it failed; empty if it did not."""
-        if self.code == HUNG:
-            return "hung and was ended"
-        if self.code == INTERRUPTED:
-            return "was interrupted"
         if self.code:
-            return f"ended with code {self.code}"
+            return _WHY.get(self.code, f"ended with code {self.code}")
         return "" if self.results else "measured nothing"
 
 
@@ -74,50 +71,36 @@ class Section:
         return "#" + re.sub(r"[^\w\- ]", "", self.comparison.title.lower()).replace(" ", "-")
 
     @property
-    def sentences(self) -> list[str]:
-        return [] if self.results is None else self.results.assessment
-
-    @property
     def problem(self) -> str:
         """Why its command line failed; empty if it did not."""
         return "" if self.ended is None else self.ended.problem
 
     @property
     def took_s(self) -> float:
-        if self.ended is not None:
-            return self.ended.took_s
-        return 0.0 if self.results is None else self.results.took_s
-
-    @property
-    def quick(self) -> bool:
-        return self.results is not None and self.results.quick
+        known = self.ended or self.results
+        return 0.0 if known is None else known.took_s
 
 
 def text(sections: Sequence[Section], run: Run | None = None) -> str:
     """The whole report as Markdown."""
-    run = run or Run()
-    parts = [*_head(sections, run), *_summary(sections, run), *_aims(sections), *_machine(sections)]
-    quick = any(section.quick for section in sections)
+    run, measured = run or Run(), [section.results for section in sections if section.results is not None]
+    quick = any(results.quick for results in measured)
+    parts = [*_head(sections, measured, quick, run), *_summary(sections, measured, run)]
+    parts += [*_aims(sections), *_machine(measured)]
     for section in sections:
         parts += _section(section, quick)
-    parts += ["## What these numbers do not show", "\n".join(f"* {line}" for line in limits(_measured(sections)))]
+    parts += ["## What these numbers do not show", "\n".join(f"* {line}" for line in limits(measured))]
     return "\n\n".join(parts) + "\n"
 
 
-def _measured(sections: Sequence[Section]) -> list[Results]:
-    return [section.results for section in sections if section.results is not None]
-
-
-def _head(sections: Sequence[Section], run: Run) -> Iterator[str]:
-    measured = _measured(sections)
-    quick = any(section.quick for section in sections)
+def _head(sections: Sequence[Section], measured: Sequence[Results], quick: bool, run: Run) -> Iterator[str]:
     yield f"{HEADING} of a quick run" if quick else HEADING
     if quick:
         yield (
             "**Quick: fewer cases, fewer and shorter rounds than a full report.** It shows that everything works, and "
             "large differences only."
         )
-    if quick and any(not one.quick and _has_quick(one) for one in sections):
+    if quick and any(one.results and not one.results.quick and one.comparison.has_quick for one in sections):
         yield "**Not all of it is quick: it combines several runs. Each comparison names its date.**"
     if run.interrupted:
         yield (
@@ -134,32 +117,28 @@ def _head(sections: Sequence[Section], run: Run) -> Iterator[str]:
     )
 
 
-def _has_quick(section: Section) -> bool:
-    about = section.comparison
-    return section.results is not None and about.has_quick
-
-
 def _span(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     return f"{seconds / 60:.0f} min" if minutes >= 10 else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _summary(sections: Sequence[Section], run: Run) -> Iterator[str]:
+def _summary(sections: Sequence[Section], measured: Sequence[Results], run: Run) -> Iterator[str]:
     lines = []
     for section in sections:
-        link = f"* [{section.comparison.title}]({section.link})"
-        found = [f"  * {line}" for line in section.sentences[: section.comparison.summary_lines]]
-        if section.results is None:
+        about, results = section.comparison, section.results
+        link = f"* [{about.title}]({section.link})"
+        found = [] if results is None else [f"  * {line}" for line in results.assessment[: about.summary_lines]]
+        if results is None:
             lines.append(f"{link}: **failed**, {section.problem or 'nothing was measured'}")
         elif section.problem:
             lines += [f"{link}: **incomplete**, it {section.problem}", *found]
         elif found:
             lines += [link, *found]
     lines += [f"* {catalogue.find(name).title}: left out, needs root" for name in run.left_out]
-    if tests := [results for results in _measured(sections) if results.bench.endswith(_NULL)]:
-        shown = [f"{results.bench.removesuffix(_NULL)} {_null(results)}" for results in tests]
+    tests = [f"{one.bench.removesuffix(_NULL)} {_null(one)}" for one in measured if one.bench.endswith(_NULL)]
+    if tests:
         lines.append(
-            f"* Null tests, each variant against itself and against itself slowed by a fifth: {', '.join(shown)}"
+            f"* Null tests, each variant against itself and against itself slowed by a fifth: {', '.join(tests)}"
         )
     if lines:
         yield "## In short"
@@ -184,9 +163,9 @@ def _aims(sections: Sequence[Section]) -> Iterator[str]:
         yield _table(("aim", "comparison", "", "measured"), rows)
 
 
-def _machine(sections: Sequence[Section]) -> Iterator[str]:
+def _machine(measured: Sequence[Results]) -> Iterator[str]:
     rows: dict[str, dict[str, None]] = {}
-    for results in _measured(sections):
+    for results in measured:
         for name, value in {**results.machine, "pebble": results.pebble}.items():
             rows.setdefault(name, {})["not installed" if value is None else str(value)] = None
     if rows:
@@ -219,20 +198,14 @@ def _section(section: Section, quick: bool) -> Iterator[str]:
 def _output(section: Section, results: Results) -> Iterator[str]:
     """The printed tables, without the assessment, which is above."""
     known = {*results.assessment, *map(str, results.aims)}
-    lines = [
-        line.rstrip()
-        for line in section.output.splitlines()
-        if line.strip() not in known and not line.startswith(_NOT_THE_TABLE)
-    ]
-    if not any(lines):
-        return
-    lines = "\n".join(lines).strip("\n").split("\n")
-    folded = len(lines) > _LONG
-    if folded:
+    printed = (line.rstrip() for line in section.output.splitlines() if not line.startswith(_NOT_THE_TABLE))
+    lines = "\n".join(line for line in printed if line.strip() not in known).strip("\n").splitlines()
+    if len(lines) > _LONG:
         yield f"<details><summary>The tables, {len(lines)} lines</summary>"
-    yield _fenced(lines)
-    if folded:
+        yield _fenced(lines)
         yield "</details>"
+    elif lines:
+        yield _fenced(lines)
 
 
 def _fenced(lines: Sequence[str]) -> str:
@@ -240,10 +213,10 @@ def _fenced(lines: Sequence[str]) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = ["|" + "---|" * len(heads)]
-    for line in (heads, *rows):
-        lines.append(f"| {' | '.join(cell.replace('|', _PIPE) for cell in line)} |".replace("|  |", "| |"))
-    return "\n".join([lines[1], lines[0], *lines[2:]])
+    lines = [
+        f"| {' | '.join(cell.replace('|', _PIPE) for cell in line)} |".replace("|  |", "| |") for line in (heads, *rows)
+    ]
+    return "\n".join([lines[0], "|" + "---|" * len(heads), *lines[1:]])
 
 
 # -- limits

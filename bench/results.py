@@ -7,12 +7,13 @@ import lzma
 import math
 import os
 import platform
-import shutil
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
@@ -26,10 +27,11 @@ _PERCENTS = (50, 95, 99, 100)  # kept of a thinned cell
 LONGEST_S = 3600.0  # of one phase of a comparison
 OVER_TIME = " over time"  # suffix of the measure of a cell that holds a curve: times, then values
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
-_MOSQUITTO = "/usr/sbin:/usr/local/sbin"
 _DIGITS = 3  # decimal places of a sample
 
 Value = str | int | float | bool | None
+T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 
 
 class Cell(msgspec.Struct, kw_only=True):
@@ -110,26 +112,24 @@ class Results(msgspec.Struct, kw_only=True):
     aims: list[Judged] = []
 
     def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
-        """The first cell that matches."""
-        return next(
-            (
-                cell
-                for cell in self.cells
-                if cell.variant == variant
-                and measure in (None, cell.measure)
-                and all(cell.params.get(name) == value for name, value in params.items())
-            ),
-            None,
-        )
+        same = (one for one in self.cells if one.variant == variant and params.items() <= one.params.items())
+        return next((one for one in same if measure in (None, one.measure)), None)
 
     def save(self, path: Path) -> None:
         """Raises PebbleError if the file cannot be written."""
         for cell in self.cells:
             cell.rounds = [[round(sample, _DIGITS) for sample in one] for one in cell.rounds]
-        try:
+        with named(path):
             path.write_bytes(msgspec.json.encode(self) + b"\n")
-        except OSError as error:
-            raise PebbleError(f"{path}: {error.strerror}") from None
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Raises PebbleError with the path for an OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise PebbleError(f"{path}: {error.strerror}") from None
 
 
 def _thinned(samples: Sequence[float], most: int) -> list[float]:
@@ -174,9 +174,8 @@ def _unpack(results: Results, path: Path) -> None:
 def load(path: Path) -> Results:
     """Raises PebbleError if the file holds no results."""
     try:
-        results = msgspec.json.decode(path.read_bytes(), type=Results)
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
+        with named(path):
+            results = msgspec.json.decode(path.read_bytes(), type=Results)
     except msgspec.DecodeError as error:
         raise PebbleError(f"{path} holds no results of pebble bench: {error}") from None
     if results.format != FORMAT:
@@ -186,29 +185,10 @@ def load(path: Path) -> Results:
     return results
 
 
-class Stopwatch:
-    """Records machine, options and start time of a run; :meth:`results` adds the cells and the duration."""
-
-    def __init__(self, bench: str, command: Sequence[str], options: Mapping[str, Value | list[Value]]) -> None:
-        self._bench, self._command, self._options = bench, list(command), dict(options)
-        self._machine = machine()
-        self._began, self._since = time.gmtime(), time.monotonic()
-
-    def results(
-        self, cells: Sequence[Cell], assessment: Sequence[str | Judged] = (), *, quick: bool = False
-    ) -> Results:
-        return Results(
-            bench=self._bench,
-            command=self._command,
-            options=self._options,
-            machine=self._machine,
-            began=time.strftime("%Y-%m-%dT%H:%M:%SZ", self._began),
-            took_s=round(time.monotonic() - self._since, 1),
-            quick=quick,
-            cells=list(cells),
-            assessment=[line for line in assessment if isinstance(line, str)],
-            aims=[line for line in assessment if isinstance(line, Judged)],
-        )
+def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results:
+    """Results of a run that begins now, on this machine."""
+    began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    return Results(bench=bench, command=list(command), machine=machine(), began=began, quick=quick)
 
 
 def machine() -> dict[str, Value]:
@@ -225,10 +205,9 @@ def machine() -> dict[str, Value]:
 
 
 def _cpu() -> str:
-    try:
+    lines: list[str] = []
+    with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
     named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model")))
     return next(named, platform.machine())
 
@@ -241,11 +220,11 @@ def _system() -> str:
 
 
 def _mosquitto() -> str | None:
-    program = shutil.which("mosquitto") or shutil.which("mosquitto", path=_MOSQUITTO)
-    if program is None:
-        return None
+    from pebble.rig.broker import mosquitto_path  # not for the processes that only measure
+
     try:
-        answer = subprocess.run([program, "-h"], capture_output=True, text=True, check=False, timeout=5).stdout
+        command = [mosquitto_path() or "", "-h"]
+        answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5).stdout
     except (OSError, subprocess.SubprocessError):
         return None
     return answer.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
@@ -256,6 +235,14 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def grouped(ones: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """By key, in the order of their first appearance."""
+    found: dict[K, list[T]] = {}
+    for one in ones:
+        found.setdefault(key(one), []).append(one)
+    return found
 
 
 def percentile(figures: Sequence[float], percent: float) -> float:

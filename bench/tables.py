@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -11,9 +11,8 @@ from rich import box
 from rich.table import Table
 
 from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, paired
-from pebble.bench.results import Cell, percentile
+from pebble.bench.results import Cell, grouped, percentile
 
-_PERCENTS = (50, 95, 99, 100)
 _LEAST_APART = 5  # rounds: with three, equal robots are disjoint in one run of ten, with five in one of 126
 
 
@@ -27,34 +26,27 @@ def plain_table(title: str, columns: Sequence[str], *, left: int = 1) -> Table:
 
 def latency_table(title: str, cells: Sequence[Cell], baseline: str) -> Table:
     """Rows in the order of the cells. Last column: ratio of the median to ``baseline``'s under the same conditions."""
-    unit = cells[0].unit if cells else "us"
-    heads = [f"p50 {unit}", "p95", "p99", "max", "n", "lost", f"p50 / {baseline}"]
+    columns = [percentile_column(50, f"p50 {cells[0].unit if cells else 'us'}"), *map(percentile_column, (95, 99, 100))]
+    columns += [COUNT, LOST]
+    heads = [*(column.head for column in columns), f"p50 / {baseline}"]
     table = plain_table(title, ["conditions", "variant", *heads], left=2)
     before = None
     for cell in cells:
         conditions = f"{cell.measure}, {cell.conditions()}"
         base = base_of(cell, cells, baseline)
-        ratio = "" if base is None or base is cell else str(paired(cell.rounds, base.rounds))
-        lost = "" if cell.lost is None else str(cell.lost)
-        times = [figure(cell.percentile(percent)) for percent in _PERCENTS]
-        shown = "" if conditions == before else conditions
-        if shown and before is not None:
+        ratio = "" if base is None else str(paired(cell.rounds, base.rounds))
+        if before not in (None, conditions):
             table.add_section()
-        table.add_row(shown, cell.variant, *times, str(len(cell.samples)), lost, ratio)
+        values = [column.value(cell) for column in columns]
+        table.add_row("" if conditions == before else conditions, cell.variant, *values, ratio)
         before = conditions
     return table
 
 
 def base_of(cell: Cell, cells: Sequence[Cell], baseline: str) -> Cell | None:
-    """The baseline's cell under the same conditions."""
-    return next(
-        (
-            other
-            for other in cells
-            if other.variant == baseline and other.params == cell.params and other.measure == cell.measure
-        ),
-        None,
-    )
+    """The baseline's cell under the same conditions; None for a cell of the baseline."""
+    same = (one for one in cells if one.params == cell.params and one.measure == cell.measure)
+    return None if cell.variant == baseline else next((one for one in same if one.variant == baseline), None)
 
 
 def figure(value: float) -> str:
@@ -184,17 +176,14 @@ class Grid:
     each: Sequence[str] = ()
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Table]:
-        tables: dict[tuple[str, ...], list[Cell]] = {} if self.each else {(): []}
-        for cell in filter(self.of, cells):
-            tables.setdefault(tuple(_field(cell, name) for name in self.each), []).append(cell)
+        cells = list(filter(self.of, cells))
+        tables = grouped(cells, lambda cell: _fields(cell, self.each)) if self.each else {(): cells}
         for names, some in tables.items():
             yield self._table(self.title.format(**dict(zip(self.each, names, strict=True))), some)
 
     def _table(self, title: str, cells: Sequence[Cell]) -> Table:
         variants = list(dict.fromkeys(cell.variant for cell in cells)) if "variant" not in self.rows else [None]
-        groups: dict[tuple[str, ...], list[Cell]] = {}
-        for cell in cells:
-            groups.setdefault(tuple(_field(cell, name) for name in self.rows), []).append(cell)
+        groups = grouped(cells, lambda cell: _fields(cell, self.rows))
         named = variants if len(variants) > 1 or self.ratio else [None]
         heads = [" ".join(filter(None, (one, column.head))) for one in named for column in self.columns]
         heads += [f"{variants[1]} / {variants[0]}"] if self.ratio and len(variants) > 1 else []
@@ -220,8 +209,9 @@ class Grid:
         return column.value(found[0]) if found else ""
 
 
-def _field(cell: Cell, name: str) -> str:
-    return str(getattr(cell, name) if name in ("measure", "unit", "variant") else cell.params.get(name, ""))
+def _fields(cell: Cell, names: Sequence[str]) -> tuple[str, ...]:
+    own = {"measure": cell.measure, "unit": cell.unit, "variant": cell.variant}
+    return tuple(str(own[name] if name in own else cell.params.get(name, "")) for name in names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,10 +228,7 @@ class Claims:
     judged: Callable[[Cell], bool] = lambda _cell: True  # the cells whose number of rounds is noted if it is too small
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[str]:
-        groups: dict[Hashable, list[Cell]] = {}
-        for cell in filter(self.of, cells):
-            groups.setdefault((*cell.params.items(), cell.measure), []).append(cell)
-        for group in groups.values():
+        for group in grouped(filter(self.of, cells), lambda cell: (*cell.params.items(), cell.measure)).values():
             quantity = self.quantity.get(group[0].measure, "time")
             group.sort(key=lambda cell: self.order.index(cell.variant) if self.order else 0)
             what = self.what.format(measure=group[0].measure, quantity=quantity, **group[0].params)

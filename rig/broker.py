@@ -64,7 +64,7 @@ class Broker(Program):
 
 def best_kind() -> BrokerKind:
     """The best kind of broker installed on this machine. Raises PebbleError with both remedies if there is none."""
-    if _mosquitto_path() is not None:
+    if mosquitto_path() is not None:
         return BrokerKind.MOSQUITTO
     if find_spec("amqtt") is not None:
         return BrokerKind.EMBEDDED
@@ -73,13 +73,14 @@ def best_kind() -> BrokerKind:
     )
 
 
-def _mosquitto_path() -> str | None:
+def mosquitto_path() -> str | None:
+    """None if it is not installed."""
     return shutil.which("mosquitto") or shutil.which("mosquitto", path=_SBIN)
 
 
 def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = _HOST) -> list[str]:
     """The command of a mosquitto on ``port``; writes its configuration to ``stem`` plus ``.conf``."""
-    path = _mosquitto_path()
+    path = mosquitto_path()
     if path is None:
         raise PebbleError("mosquitto is not installed: apt install mosquitto")
     config = stem.with_suffix(".conf")

@@ -9,18 +9,30 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from functools import partial
 
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
-from pebble.contract import DRIVE, LIGHTS_FLASH, LIGHTS_SOLID, codec
-from pebble.contract.payloads import Drive, LightsFlash
-from pebble.errors import PebbleError
-from pebble.rig.emergency import NAME as EMERGENCY_STOP
-from pebble.rig.emergency import CompletedStop, EmergencyStop
-from pebble.rig.steps import COMMAND_PERIOD_S, SCRIPT, CompletedStep, Step, repeat
-from pebble.rig.takeover import NAME as BY_ITSELF
-from pebble.rig.takeover import CompletedFollow, TakeOver
-from pebble.rig.visitors import Visitors
+from pebble.contract import DRIVE, DRIVING, LIGHTS_FLASH, LIGHTS_SOLID, codec
+from pebble.contract.identity import parse_topic
+from pebble.contract.payloads import Drive, Driver, LightsFlash
+from pebble.errors import PayloadError, PebbleError
+from pebble.rig.acts import (
+    BY_ITSELF,
+    COMMAND_PERIOD_S,
+    EMERGENCY_STOP,
+    SCRIPT,
+    CompletedFollow,
+    CompletedStep,
+    CompletedStop,
+    EmergencyStop,
+    EndedEarlyError,
+    Step,
+    TakeOver,
+    Wait,
+    repeat,
+)
 from pebble.transports import Message, MqttSettings, QoS, create
 
 STOP = Drive()
@@ -31,6 +43,7 @@ _EVENTS = 100  # that wait to be shown
 _MOST_TIMES = 3  # for the emergency stop and for the script
 _ASSESSED_S = 5.0  # until what was completed is assessed, on the smallest machine
 _BACK_OFF, _BACK_OFF_S = Drive(z=-0.5), 1.0
+EXPIRES_S = 3.0  # of a visit; announcements come every second
 
 
 class Operator:
@@ -76,7 +89,6 @@ class Operator:
             time.sleep(_POLL_S)
 
     def show(self, event: str) -> None:
-        """Add a line to the events."""
         self.events.append((time.monotonic(), f"operator {event}"))
 
     @property
@@ -102,8 +114,6 @@ class Operator:
         self.discovery.receive(message, time.monotonic(), time.time())
         self.visitors.receive(message, time.monotonic())
 
-    # -- people at the page
-
     def _taken(self, robot: DiscoveredRobot, now: float) -> str:
         """Why people have the control of it now; empty: they have not."""
         if driver := self.visitors.driver(robot.base, now):
@@ -123,20 +133,21 @@ class Operator:
 
     def _drive(self) -> None:
         robots = self.discovery.all_robots()
-        while not self._stopping.is_set() and not (self._yours and self.rounds):
-            for step in SCRIPT:
-                self._perform(step, self._begin(step.name, robots))
-                if self._stopping.is_set():
-                    break
-            else:
+        with suppress(EndedEarlyError):
+            while not (self._yours and self.rounds):
+                for step in SCRIPT:
+                    self._perform(step, self._begin(step.name, robots))
                 if not self.rounds:
                     self._until_right(EMERGENCY_STOP, lambda: self._stop_all(robots))
                     self._until_right(BY_ITSELF, lambda: self._take_over(robots))
                 self.rounds += 1
-        if not self._stopping.is_set():
             self._doing = self._yours
             self._stopping.wait()
         self._send(STOP, self._begin("disconnecting", robots))
+
+    def _wait(self, seconds: float) -> None:
+        if self._stopping.wait(seconds):
+            raise EndedEarlyError
 
     def _until_right(self, name: str, act: Callable[[], None]) -> None:
         """Once, and again while its assessment leaves ``name`` in ``again``."""
@@ -144,8 +155,7 @@ class Operator:
             act()
             end = time.monotonic() + _ASSESSED_S
             while self.completed and time.monotonic() < end:
-                if self._stopping.wait(COMMAND_PERIOD_S):
-                    return
+                self._wait(COMMAND_PERIOD_S)
             if name not in self.again:
                 return
 
@@ -155,56 +165,46 @@ class Operator:
         return [robot for robot in robots if self._mine(robot)]
 
     def _perform(self, step: Step, robots: list[DiscoveredRobot]) -> None:
-        began = due = released = time.monotonic()
+        began = time.monotonic()
         self._switch_lights(step, robots)
-        while due < began + step.drive_s:
-            self._send(step.drive, robots)
-            released = time.monotonic()
-            due += COMMAND_PERIOD_S
-            if self._stopping.wait(max(0.0, due - released)):
-                return
+        released = repeat(lambda: self._send(step.drive, robots), self._wait, step.drive_s)
         if step.sends_stop:
             self._send(STOP, robots)
             released = time.monotonic()
         self._doing = f"{step.name}: observing"
-        if self._stopping.wait(step.rest_s):
-            return
+        self._wait(step.rest_s)
         ended = time.monotonic()
         self.completed.extend(
             CompletedStep(robot.name, step, began, released, ended) for robot in robots if self._mine(robot)
         )
 
     def _stop_all(self, robots: list[DiscoveredRobot]) -> None:
-        """Stop all robots, try to drive them, and reset them."""
         robots = self._begin(EMERGENCY_STOP, robots)
-        emergency = EmergencyStop(
-            self._transport, lambda drive: self._send(drive, robots), self._stopping.wait, by=NAME
-        )
-        subscription = self._transport.subscribe(ALL_OUTGOING, emergency.receive)  # brings retained capabilities again
-        completed = emergency.perform(robots)
-        subscription.close()
+        emergency = EmergencyStop(self._transport, lambda drive: self._send(drive, robots), self._wait, by=NAME)
+        with closing(self._transport.subscribe(ALL_OUTGOING, emergency.receive)):  # brings retained capabilities again
+            completed = emergency.perform(robots)
         mine = {robot.name for robot in robots if self._mine(robot)}
         self.completed.extend(one for one in completed if one.robot in mine)
 
     def _take_over(self, robots: list[DiscoveredRobot]) -> None:
         """Let each robot with scripts follow a tag, and overrule the script for a moment."""
         for robot in self._begin("scripts", [robot for robot in robots if robot.offers("autonomy")]):
-            if BY_ITSELF in self.again:
-                self._back_off(robot)
-            if not self._stopping.is_set():
-                drive = partial(self._send, robots=[robot])
-                wait = partial(self._wait_with, robot)
-                completed = TakeOver(self._transport, robot, drive, wait, self._note).perform()
-                self.completed.extend([completed] if completed else [])
+            drive, wait = partial(self._send, robots=[robot]), partial(self._wait_with, robot)
+            with suppress(EndedEarlyError):
+                if BY_ITSELF in self.again:
+                    self._back_off(drive, wait)
+                self.completed.append(TakeOver(self._transport, robot, drive, wait, self._note).perform())
+            self._wait(0.0)
 
-    def _back_off(self, robot: DiscoveredRobot) -> None:
+    def _back_off(self, drive: Callable[[Drive], None], wait: Wait) -> None:
         """Away from the tag before which it arrived, so that there is a way to drive."""
-        repeat(lambda: self._send(_BACK_OFF, [robot]), partial(self._wait_with, robot), _BACK_OFF_S)
-        self._send(STOP, [robot])
+        repeat(lambda: drive(_BACK_OFF), wait, _BACK_OFF_S)
+        drive(STOP)
 
-    def _wait_with(self, robot: DiscoveredRobot, seconds: float) -> bool:
-        """True if the demo ends, or a person has taken this robot."""
-        return self._stopping.wait(seconds) or not self._mine(robot)
+    def _wait_with(self, robot: DiscoveredRobot, seconds: float) -> None:
+        self._wait(seconds)
+        if not self._mine(robot):
+            raise EndedEarlyError
 
     def _note(self, what: str, text: str) -> None:
         self._doing = f"{what}: {text}"
@@ -225,3 +225,51 @@ class Operator:
     def _publish(self, topic: str | None, payload: bytes) -> None:
         if topic is not None:
             self._transport.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
+
+
+# -- people at the page
+
+
+@dataclass(frozen=True, slots=True)
+class _Visit:
+    server: str
+    driver: Driver
+    announced: float  # monotonic
+    over: bool = False
+
+
+class Visitors:
+    """Which robots people drive from the operator page, by what its server announces; times are monotonic. Pure.
+
+    It has the newest visit of every robot, by base topic. One thread receives, another reads.
+    """
+
+    def __init__(self) -> None:
+        self._visits: dict[str, _Visit] = {}
+
+    def receive(self, message: Message, now: float) -> None:
+        address = parse_topic(message.topic)
+        if address is None or not address.identity.is_server or message.retain:
+            return
+        try:
+            payload = codec.decode(DRIVING, message.payload)
+        except PayloadError:  # from something that is no server of ours
+            return
+        server = address.identity.id
+        for base, visit in list(self._visits.items()):
+            if visit.server == server and not visit.over and base not in payload.robots:
+                self._visits[base] = _Visit(server, visit.driver, now, over=True)
+        for base, driver in payload.robots.items():
+            self._visits[base] = _Visit(server, driver, now)
+
+    def driver(self, base: str, now: float) -> str:
+        """Who has that robot now, for display; empty: nobody."""
+        visit = self._visits.get(base)
+        if visit is None or visit.over or now - visit.announced > EXPIRES_S:
+            return ""
+        return f"{visit.driver.by} on {visit.driver.device}" if visit.driver.device else visit.driver.by
+
+    def driven_since(self, base: str, since: float, now: float) -> bool:
+        """Whether a person has it, or had it at any time after ``since``."""
+        visit = self._visits.get(base)
+        return visit is not None and (visit.announced >= since or bool(self.driver(base, now)))

@@ -7,12 +7,17 @@ processes that map them.
 from __future__ import annotations
 
 import json
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import msgspec
 
 from pebble.config import load
+from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.launcher.programs import programs
@@ -21,23 +26,90 @@ from pebble.rig.processes import MCUS, ROBOTS, Processes, python
 from pebble.rig.programs import Program, Wrap, children, unchanged
 from pebble.simulation.trace import Entry, read_trace
 
+if TYPE_CHECKING:
+    from pebble.rig.room import Outcome
+    from pebble.simulation.mcu import Snapshot
+
 KINDS = ("mqtt", "zenoh")
 LAUNCHER, BROKER = "launcher", "mosquitto"
 NAME = "rover"
 BASE = Identity("pebble", "robots", NAME).base
 _HOST = "127.0.0.1"
-_MCU_START_S = 15.0
+MCU_START_S = 15.0
 _COMM_BYTES = 15  # of a process's name in the kernel
+_REPORTS = 600  # a minute of reports
+_ENTRIES = 5_000  # minutes of commands
 
 Config = Mapping[str, Any]
 
 
-class Robot:
-    """``kind`` is its local transport. It connects to a broker for operators at ``remote``, host and port.
+class SimulatedRobot:
+    """A robot on this machine. ``entries()`` and ``mcu_reports`` are what its MCU measured, independent of telemetry.
 
-    ``services``: fields of its services' configs besides these connections; one that is named is enabled. ``reports``:
-    whether every report of its MCU is recorded and forwarded, 50 a second; None: as is usual. ``wrap`` extends the
-    commands of all processes that use the network. Its processes are among ``running``, and end with them.
+    Its processes are among ``running``, and end with them. ``stop_s``: how long its wheels may turn after the last
+    command, its own watchdog included.
+    """
+
+    runs_on: str
+    stop_s: float
+    has_media = has_imu = has_scripts = False
+    has_counter = True  # its camera shows a scene with a counter in it
+
+    def __init__(self, running: Processes, name: str, folder: Path) -> None:
+        self.running, self.name, self.folder = running, name, folder
+        self.folder.mkdir(exist_ok=True)
+        self.mcu_reports: deque[Snapshot] = deque(maxlen=_REPORTS)
+        self.programs: list[Program] = []  # all that were started for it
+        self.mcu: Program | None = None  # of its motors
+        self._trace, self._trace_read = folder / "trace.jsonl", 0
+        self._entries: deque[Entry] = deque(maxlen=_ENTRIES)
+
+    def entries(self) -> list[Entry]:
+        """The lines that the MCU received and the changes of its motors, oldest first."""
+        with self._trace.open("rb") as file:
+            file.seek(self._trace_read)
+            new = file.read()
+        complete = new[: new.rfind(b"\n") + 1]
+        self._trace_read += len(complete)
+        self._entries.extend(msgspec.json.decode(line, type=Entry) for line in complete.splitlines())
+        return list(self._entries)
+
+    def relays(self) -> list[Entry]:
+        """The changes of its outlets' relays, oldest first; most robots have none."""
+        return []
+
+    def outcome(self, at: float) -> Outcome:
+        """What came of a script that ended at ``at``; only a robot with scripts knows."""
+        raise NotImplementedError
+
+    def _add(self, name: str, command: Sequence[str], kind: int, log: str, *, reports: bool = False) -> Program:
+        self.programs.append(Program(name, command, self.folder / log, reports=reports))
+        return self.running.add(self.programs[-1], kind)
+
+    def _start_mcu(self, module: str, *options: object, reports: bool = True) -> Program:
+        """The MCU of its motors; with ``reports`` what it measures is collected."""
+        command = python(module, *options, *(["--report"] if reports else []))
+        self.mcu = self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", reports=reports)
+        if reports:
+            threading.Thread(target=self._watch, args=(self.mcu,), name=f"reports of {self.name}", daemon=True).start()
+        return self.mcu
+
+    def _watch(self, mcu: Program) -> None:
+        for line in mcu.reports:
+            self.mcu_reports.append(self._read(line))
+
+    def _read(self, line: bytes) -> Snapshot:
+        from pebble.simulation.mcu import Snapshot
+
+        return msgspec.json.decode(line, type=Snapshot)
+
+
+class Robot(SimulatedRobot):
+    """One with the launcher and its services; ``kind`` is its local transport.
+
+    It connects to a broker for operators at ``remote``, host and port. ``services``: fields of its services' configs
+    besides these connections; one that is named is enabled. ``reports``: whether every report of its MCU is recorded
+    and forwarded, 50 a second; None: as is usual. ``wrap`` extends the commands of all processes that use the network.
     """
 
     def __init__(
@@ -52,27 +124,27 @@ class Robot:
         reports: bool | None = False,
         wrap: Wrap = unchanged,
     ) -> None:
-        self.kind, self.name, self.remote, self.base = kind, name, remote, Identity("pebble", "robots", name).base
-        self.folder = folder or running.folder
-        self.run_dir, self.config = self.folder / "run", self.folder / "robot.json"
-        self.port, self._trace = self.folder / "mcu", self.folder / "trace.jsonl"
+        super().__init__(running, name, folder or running.folder)
+        self.kind, self.remote, self.base = kind, remote, Identity("pebble", "robots", name).base
+        self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
-        self.running, self._services, self.reports, self._wrap = running, services or {}, reports, wrap
-        self._mcu: Program | None = None
+        self.local_port: int | None = None  # of the local broker, which may be that of several robots
+        self._services, self.reports, self._wrap = services or {}, reports, wrap
         self._started: list[Program] = []
 
-    def prepare(self) -> None:
-        """Starts what the robot needs and writes its config. Raises PebbleError if a process does not start."""
-        self.folder.mkdir(exist_ok=True)
-        if self.kind != "zenoh":
+    def prepare(self, ending: threading.Event | None = None) -> None:
+        """Starts what the robot needs and writes its config, or waits no longer once ``ending`` is set.
+
+        Raises PebbleError if a process does not start.
+        """
+        if self.kind != "zenoh" and self.local_port is None:
             self.local_broker = self.running.broker("local", folder=self.folder, wrap=self._wrap)
+            self.programs.append(self.local_broker)
+            self.local_port = self.local_broker.port
             if self._wrap is unchanged:  # else it is in another network
                 self.local_broker.wait()
         self._trace.touch()
-        options = ["--link", self.port, "--trace", self._trace, *(["--trace-said"] if self.reports else [])]
-        command = python("pebble.simulation.mcu", "--kind", "goob", *options)
-        self._mcu = self.running.add(Program("MCU", command, self.folder / "mcu.log"), MCUS)
-        self._mcu.wait_until(self.port.exists, _MCU_START_S)
+        self._start_motors().wait_until(self.port.exists, MCU_START_S, ending)
         self.config.write_text(json.dumps(self._contents(), indent=1))
 
     def launch(self) -> None:
@@ -91,11 +163,6 @@ class Robot:
         return self._started[0] if self._started else None
 
     # -- its processes
-
-    @property
-    def programs(self) -> list[Program]:
-        """All that were started for it."""
-        return [*(one for one in (self.local_broker, self._mcu) if one is not None), *self._started]
 
     @property
     def remote_port(self) -> int:
@@ -144,25 +211,41 @@ class Robot:
 
     def start(self, name: str, command: Sequence[str]) -> None:
         """One of the robot's own processes."""
-        program = Program(name, self._wrap(command), self.folder / "robot.log")
-        self._started.append(self.running.add(program, ROBOTS))
+        self._started.append(self._add(name, self._wrap(command), ROBOTS, "robot.log"))
+
+    def _start_motors(self) -> Program:
+        options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
+        return self._start_mcu("pebble.simulation.mcu", *options, reports=False)
 
     def _contents(self) -> dict[str, Any]:
         """Of its config file."""
-        host, port = self.remote
-        services: dict[str, Any] = {
-            "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": host, "port": port}},
-            "serial_mcu_bridge": {"enabled": True, "serial": {"port": str(self.port), "baud": 460_800}},
-        }
+        motors: dict[str, Any] = {"enabled": True, "serial": {"baud": 460_800}}
         if self.reports is not None:
-            services["serial_mcu_bridge"]["telemetry"] = {"publish_touch_sensors": self.reports}
-        for service, fields in self._services.items():
-            services[service] = {**services.get(service, {"enabled": True}), **fields}
-        folders = {"run_dir": str(self.run_dir), "state_dir": str(self.run_dir)}
-        config: dict[str, Any] = {"robot": {"id": self.name}, "transport": {"kind": self.kind, **folders}}
-        if self.local_broker is not None:
-            config["local_mqtt"] = {"host": "localhost", "port": self.local_broker.port}
-        return {**config, "services": services}
+            motors["telemetry"] = {"publish_touch_sensors": self.reports}
+        services = {"mqtt_bridge": {"enabled": True}, "serial_mcu_bridge": motors}
+        more = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
+        own = {"robot": {"id": self.name}, "transport": {"kind": self.kind}, "services": deep_merge(services, more)}
+        return self._connected(own)
+
+    def _connected(self, config: dict[str, Any]) -> dict[str, Any]:
+        """A config with the addresses and paths of this robot."""
+        host, port = self.remote
+        changes: dict[str, Any] = {
+            "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
+            "services": {
+                "mqtt_bridge": {"remote_mqtt": {"host": host, "port": port}},
+                "serial_mcu_bridge": {"serial": {"port": str(self.port)}},
+            },
+        }
+        if self.local_port is not None:
+            changes["local_mqtt"] = {"host": "localhost", "port": self.local_port}
+        connected: dict[str, Any] = deep_merge(config, changes)
+        return connected
+
+
+def board(kind: str, port: Path, trace: Path) -> tuple[object, ...]:
+    """The options of a simulated MCU."""
+    return "--kind", kind, "--link", port, "--trace", trace
 
 
 def synthetic_media(camera: tuple[int, int, int], published: tuple[int, int, int]) -> dict[str, Config]:
@@ -191,16 +274,6 @@ def one_robot(kind: str, make: Callable[..., Robot] = Robot, **options: Any) -> 
         broker.wait()
         robot.prepare()
         yield robot
-
-
-def check_kinds(kinds: Sequence[str], *, also: Sequence[str] = ()) -> None:
-    """Raises PebbleError naming an unknown or repeated transport. ``also`` may be named besides ours."""
-    known = (*KINDS, *also)
-    unknown = [kind for kind in kinds if kind not in known]
-    if unknown or not kinds:
-        raise PebbleError(f"unknown transport {', '.join(unknown)}: there are {', '.join(known)}")
-    if len(set(kinds)) < len(kinds):
-        raise PebbleError(f"{', '.join(kinds)}: name each transport once")
 
 
 def _comm(pid: int) -> str:

@@ -9,13 +9,12 @@ from typing import Any
 
 from pebble.errors import PebbleError
 from pebble.rig.operator import Operator
-from pebble.rig.page import PageServer
-from pebble.rig.testbed import ROBOTS, Testbed
+from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.simulation.trace import Entry
 
 _DRIVABLE_S = 30.0
 
-Changes = list[tuple[int, tuple[float, float]]]
+_AT_REST = (0.0, 0.0)
 
 
 class Stage(Testbed):
@@ -68,28 +67,29 @@ class Stage(Testbed):
 
     # -- the motors
 
-    def motors(self, name: str) -> Changes:
+    def motors(self, name: str) -> list[tuple[int, tuple[float, float]]]:
         """Every change of its motors, oldest first: monotonic ns, left and right."""
         return [(entry.ns, entry.motors) for entry in self.robots[name].entries() if entry.motors is not None]
 
     def wheels_turning(self, name: str, since_ns: int | None = None) -> bool:
         """Whether its motors run now; with ``since_ns`` whether they have run at any time since then."""
-        changes = self.motors(name)
         if since_ns is None:
-            return bool(changes) and _runs(changes, -1)
-        return any(_runs(changes, index) and _until(changes, index) > since_ns for index in range(len(changes)))
+            return [speeds for _, speeds in self.motors(name)][-1:] not in ([], [_AT_REST])
+        return self.last_motion_ns(name) > since_ns
 
     def turned_s(self, name: str, since_ns: int) -> float:
         """How long its motors have run since then, in seconds."""
-        changes = self.motors(name)
-        runs = [(max(since_ns, changes[index][0]), _until(changes, index)) for index in _running(changes)]
-        return sum(max(0, end - begin) for begin, end in runs) / 1e9
+        return sum(max(0, end - max(since_ns, begin)) for begin, end in self._motions(name)) / 1e9
 
     def last_motion_ns(self, name: str) -> int:
         """When its motors were last switched off; now if they run, 0 if they have never run."""
+        return max((end for _, end in self._motions(name)), default=0)
+
+    def _motions(self, name: str) -> list[tuple[int, int]]:
+        """From when until when its motors ran at the same speeds; now if they run."""
         changes = self.motors(name)
-        last = next((index for index in reversed(range(len(changes))) if _runs(changes, index)), None)
-        return 0 if last is None else _until(changes, last)
+        ends = [*(ns for ns, _ in changes[1:]), time.monotonic_ns()]
+        return [(ns, end) for (ns, speeds), end in zip(changes, ends, strict=False) if speeds != _AT_REST]
 
     def relays(self, name: str) -> list[str]:
         """Every change of its outlets' relays, oldest first: "o1 on"."""
@@ -98,15 +98,3 @@ class Stage(Testbed):
     def lines(self, name: str) -> list[Entry]:
         """What its MCU received, oldest first."""
         return [entry for entry in self.robots[name].entries() if entry.event == "line"]
-
-
-def _running(changes: Changes) -> list[int]:
-    return [index for index in range(len(changes)) if _runs(changes, index)]
-
-
-def _runs(changes: Changes, index: int) -> bool:
-    return changes[index][1] != (0.0, 0.0)
-
-
-def _until(changes: Changes, index: int) -> int:
-    return changes[index + 1][0] if index + 1 < len(changes) else time.monotonic_ns()

@@ -43,12 +43,10 @@ class Worker(Program):
                 self._process.stdin.flush()
 
     def ask(self, line: str, timeout: float) -> dict[str, Any]:
-        """Sends a line and returns the next answer."""
         self.send(line)
         return self.answer(timeout)
 
     def ask_to_end(self) -> None:
-        """Closes standard input."""
         if self._process.stdin is not None and not self._process.stdin.closed:
             with contextlib.suppress(BrokenPipeError):  # it ended by itself
                 self._process.stdin.close()

@@ -199,7 +199,7 @@ import sys
 import pebble.demo.main as main
 import pebble.rig.testbed as testbed
 main._DISCOVERY_S = 1.0
-testbed.LinuxRobot.start = lambda self, ending: None
+testbed.LinuxRobot.bring_up = lambda self, ending: None
 sys.exit(main.run(main.SHORTEST_S))
 """
     demos.append(Demo(temporary, code))

@@ -125,19 +125,14 @@ def command_of(about: Comparison) -> Callable[..., int]:
         mode = next((mode for name, mode in about.modes.items() if wanted.get(name)), about)
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
-    parameters: dict[str, tuple[Any, Any]] = {
-        _python(option): (_annotation(about, option), None) for option in about.options
-    }
-    parameters |= {"quick": (Quick, False)} if about.has_quick else {}
-    parameters["output"] = (Output, about.folder)
+    parameters = [_parameter(_python(option), _annotation(about, option)) for option in about.options]
+    parameters += [_parameter("quick", Quick, False)] if about.has_quick else []
     run.__doc__ = about.help
-    return with_parameters(
-        run,
-        [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-            for name, (annotation, default) in parameters.items()
-        ],
-    )
+    return with_parameters(run, [*parameters, _parameter("output", Output, about.folder)])
+
+
+def _parameter(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 def with_parameters(run: Callable[..., int], parameters: Sequence[inspect.Parameter]) -> Callable[..., int]:

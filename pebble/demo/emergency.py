@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pebble.rig.emergency import NAME, CompletedStop
+from pebble.rig.acts import EMERGENCY_STOP, CompletedStop
 from pebble.simulation.trace import Entry
 
 _STOPPED_S = 1.0  # until the motors are off
@@ -20,7 +20,7 @@ class StopResult:
     stop_s: float
     confirmed_s: float | None
     wrong: tuple[str, ...]
-    step: str = NAME
+    step: str = EMERGENCY_STOP
 
     @property
     def summary(self) -> str:

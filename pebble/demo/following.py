@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pebble.rig.acts import BY_ITSELF, DISTANCE_M, FOLLOW, HOLD_S, TOLERANCE_M, CompletedFollow, Wheels
 from pebble.rig.room import Outcome
-from pebble.rig.takeover import DISTANCE_M, HOLD_S, NAME, SCRIPT, TOLERANCE_M, CompletedFollow, Wheels
 from pebble.simulation.trace import Entry
 
 BEARING_RAD = 0.09
@@ -31,7 +31,7 @@ class Check:
 class FollowResult:
     robot: str
     checks: tuple[Check, ...]
-    step: str = NAME
+    step: str = BY_ITSELF
 
     @property
     def wrong(self) -> tuple[str, ...]:
@@ -57,12 +57,12 @@ def _driven(completed: CompletedFollow, drives: Sequence[tuple[float, Wheels]]) 
         (at for at, wheels in drives if completed.started <= at < completed.took_over and wheels != _STOP), None
     )
     if first is None:
-        return Check(name, "never", f"{SCRIPT} did not drive before the operator took over")
+        return Check(name, "never", f"{FOLLOW} did not drive before the operator took over")
     took = first - completed.started
     return Check(
         name,
         f"{took:.2f} s after its start",
-        "" if took <= _STARTED_S else f"{SCRIPT} drove only after {took:.1f} s",
+        "" if took <= _STARTED_S else f"{FOLLOW} drove only after {took:.1f} s",
     )
 
 
@@ -95,12 +95,12 @@ def _resumed(completed: CompletedFollow, drives: Sequence[tuple[float, Wheels]])
     after = completed.released + HOLD_S - 0.1
     first = next((at for at, wheels in drives if after <= at <= completed.ended and wheels != _STOP), None)
     if first is None:
-        return Check(name, "never", f"{SCRIPT} did not drive again")
+        return Check(name, "never", f"{FOLLOW} did not drive again")
     took = first - completed.released
     return Check(
         name,
         f"{took:.2f} s after the operator let go",
-        "" if took <= _RESUMED_S else f"{SCRIPT} drove again only after {took:.1f} s",
+        "" if took <= _RESUMED_S else f"{FOLLOW} drove again only after {took:.1f} s",
     )
 
 

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.demo import emergency, following
+from pebble.demo.machine import Machine
 from pebble.demo.media import ROUND_S as MEDIA_ROUND_S
 from pebble.demo.media import MediaCheck
 from pebble.demo.media_assessment import MediaResult
@@ -23,18 +24,20 @@ from pebble.demo.results import Result, Results
 from pebble.demo.steps import assess
 from pebble.demo.view import View, show_media_results, show_results
 from pebble.errors import PebbleError
+from pebble.rig.acts import (
+    BY_ITSELF,
+    EMERGENCY_S,
+    EMERGENCY_STOP,
+    ROUND_S,
+    SCRIPT,
+    TAKEOVER_S,
+    CompletedFollow,
+    CompletedStep,
+    CompletedStop,
+)
 from pebble.rig.broker import BrokerKind, best_kind
-from pebble.rig.emergency import DURATION_S as EMERGENCY_S
-from pebble.rig.emergency import NAME as EMERGENCY_STOP
-from pebble.rig.emergency import CompletedStop
-from pebble.rig.machine import Machine
 from pebble.rig.operator import Operator
-from pebble.rig.page import PageServer
-from pebble.rig.steps import ROUND_S, SCRIPT, CompletedStep
-from pebble.rig.takeover import DURATION_S as TAKEOVER_S
-from pebble.rig.takeover import NAME as BY_ITSELF
-from pebble.rig.takeover import CompletedFollow
-from pebble.rig.testbed import ROBOTS, Testbed
+from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.web.extra import require_packages
 from pebble.web.settings import DEFAULT_PORT
 

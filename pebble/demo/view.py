@@ -23,7 +23,7 @@ from pebble.demo.media_assessment import MediaResult
 from pebble.demo.results import Result
 from pebble.demo.steps import StepResult
 from pebble.rig.operator import Operator
-from pebble.rig.testbed import SimulatedRobot
+from pebble.rig.robot import SimulatedRobot
 
 _LINE_PERIOD_S = 1.0
 _COLUMN_WIDTH = 26  # characters, of the longest usual cell: keeps the layout stable

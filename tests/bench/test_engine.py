@@ -139,6 +139,19 @@ def test_tables_name_options_of_the_run(tmp_path: Path) -> None:
     assert "times, for 2 s, quick" in console.file.getvalue()
 
 
+def test_a_cell_without_samples_exits_with_1(tmp_path: Path) -> None:
+    about = declared(measure=lambda case: [case.cell("way", "us", [] if case.variant == "socket" else [1.0])])
+    assert engine.run(about.run_of(output=tmp_path, console=Console(file=io.StringIO()))) == 1
+
+
+def test_the_machine_is_asked_before_anything_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measure(case: Case) -> Iterator[Cell]:
+        monkeypatch.setattr("pebble.bench.results.machine", None)
+        yield case.cell("way", "us", [1.0])
+
+    assert measured(declared(measure=measure), tmp_path).machine["cpu"]
+
+
 def test_an_option_may_set_a_value_of_another_name(tmp_path: Path) -> None:
     option = Option(name="way", sets="variants", many=True, known=("pipe", "socket"), help="W.")
     results = measured(declared(options=(option,)), tmp_path, variants=["socket"])

@@ -14,7 +14,7 @@ from pebble.bench.results import (
     OVER_TIME,
     Cell,
     Results,
-    Stopwatch,
+    begin,
     load,
     machine,
     pack,
@@ -29,14 +29,15 @@ def a_cell(**more: object) -> Cell:
 
 
 def test_a_file_comes_back_as_it_was(tmp_path: Path) -> None:
-    watch = Stopwatch("control", ["pebble", "bench", "control"], {"rounds": 2, "sizes": ["40 B"]})
-    results = watch.results([a_cell(figures={"sent": 4, "cpu": None})], ["equal within noise"], quick=True)
+    results = begin("control", ["pebble", "bench", "control"], quick=True)
+    results.options, results.assessment = {"rounds": 2, "sizes": ["40 B"]}, ["equal within noise"]
+    results.cells = [a_cell(figures={"sent": 4, "cpu": None})]
     results.save(tmp_path / "control.json")
     assert load(tmp_path / "control.json") == results
 
 
 def test_all_that_repeats_it_is_there(tmp_path: Path) -> None:
-    Stopwatch("control", ["pebble"], {}).results([]).save(tmp_path / "x.json")
+    begin("control", ["pebble"]).save(tmp_path / "x.json")
     results = load(tmp_path / "x.json")
     assert (results.bench, results.format, results.command) == ("control", FORMAT, ["pebble"])
     assert results.pebble
@@ -53,12 +54,6 @@ def test_a_broker_without_a_version_costs_no_results(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(subprocess, "run", stuck)
     assert machine()["mosquitto"] is None
-
-
-def test_the_machine_is_asked_before_anything_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    watch = Stopwatch("control", ["pebble"], {})
-    monkeypatch.setattr("pebble.bench.results.machine", None)
-    assert watch.results([]).machine["cpu"]
 
 
 def test_a_folder_in_which_nothing_can_be_written_is_refused(tmp_path: Path) -> None:

@@ -1,11 +1,7 @@
 """Results of two robots in words: what is claimed, and what is not."""
 
-import pytest
-
 from pebble.bench.results import Cell
 from pebble.bench.tables import against, caveat, sentence, spread
-from pebble.errors import PebbleError
-from pebble.rig.robot import check_kinds
 
 
 def cells(mqtt: list[float], zenoh: list[float]) -> list[Cell]:
@@ -60,14 +56,3 @@ def test_one_round_claims_nothing() -> None:
 
 def test_a_single_robot_is_not_compared() -> None:
     assert sentence("M", cells([1.0, 2.0], [])[:1], quantity="time") == "M: mqtt 1.50 (1.00 to 2.00) ms"
-
-
-@pytest.mark.parametrize("kinds", [[], ["carrier-pigeon"], ["mqtt", ""]])
-def test_unknown_transports_are_refused(kinds: list[str]) -> None:
-    with pytest.raises(PebbleError, match="there are mqtt, zenoh"):
-        check_kinds(kinds)
-
-
-def test_no_robot_is_compared_with_itself() -> None:
-    with pytest.raises(PebbleError, match="name each transport once"):
-        check_kinds(["mqtt", "zenoh", "mqtt"])

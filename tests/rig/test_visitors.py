@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pebble.contract import DRIVING, codec
 from pebble.contract.payloads import Driver, Driving
-from pebble.rig.visitors import EXPIRES_S, Visitors
+from pebble.rig.operator import EXPIRES_S, Visitors
 from pebble.transports import Message
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"

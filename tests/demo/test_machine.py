@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.rig.machine import Machine, Sample, overloaded
+from pebble.demo.machine import Machine, Sample, overloaded
 
 TICKS = 100  # in each slice of half a second, on two processors
 
@@ -49,12 +49,12 @@ def test_this_machine_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     machine, before = Machine(), time.monotonic()
     machine.sample()
     time.sleep(0.5)
-    monkeypatch.setattr("pebble.rig.machine._LEAST_IDLE", 1.01)  # nothing can be that idle
+    monkeypatch.setattr("pebble.demo.machine._LEAST_IDLE", 1.01)  # nothing can be that idle
     assert "idle" in machine.overloaded(before, time.monotonic())
 
 
 def test_where_the_system_does_not_count_nothing_is_excused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("pebble.rig.machine._STAT", tmp_path / "none")
+    monkeypatch.setattr("pebble.demo.machine._STAT", tmp_path / "none")
     machine = Machine()
     machine.sample()
     assert machine.overloaded(0.0, time.monotonic()) == ""
