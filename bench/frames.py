@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import statistics
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from pebble.bench.tables import COUNT, LOST, Column, Grid, figure, percentile_co
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
 from pebble.rig.broker import Broker, BrokerKind, best_kind
-from pebble.rig.processes import Processes
+from pebble.rig.processes import Processes, python
 from pebble.rig.worker import Worker
 
 VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
@@ -87,16 +87,16 @@ def prepare(run: Run) -> None:
 
 def missing(variant: str) -> str | None:
     """Why this variant cannot run on this machine, with the command that installs it; None if it can."""
-    check = _NEEDS.get(variant)
-    return check() if check is not None else None
+    if variant == "mqtt":
+        return _mosquitto()
+    return _gstreamer() if variant == "gstreamer-shm" else None
 
 
 def _mosquitto() -> str | None:
-    try:
-        installed = best_kind() is BrokerKind.MOSQUITTO
-    except PebbleError:
-        installed = False
-    return None if installed else f"mosquitto is not installed: {_INSTALL_MOSQUITTO}"
+    with suppress(PebbleError):
+        if best_kind() is BrokerKind.MOSQUITTO:
+            return None
+    return f"mosquitto is not installed: {_INSTALL_MOSQUITTO}"
 
 
 @functools.cache
@@ -106,9 +106,6 @@ def _gstreamer() -> str | None:
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{error}; GStreamer is read by {_SYSTEM_PYTHON}: {INSTALL_GSTREAMER}"
     return None if probe.returncode == 0 else f"GStreamer is not installed: {INSTALL_GSTREAMER}"
-
-
-_NEEDS: dict[str, Callable[[], str | None]] = {"mqtt": _mosquitto, "gstreamer-shm": _gstreamer}
 
 
 # -- one case
@@ -123,30 +120,24 @@ def measure(case: Case) -> Iterator[Cell]:
         broker = processes.broker() if case.variant == "mqtt" else None
         if broker is not None:
             broker.wait()
-        writer_first = case.variant == "gstreamer-shm"  # its readers fail without a writer; the others wait
-        workers: list[Worker] = []
-        for name in ("writer", *(f"reader {number + 1}" for number in range(_readers(case)))):
-            command = _command(case, name.partition(" ")[0], processes.folder, broker.port if broker is not None else 0)
-            workers.append(processes.command(f"{case}: {name}", command))
-            if name == "writer" and writer_first:
-                workers[0].answer(_READY_S)
-        for worker in workers[1 if writer_first else 0 :]:
+        where, writers_first = processes.folder if broker is None else broker.port, case.variant == "gstreamer-shm"
+        workers = [processes.command(f"{case}: writer", _command(case, "writer", where))]
+        if writers_first:  # its readers fail without a writer; the others wait
+            workers[0].answer(_READY_S)
+        for number in range(int(case.condition["readers"] or 0)):
+            workers.append(processes.command(f"{case}: reader {number + 1}", _command(case, "reader", where)))
+        for worker in workers[writers_first:]:
             worker.answer(_READY_S)
         yield _observed(case, workers, broker, case.run["seconds"])
 
 
-def _readers(case: Case) -> int:
-    return int(case.condition["readers"] or 0)
-
-
-def _command(case: Case, end: str, folder: Path, port: int) -> list[str]:
-    """The command of one end (writer or reader); ``folder`` is for sockets, ``port`` is the broker's."""
-    size, slower_us = parse_size(str(case.condition["size"])), str(case.planted_us if case.slowed else 0.0)
+def _command(case: Case, role: str, where: Path | int) -> list[str]:
+    """Of the writer or a reader; ``where`` is a folder for sockets, or the broker's port."""
+    size, slower_us = case.condition["size"], case.planted_us if case.slowed else 0.0
     if case.variant == "gstreamer-shm":
-        program, socket = Path(__file__).with_name("frames_gstreamer.py"), folder / "gst.sock"
-        return [_SYSTEM_PYTHON, str(program), end, str(socket), str(size.width), str(size.height), slower_us]
-    where = str(port if case.variant == "mqtt" else folder)
-    return [sys.executable, "-m", "pebble.bench.frames_worker", case.variant, end, where, str(size), slower_us]
+        program = Path(__file__).with_name("frames_loop.py")
+        return [_SYSTEM_PYTHON, *map(str, (program, role, f"{where}/gst.sock", size, slower_us))]
+    return python("pebble.bench.frames_worker", case.variant, role, where, size, slower_us)
 
 
 def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seconds: float) -> Cell:
