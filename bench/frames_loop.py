@@ -60,7 +60,8 @@ class Reader(Protocol):
         """The next frame, or None after ``timeout`` seconds."""
 
     def done(self) -> None:
-        """Releases the array, unless it is the reader's own."""
+        """Releases the array; nothing to do if it is a copy."""
+        return
 
     def close(self) -> None: ...
 
