@@ -39,15 +39,7 @@ INSTALL_GSTREAMER = (
 )
 _INSTALL_MOSQUITTO = "apt-get install -y --no-install-recommends mosquitto"
 _SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
-_PROBE = """
-import gi, numpy
-gi.require_version("Gst", "1.0")
-gi.require_version("GstApp", "1.0")
-from gi.repository import Gst, GstApp
-Gst.init(None)
-for name in ("shmsink", "shmsrc", "appsrc", "appsink"):
-    assert Gst.ElementFactory.find(name), name
-"""
+_GSTREAMER = str(Path(__file__).with_name("frames_loop.py"))
 _PROBE_S = 20.0
 OURS = "zenoh-shm"
 SIZES, READERS = ("640x480", "1920x1080"), (1, 3)
@@ -102,7 +94,7 @@ def _mosquitto() -> str | None:
 @functools.cache
 def _gstreamer() -> str | None:
     try:
-        probe = subprocess.run([_SYSTEM_PYTHON, "-c", _PROBE], capture_output=True, timeout=_PROBE_S, check=False)
+        probe = subprocess.run([_SYSTEM_PYTHON, _GSTREAMER], capture_output=True, timeout=_PROBE_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{error}; GStreamer is read by {_SYSTEM_PYTHON}: {INSTALL_GSTREAMER}"
     return None if probe.returncode == 0 else f"GStreamer is not installed: {INSTALL_GSTREAMER}"
@@ -135,8 +127,7 @@ def _command(case: Case, role: str, where: Path | int) -> list[str]:
     """Of the writer or a reader; ``where`` is a folder for sockets, or the broker's port."""
     size, slower_us = case.condition["size"], case.planted_us if case.slowed else 0.0
     if case.variant == "gstreamer-shm":
-        program = Path(__file__).with_name("frames_loop.py")
-        return [_SYSTEM_PYTHON, *map(str, (program, role, f"{where}/gst.sock", size, slower_us))]
+        return [_SYSTEM_PYTHON, *map(str, (_GSTREAMER, role, f"{where}/gst.sock", size, slower_us))]
     return python("pebble.bench.frames_worker", case.variant, role, where, size, slower_us)
 
 
@@ -144,19 +135,20 @@ def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seco
     begin = time.monotonic_ns() + int(_STARTUP_S * 1e9)
     for worker in workers:
         worker.send(f"{begin} {begin + int(seconds * 1e9)}")
+    pids = [process.pid for process in (*workers, *([] if broker is None else [broker]))]
     time.sleep(_STARTUP_S)
-    before = cpu_s([broker.pid]) if broker is not None else 0.0
+    before = [cpu_s([pid]) for pid in pids]
     time.sleep(seconds)
-    used = cpu_s([broker.pid]) - before if broker is not None else None
+    cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
     writer, *readers = (worker.answer(_ANSWER_S) for worker in workers)
     bare = case.variant == "memcpy"  # has no writer; it times copies, so there is no number of sent ones
     return case.cell(
         "frame",
         "us",
         (latency for reader in readers for latency in reader["latencies_us"]),
-        cpu_writer=0.0 if bare else writer["cpu"],
-        cpu_reader=statistics.fmean(reader["cpu"] for reader in readers),
-        cpu_broker=None if used is None else 100 * used / seconds,
+        cpu_writer=0.0 if bare else cpu[0],
+        cpu_reader=statistics.fmean([reader["cpu"] for reader in readers] if bare else cpu[1 : len(workers)]),
+        cpu_broker=None if broker is None else cpu[-1],
         memory_writer_mb=0.0 if bare else pss_mb(workers[0].pid),
         memory_reader_mb=0.0 if bare else statistics.fmean(pss_mb(worker.pid) for worker in workers[1:]),
         torn=sum(reader["torn"] for reader in readers),

@@ -1,8 +1,8 @@
 """Writes and reads time-stamped frames at a steady rate, and measures during a given window.
 
 Runs in two Pythons: Pebble's own, and the system's, where gi and Gst are installed. There it is one end of a transfer
-through GStreamer, as a plain file: ``python3 frames_loop.py writer|reader SOCKET 640x480 SLOWER_US``. So it imports
-only the standard library, numpy, and the other end of a worker.
+through GStreamer, as a plain file: ``python3 frames_loop.py writer|reader SOCKET 640x480 SLOWER_US``; without
+arguments it fails if it could not be. So it imports only the standard library, numpy, and the other end of a worker.
 
 A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
 time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns) and answers
@@ -67,41 +67,29 @@ class Reader(Protocol):
 
 
 class Window:
-    """The time in which is measured, as standard input names it, and the CPU usage of this process in it."""
+    """The time in which is measured, as standard input names it; CLOCK_MONOTONIC, ns."""
 
     def __init__(self) -> None:
-        self._ns: tuple[float, float] = (math.inf, math.inf)  # CLOCK_MONOTONIC
-        self._before: tuple[int, int] | None = None  # the first poll in the window: its time, and CPU time so far
-        self.cpu: float | None = None  # % of one core; None before the window has ended
+        self._begin = self._end = math.inf
         self.ended = worker_end.serve_on_thread(self._take)  # standard input
 
     def _take(self, line: str) -> None:
-        begin, end = map(int, line.split())
-        self._ns = begin, end
+        self._begin, self._end = map(int, line.split())
 
     def __contains__(self, ns: int) -> bool:
-        return self._ns[0] <= ns < self._ns[1]
+        return self._begin <= ns < self._end
 
-    def is_over(self, now: int) -> bool:
+    def is_over(self) -> bool:
         """Whether the last frames of the window have had time to arrive."""
-        return now >= self._ns[1] + _LATE_NS
+        return time.monotonic_ns() >= self._end + _LATE_NS
 
     def percent(self, ns: int) -> float:
         """Of the window's duration."""
-        return 100 * ns / (self._ns[1] - self._ns[0])
-
-    def poll(self, now: int) -> None:
-        """Updates ``cpu``; called repeatedly with ``now`` = time.monotonic_ns()."""
-        if now < self._ns[0] or self.cpu is not None:
-            return
-        if self._before is None:
-            self._before = (now, time.process_time_ns())
-        elif now >= self._ns[1]:
-            self.cpu = 100 * (time.process_time_ns() - self._before[1]) / (now - self._before[0])
+        return 100 * ns / (self._end - self._begin)
 
 
 def write(writer: Writer, size: int, *, slower_us: float = 0.0) -> None:
-    """Writes a frame of ``size`` bytes 30 times a second until standard input closes; answers with CPU and frames sent.
+    """Writes a frame of ``size`` bytes 30 times a second until standard input closes; answers how many of the window.
 
     Each frame is delayed by ``slower_us`` of busy work between its time stamp and its sending.
     """
@@ -118,10 +106,9 @@ def write(writer: Writer, size: int, *, slower_us: float = 0.0) -> None:
             _spin(slower_us)
             writer.send()
             sent += stamp in window
-        window.poll(time.monotonic_ns())
-        if window.cpu is not None and not answered:
+        if window.is_over() and not answered:
             answered = True
-            worker_end.answer({"cpu": window.cpu, "sent": sent, "fallbacks": writer.fallbacks})
+            worker_end.answer({"sent": sent, "fallbacks": writer.fallbacks})
     writer.close()
 
 
@@ -145,18 +132,16 @@ def _spin(us: float) -> None:
 def read(reader: Reader, *, bare_copy: int = 0) -> None:
     """Reads until standard input closes; answers with every latency of the window in µs.
 
-    With ``bare_copy``, measures instead the time of a copy of that many bytes between two frames, when the caches hold
-    other data.
+    With ``bare_copy``, measures instead the time and the CPU (%) of a copy of that many bytes between two frames, when
+    the caches hold other data.
     """
     source = np.random.default_rng(2).integers(0, 256, bare_copy, dtype=np.uint8)
     target = np.zeros(bare_copy, np.uint8)
     window, took_ns, torn, frames, answered = Window(), [], 0, 0, False
     while not window.ended.is_set():
         frame = reader.read(_READ_S)
-        now = time.monotonic_ns()
-        window.poll(now)
         if frame is not None:
-            frames += 1
+            now, frames = time.monotonic_ns(), frames + 1
             stamp, number = (int.from_bytes(frame[at : at + 8].tobytes(), "little") for at in (0, 8))
             torn += number != int.from_bytes(frame[-8:].tobytes(), "little")
             reader.done()
@@ -168,10 +153,10 @@ def read(reader: Reader, *, bare_copy: int = 0) -> None:
                 took_ns.append(_copy(source, target))
             if frames == _WARM_UP:
                 worker_end.answer({"ready": True})
-        if not answered and window.is_over(now):
+        if window.is_over() and not answered:
             answered = True
-            cpu = window.percent(sum(took_ns)) if bare_copy else window.cpu
-            worker_end.answer({"cpu": cpu, "latencies_us": [took / 1000 for took in took_ns], "torn": torn})
+            copies = {"cpu": window.percent(sum(took_ns))} if bare_copy else {}
+            worker_end.answer({"latencies_us": [took / 1000 for took in took_ns], "torn": torn, **copies})
     reader.close()
 
 
@@ -265,6 +250,11 @@ def main(arguments: list[str]) -> None:
     Gst = import_module("gi.repository.Gst")
     import_module("gi.repository.GstApp")  # gives appsrc and appsink their methods
     Gst.init(None)
+    for name in ("shmsink", "shmsrc", "appsrc", "appsink"):
+        if not Gst.ElementFactory.find(name):
+            raise RuntimeError(f"GStreamer has no {name}")
+    if not arguments:  # only asked whether it could
+        return
     role, socket, size, slower_us = arguments
     width, _, height = size.partition("x")
     caps = f"video/x-raw,format=BGR,width={width},height={height},framerate=30/1"
