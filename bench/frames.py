@@ -24,7 +24,6 @@ from pebble.rig.broker import Broker, BrokerKind, best_kind
 from pebble.rig.processes import Processes, python
 from pebble.rig.worker import Worker
 
-VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
 _ABOUT = {
     "zenoh-shm": "created in the shared segment, read as a view: no copy",
     "zenoh-copy": "shared memory, one copy in and one out",
@@ -33,6 +32,7 @@ _ABOUT = {
     "gstreamer-shm": "shmsink and shmsrc, created in the segment, one copy out",
     "memcpy": "no transport: a bare copy of as many bytes between two frames",
 }
+VARIANTS = tuple(_ABOUT)
 INSTALL_GSTREAMER = (
     "apt-get install -y --no-install-recommends gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
     " gir1.2-gst-plugins-base-1.0 python3-gst-1.0 python3-numpy"

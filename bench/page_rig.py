@@ -300,20 +300,14 @@ def linked(condition: Condition, *names: str, flags: tuple[str, ...] = ()) -> It
         raise PebbleError(f"no network namespaces: {problem}")
     with ExitStack() as stack:
         network = stack.enter_context(NamespaceNetwork())
-        program = _script(Path(stack.enter_context(tempfile.TemporaryDirectory())), network)
+        program = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "chromium"
+        program.write_text(f'#!/bin/sh\nexec {shlex.join(network.on_remote(["chromium"]))} "$@"\n')
+        program.chmod(0o700)
         stack.enter_context(_inside(network.on_robot(())[1].removeprefix("--net=")))
         secure = f"--unsafely-treat-insecure-origin-as-secure=http://{SERVER}:{_PORT}"  # as https would be
-        made = stack.enter_context(rig(*names, program=program, flags=(secure, *flags), host=SERVER, port=_PORT))
+        made = stack.enter_context(rig(*names, program=str(program), flags=(secure, *flags), host=SERVER, port=_PORT))
         network.apply(condition)
         yield made
-
-
-def _script(folder: Path, network: NamespaceNetwork) -> str:
-    """A program that is Chromium on the far side."""
-    path = folder / "chromium"
-    path.write_text(f'#!/bin/sh\nexec {shlex.join(network.on_remote(["chromium"]))} "$@"\n')
-    path.chmod(0o700)
-    return str(path)
 
 
 @contextmanager

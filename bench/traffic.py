@@ -134,30 +134,22 @@ def _polls(receivers: Sequence[MediaReceiver], seconds: float) -> Iterator[None]
 
 def cells_of(traffic: Traffic) -> list[Cell]:
     """The lengths of each robot's outages with all of its analysis, and the bandwidths of each kind of message."""
-    return [cell for robot in traffic.robots for cell in (_outage_cell(robot), *_bandwidth_cells(robot))]
+    return [cell for robot in traffic.robots for cell in _cells_of(robot)]
 
 
-def _outage_cell(robot: RobotTraffic) -> Cell:
-    lengths = [one.length_ms for one in robot.outages]
-    analysis = {_ANALYSIS: msgspec.json.encode(robot).decode()}
-    return Cell(variant=name_of(robot), measure="outage", unit="ms", rounds=[lengths], figures=dict(analysis))
-
-
-def _bandwidth_cells(robot: RobotTraffic) -> Iterator[Cell]:
+def _cells_of(robot: RobotTraffic) -> Iterator[Cell]:
+    name, lengths = robot.robot.rpartition("/")[2], [one.length_ms for one in robot.outages]
+    analysis = msgspec.json.encode(robot).decode()
+    yield Cell(variant=name, measure="outage", unit="ms", rounds=[lengths], figures={_ANALYSIS: analysis})
     for one in robot.bandwidth:
         yield Cell(
-            variant=name_of(robot),
+            variant=name,
             params={"messages": one.family, "time": one.time},
             measure="bandwidth",
             unit="kbit/s",
             rounds=[[one.median_kbps]],
             figures={"p95": round(one.p95_kbps, 3), "seconds": one.seconds, "count": one.messages, "bytes": one.bytes},
         )
-
-
-def name_of(robot: RobotTraffic) -> str:
-    """``goob``."""
-    return robot.robot.rpartition("/")[2]
 
 
 def robots_of(cells: Sequence[Cell]) -> Robots:
@@ -172,11 +164,6 @@ def robots_of(cells: Sequence[Cell]) -> Robots:
 def tables(cells: Sequence[Cell]) -> Iterator[Table]:
     """Table 4.1 beside the paper's, and heartbeats, whose distributions the paper shows as figures."""
     robots = robots_of(cells)
-    yield _media(robots)
-    yield _heartbeats(robots)
-
-
-def _media(robots: Robots) -> Table:
     heads = [f"{family} {value}" for family in (VIDEO, AUDIO) for value in ("median", "p95")]
     table = plain_table("Table 4.1: media, kbit/s of active seconds", ["robot", "", *heads], left=2)
     for name, paper in TABLE_4_1.items():
@@ -184,11 +171,8 @@ def _media(robots: Robots) -> Table:
         shown = [("–", "–") if one is None else (f"{one.median_kbps:.2f}", f"{one.p95_kbps:.2f}") for one in here]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
         table.add_row("", "here", *(value for pair in shown for value in pair))
-    return table
-
-
-def _heartbeats(robots: Robots) -> Table:
-    heads = ("robot", "heartbeats", "every ms", "outages", "below 300 ms", "shared", "latency p1", "p50", "p95 ms")
+    yield table
+    heads = ["robot", "heartbeats", "every ms", "outages", "below 300 ms", "shared", "latency p1", "p50", "p95 ms"]
     table = plain_table("Heartbeats", heads)
     for name, robot in robots.items():
         usual, latency = robot.intervals, robot.latency
@@ -196,7 +180,7 @@ def _heartbeats(robots: Robots) -> Table:
             counts = (latency.count, f"{usual.median_ms:.0f}", len(robot.outages), *_brief_and_shared([robot]))
             times = (latency.floor_ms, latency.median_ms, latency.p95_ms)
             table.add_row(name, *map(str, counts), *(f"{time:.1f}" for time in times))
-    return table
+    yield table
 
 
 def _brief_and_shared(robots: Iterable[RobotTraffic]) -> tuple[int, int]:
