@@ -33,8 +33,14 @@ class Clip:
         self._noise = noise.astype(np.float32)
 
     def frame(self, number: int) -> Pixels:
-        """BGR, 640×480."""
-        return self._noisy(self._walker(self._view(number), number), number)
+        """BGR, 640×480: a figure crosses the picture and moves against the background."""
+        view = self._view(number)
+        x, y = round(40 + number * 3.7) % WIDTH, 300
+        cv2.ellipse(view, (x, y), (22, 60), 0, 0, 360, (52, 60, 140), -1, cv2.LINE_AA)
+        cv2.circle(view, (x, y - 74), 17, (120, 150, 190), -1, cv2.LINE_AA)
+        down, right = (number * 29) % 64, (number * 47) % 64  # another part of the noise in each frame
+        grain = self._noise[down : down + HEIGHT, right : right + WIDTH]
+        return cast(Pixels, np.clip(view + grain + 0.5, 0, 255).astype(np.uint8))
 
     def _view(self, number: int) -> Pixels:
         """A window onto the world. While panning it also rotates and zooms, so that no block is merely shifted."""
@@ -49,19 +55,6 @@ class Clip:
         turn = cv2.getRotationMatrix2D((middle_x, middle_y), lean, scale)
         turn[:, 2] += np.array((WIDTH / 2 - middle_x, HEIGHT / 2 - middle_y))
         return cast(Pixels, cv2.warpAffine(self._world, turn, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC))
-
-    def _walker(self, view: Pixels, number: int) -> Pixels:
-        """Draws a figure that crosses the picture and moves against the background."""
-        x, y = round(40 + number * 3.7) % WIDTH, 300
-        cv2.ellipse(view, (x, y), (22, 60), 0, 0, 360, (52, 60, 140), -1, cv2.LINE_AA)
-        cv2.circle(view, (x, y - 74), 17, (120, 150, 190), -1, cv2.LINE_AA)
-        return view
-
-    def _noisy(self, view: Pixels, number: int) -> Pixels:
-        """Adds a different part of the same noise each time: cheap, and it does not repeat between frames."""
-        down, right = (number * 29) % 64, (number * 47) % 64
-        grain = self._noise[down : down + HEIGHT, right : right + WIDTH]
-        return cast(Pixels, np.clip(view + grain + 0.5, 0, 255).astype(np.uint8))
 
 
 def _world(random: np.random.Generator) -> Pixels:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import statistics
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,10 +21,9 @@ from pebble.bench.tables import COUNT, LOST, Column, Grid, figure, percentile_co
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
 from pebble.rig.broker import Broker, BrokerKind, best_kind
-from pebble.rig.processes import Processes
+from pebble.rig.processes import Processes, python
 from pebble.rig.worker import Worker
 
-VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
 _ABOUT = {
     "zenoh-shm": "created in the shared segment, read as a view: no copy",
     "zenoh-copy": "shared memory, one copy in and one out",
@@ -33,21 +32,14 @@ _ABOUT = {
     "gstreamer-shm": "shmsink and shmsrc, created in the segment, one copy out",
     "memcpy": "no transport: a bare copy of as many bytes between two frames",
 }
+VARIANTS = tuple(_ABOUT)
 INSTALL_GSTREAMER = (
     "apt-get install -y --no-install-recommends gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
     " gir1.2-gst-plugins-base-1.0 python3-gst-1.0 python3-numpy"
 )
 _INSTALL_MOSQUITTO = "apt-get install -y --no-install-recommends mosquitto"
 _SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
-_PROBE = """
-import gi, numpy
-gi.require_version("Gst", "1.0")
-gi.require_version("GstApp", "1.0")
-from gi.repository import Gst, GstApp
-Gst.init(None)
-for name in ("shmsink", "shmsrc", "appsrc", "appsink"):
-    assert Gst.ElementFactory.find(name), name
-"""
+_GSTREAMER = str(Path(__file__).with_name("frames_loop.py"))
 _PROBE_S = 20.0
 OURS = "zenoh-shm"
 SIZES, READERS = ("640x480", "1920x1080"), (1, 3)
@@ -87,28 +79,25 @@ def prepare(run: Run) -> None:
 
 def missing(variant: str) -> str | None:
     """Why this variant cannot run on this machine, with the command that installs it; None if it can."""
-    check = _NEEDS.get(variant)
-    return check() if check is not None else None
+    if variant == "mqtt":
+        return _mosquitto()
+    return _gstreamer() if variant == "gstreamer-shm" else None
 
 
 def _mosquitto() -> str | None:
-    try:
-        installed = best_kind() is BrokerKind.MOSQUITTO
-    except PebbleError:
-        installed = False
-    return None if installed else f"mosquitto is not installed: {_INSTALL_MOSQUITTO}"
+    with suppress(PebbleError):
+        if best_kind() is BrokerKind.MOSQUITTO:
+            return None
+    return f"mosquitto is not installed: {_INSTALL_MOSQUITTO}"
 
 
 @functools.cache
 def _gstreamer() -> str | None:
     try:
-        probe = subprocess.run([_SYSTEM_PYTHON, "-c", _PROBE], capture_output=True, timeout=_PROBE_S, check=False)
+        probe = subprocess.run([_SYSTEM_PYTHON, _GSTREAMER], capture_output=True, timeout=_PROBE_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{error}; GStreamer is read by {_SYSTEM_PYTHON}: {INSTALL_GSTREAMER}"
     return None if probe.returncode == 0 else f"GStreamer is not installed: {INSTALL_GSTREAMER}"
-
-
-_NEEDS: dict[str, Callable[[], str | None]] = {"mqtt": _mosquitto, "gstreamer-shm": _gstreamer}
 
 
 # -- one case
@@ -123,49 +112,43 @@ def measure(case: Case) -> Iterator[Cell]:
         broker = processes.broker() if case.variant == "mqtt" else None
         if broker is not None:
             broker.wait()
-        writer_first = case.variant == "gstreamer-shm"  # its readers fail without a writer; the others wait
-        workers: list[Worker] = []
-        for name in ("writer", *(f"reader {number + 1}" for number in range(_readers(case)))):
-            command = _command(case, name.partition(" ")[0], processes.folder, broker.port if broker is not None else 0)
-            workers.append(processes.command(f"{case}: {name}", command))
-            if name == "writer" and writer_first:
-                workers[0].answer(_READY_S)
-        for worker in workers[1 if writer_first else 0 :]:
+        where, writers_first = processes.folder if broker is None else broker.port, case.variant == "gstreamer-shm"
+        workers = [processes.command(f"{case}: writer", _command(case, "writer", where))]
+        if writers_first:  # its readers fail without a writer; the others wait
+            workers[0].answer(_READY_S)
+        for number in range(int(case.condition["readers"] or 0)):
+            workers.append(processes.command(f"{case}: reader {number + 1}", _command(case, "reader", where)))
+        for worker in workers[writers_first:]:
             worker.answer(_READY_S)
         yield _observed(case, workers, broker, case.run["seconds"])
 
 
-def _readers(case: Case) -> int:
-    return int(case.condition["readers"] or 0)
-
-
-def _command(case: Case, end: str, folder: Path, port: int) -> list[str]:
-    """The command of one end (writer or reader); ``folder`` is for sockets, ``port`` is the broker's."""
-    size, slower_us = parse_size(str(case.condition["size"])), str(case.planted_us if case.slowed else 0.0)
+def _command(case: Case, role: str, where: Path | int) -> list[str]:
+    """Of the writer or a reader; ``where`` is a folder for sockets, or the broker's port."""
+    size, slower_us = case.condition["size"], case.planted_us if case.slowed else 0.0
     if case.variant == "gstreamer-shm":
-        program, socket = Path(__file__).with_name("frames_gstreamer.py"), folder / "gst.sock"
-        return [_SYSTEM_PYTHON, str(program), end, str(socket), str(size.width), str(size.height), slower_us]
-    where = str(port if case.variant == "mqtt" else folder)
-    return [sys.executable, "-m", "pebble.bench.frames_worker", case.variant, end, where, str(size), slower_us]
+        return [_SYSTEM_PYTHON, *map(str, (_GSTREAMER, role, f"{where}/gst.sock", size, slower_us))]
+    return python("pebble.bench.frames_worker", case.variant, role, where, size, slower_us)
 
 
 def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seconds: float) -> Cell:
     begin = time.monotonic_ns() + int(_STARTUP_S * 1e9)
     for worker in workers:
         worker.send(f"{begin} {begin + int(seconds * 1e9)}")
+    pids = [process.pid for process in (*workers, *([] if broker is None else [broker]))]
     time.sleep(_STARTUP_S)
-    before = cpu_s([broker.pid]) if broker is not None else 0.0
+    before = [cpu_s([pid]) for pid in pids]
     time.sleep(seconds)
-    used = cpu_s([broker.pid]) - before if broker is not None else None
+    cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
     writer, *readers = (worker.answer(_ANSWER_S) for worker in workers)
     bare = case.variant == "memcpy"  # has no writer; it times copies, so there is no number of sent ones
     return case.cell(
         "frame",
         "us",
         (latency for reader in readers for latency in reader["latencies_us"]),
-        cpu_writer=0.0 if bare else writer["cpu"],
-        cpu_reader=statistics.fmean(reader["cpu"] for reader in readers),
-        cpu_broker=None if used is None else 100 * used / seconds,
+        cpu_writer=0.0 if bare else cpu[0],
+        cpu_reader=statistics.fmean([reader["cpu"] for reader in readers] if bare else cpu[1 : len(workers)]),
+        cpu_broker=None if broker is None else cpu[-1],
         memory_writer_mb=0.0 if bare else pss_mb(workers[0].pid),
         memory_reader_mb=0.0 if bare else statistics.fmean(pss_mb(worker.pid) for worker in workers[1:]),
         torn=sum(reader["torn"] for reader in readers),

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pebble.bench import frames_loop
+from pebble.bench.frames_loop import Reader, Writer, frame_bytes, read, write
 from pebble.errors import TransportError
 from pebble.transports.frames import Frame, FrameInfo, FrameReader, FrameWriter, Slot, shared_memory
 
@@ -56,7 +56,7 @@ class ZenohWriter:
         self._writer.close()
 
 
-class ZenohReader:
+class ZenohReader(Reader):
     """Pebble's frame transport, as views into the segment or as copies."""
 
     def __init__(self, folder: Path, *, views: bool, shared: bool) -> None:
@@ -105,7 +105,7 @@ class MqttWriter:
         self._client.loop_stop()
 
 
-class MqttReader:
+class MqttReader(Reader):
     """Runs paho's network loop in the reading thread, which avoids a handover between threads."""
 
     def __init__(self, port: int) -> None:
@@ -121,9 +121,6 @@ class MqttReader:
                 return None
             self._client.loop(left)
         return np.frombuffer(self._arrived.popleft(), np.uint8)
-
-    def done(self) -> None:
-        """The array is our own."""
 
     def close(self) -> None:
         self._client.disconnect()
@@ -144,25 +141,23 @@ def _mqtt(port: int, on_message: Any) -> Any:
 
 def main(arguments: list[str]) -> int:
     variant, role, where, size_, slower_us = arguments
-    width, _, height = size_.partition("x")
-    size = int(width) * int(height) * 3
+    size = frame_bytes(size_)
     if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
         shared_memory.lockable = lambda size: False  # noqa: ARG005
-    control_pipe = frames_loop.ControlPipe()
     if role == "writer":
-        frames_loop.write(writer(variant, where, size), size, control_pipe, slower_us=float(slower_us))
+        write(writer(variant, where, size), size, slower_us=float(slower_us))
     else:
-        frames_loop.read(reader(variant, where), control_pipe, bare_copy=size if variant == "memcpy" else 0)
+        read(reader(variant, where), bare_copy=size if variant == "memcpy" else 0)
     return 0
 
 
-def writer(variant: str, where: str, size: int) -> frames_loop.Writer:
+def writer(variant: str, where: str, size: int) -> Writer:
     if variant == "mqtt":
         return MqttWriter(int(where), size)
     return ZenohWriter(Path(where), size, in_segment=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
 
 
-def reader(variant: str, where: str) -> frames_loop.Reader:
+def reader(variant: str, where: str) -> Reader:
     if variant == "mqtt":
         return MqttReader(int(where))
     return ZenohReader(Path(where), views=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")

@@ -12,16 +12,18 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.table import Table
 
 from pebble.bench import page_cases as cases
-from pebble.bench import page_links as links
 from pebble.bench.aims import outcome
 from pebble.bench.comparison import Budget, Case, Comparison, Option
-from pebble.bench.page_rig import Rig, rig
+from pebble.bench.impair.conditions import Condition, Shape
+from pebble.bench.page_rig import Rig, linked, rig
 from pebble.bench.results import Cell, Judged, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
@@ -61,27 +63,11 @@ class PageCase:
     setting: Callable[[], AbstractContextManager[Rig]] = rig
 
 
-def _thin() -> AbstractContextManager[Rig]:
-    return links.linked(links.THIN, "minilamp", wide=True)
+#: Up is from the server to the page.
+THIN = Condition("2 Mbit/s", up=Shape(kbit=2000))
+FAR = Condition("256 kbit/s, 100 ms, 2 %", up=Shape(kbit=256, loss=0.02, delay_ms=50), down=Shape(delay_ms=50))
 
-
-def _far() -> AbstractContextManager[Rig]:
-    return links.linked(links.FAR, cases.ROBOT)
-
-
-def _lamp() -> AbstractContextManager[Rig]:
-    return rig("minilamp")
-
-
-def _goob() -> AbstractContextManager[Rig]:
-    return rig(cases.ROBOT)
-
-
-def _goob_alone() -> AbstractContextManager[Rig]:
-    """Its pictures are as old as they look: those of the demo's room are up to 20 ms old when they are drawn."""
-    return rig(cases.ROBOT, room=False)
-
-
+_GOOB = partial(rig, cases.ROBOT)
 _STOP, _GONE, _SERVER = Goal(15, 60), Goal(None, 300), Goal(None, 450)
 _PICTURES = {"json": "17 / 24", "pbvd": "14 / 18", "pbvz": "17 / 22", "h264": "13 / 20"}
 _V, _R = f"{cases.VIEWERS} viewers", f"{cases.ROBOTS_SHOWN} robots"
@@ -91,7 +77,7 @@ CASES = (
         Row("key to MQTT", "ms", Goal(2, 5), "0.93 / 1.35"),
         Row("key to motors", "ms", Goal(10, 20), "6.2 / 9.4"),
         Row("release to stop", "ms", _STOP, "7 / 18"),
-    ), _goob),
+    ), _GOOB),
     PageCase("interruptions", cases.interruptions, (
         Row("blur to stop", "ms", _STOP, "12"),
         Row("hidden to stop", "ms", _STOP, "48"),
@@ -100,7 +86,7 @@ CASES = (
         Row("stalled to stop", "ms", _GONE, "252"),
         Row("server frozen to stop", "ms", _SERVER, "723"),
         Row("server killed to stop", "ms", _SERVER, "739"),
-    ), _goob),
+    ), _GOOB),
     PageCase("stops", cases.stops, (
         Row("STOP to motors", "ms", Goal(None, 50), "12-28"),
         Row("STOP to confirmed", "ms", Goal(None, 300)),
@@ -114,7 +100,7 @@ CASES = (
             Row(f"scene, {encoding} to drawn", "ms", Goal(25, 50), prototype),
             Row(f"scene, {encoding} lost", "%", Goal(0, 0), "0"),
         )
-    ), _goob_alone),
+    ), partial(rig, cases.ROBOT, room=False)),  # pictures of the demo's room are up to 20 ms old when they are drawn
     PageCase("loading", cases.loading, (
         Row("first robot", "ms", Goal(None, 1000), "400-700"),
         Row("first picture", "ms", Goal(None, 3000), "1700-2500"),
@@ -125,34 +111,34 @@ CASES = (
         Row("with other screens, kB gz", "kB"),
         Row("requests", ""),
         Row("foreign hosts", "", Goal(0), "0"),
-    ), _goob),
+    ), _GOOB),
     PageCase("driving", cases.driving, (
         Row("1 viewer, driving: CPU", "%", Goal(8), "5.0"),
         Row("1 viewer, driving: RSS", "MB", Goal(60), "36"),
-    ), _goob),
+    ), _GOOB),
     PageCase("viewers", cases.viewers, (
         Row(f"{_V}: CPU", "%", Goal(25), "5.2"),
         Row(f"{_V}: RSS", "MB", Goal(80), "37"),
         Row("frames of each viewer", "%", Goal(at_least=95), "50"),
         Row("robot's uplink, of that with 1 viewer", "%", Goal(110)),
-    ), _goob),
+    ), _GOOB),
     PageCase("crowd", cases.crowd, (
         Row(f"{_R}: ms an update", "ms", Goal(8)),
         Row(f"{_R}: CPU", "%", Goal(10)),
         Row(f"{_R}: RSS", "MB", Goal(80)),
-    ), _lamp),
-    PageCase("thin link", links.pictures, (
+    ), partial(rig, "minilamp")),
+    PageCase("thin link", cases.thin, (
         Row("2 Mbit/s: picture age", "ms", Goal(250), "183 / 209"),
         Row("2 Mbit/s: offered", "Mbit/s", Goal(at_least=3.8), "4.2"),
         Row("2 Mbit/s: drawn a second", ""),
-    ), _thin),
-    PageCase("far link", links.driving, (
+    ), partial(linked, THIN, "minilamp")),
+    PageCase("far link", cases.far, (
         Row("256 kbit/s: drive", "ms", Goal(None, 110)),
         Row("256 kbit/s: drive, arrived", "%"),
         Row("256 kbit/s: gestures interrupted", ""),
         Row("256 kbit/s: STOP to motors", "ms"),
         Row("256 kbit/s: round trip shown", "ms"),
-    ), _far),
+    ), partial(linked, FAR, cases.ROBOT)),
 )  # fmt: skip
 
 
@@ -186,7 +172,7 @@ def _idle(wait_s: float) -> float:
     return os.getloadavg()[0]
 
 
-# -- pure
+# -- what is shown
 
 
 def worst(row: Row, samples: Sequence[float]) -> float:
@@ -204,8 +190,8 @@ def ranked(row: Row, tries: Sequence[Sequence[float]]) -> list[Sequence[float]]:
 
 
 def met(goal: Goal, samples: Sequence[float]) -> bool | None:
-    """Whether samples satisfy a goal; None: there is none."""
-    if goal == NO_GOAL:
+    """Whether samples satisfy a goal; None: there is none, or nothing was measured."""
+    if goal == NO_GOAL or not samples:
         return None
     bounds = [(goal.p50, percentile(samples, 50)), (goal.p95, percentile(samples, 95))]
     return (goal.at_least is None or min(samples) >= goal.at_least) and all(
@@ -221,42 +207,45 @@ def words(goal: Goal) -> str:
     return "–" if bounds == ["–", "–"] else f"≤ {' / '.join(bounds)}"
 
 
-def shown(goal: Goal, samples: Sequence[float]) -> str:
-    """Median and 95th percentile, or the smallest; a single sample as it is."""
+def shown(goal: Goal, samples: Sequence[float], unit: str = "") -> str:
+    """Median and 95th percentile, and the smallest if that is the goal; a single sample as it is."""
+    if not samples:
+        return "not measured"
     if len(samples) == 1:
-        return figure(samples[0])
+        return f"{figure(samples[0])} {unit}".strip()
     low = f", least {figure(min(samples))}" if goal.at_least is not None else ""
-    return f"{figure(percentile(samples, 50))} / {figure(percentile(samples, 95))}{low}"
+    return f"{figure(percentile(samples, 50))} / {figure(percentile(samples, 95))}{low} {unit}".strip()
+
+
+def _rows(cells: Sequence[Cell]) -> Iterator[tuple[str, Row, Sequence[float], Sequence[Sequence[float]]]]:
+    """The case and the row of each cell, its best try and the others."""
+    for cell in cells:
+        row = ROWS[cell.measure]
+        best, *others = ranked(row, cell.rounds) or [()]
+        yield str(cell.params["case"]), row, best, others
 
 
 def tables(cells: Sequence[Cell]) -> Iterator[Table]:
     """A line for each row: the best try, its goal, the prototype's figure, and the other tries."""
     heads = ["", "unit", "measured", "n", "goal", "", "prototype", "others"]
-    table, before = plain_table("p50 / p95 of the best try", heads, left=2), None
-    for cell in cells:
-        row = ROWS[cell.measure]
-        best, *others = ranked(row, cell.rounds) or [()]
-        state = {None: "", True: "met", False: "MISSED"}[met(row.goal, best) if best else None]
-        measured = shown(row.goal, best) if best else "not measured"
-        rest = "; ".join(shown(row.goal, one) for one in others)
-        if before not in (None, cell.params["case"]):
-            table.add_section()
-        before = cell.params["case"]
-        table.add_row(row.key, row.unit, measured, str(len(best)), words(row.goal), state, row.prototype, rest)
+    table = plain_table("p50 / p95 of the best try", heads, left=2)
+    for _, rows in groupby(_rows(cells), key=lambda one: one[0]):
+        for _, row, best, others in rows:
+            state = {None: "", True: "met", False: "MISSED"}[met(row.goal, best)]
+            rest = "; ".join(shown(row.goal, one) for one in others)
+            count, measured = str(len(best)), shown(row.goal, best)
+            table.add_row(row.key, row.unit, measured, count, words(row.goal), state, row.prototype, rest)
+        table.add_section()
     yield table
 
 
 def goals(cells: Sequence[Cell]) -> Iterator[Judged]:
     """The goals as aims, each judged by the best try."""
-    for cell in cells:
-        row = ROWS[cell.measure]
-        best = next(iter(ranked(row, cell.rounds)), ())
+    for _, row, best, _ in _rows(cells):
         if row.goal != NO_GOAL:
-            what = f"{row.key}, p50 / p95 {words(row.goal)} {row.unit}".strip()
-            measured = f"{shown(row.goal, best)} {row.unit}".strip() if best else "not measured"
-            yield Judged(
-                what=what, outcome=outcome(bool(best and met(row.goal, best)), judged=bool(best)), measured=measured
-            )
+            what, is_met = f"{row.key}, p50 / p95 {words(row.goal)} {row.unit}".strip(), met(row.goal, best)
+            how = outcome(bool(is_met), judged=is_met is not None)
+            yield Judged(what=what, outcome=how, measured=shown(row.goal, best, row.unit))
 
 
 def _is_complete(cells: Sequence[Cell]) -> bool:

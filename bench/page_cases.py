@@ -8,19 +8,27 @@ import signal
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urldefrag, urlsplit
 
+import numpy as np
+
 from pebble.bench.drivers import Driver
 from pebble.bench.page_rig import Rig, monotonic
 from pebble.bench.usage import cpu_s
+from pebble.contract import CAMERA, CAPABILITIES, MQTT_VIDEO, ONLINE, VIDEO_CONTROL, codec
 from pebble.contract.encodings import ALL_VIDEO
+from pebble.contract.payloads import Capabilities, Heartbeat
 from pebble.errors import PebbleError
+from pebble.media.scene import Scene
+from pebble.media.video import make_encoder
 from pebble.rig.programs import children
 from pebble.rig.testbed import ROBOTS
+from pebble.transports import MqttSettings, QoS, Transport, create
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -33,6 +41,9 @@ _HELD_S = 0.4
 _COUNT_S = 40.0  # for processes of viewers to answer, beyond their time
 _LATER_S = 5.0  # the page has fetched its other screens by then
 _REST_S = 8.0  # after the last viewer: the server lets go after 5, the camera rests then
+_WIDE = "wide"  # a robot whose pictures are larger than the network carries
+_FPS, _SIZE = 15, (640, 360)  # of its pictures
+_OFFERED_BYTES = 35_000  # of each: 4.2 megabits a second
 _HIDE = """hidden => {
   Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
   const at = bench.now();
@@ -45,7 +56,7 @@ _BLUR = "() => { const at = bench.now(); dispatchEvent(new Event('blur')); retur
 def keys(rig: Rig, scale: float) -> Samples:
     """A key is pressed and released again and again."""
     page = rig.drivable(ROBOT)
-    found: Samples = {"key to MQTT": [], "key to motors": [], "release to stop": []}
+    found: Samples = defaultdict(list)
     for number in range(round(40 * scale)):
         page.keyboard.down(KEY)
         pressed = rig.stamp(page, "down")
@@ -61,15 +72,15 @@ def keys(rig: Rig, scale: float) -> Samples:
 
 def interruptions(rig: Rig, scale: float) -> Samples:
     """A key is held, and something happens to the page, the connection or the server."""
-    thaw: list[Callable[[], object]] = []
+    undo = ExitStack()
 
     def frozen(page: Page) -> float:
         """Its script stands still; Page.setWebLifecycleState has no effect on visible pages, as all here are."""
         session = page.context.new_cdp_session(page)
+        undo.callback(session.detach)
         session.send("Debugger.enable")
         at = time.monotonic()
         session.send("Debugger.pause")
-        thaw.append(session.detach)
         return at
 
     def closed(page: Page) -> float:
@@ -79,7 +90,14 @@ def interruptions(rig: Rig, scale: float) -> Samples:
 
     def stalled(_page: Page) -> float:
         """The browser's process for the network stands still."""
-        return _signal(_network_process(), signal.SIGSTOP)
+        pid = _network_process()
+        undo.callback(os.kill, pid, signal.SIGCONT)
+        return _signal(pid, signal.SIGSTOP)
+
+    def server(number: signal.Signals) -> float:
+        undo.callback(rig.stage.restart_server)
+        undo.callback(rig.stage.server.thaw)
+        return _signal(rig.stage.server.pid, number)
 
     actions: dict[str, Callable[[Page], float]] = {
         "blur to stop": lambda page: monotonic(page.evaluate(_BLUR)),
@@ -87,22 +105,21 @@ def interruptions(rig: Rig, scale: float) -> Samples:
         "frozen to stop": frozen,
         "closed to stop": closed,
         "stalled to stop": stalled,
-        "server frozen to stop": lambda _: _signal(rig.stage.server.pid, signal.SIGSTOP),
-        "server killed to stop": lambda _: _signal(rig.stage.server.pid, signal.SIGKILL),
+        "server frozen to stop": lambda _: server(signal.SIGSTOP),
+        "server killed to stop": lambda _: server(signal.SIGKILL),
     }
-    found: Samples = {name: [] for name in actions}
-    for name, act in actions.items():
-        for _ in range(max(1, round(8 * scale))):
-            page = rig.drivable(ROBOT)
-            while not rig.stage.wheels_turning(ROBOT):  # a busy machine interrupts gestures, too
-                page.keyboard.up(KEY)
-                rig.hold(page, ROBOT, KEY)
-                rig.pause(page, _HELD_S)
-            at = act(page)
+    found: Samples = defaultdict(list)
+    for name in [name for name in actions for _ in range(max(1, round(8 * scale)))]:
+        page = rig.drivable(ROBOT)
+        while not rig.stage.wheels_turning(ROBOT):  # a busy machine interrupts gestures, too
+            page.keyboard.up(KEY)
+            rig.hold(page, ROBOT, KEY)
+            rig.pause(page, _HELD_S)
+        with undo:
+            at = actions[name](page)
             found[name].append(1000 * (rig.stopped(None, ROBOT) - at))
-            while thaw:
-                thaw.pop()()
-            _recover(rig, page)
+        if not page.is_closed():
+            page.context.close()
     return found
 
 
@@ -112,67 +129,62 @@ def _signal(pid: int, number: signal.Signals) -> float:
     return at
 
 
-def _recover(rig: Rig, page: Page) -> None:
-    _signal(_network_process(), signal.SIGCONT)
-    if rig.stage.server.ended or _is_stopped(rig.stage.server.pid):
-        rig.stage.server.thaw()
-        rig.stage.restart_server()
-    if not page.is_closed():
-        page.context.close()
-
-
-def _is_stopped(pid: int) -> bool:
-    """Whether SIGSTOP holds it."""
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
-
-
 def _network_process() -> int:
     """The process of our browser that has its connections."""
-    waiting = [os.getpid()]
-    while waiting:
-        pid = waiting.pop()
+    pids = [os.getpid()]
+    for pid in pids:
         if b"network.mojom.NetworkService" in Path(f"/proc/{pid}/cmdline").read_bytes():
             return pid
-        waiting += children(pid)
+        pids += children(pid)
     raise PebbleError("the browser has no process for its network")
 
 
 def stops(rig: Rig, scale: float) -> Samples:
     """STOP is clicked while other operators drive."""
-    found: Samples = {}
-    driver = driven_by_others(rig)
-    for what, names, button in (("STOP", (ROBOT,), "stop-one"), ("STOP ALL", ROBOTS, "stop-all")):
-        page = rig.page(ROBOT) if what == "STOP" else rig.fleet()
-        stop, shown = found.setdefault(f"{what} to motors", []), found.setdefault(f"{what} to confirmed", [])
-        refs = [rig.ref(name) for name in names]
-        page.locator(f"[data-test={button}]").wait_for()
-        for _ in range(max(1, round(10 * scale))):
-            driver.choose(tuple(refs))
-            rig.until(page, lambda: all(map(rig.stage.wheels_turning, names)), "the robots do not move")  # noqa: B023
-            rig.pause(page, _HELD_S)
-            page.evaluate("refs => bench.confirmed(refs)", refs)
-            page.locator(f"[data-test={button}]").click()
-            pressed = rig.stamp(page, "pointer")
-            rig.until(page, lambda: page.evaluate("bench.mark"), "the stop was not confirmed")  # noqa: B023
-            stop += [1000 * (rig.stopped(page, name) - pressed) for name in names]
-            shown.append(1000 * (monotonic(page.evaluate("bench.mark")) - pressed))
-            driver.choose(())
-            reset(rig, page, refs)
-        page.context.close()
-    driver.close()
+    found: Samples = defaultdict(list)
+    with _driven_by_others(rig) as driver:
+        for what, names, button in (("STOP", (ROBOT,), "stop-one"), ("STOP ALL", ROBOTS, "stop-all")):
+            page = rig.page(ROBOT) if what == "STOP" else rig.fleet()
+            page.locator(f"[data-test={button}]").wait_for()
+            for _ in range(max(1, round(10 * scale))):
+                pressed, stopped = _stop(rig, page, driver, names, button)
+                rig.until(page, lambda: page.evaluate("bench.mark"), "the stop was not confirmed")  # noqa: B023
+                found[f"{what} to motors"] += stopped
+                found[f"{what} to confirmed"].append(1000 * (monotonic(page.evaluate("bench.mark")) - pressed))
+                _reset(rig, page, names)
+            page.context.close()
     return found
 
 
-def driven_by_others(rig: Rig) -> Driver:
+@contextmanager
+def _driven_by_others(rig: Rig) -> Iterator[Driver]:
     """Another operator, who drives whichever robots are chosen."""
-    driver = Driver(rig.stage.broker_port)
-    threading.Thread(target=driver.run, name="another operator", daemon=True).start()
-    return driver
+    with closing(Driver(rig.stage.broker_port)) as driver:
+        threading.Thread(target=driver.run, name="another operator", daemon=True).start()
+        yield driver
 
 
-def reset(rig: Rig, page: Page, refs: list[str]) -> None:
-    """End the stops that the page shows."""
-    value = "pebble.store.get(ref, 'web/estop')?.value"
+def _stop(
+    rig: Rig, page: Page, driver: Driver, names: Sequence[str], button: str = "stop-one"
+) -> tuple[float, list[float]]:
+    """Click it while another operator drives: when, and ms until the motors of each robot stopped."""
+    refs = list(map(rig.ref, names))
+    driver.choose(tuple(refs))
+    rig.until(page, lambda: all(map(rig.stage.wheels_turning, names)), "the robots do not move")
+    rig.pause(page, _HELD_S)
+    page.evaluate("refs => bench.confirmed(refs)", refs)
+    page.locator(f"[data-test={button}]").click()
+    pressed = rig.stamp(page, "pointer")
+    stopped = [1000 * (rig.stopped(page, name) - pressed) for name in names]
+    driver.choose(())
+    return pressed, stopped
+
+
+def _reset(rig: Rig, page: Page, names: Sequence[str]) -> None:
+    """End the stops of these robots, once the page shows them."""
+    refs, value = list(map(rig.ref, names)), "pebble.store.get(ref, 'web/estop')?.value"
+    latched = f"refs => refs.every((ref) => {value}.latched)"
+    rig.until(page, lambda: page.evaluate(latched, refs), "not shown")
     rig.pause(page, 0.6)  # robots refuse a reset of those who still drive
     page.evaluate(f"refs => refs.forEach((ref) => pebble.commands.reset(ref, {value}.owners))", refs)
     free = f"refs => refs.every((ref) => !{value}.latched)"
@@ -182,20 +194,25 @@ def reset(rig: Rig, page: Page, refs: list[str]) -> None:
 
 def pictures(rig: Rig, scale: float) -> Samples:
     """Capture to drawn in each encoding, and the share of pictures that were not drawn."""
-    page = rig.page(ROBOT)
-    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture")
+    page = rig.watched(ROBOT)
     page.evaluate("bench.film()")
     found: Samples = {}
     for encoding in ALL_VIDEO:
         page.evaluate("([ref, one]) => pebble.commands.setEncoding(ref, one)", [rig.ref(ROBOT), encoding])
         rig.until(page, lambda: page.evaluate("bench.drawn.at(-1)?.[0]") == encoding, f"no {encoding}")  # noqa: B023
         rig.pause(page, 1.5)
-        page.evaluate("bench.drawn.length = 0")
-        rig.pause(page, 20 * scale)
-        drawn = [one for one in page.evaluate("bench.drawn") if one[0] == encoding]
+        drawn = [one for one in _drawn(rig, page, 20 * scale) if one[0] == encoding]
         found[f"scene, {encoding} to drawn"] = [at - captured for _, _, captured, at, _ in drawn]
         found[f"scene, {encoding} lost"] = [lost_percent([one[1] for one in drawn])]
     return found
+
+
+def _drawn(rig: Rig, page: Page, seconds: float) -> list[tuple[str, int, float, float, bool]]:
+    """The pictures drawn in this time, as the page notes them: encoding, number, captured and drawn (ms), rescue."""
+    page.evaluate("bench.drawn.length = 0")
+    rig.pause(page, seconds)
+    drawn: list[tuple[str, int, float, float, bool]] = page.evaluate("bench.drawn")
+    return drawn
 
 
 def lost_percent(numbers: list[int]) -> float:
@@ -207,7 +224,7 @@ def lost_percent(numbers: list[int]) -> float:
 
 def loading(rig: Rig, scale: float) -> Samples:
     """A visitor opens the fleet's page, then a robot's, whose camera rests."""
-    found: Samples = {"first robot": [], "first picture": []}
+    found: Samples = defaultdict(list)
     for _ in range(max(1, round(4 * scale))):
         for key, page, stamp in (("first robot", rig.fleet(), "robot"), ("first picture", rig.page(ROBOT), "picture")):
             rig.until(page, lambda: page.evaluate(f"bench.{stamp}"), f"no {stamp}")  # noqa: B023
@@ -219,8 +236,7 @@ def loading(rig: Rig, scale: float) -> Samples:
 
 def files(rig: Rig, _scale: float) -> Samples:
     """Everything that a robot's page requests until it shows a picture, and what it fetches later."""
-    page = rig.page(ROBOT)
-    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture")
+    page = rig.watched(ROBOT)
     rig.pause(page, _LATER_S)
     entries = page.evaluate("performance.getEntriesByType('resource').map((one) => [one.name, one.startTime])")
     picture = page.evaluate("bench.picture")
@@ -241,8 +257,8 @@ def files(rig: Rig, _scale: float) -> Samples:
 
 def driving(rig: Rig, scale: float) -> Samples:
     """The server while one page shows pictures and drives."""
-    page = rig.drivable(ROBOT)
-    rig.until(page, lambda: page.evaluate("bench.picture"), "no picture")
+    page = rig.watched(ROBOT)
+    rig.ready(page)
     rig.hold(page, ROBOT, "KeyA")
     with _cost(rig, "1 viewer, driving") as found:
         rig.pause(page, 20 * scale)
@@ -273,23 +289,20 @@ def _watched(rig: Rig, count: int, seconds: float) -> tuple[float, list[float]]:
 def crowd(rig: Rig, scale: float) -> Samples:
     """A hundred robots on the fleet's screen."""
     broker = f"mqtt://127.0.0.1:{rig.stage.broker_port}"
-    robots = rig.stage.robot("the fleet", "pebble.cli", "sim", "fleet", "-n", ROBOTS_SHOWN, "--broker", broker)
-    try:
-        page = rig.fleet()
-        count = "document.querySelectorAll('[data-test^=\"card-\"]').length"
-        rig.until(page, lambda: page.evaluate(count) > ROBOTS_SHOWN, lambda: f"{page.evaluate(count)} robots", 60.0)
-        rig.pause(page, 5.0)
-        page.evaluate("new MutationObserver(() => bench.updates++).observe(document.body, "
-                      "{ subtree: true, childList: true, characterData: true, attributes: true })")  # fmt: skip
-        session = page.context.new_cdp_session(page)
-        session.send("Performance.enable")
-        before = _busy(session.send("Performance.getMetrics"))
-        with _cost(rig, f"{ROBOTS_SHOWN} robots") as found:
-            rig.pause(page, 20 * scale)
-        busy = _busy(session.send("Performance.getMetrics")) - before
-        return {**found, f"{ROBOTS_SHOWN} robots: ms an update": [1000 * busy / max(1, page.evaluate("bench.updates"))]}
-    finally:
-        rig.stage.end(robots)
+    rig.stage.robot("the fleet", "pebble.cli", "sim", "fleet", "-n", ROBOTS_SHOWN, "--broker", broker)
+    page = rig.fleet()
+    count = "document.querySelectorAll('[data-test^=\"card-\"]').length"
+    rig.until(page, lambda: page.evaluate(count) > ROBOTS_SHOWN, lambda: f"{page.evaluate(count)} robots", 60.0)
+    rig.pause(page, 5.0)
+    page.evaluate("new MutationObserver(() => bench.updates++).observe(document.body, "
+                  "{ subtree: true, childList: true, characterData: true, attributes: true })")  # fmt: skip
+    session = page.context.new_cdp_session(page)
+    session.send("Performance.enable")
+    before = _busy(session.send("Performance.getMetrics"))
+    with _cost(rig, f"{ROBOTS_SHOWN} robots") as found:
+        rig.pause(page, 20 * scale)
+    busy = _busy(session.send("Performance.getMetrics")) - before
+    return {**found, f"{ROBOTS_SHOWN} robots: ms an update": [1000 * busy / max(1, page.evaluate("bench.updates"))]}
 
 
 def _busy(answer: dict[str, Any]) -> float:
@@ -308,3 +321,91 @@ def _cost(rig: Rig, what: str) -> Iterator[Samples]:
     found[f"{what}: CPU"] = [100 * (cpu_s([pid]) - before) / (time.monotonic() - began)]
     status = Path(f"/proc/{pid}/status").read_text()
     found[f"{what}: RSS"] = [int(status.partition("VmRSS:")[2].split()[0]) / 1000]
+
+
+# -- with the browser behind an impaired network
+
+
+def thin(rig: Rig, scale: float) -> Samples:
+    """The age of pictures that offer more than the link carries."""
+    with _wide_robot(rig.stage.broker_port):
+        page = rig.watched(_WIDE, 30.0)
+        page.evaluate("bench.film()")
+        rig.pause(page, 3.0)
+        began = time.monotonic()
+        drawn = _drawn(rig, page, 20 * scale)
+        took_s = time.monotonic() - began
+        offered = sum(size for at, ref, size in rig.frames if ref == rig.ref(_WIDE) and at >= began)
+    return {
+        "2 Mbit/s: picture age": [at - captured for _, _, captured, at, _ in drawn if captured],
+        "2 Mbit/s: offered": [8 * offered / 1e6 / took_s],
+        "2 Mbit/s: drawn a second": [len(drawn) / took_s],
+    }
+
+
+@contextmanager
+def _wide_robot(port: int) -> Iterator[None]:
+    """A robot that only sends pictures, four megabits of them a second, whether or not they are requested."""
+    base, ending = f"pebble/robots/{_WIDE}", threading.Event()
+    topics = {"topic": CAMERA, "command_topic": VIDEO_CONTROL, "flag_topic": MQTT_VIDEO}
+    video = {name: channel.topic(base) for name, channel in topics.items()}
+    value = {"video": {"available": True, "controls": True, "encodings": ["pbvd"], **video}}
+    with closing(create("mqtt", _WIDE, MqttSettings(host="127.0.0.1", port=port))) as transport:
+        transport.open()
+        payload = codec.encode(CAPABILITIES, Capabilities(t=int(1000 * time.time()), value=value))
+        transport.publish(CAPABILITIES.topic(base), payload, retain=True, qos=QoS.DELIVERED)
+        thread = threading.Thread(target=_film, args=(transport, base, ending), name=_WIDE, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ending.set()
+            thread.join()
+
+
+def _film(transport: Transport, base: str, ending: threading.Event) -> None:
+    scene, picture = Scene(*_SIZE), np.empty((_SIZE[1], _SIZE[0], 3), np.uint8)
+    noise = np.random.default_rng(1).integers(0, 60, (8, *picture.shape), np.uint8)
+    encoder = make_encoder("pbvd", fps=_FPS, quality=50)
+    number, due = 0, time.monotonic()
+    while not ending.wait(max(0.0, due - time.monotonic())):
+        due += 1 / _FPS
+        scene.render(number, picture)
+        payload = encoder.encode(picture // 2 + noise[number % 8], int(1000 * time.time()))
+        encoder.quality = min(95.0, max(5.0, encoder.quality * (_OFFERED_BYTES / len(payload)) ** 0.3))
+        transport.publish(CAMERA.topic(base), payload)
+        if number % _FPS == 0:
+            transport.publish(ONLINE.topic(base), codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()))))
+        number += 1
+
+
+def far(rig: Rig, scale: float) -> Samples:
+    """Driving, and the emergency stop, over a link that is slow, far and lossy."""
+    page = rig.drivable(ROBOT)
+    page.evaluate("bench.number = 1")
+    interrupted, end = -1.0, time.monotonic() + 20 * scale
+    while time.monotonic() < end:
+        if not page.evaluate("pebble.driver.gestureActive"):
+            interrupted += 1
+            page.keyboard.up(KEY)
+            with suppress(PebbleError):  # the page may refuse for a while, because commands are late
+                rig.ready(page)
+                rig.hold(page, ROBOT, KEY)
+        rig.pause(page, 0.1)
+    page.keyboard.up(KEY)
+    rig.pause(page, 1.0)
+    sent = page.evaluate("bench.sent")
+    arrived = {round(axes.get("y", 0.0), 3): at for at, base, axes in rig.drives if base == rig.ref(ROBOT)}
+    late = [1000 * (arrived[round(y, 3)] - monotonic(at)) for y, at in sent if round(y, 3) in arrived]
+    stopped: list[float] = []
+    with _driven_by_others(rig) as driver:
+        for _ in range(max(1, round(8 * scale))):
+            stopped += _stop(rig, page, driver, [ROBOT])[1]
+            _reset(rig, page, [ROBOT])
+    return {
+        "256 kbit/s: drive": late,
+        "256 kbit/s: drive, arrived": [100 * len(late) / max(1, len(sent))],
+        "256 kbit/s: gestures interrupted": [interrupted],
+        "256 kbit/s: STOP to motors": stopped,
+        "256 kbit/s: round trip shown": [page.evaluate("pebble.connection.socket.roundTripMs")],
+    }

@@ -1,20 +1,29 @@
 """A stage, a browser and subscribers at the broker: what all measurements of the operator page need.
 
 Times are seconds of time.monotonic(), also those that the page stamps. The subscribers are mosquitto's own: one in this
-process would wait for its other threads at the very moment that counts.
+process would wait for its other threads at the very moment that counts. The browser is Chromium, driven by Playwright,
+which comes with the extra ``dev``; it may be behind an impaired network, by the namespaces of pebble impair.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
+import os
+import shlex
 import shutil
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import IO, TYPE_CHECKING, Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from pebble.bench.chromium import chromium
+from pebble.bench.impair.conditions import Condition
+from pebble.bench.impair.network import ROBOT_HOST as SERVER
+from pebble.bench.impair.network import NamespaceNetwork, why_no_namespaces
 from pebble.contract import CAMERA, DRIVE
 from pebble.contract.channels import Channel
 from pebble.errors import PebbleError
@@ -24,13 +33,31 @@ from pebble.rig.stage import Stage
 from pebble.rig.testbed import ROBOTS
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
-AT_REST_S = 0.2  # motors that are off for so long have stopped
+Received = list[tuple[float, str, Any]]  # time, base topic, and what was received
+
+_AT_REST_S = 0.2  # motors that are off for so long have stopped
 _WAIT_S, _MOVED_S = 20.0, 3.0
 _PRESSES = 3
-_STEP_MS = 10
+_STEP_S = 0.01
 _AT_ONCE_S = 2e-5
+_PORT = 8080  # of the page's server, behind an impaired network
+_CLONE_NEWNET = 0x40000000
+
+#: Of several lists the last one counts, so this has what Playwright switches off, too. The popups of the address bar
+#: are pages of their own for each window: without them it opens in 0.28 s instead of 0.39 (Chromium 156, measured).
+_WITHOUT = (
+    "WebUIOmniboxPopup,WebUIOmniboxAimPopup,WebUIOmniboxFullPopup,OmniboxPopupWebUI,"
+    "AvoidUnnecessaryBeforeUnloadCheckSync,DestroyProfileOnBrowserClose,HttpsUpgrades,LensOverlay,"
+    "HttpsFirstBalancedModeAutoEnable,MediaRouter,PaintHolding,ThirdPartyStoragePartitioning,"
+    "AvoidCorsURLLoaderRestartOnRedirect,OptimizationHints,NetworkTimeServiceQuerying,AimEnabled,PreconnectToSearch"
+)
+FLAGS = (
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--autoplay-policy=no-user-gesture-required"),
+    f"--disable-features={_WITHOUT}",
+)
 
 #: Stamps inputs, first contents, drawn pictures and sent commands; runs before the page's own scripts.
 _HOOKS = """
@@ -85,22 +112,25 @@ _READY = """() => {
 
 
 class Rig:
-    """One stage and one browser. ``drives`` and ``frames`` are what the broker has delivered, with its time."""
+    """One stage and one browser. ``drives`` and ``frames`` are what the broker has delivered so far."""
 
-    def __init__(self, stage: Stage, open_page: Callable[[], Page]) -> None:
-        self.stage = stage
-        self.drives: list[tuple[float, str, dict[str, Any]]] = []  # time, base topic, command
-        self.frames: list[tuple[float, str, int]] = []  # time, base topic, bytes
-        self._open_page = open_page
-
-    def ref(self, name: str) -> str:
-        return self.stage.ref(name)
+    def __init__(self, stage: Stage, browser: Browser, drives: Received, frames: Received) -> None:
+        self.stage, self.ref = stage, stage.ref
+        self.drives = drives  # commands
+        self.frames = frames  # bytes
+        self._browser = browser
 
     def fleet(self) -> Page:
         return self._goto(self.stage.url)
 
     def page(self, name: str) -> Page:
         return self._goto(self.stage.robot_url(name))
+
+    def watched(self, name: str, wait_s: float = _WAIT_S) -> Page:
+        """Its page, once it shows pictures."""
+        page = self.page(name)
+        self.until(page, lambda: page.evaluate("bench.picture"), "no picture", wait_s)
+        return page
 
     def drivable(self, name: str) -> Page:
         """Its page, with the lease."""
@@ -120,7 +150,7 @@ class Rig:
         while not condition():
             if time.monotonic() > end:
                 raise PebbleError(f"waited {wait_s:.0f} s: {what() if callable(what) else what}")
-            self.pause(page, _STEP_MS / 1000)
+            self.pause(page, _STEP_S)
 
     def pause(self, page: Page | None, seconds: float) -> None:
         """Wait; the page's events are handled meanwhile."""
@@ -140,7 +170,7 @@ class Rig:
         for attempt in range(_PRESSES):
             page.keyboard.down(key)
             try:
-                self.moved_after(page, name, self.stamp(page, "down"), _MOVED_S)
+                self.moved_after(page, name, self.stamp(page, "down"))
             except PebbleError:
                 page.keyboard.up(key)
                 self.ready(page)
@@ -149,20 +179,20 @@ class Rig:
             else:
                 return
 
-    def moved_after(self, page: Page, name: str, since: float, wait_s: float = _MOVED_S) -> float:
+    def moved_after(self, page: Page, name: str, since: float) -> float:
         """When its motors first ran after ``since``."""
 
         def why() -> str:
             return f"{name} did not move: {page.evaluate('pebble.driver.reason()?.text') or 'no reason'}"
 
-        self.until(page, lambda: self.stage.wheels_turning(name, int(1e9 * since)), why, wait_s)
+        self.until(page, lambda: self.stage.wheels_turning(name, int(1e9 * since)), why, _MOVED_S)
         return next(ns / 1e9 for ns, speeds in self.stage.motors(name) if ns / 1e9 > since and any(speeds))
 
     def stopped(self, page: Page | None, name: str) -> float:
         """When its motors stopped, once they have."""
 
         def at_rest() -> bool:
-            return time.monotonic() - self.stage.last_motion_ns(name) / 1e9 > AT_REST_S
+            return time.monotonic() - self.stage.last_motion_ns(name) / 1e9 > _AT_REST_S
 
         self.until(page, at_rest, f"{name} did not stop", 5.0)
         return self.stage.last_motion_ns(name) / 1e9
@@ -171,35 +201,18 @@ class Rig:
         """When the broker delivered the first command that moves it after ``since``."""
 
         def found() -> list[float]:
-            return [at for at, ref, axes in self.drives if ref == self.ref(name) and at > since and _moves(axes)]
+            drives = [(at, axes) for at, base, axes in self.drives if base == self.ref(name) and at > since]
+            return [at for at, axes in drives if axes.get("x") or axes.get("z")]
 
         self.until(page, found, "no command reached the broker", 5.0)
         return found()[0]
 
     def _goto(self, url: str) -> Page:
-        page = self._open_page()
+        context = self._browser.new_context(viewport={"width": 1280, "height": 800})
+        context.add_init_script(_HOOKS)
+        page = context.new_page()
         page.goto(url, wait_until="domcontentloaded")
         return page
-
-    # -- threads that read what was received
-
-    def receive_drives(self, lines: IO[bytes]) -> None:
-        for at, topic, payload in _received(lines):
-            self.drives.append((at, topic.removesuffix(f"/{DRIVE.suffix}"), json.loads(payload)))
-
-    def receive_frames(self, lines: IO[bytes]) -> None:
-        for at, topic, size in _received(lines):
-            self.frames.append((at, topic.removesuffix(f"/{CAMERA.suffix}"), int(size)))
-
-
-def _received(lines: IO[bytes]) -> Iterator[tuple[float, str, bytes]]:
-    for line in lines:
-        at, topic, rest = line.split(b" ", 2)
-        yield monotonic(1000 * float(at)), topic.decode(), rest
-
-
-def _moves(axes: dict[str, Any]) -> bool:
-    return bool(axes.get("x") or axes.get("z"))
 
 
 def monotonic(page_ms: float) -> float:
@@ -212,32 +225,102 @@ def monotonic(page_ms: float) -> float:
 
 @contextmanager
 def rig(*names: str, program: str | None = None, flags: tuple[str, ...] = (), **settings: Any) -> Iterator[Rig]:
-    """Start everything; ``settings`` are of the page's server. Raises PebbleError."""
+    """Start everything; ``settings`` are of the stage and of the page's server. Raises PebbleError."""
     with ExitStack() as stack:
         stage = stack.enter_context(Stage(*(names or ROBOTS), **settings))
         browser = stack.enter_context(chromium(*flags, program=program))
+        drives = stack.enter_context(_subscribed(stage, DRIVE, "%p", json.loads))
+        frames = stack.enter_context(_subscribed(stage, CAMERA, "%l", int))
+        yield Rig(stage, browser, drives, frames)
 
-        def open_page() -> Page:
-            context = browser.new_context(viewport={"width": 1280, "height": 800})
-            context.add_init_script(_HOOKS)
-            return context.new_page()
 
-        made = Rig(stage, open_page)
-        stack.enter_context(_subscribed(stage, DRIVE, "%U %t %p", made.receive_drives))
-        stack.enter_context(_subscribed(stage, CAMERA, "%U %t %l", made.receive_frames))
+@contextmanager
+def _subscribed(stage: Stage, channel: Channel, what: str, read: Callable[[bytes], Any]) -> Iterator[Received]:
+    """``what`` of each message, in mosquitto_sub's format, as ``read`` reads it; on a thread."""
+    program = shutil.which("mosquitto_sub")
+    if program is None:
+        raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
+    options = ["-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", channel.filter("+/+/+"), "-F", f"%U %t {what}"]
+    log = stage.folder / "subscriber.log"
+    subscriber = stage.add(Program("mosquitto_sub", [program, *options], log, reports=True), OPERATORS)
+    received: Received = []
+
+    def receive() -> None:
+        for line in subscriber.reports:
+            at, topic, rest = line.split(b" ", 2)
+            base = topic.decode().removesuffix(f"/{channel.suffix}")
+            received.append((monotonic(1000 * float(at)), base, read(rest)))
+
+    reader = threading.Thread(target=receive, name="subscriber", daemon=True)
+    reader.start()
+    yield received
+    if subscriber.ended or not reader.is_alive():
+        raise PebbleError("mosquitto_sub has ended: what it should have received is missing")
+
+
+# -- the browser
+
+
+def missing() -> str | None:
+    """What to do before a page can be opened; None: nothing."""
+    if shutil.which("chromium") is None:
+        return "no Chromium: apt install chromium"
+    if find_spec("playwright") is None:
+        return "no Playwright: pip install 'pebble-robot[dev]'"
+    return None
+
+
+@contextmanager
+def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
+    """Run one with further ``flags``; ``program`` starts it in another way. Raises PebbleError with what to install."""
+    problem = missing()
+    if problem is not None:
+        raise PebbleError(problem)
+    from playwright.sync_api import sync_playwright  # optional
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program or shutil.which("chromium"), args=[*FLAGS, *flags])
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+# -- the browser behind an impaired network
+
+
+@contextmanager
+def linked(condition: Condition, *names: str, flags: tuple[str, ...] = ()) -> Iterator[Rig]:
+    """Everything but the browser, which has further ``flags``, is on the robot's side of the network.
+
+    Needs root. Raises PebbleError.
+    """
+    problem = why_no_namespaces()
+    if problem is not None:
+        raise PebbleError(f"no network namespaces: {problem}")
+    with ExitStack() as stack:
+        network = stack.enter_context(NamespaceNetwork())
+        program = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "chromium"
+        program.write_text(f'#!/bin/sh\nexec {shlex.join(network.on_remote(["chromium"]))} "$@"\n')
+        program.chmod(0o700)
+        stack.enter_context(_inside(network.on_robot(())[1].removeprefix("--net=")))
+        secure = f"--unsafely-treat-insecure-origin-as-secure=http://{SERVER}:{_PORT}"  # as https would be
+        made = stack.enter_context(rig(*names, program=str(program), flags=(secure, *flags), host=SERVER, port=_PORT))
+        network.apply(condition)
         yield made
 
 
 @contextmanager
-def _subscribed(stage: Stage, channel: Channel, line: str, receive: Callable[[IO[bytes]], None]) -> Iterator[None]:
-    """``receive`` reads a line for each message, on a thread; ``line`` is mosquitto_sub's format."""
-    program = shutil.which("mosquitto_sub")
-    if program is None:
-        raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
-    command = [program, "-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", channel.filter("+/+/+"), "-F", line]
-    subscriber = stage.add(Program("mosquitto_sub", command, stage.folder / "subscriber.log", reports=True), OPERATORS)
-    reader = threading.Thread(target=receive, args=(subscriber.reports,), name="subscriber", daemon=True)
-    reader.start()
-    yield
-    if subscriber.ended or not reader.is_alive():
-        raise PebbleError("mosquitto_sub has ended: what it should have received is missing")
+def _inside(namespace: str) -> Iterator[None]:
+    """This thread, and all that it starts, use that network."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    own = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+    other = os.open(namespace, os.O_RDONLY)
+    try:
+        if libc.setns(other, _CLONE_NEWNET):
+            raise PebbleError(f"the network namespace cannot be entered: {os.strerror(ctypes.get_errno())}")
+        yield
+    finally:
+        libc.setns(own, _CLONE_NEWNET)
+        os.close(own)
+        os.close(other)

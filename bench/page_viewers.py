@@ -21,19 +21,19 @@ _CAN = "h264,pbvz,pbvd,json,jpeg"
 _FLOW_S = 4.0  # until the camera is running and every viewer has a key frame
 
 
-async def watch(url: str, ref: str, counted: list[tuple[float, int]]) -> None:
+async def watch(url: str, ref: str, arrived: list[float]) -> None:
     """Receive and acknowledge until cancelled."""
     host = urlsplit(url).netloc
     address = f"ws://{host}/ws/media?{urlencode({'ref': ref, 'can': _CAN})}"
     async with connect(address, origin=f"http://{host}", compression=None, max_size=None) as socket:  # type: ignore[arg-type]
         async for message in socket:
-            counted.append((time.monotonic(), len(message)))
+            arrived.append(time.monotonic())
             await socket.send(message[:4] + struct.pack(">B", 0))  # type: ignore[operator]
 
 
 async def measure(url: str, ref: str, count: int, seconds: float) -> dict[str, Any]:
-    counted: list[list[tuple[float, int]]] = [[] for _ in range(count)]
-    tasks = [asyncio.create_task(watch(url, ref, one)) for one in counted]
+    arrived: list[list[float]] = [[] for _ in range(count)]
+    tasks = [asyncio.create_task(watch(url, ref, one)) for one in arrived]
     await asyncio.sleep(_FLOW_S)
     began = time.monotonic()
     await asyncio.sleep(seconds)
@@ -42,7 +42,7 @@ async def measure(url: str, ref: str, count: int, seconds: float) -> dict[str, A
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-    frames = [sum(began <= at < ended for at, _ in one) for one in counted]
+    frames = [sum(began <= at < ended for at in one) for one in arrived]
     return {"began": began, "ended": ended, "frames": frames}
 
 

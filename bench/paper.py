@@ -9,7 +9,6 @@ from typing import Final
 PAPER_BEST_PERCENT: Final = 80.0
 PAPER_WORDS: Final = {"512k": "degraded", "256k": "broken"}
 
-
 #: Table 4.1 of the paper, kbit/s: median and 95th percentile of video, and of audio.
 TABLE_4_1: Final = {
     "fred": (172.46, 283.99, 265.60, 270.91),

@@ -5,12 +5,11 @@ The demo's robots on a real mosquitto: idle, then driven and watched, recorded b
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 from rich.table import Table
 
-from pebble.bench.aims import NOT_JUDGED, outcome
+from pebble.bench.aims import outcome
 from pebble.bench.comparison import Budget, Case, Comparison, Run
 from pebble.bench.paper import MONO_PCM_KBPS, TABLE_4_1
 from pebble.bench.pictures import Drawn
@@ -27,9 +26,10 @@ from pebble.bench.tables import plain_table
 from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
-from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, Bandwidth, RobotTraffic, Traffic
+from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, RobotTraffic, Traffic
 from pebble.recordings.traffic.tables import BRIEF_MS
 from pebble.rig.operator import Operator
+from pebble.rig.processes import OPERATORS, python
 from pebble.rig.programs import Program, end_all
 from pebble.rig.testbed import ROBOTS, Testbed
 from pebble.transports import MqttSettings, create
@@ -68,86 +68,65 @@ def measure(case: Case) -> Iterator[Cell]:
     from pebble.recordings.traffic.sources import sources
 
     with tempfile.TemporaryDirectory(prefix="pebble-traffic-") as name:
-        folder, scratch = Path(name) / "stage", Path(name) / "scratch"
-        record(folder, case.run["idle_s"], case.run["session_s"])
+        recordings, scratch = Path(name) / "recordings", Path(name) / "scratch"
+        record(recordings, case.run["idle_s"], case.run["session_s"])
         scratch.mkdir()
-        found = sources([folder / "recordings"], scratch, since_ns=0, until_ns=FOREVER_NS)
-        yield from cells_of(analyse(found, scratch))
+        yield from cells_of(analyse(sources([recordings], scratch, since_ns=0, until_ns=FOREVER_NS), scratch))
 
 
 def record(folder: Path, idle_s: float, session_s: float) -> None:
     """Record all robots into ``folder``: idle for ``idle_s``, then used for ``session_s``. Raises PebbleError."""
     with Testbed(threading.Event()) as testbed:
         testbed.start_brokers()
-        with _recorder(folder, testbed.broker_port), closing(_Session(testbed.broker_port)) as session:
+        command = python("pebble.cli", "record", "--url", f"mqtt://127.0.0.1:{testbed.broker_port}", "--into", folder)
+        recorder = testbed.add(Program("pebble record", command, testbed.folder / "record.log"), OPERATORS)
+        recorder.wait_until(lambda: b"Recording" in recorder.log.read_bytes(), _READY_S)  # it is connected
+        with closing(Operator(testbed.broker_port, "pebble-bench-operator")) as operator:
+            operator.connect()
             testbed.start_robots()
-            session.operator.wait_until_ready(len(ROBOTS), _READY_S, testbed.unexpected_exits)
+            operator.wait_until_ready(len(ROBOTS), _READY_S, testbed.unexpected_exits)
             time.sleep(idle_s)
-            session.run(session_s)
+            _use(operator, testbed.broker_port, session_s)
             if problems := testbed.unexpected_exits():
                 raise PebbleError("; ".join(problems))
             time.sleep(_LAST_S)
+        end_all([recorder], _END_S)
         testbed.keep = False
 
 
-@contextmanager
-def _recorder(folder: Path, port: int) -> Iterator[None]:
-    folder.mkdir()
-    command = [sys.executable, "-m", "pebble.cli", "record", "--url", f"mqtt://127.0.0.1:{port}", "--into"]
-    recorder = Program("pebble record", [*command, str(folder / "recordings")], folder / "record.log")
-    try:
-        recorder.wait_until(lambda: b"Recording" in recorder.log.read_bytes(), _READY_S)  # it is connected
+def _use(operator: Operator, port: int, seconds: float) -> None:
+    """Drive all robots while pictures and sound arrive of those that have them. Raises PebbleError."""
+    with ExitStack() as stack:
+        viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
+        stack.enter_context(closing(viewer))
+        viewer.open()
+        receivers = [
+            stack.enter_context(closing(MediaReceiver(viewer, robot.base)))
+            for robot in operator.discovery.all_robots()
+            if robot.offers("video")
+        ]
+        for receiver in receivers:
+            receiver.wait_for_capabilities(_READY_S)
+            receiver.viewer.request("video", "json")
+            receiver.viewer.request("audio", "pcm")
+        for _ in _polls(receivers, _READY_S):
+            if not (missing := [one.name for one in receivers if not one.encoding.keys() >= {"video", "audio"}]):
+                break
+        else:
+            raise PebbleError(f"no pictures or no sound came from {', '.join(missing)}")
+        operator.begin()
+        for _ in _polls(receivers, seconds):
+            operator.completed.clear()  # nothing is assessed here
+
+
+def _polls(receivers: Sequence[MediaReceiver], seconds: float) -> Iterator[None]:
+    """Several times a second, for so long: the receivers repeat what they have requested."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(_POLL_S)
+        for receiver in receivers:
+            receiver.poll()
         yield
-        if recorder.ended:
-            raise PebbleError(f"pebble record ended: {recorder.tail()}")
-    finally:
-        end_all([recorder], _END_S)
-
-
-class _Session:
-    """The demo's operator, and a viewer of all pictures and sound."""
-
-    def __init__(self, port: int) -> None:
-        self.operator = Operator(port, "pebble-bench-operator")
-        self.operator.connect()
-        self._viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
-        self._watching = ExitStack()
-
-    def run(self, seconds: float) -> None:
-        """Drive all robots while their pictures and sound arrive, of those that have them. Raises PebbleError."""
-        self._viewer.open()
-        robots = self.operator.discovery.all_robots()
-        receivers = [self._watch(robot.base) for robot in robots if robot.offers("video")]
-        self._wait_for_media(receivers)
-        self.operator.begin()
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            time.sleep(_POLL_S)
-            for receiver in receivers:
-                receiver.poll()
-            self.operator.completed.clear()  # nothing is assessed here
-        self._watching.close()
-
-    def _wait_for_media(self, receivers: Sequence[MediaReceiver]) -> None:
-        end = time.monotonic() + _READY_S
-        while missing := [one.name for one in receivers if not one.encoding.keys() >= {"video", "audio"}]:
-            if time.monotonic() > end:
-                raise PebbleError(f"no pictures or no sound came from {', '.join(missing)}")
-            time.sleep(_POLL_S)
-            for receiver in receivers:
-                receiver.poll()
-
-    def close(self) -> None:
-        self._watching.close()
-        self.operator.close()
-        self._viewer.close()
-
-    def _watch(self, base: str) -> MediaReceiver:
-        receiver = self._watching.enter_context(closing(MediaReceiver(self._viewer, base)))
-        receiver.wait_for_capabilities(_READY_S)
-        receiver.viewer.request("video", "json")
-        receiver.viewer.request("audio", "pcm")
-        return receiver
 
 
 # -- cells
@@ -155,19 +134,16 @@ class _Session:
 
 def cells_of(traffic: Traffic) -> list[Cell]:
     """The lengths of each robot's outages with all of its analysis, and the bandwidths of each kind of message."""
-    return [cell for robot in traffic.robots for cell in (_outage_cell(robot), *_bandwidth_cells(robot))]
+    return [cell for robot in traffic.robots for cell in _cells_of(robot)]
 
 
-def _outage_cell(robot: RobotTraffic) -> Cell:
-    lengths = [one.length_ms for one in robot.outages]
-    analysis = {_ANALYSIS: msgspec.json.encode(robot).decode()}
-    return Cell(variant=name_of(robot), measure="outage", unit="ms", rounds=[lengths], figures=dict(analysis))
-
-
-def _bandwidth_cells(robot: RobotTraffic) -> Iterator[Cell]:
+def _cells_of(robot: RobotTraffic) -> Iterator[Cell]:
+    name, lengths = robot.robot.rpartition("/")[2], [one.length_ms for one in robot.outages]
+    analysis = msgspec.json.encode(robot).decode()
+    yield Cell(variant=name, measure="outage", unit="ms", rounds=[lengths], figures={_ANALYSIS: analysis})
     for one in robot.bandwidth:
         yield Cell(
-            variant=name_of(robot),
+            variant=name,
             params={"messages": one.family, "time": one.time},
             measure="bandwidth",
             unit="kbit/s",
@@ -185,74 +161,42 @@ def robots_of(cells: Sequence[Cell]) -> Robots:
 # -- the report
 
 
-def name_of(robot: RobotTraffic) -> str:
-    """``goob``."""
-    return robot.robot.rpartition("/")[2]
-
-
 def tables(cells: Sequence[Cell]) -> Iterator[Table]:
     """Table 4.1 beside the paper's, and heartbeats, whose distributions the paper shows as figures."""
     robots = robots_of(cells)
-    yield _media(robots)
-    yield _heartbeats(robots)
-
-
-def _media(robots: Robots) -> Table:
     heads = [f"{family} {value}" for family in (VIDEO, AUDIO) for value in ("median", "p95")]
     table = plain_table("Table 4.1: media, kbit/s of active seconds", ["robot", "", *heads], left=2)
     for name, paper in TABLE_4_1.items():
+        here = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
+        shown = [("–", "–") if one is None else (f"{one.median_kbps:.2f}", f"{one.p95_kbps:.2f}") for one in here]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
-        table.add_row("", "here", *_media_cells(robots.get(name)))
-    return table
-
-
-def _media_cells(robot: RobotTraffic | None) -> Iterator[str]:
-    for family in (VIDEO, AUDIO):
-        found = None if robot is None else robot.of(family)
-        yield from ("–", "–") if found is None else (f"{found.median_kbps:.2f}", f"{found.p95_kbps:.2f}")
-
-
-def _heartbeats(robots: Robots) -> Table:
-    heads = ("robot", "heartbeats", "every ms", "outages", "below 300 ms", "shared", "latency p1", "p50", "p95 ms")
+        table.add_row("", "here", *(value for pair in shown for value in pair))
+    yield table
+    heads = ["robot", "heartbeats", "every ms", "outages", "below 300 ms", "shared", "latency p1", "p50", "p95 ms"]
     table = plain_table("Heartbeats", heads)
     for name, robot in robots.items():
         usual, latency = robot.intervals, robot.latency
         if usual is not None and latency is not None:
-            brief = sum(one.length_ms < BRIEF_MS for one in robot.outages)
-            counts = (latency.count, f"{usual.median_ms:.0f}", len(robot.outages), brief)
-            shared = sum(one.cause != "robot" for one in robot.outages)
+            counts = (latency.count, f"{usual.median_ms:.0f}", len(robot.outages), *_brief_and_shared([robot]))
             times = (latency.floor_ms, latency.median_ms, latency.p95_ms)
-            table.add_row(name, *map(str, counts), str(shared), *(f"{time:.1f}" for time in times))
-    return table
+            table.add_row(name, *map(str, counts), *(f"{time:.1f}" for time in times))
+    yield table
+
+
+def _brief_and_shared(robots: Iterable[RobotTraffic]) -> tuple[int, int]:
+    """How many outages are brief, and how many are of several robots at once or of the recorder."""
+    outages = [one for robot in robots for one in robot.outages]
+    return sum(one.length_ms < BRIEF_MS for one in outages), sum(one.cause != "robot" for one in outages)
 
 
 def sentences(cells: Sequence[Cell]) -> Iterator[str | Judged]:
     """What agrees with the paper, what differs, and why."""
     robots = robots_of(cells)
-    for about in (_sound, _video, _outages, _latencies):
-        yield from about(robots)
-
-
-def _sound(robots: Robots) -> Iterator[str | Judged]:
-    sounds = {name: one for name, robot in robots.items() if (one := robot.of(AUDIO)) is not None}
-    shown = ", ".join(f"{name} {one.median_kbps:.1f} kbit/s" for name, one in sounds.items()) or "no sound"
-    what = f"PCM, one channel at 16 kHz, takes the paper's {MONO_PCM_KBPS:.1f} kbit/s within 1 %"
-    yield Judged(what=what, outcome=_outcome(list(sounds.values())), measured=shown)
+    yield _sound(robots)
     yield (
         f"Goob's sound takes {TABLE_4_1['goob'][2]:.1f} kbit/s in the paper, as much as two channels: 50 packets of "
         "1,304 bytes a second; here Goob has one channel"
     )
-
-
-def _outcome(sounds: Sequence[Bandwidth]) -> str:
-    """Packets of a second may be received in the next one: only the median of many seconds is the rate."""
-    if sounds and min(one.seconds for one in sounds) < LEAST_SECONDS:
-        return NOT_JUDGED
-    met = bool(sounds) and all(abs(one.median_kbps / MONO_PCM_KBPS - 1) <= _SAME for one in sounds)
-    return outcome(met)
-
-
-def _video(robots: Robots) -> Iterator[str]:
     for name, robot in robots.items():
         found, paper = robot.of(VIDEO), TABLE_4_1.get(name)
         if found is not None and paper is not None:
@@ -260,29 +204,30 @@ def _video(robots: Robots) -> Iterator[str]:
                 f"{name}'s video as JSON takes {found.median_kbps / paper[0]:.2f}× the paper's median: a "
                 "simulated camera shows other things, and Table 4.1 names neither encoding, size nor rate"
             )
-
-
-def _outages(robots: Robots) -> Iterator[str]:
-    outages = [one for robot in robots.values() for one in robot.outages]
-    brief = sum(one.length_ms < BRIEF_MS for one in outages)
-    shared = sum(one.cause != "robot" for one in outages)
-    found = (
-        f"{len(outages)} outages of heartbeats, {brief} of them shorter than 300 ms (the paper: most), {shared} of "
+    count, (brief, shared) = sum(len(robot.outages) for robot in robots.values()), _brief_and_shared(robots.values())
+    found_ = (
+        f"{count} outages of heartbeats, {brief} of them shorter than 300 ms (the paper: most), {shared} of "
         "several robots at once or of the recorder, so of this machine"
     )
-    paper = "the paper's are of archived operation, over the internet"
-    yield f"{found if outages else 'no outage of heartbeats'}; {paper}"
-
-
-def _latencies(robots: Robots) -> Iterator[str]:
+    yield f"{found_ if count else 'no outage of heartbeats'}; the paper's are of archived operation, over the internet"
     for name, robot in robots.items():
-        latency, paper = robot.latency, _PAPER_LATENCIES.get(name)
-        if latency is not None and paper is not None:
-            whole = "its stamps are of whole seconds" if latency.whole_seconds else "its stamps are of milliseconds"
+        if robot.latency is not None and name in _PAPER_LATENCIES:
+            whole = "whole seconds" if robot.latency.whole_seconds else "milliseconds"
             yield (
-                f"{name}'s heartbeats take {latency.median_ms:.1f} ms, p95 {latency.p95_ms:.1f} ms, over "
-                f"loopback; {whole} (the paper: {paper})"
+                f"{name}'s heartbeats take {robot.latency.median_ms:.1f} ms, p95 {robot.latency.p95_ms:.1f} ms, over "
+                f"loopback; its stamps are of {whole} (the paper: {_PAPER_LATENCIES[name]})"
             )
+
+
+def _sound(robots: Robots) -> Judged:
+    """Packets of a second may be received in the next one: only the median of many seconds is the rate."""
+    sounds = {name: one for name, robot in robots.items() if (one := robot.of(AUDIO)) is not None}
+    same = all(abs(one.median_kbps / MONO_PCM_KBPS - 1) <= _SAME for one in sounds.values())
+    return Judged(
+        what=f"PCM, one channel at 16 kHz, takes the paper's {MONO_PCM_KBPS:.1f} kbit/s within 1 %",
+        outcome=outcome(bool(sounds) and same, judged=all(one.seconds >= LEAST_SECONDS for one in sounds.values())),
+        measured=", ".join(f"{name} {one.median_kbps:.1f} kbit/s" for name, one in sounds.items()) or "no sound",
+    )
 
 
 def figures(results: Results) -> list[Picture]:

@@ -11,7 +11,7 @@ import pytest
 from pebble.bench.clips import SCENES, Clip
 from pebble.bench.engine import run
 from pebble.bench.results import load
-from pebble.bench.video import AIMS, TOLERANCE, VIDEO, psnr, squared_error, ssim
+from pebble.bench.wire import AIMS, TOLERANCE, VIDEO, psnr, squared_error, ssim
 
 
 def test_similarity_of_known_pictures() -> None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pebble.bench.video import psnr, squared_error
+from pebble.bench.wire import psnr, squared_error
 from pebble.errors import ConfigError, PebbleError
 from pebble.media import h264, pyav
 from pebble.media.decode import VideoDecoder

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import pytest
 from playwright.sync_api import Browser, BrowserContext, CDPSession, Locator, Page
 
-from pebble.bench import chromium as program
+from pebble.bench import page_rig as program
 
 Size = Literal["desktop", "phone", "landscape", "small"]
 Theme = Literal["light", "dark"]

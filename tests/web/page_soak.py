@@ -18,7 +18,7 @@ from playwright.sync_api import CDPSession
 from rich.console import Console as Terminal
 from rich.table import Table
 
-from pebble.bench import chromium as program
+from pebble.bench import page_rig as program
 from pebble.bench.usage import pss_mb
 from pebble.rig.testbed import ROBOTS
 from tests.support import quarters

@@ -15,7 +15,7 @@ from typing import Any
 
 from playwright.sync_api import Browser, CDPSession
 
-from pebble.bench import chromium as program
+from pebble.bench import page_rig as program
 from pebble.bench.results import percentile
 from pebble.bench.usage import pss_mb
 from tests.recordings.playing import GOOB, ms

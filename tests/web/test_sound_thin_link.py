@@ -9,8 +9,7 @@ import pytest
 
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import why_no_namespaces
-from pebble.bench.page_links import linked
-from pebble.bench.page_rig import Rig
+from pebble.bench.page_rig import Rig, linked
 from tests.web.ears import PLAIN_MICROPHONE, TAP, compared, fake_microphone, played, recorded, write_voice
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]

@@ -1,0 +1,320 @@
+"""Measures bytes on the wire: each video encoding at equal quality, each sound encoding with headers of MQTT, TCP, IP.
+
+Nothing is sent. Bytes are the same in every run with the same programs, so there is one sample per cell.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pebble.bench.aims import Aim, single
+from pebble.bench.clips import FPS, HEIGHT, SCENES, WIDTH, Clip
+from pebble.bench.comparison import Budget, Case, Comparison, Round, Run, seconds
+from pebble.bench.pictures import bars
+from pebble.bench.results import Cell, Value
+from pebble.bench.tables import Grid, percentile_column, single_column
+from pebble.contract import AUDIO
+from pebble.errors import PebbleError
+from pebble.media.decode import VideoDecoder
+from pebble.media.jpeg import Pixels
+from pebble.media.opus import BUNDLE_LIMIT
+from pebble.media.pcm import to_bytes
+from pebble.media.sound import SOUND_ENCODINGS, SoundDecoder, make_sound_encoder
+from pebble.media.speech import Speech
+from pebble.media.video import VIDEO_ENCODINGS, JsonEncoder, VideoEncoder, make_encoder
+
+TOLERANCE: Final = 0.005  # of SSIM
+QUALITY, INTERVAL = 10, 5  # the reference implementation's settings
+AIMS: Final = {"pbvz": 0.75, "h264": 0.25}
+_REFERENCE: Final = "reference"
+#: h264 is there twice: with its own interval (key frames on request) and with that of the others.
+_VIDEO: Final = (_REFERENCE, *VIDEO_ENCODINGS, *(["h264, key/5"] if "h264" in VIDEO_ENCODINGS else []))
+_EVERY: Final = 7  # one picture in so many is compared: not only key frames
+_STARTED_MS: Final = 1_700_000_000_000
+_TRIES: Final = 8
+
+TOPIC = AUDIO.topic("pebble/robots/goob")
+AIM = 0.16  # of PCM's bytes
+BITRATES = (16_000, 24_000, 32_000)
+RATE = 16_000
+_IP, _TCP = 20, 32  # bytes; version 4 without options, TCP with time stamps as Linux sends them
+_CHUNK_MS = 20
+_DELAY_S = 0.02  # at most, of codec and resampler
+_STEP_S = 0.02  # of an envelope
+
+Coded = dict[str, float]  # figures of a clip or of speech in one encoding; "wire": per second
+Wave = npt.NDArray[np.float64]
+
+
+def _cell(case: Case, unit: str, coded: Coded, reference: Coded, params: dict[str, Value] | None = None) -> Cell:
+    figures: dict[str, Value] = {name: round(value, 4) for name, value in coded.items() if name != "wire"}
+    figures["ratio"] = round(coded["wire"] / reference["wire"], 4)
+    return case.cell("wire", unit, [coded["wire"]], params, **figures)
+
+
+# -- video
+
+
+class ReferenceJson(JsonEncoder):
+    """Encodes as the reference implementation does, with the Huffman tables of the JPEG standard."""
+
+    optimize = False
+
+
+def _encoder(variant: str, quality: float) -> VideoEncoder:
+    if variant == _REFERENCE:
+        return ReferenceJson(INTERVAL, quality)
+    interval = None if variant == "h264" else INTERVAL
+    return make_encoder(variant.partition(",")[0], fps=FPS, keyframe_interval=interval, quality=quality)
+
+
+def code(film: Sequence[Pixels], variant: str, quality: float) -> Coded:
+    """Encodes and decodes the clip. Raises PebbleError if a picture cannot be decoded."""
+    encoder, decoder = _encoder(variant, quality), VideoDecoder()
+    sent, likeness, errors = 0, [], []
+    encoding = decoding = 0.0
+    for number, picture in enumerate(film):
+        began = time.perf_counter()
+        payload = encoder.encode(picture, _STARTED_MS + number * 1000 // FPS)
+        encoded = time.perf_counter()
+        shown = decoder.feed(payload)
+        decoding += time.perf_counter() - encoded
+        encoding += encoded - began
+        sent += len(payload)
+        if shown is None:
+            raise PebbleError(f"{variant}: picture {number} was not decoded: {decoder.problem}")
+        if number % _EVERY == 0:
+            likeness.append(ssim(picture, shown.picture))
+            errors.append(squared_error(picture, shown.picture))
+    n = len(film)
+    return {
+        "wire": sent * FPS / n / 1000,
+        "quality": quality,
+        "pictures": n,
+        "ssim": sum(likeness) / len(likeness),
+        "psnr_db": psnr(sum(errors) / len(errors)),
+        "encode_ms": encoding / n * 1000,
+        "decode_ms": decoding / n * 1000,
+    }
+
+
+def match(film: Sequence[Pixels], variant: str, wanted: float) -> Coded:
+    """The one whose SSIM is nearest to ``wanted``, found by bisection; stops within a fifth of the tolerance."""
+    low, high = 1.0, 100.0
+    quality = float(QUALITY)
+    tried: list[Coded] = []
+    while len(tried) < _TRIES:
+        one = code(film, variant, quality)
+        tried.append(one)
+        if abs(one["ssim"] - wanted) <= TOLERANCE / 5:
+            break
+        low, high = (quality, high) if one["ssim"] < wanted else (low, quality)
+        quality = (low * high) ** 0.5
+    return min(tried, key=lambda one: abs(one["ssim"] - wanted))
+
+
+def measure_video(round_: Round) -> Iterator[Cell]:
+    films: dict[str, list[Pixels]] = {}
+    references: dict[str, Coded] = {}
+    count = max(_EVERY, round(round_.run["seconds"] * FPS))
+    for case in round_.cases():
+        scene = str(case.condition["scene"])
+        if case.variant == _REFERENCE:
+            clip = Clip(scene)
+            films[scene] = [clip.frame(number) for number in range(count)]
+            coded = references[scene] = code(films[scene], case.variant, QUALITY)
+        else:
+            coded = match(films[scene], case.variant, references[scene]["ssim"])
+        yield _cell(case, "kB/s", coded, references[scene])
+
+
+# -- the quality of a decoded picture: PSNR over all colours, and SSIM (Wang et al. 2004) as the mean of the channels
+
+_WINDOW, _SIGMA = (11, 11), 1.5  # the paper's Gaussian window
+_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+
+
+def squared_error(one: Pixels, other: Pixels) -> float:
+    """Mean over all pixels and channels, in levels squared."""
+    return float(cv2.norm(one, other, cv2.NORM_L2SQR)) / one.size
+
+
+def psnr(mean_squared_error: float) -> float:
+    """In dB; infinite for identical pictures."""
+    return math.inf if mean_squared_error == 0 else 10 * math.log10(255**2 / mean_squared_error)
+
+
+def ssim(one: Pixels, other: Pixels) -> float:
+    """1 for identical pictures. BGR, of one shape. (Borders are reflected; the paper leaves them out.)"""
+    x, y = one.astype(np.float32), other.astype(np.float32)
+    mean_x, mean_y = _smooth(x), _smooth(y)
+    both, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    covariance = _smooth(x * y) - both
+    variances = _smooth(x * x + y * y) - squares
+    likeness = (2 * both + _C1) * (2 * covariance + _C2) / ((squares + _C1) * (variances + _C2))
+    return float(likeness.mean())
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(values, _WINDOW, _SIGMA)
+
+
+def unequal(cells: Sequence[Cell]) -> Iterator[str]:
+    """The encodings that did not reach the reference's quality."""
+    likeness = single("ssim")
+    wanted = {cell.params["scene"]: likeness(cell) for cell in cells if cell.variant == _REFERENCE}
+    for cell in cells:
+        far = likeness(cell) - wanted[cell.params["scene"]]
+        if abs(far) > TOLERANCE:
+            yield f"{cell.params['scene']}, {cell.variant}: SSIM differs by {far:+.4f}, quality is not equal"
+
+
+VIDEO = Comparison(
+    name="video",
+    title="Video on the wire",
+    what="Bytes of each video encoding at equal quality (SSIM) on the same synthetic clips. Nothing is sent: this "
+    "is the encoders' output.",
+    help="Video on the wire: bytes of every encoding at equal quality, for the same film.",
+    options=(seconds("Length of the film.", least=1),),
+    full=Budget(60, seconds=10.0),
+    quick=Budget(8, seconds=1.0),
+    variants=_VIDEO,
+    conditions=lambda _run: [{"scene": scene, "size": f"{WIDTH}x{HEIGHT}", "fps": FPS} for scene in SCENES],
+    measure_round=measure_video,
+    tables=(
+        Grid(
+            title=f"Video on the wire at equal SSIM, {WIDTH}x{HEIGHT}, {FPS} fps", rows=("scene", "variant"),
+            heads=("scene", "encoding"),
+            columns=(percentile_column(50, "kB/s"), *(single_column(*words) for words in (
+                ("quality", "quality", ".1f"), ("ratio", "ratio", ".3f"), ("SSIM", "ssim", ".4f"),
+                ("PSNR", "psnr_db", ".2f"), ("enc ms", "encode_ms", ".2f"), ("dec ms", "decode_ms", ".2f"),
+            ))),
+        ),
+    ),
+    assessment=(unequal, *(
+        Aim(
+            what=f"{name} takes at most {{bound:.2f}} of the reference's bytes at equal quality",
+            of=lambda cell, name=name: cell.variant == name,  # type: ignore[misc]
+            value=single("ratio"), at_most=aim, worst=True, shown="{:.2f}".format,
+        )
+        for name, aim in AIMS.items()
+    )),
+    complete=lambda cells: not any(unequal(cells)),
+    pictures=(bars("Video at equal quality"),),
+)  # fmt: skip
+
+
+# -- sound
+
+
+def wire_bytes(payload: int, topic: str = TOPIC) -> int:
+    """Size of one PUBLISH with QoS 0 in a TCP segment of its own (MQTT 3.1.1, 3.3)."""
+    length = 2 + len(topic.encode()) + payload
+    digits = max(1, (length.bit_length() + 6) // 7)  # of the remaining length
+    return _IP + _TCP + 1 + digits + length
+
+
+def measure_sound(case: Case) -> Iterator[Cell]:
+    """One cell per encoding; PCM comes first, as the reference of the others."""
+    speech = Speech(RATE).samples(0, round(case.run["seconds"] * RATE))
+    pcm = speak(speech, "pcm")
+    yield _cell(replace(case, role="pcm"), "kbit/s", pcm, pcm)
+    for bitrate in case.run["bitrates"]:
+        for bundle in range(1, BUNDLE_LIMIT + 1):
+            packet = "1 part" if bundle == 1 else f"{bundle} parts"
+            params: dict[str, Value] = {"bitrate": f"{bitrate // 1000} kbit/s", "packet": packet}
+            opus = speak(speech, "opus", bitrate, bundle)
+            yield _cell(replace(case, role="opus"), "kbit/s", opus, pcm, params)
+
+
+def speak(speech: npt.NDArray[np.int16], name: str, bitrate: int = 24_000, bundle: int = 1) -> Coded:
+    """Encodes and decodes the speech; ``likeness``: of the samples for PCM, of the envelopes for Opus."""
+    encoder = make_sound_encoder(name, rate=RATE, channels=1, chunk_ms=_CHUNK_MS, bitrate=bitrate, bundle=bundle)
+    size = RATE * _CHUNK_MS // 1000
+    began = time.process_time()
+    packets = []
+    for at in range(0, len(speech), size):
+        packets += encoder.encode(to_bytes(speech[at : at + size]), round(1000 * at / RATE))
+    encoded = time.process_time()
+    decoder = SoundDecoder()
+    received = [one.samples for one in map(decoder.feed, packets) if one is not None]
+    decoded = time.process_time()
+    sound = np.concatenate(received)[:, 0].astype(np.float64)
+    lasts_s = len(sound) / encoder.rate
+    return {
+        "wire": sum(wire_bytes(len(packet)) for packet in packets) / lasts_s * 8 / 1000,
+        "packets_per_s": len(packets) / lasts_s,
+        "payload_kbits": sum(map(len, packets)) * 8 / 1000 / lasts_s,
+        "likeness": likeness(sound, speech[:, 0].astype(np.float64), RATE, by_envelope=name != "pcm"),
+        "encode_cpu": (encoded - began) / lasts_s,  # share of one core
+        "decode_cpu": (decoded - encoded) / lasts_s,
+    }
+
+
+def likeness(received: Wave, speech: Wave, rate: int, *, by_envelope: bool) -> float:
+    """Correlation (-1 to 1) at the delay that gives the highest one."""
+    count = min(len(received), len(speech)) - round(_DELAY_S * rate)
+    delays = range(0, round(_DELAY_S * rate), max(1, rate // 2000) if by_envelope else 1)
+
+    def compared(wave: Wave) -> Wave:
+        return _envelope(wave, rate) if by_envelope else wave
+
+    said = compared(speech[:count])
+    return max(float(np.corrcoef(compared(received[delay : delay + count]), said)[0, 1]) for delay in delays)
+
+
+def _envelope(wave: Wave, rate: int) -> Wave:
+    step = round(rate * _STEP_S)
+    loudness: Wave = np.sqrt((wave[: len(wave) // step * step].reshape(-1, step) ** 2).mean(axis=1))
+    return loudness
+
+
+def _needs_opus(_run: Run) -> None:
+    if "opus" not in SOUND_ENCODINGS:
+        raise PebbleError("Opus needs PyAV, which is not installed: pip install 'pebble-robot[media]'")
+
+
+_BUDGET = Budget(6, seconds=10.0, bitrates=BITRATES)
+
+SOUND = Comparison(
+    name="sound",
+    title="Sound on the wire",
+    what="Bytes of each sound encoding with the headers of MQTT, TCP and IP. Nothing is sent: these are the "
+    "encoders' bytes for synthetic speech.",
+    help="Sound on the wire: bytes of every encoding, with all headers.",
+    full=_BUDGET,
+    quick=_BUDGET,
+    constants={"rate": RATE},
+    prepare=_needs_opus,
+    measure=measure_sound,
+    tables=(
+        Grid(
+            title=f"Sound of {RATE / 1000:g} kHz mono on the wire, chunks of {_CHUNK_MS} ms",
+            rows=("variant", "bitrate", "packet"), heads=("encoding", "", ""),
+            columns=(
+                single_column("pack./s", "packets_per_s", ".1f"), single_column("payload", "payload_kbits", ".1f"),
+                percentile_column(50, "wire"), single_column("× PCM", "ratio", ".3f"),
+                single_column("likeness", "likeness", ".3f"), single_column("enc.", "encode_cpu", ".1%"),
+                single_column("dec.", "decode_cpu", ".1%"),
+            ),
+            caption=f"payload, wire: kbit/s, topic {TOPIC}\nenc., dec.: CPU of the encoder and the decoder\n"
+            "likeness: correlation of samples (pcm), of envelopes by 20 ms (opus)",
+        ),
+    ),
+    assessment=(
+        Aim(
+            what=f"Opus with several parts in a packet takes at most {AIM} of PCM's bytes",
+            of=lambda cell: cell.variant == "opus" and cell.params["packet"] != "1 part",
+            value=single("ratio"), at_most=AIM, worst=True, shown="{:.3f}".format,
+        ),
+    ),
+    pictures=(bars("Sound"),),
+)  # fmt: skip
