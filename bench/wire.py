@@ -267,8 +267,8 @@ def likeness(received: Wave, speech: Wave, rate: int, *, by_envelope: bool) -> f
     def compared(wave: Wave) -> Wave:
         return _envelope(wave, rate) if by_envelope else wave
 
-    said = compared(speech[:count])
-    return max(float(np.corrcoef(compared(received[delay : delay + count]), said)[0, 1]) for delay in delays)
+    original = compared(speech[:count])
+    return max(float(np.corrcoef(compared(received[delay : delay + count]), original)[0, 1]) for delay in delays)
 
 
 def _envelope(wave: Wave, rate: int) -> Wave:

@@ -147,7 +147,7 @@ class MqttMirror(Service):
 
     @every(PROBE_PERIOD_S)
     def _probe_again(self) -> None:
-        self._forwarder.probe_again()
+        self._forwarder.probe_again(*Side)
 
     def _request_probe(self) -> None:
         """Request a probe from the bridge, if the robot has one."""

@@ -176,7 +176,8 @@ class Cycles:
         side, topic, since = self._unlogged
         if self._yields and self._clock() - since < _YIELDS_S:
             return
-        if self._yields and any(to is side and at >= since for (to, _), at in self._others.items()):
+        circulating = {side for side, _ in self.closed_ways}
+        if self._yields and any(to in circulating and at >= since for (to, _), at in self._others.items()):
             log.info("%s circulates from the %s side; another bridge on the same way probes it", topic, side.value)
         else:
             log.error(

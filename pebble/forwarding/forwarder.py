@@ -214,10 +214,17 @@ class Forwarder:
             for topic in self._subjects.topics(*_PROBED):
                 self._probe(side, topic, b"")
 
-    def probe_again(self) -> None:
-        """Find out whether what circulated does so still; to be called once a second."""
+    def probe_again(self, *sides: Side) -> None:
+        """Find out whether what circulated does so still, and commands from ``sides`` as well; once a second.
+
+        Commands were probed when a connection began; the other way may be younger.
+        """
         for side, topic in self._cycles.poll():
             self._probe(side, topic, self._reconciliation.value(topic) or b"")
+        if self._cycles.closed_ways:
+            for side, topic in itertools.product(sides, self._subjects.topics(*_PROBED)):
+                if (side, topic) not in self._cycles.closed_ways:
+                    self._probe(side, topic, b"")
 
     def _probe(self, side: Side, topic: str, value: bytes) -> None:
         """Publish a probe on the other side, where something else may lead back to ``side``."""

@@ -247,7 +247,7 @@ class MqttBridge(Service):
 
     @every(PROBE_PERIOD_S)
     def _probe_again(self) -> None:
-        self._forwarder.probe_again()
+        self._forwarder.probe_again(Side.REMOTE)
 
     # -- the transports' threads
 

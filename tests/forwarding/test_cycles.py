@@ -47,7 +47,7 @@ class World:
         for _ in range(seconds):
             self.network.now += 1
             for forwarder in self.bridges:
-                forwarder.probe_again()
+                forwarder.probe_again(REMOTE)
             assert self.rests()
 
     def arrives(self, client: Client, suffix: str, payload: bytes) -> bool:
@@ -210,6 +210,19 @@ class TestSeveralBridges:
         world.send(world.robot, "outgoing/status", b"1", b"2", retain=True)
         assert world.rests(5_000)
 
+    def test_commands_are_probed_again_once_something_circulates(self, world: World) -> None:
+        """The other way is younger than the connection, at whose begin they were probed."""
+        world.bridge()
+        assert world.rests()
+        Way(world.local, world.remote, "both", "incoming/#")
+        for _ in range(10):
+            world.send(world.operator, FLAG, b"true", retain=True)
+            assert world.rests()
+        world.wait(1)
+        world.send(world.operator, DRIVE, MOVE)
+        assert world.rests()
+        assert world.robot.payloads(DRIVE) == [MOVE]  # by the other way only
+
     def test_a_mirror_and_a_way_from_its_broker(self, world: World, caplog: pytest.LogCaptureFixture) -> None:
         mirrored = Node(world.network)
         way = Way(mirrored, world.remote, "both", "incoming/#")
@@ -325,6 +338,19 @@ class TestCycles:
             for side, topic in cycles.poll():
                 cycles.receive(side, topic, cycles.probe(side, topic), once=True)
         assert (REMOTE, TOPIC) in cycles.closed_ways
+        assert len(errors(caplog)) == logged
+
+    @pytest.mark.parametrize(("both", "logged"), [(True, 0), (False, 1)])
+    def test_a_probe_the_other_way_counts_only_if_that_circulates_too(
+        self, network: Network, caplog: pytest.LogCaptureFixture, both: bool, logged: int
+    ) -> None:
+        cycles = Cycles(network.clock, yields=True)
+        for side in (REMOTE, LOCAL) if both else (REMOTE,):
+            cycles.receive(side, TOPIC, cycles.probe(side, TOPIC), once=True)
+        for _ in range(4):
+            network.now += 1
+            cycles.receive(LOCAL, FLAG, Cycles(network.clock).probe(REMOTE, FLAG), once=True)
+            cycles.poll()
         assert len(errors(caplog)) == logged
 
     def test_memory_is_bounded(self, cycles: Cycles) -> None:
