@@ -1,7 +1,7 @@
 """The two ends of the control comparison, a periodic sender and an echo, which use a transport as services do.
 
-A service's handlers run on its one thread, fed by an inbox to which the transport's thread posts; these do the same.
-Only stock paho calls its handler on its network thread, as programs written for it expect.
+A service handles a drive command on the transport's thread that brings it, if it is idle; else its inbox keeps the
+command for its own thread (decision 24). These do the same. Stock paho calls its handler on its network thread.
 
 As a process: ``python -m pebble.bench.control_ends echo|sender paho|mqtt|zenoh SETTINGS`` (JSON, of the transport). It
 writes ``{"ready": true}``. A sender receives slices as JSON and answers each.
@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import msgspec
@@ -24,6 +25,7 @@ from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.runtime.inbox import Inbox
+from pebble.runtime.work_lock import WorkLock
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
 
 if TYPE_CHECKING:
@@ -119,11 +121,36 @@ class Connection(Protocol):
     def close(self) -> None: ...
 
 
+class Desk:
+    """The inbox of one end, and the lock under which it works."""
+
+    def __init__(self) -> None:
+        self.inbox, self.lock = Inbox(), WorkLock()
+
+    def bring(self, job: Callable[[], None]) -> None:
+        """As Service.run_if_idle; posted if the end is busy."""
+        if self.lock.try_enter():
+            try:
+                if not self.inbox:
+                    return job()
+            finally:
+                self.lock.leave()
+        return self.inbox.post(job)
+
+    def turn(self, timeout: float | None = None) -> None:
+        """Does the next job that waits, waiting up to ``timeout`` seconds for one."""
+        self.inbox.wait(timeout)
+        with self.lock:
+            job = self.inbox.take()
+            if job is not None:
+                job()
+
+
 class TransportConnection:
     """Any of Pebble's transports, used through the same calls as in pebble.service.Service."""
 
-    def __init__(self, transport: Transport, inbox: Inbox) -> None:
-        self._transport, self._inbox = transport, inbox
+    def __init__(self, transport: Transport, desk: Desk) -> None:
+        self._transport, self._desk = transport, desk
         transport.open(_CONNECT_S)
         if transport.state is not State.CONNECTED:
             problem = transport.problem
@@ -133,7 +160,7 @@ class TransportConnection:
     def subscribe(self, filter_: str, handler: Handler) -> None:
         def on_message(message: Message) -> None:
             received_ns = time.monotonic_ns()
-            self._inbox.post(lambda: handler(message.topic, message.payload, received_ns))
+            self._desk.bring(lambda: handler(message.topic, message.payload, received_ns))
 
         self._transport.subscribe(filter_, on_message, qos=QOS, direct=True)
 
@@ -167,13 +194,6 @@ class PahoConnection:
         self._client.close()
 
 
-def work(inbox: Inbox, timeout: float | None = None) -> None:
-    """Does the next job, waiting up to ``timeout`` seconds for one."""
-    job = inbox.take(timeout)
-    if job is not None:
-        job()
-
-
 class Echo:
     """Returns every message for ``who`` (``+`` for all) at once, with its own time stamps."""
 
@@ -193,13 +213,10 @@ class Echo:
 
 
 class Sender:
-    """Sends slices and collects the replies, on the thread that processes ``inbox``.
+    """Sends slices and collects the replies; what collects on another thread fills entries that the slice has made."""
 
-    Stock paho collects on a thread of its own: it only fills entries that the slice has already made.
-    """
-
-    def __init__(self, connection: Connection, who: str, clock: Clock, inbox: Inbox) -> None:
-        self._connection, self._clock, self._inbox = connection, clock, inbox
+    def __init__(self, connection: Connection, who: str, clock: Clock, desk: Desk) -> None:
+        self._connection, self._clock, self._desk = connection, clock, desk
         self._topic = f"{REQUESTS}/{who}"
         self._next = self._first = self._missing = 0
         self._received: list[Exchange | None] = []
@@ -214,7 +231,8 @@ class Sender:
         end, returned = time.monotonic() + timeout, 0
         while returned < count and time.monotonic() < end and not self.ended:
             self._expect(1)
-            self._send(self._first, SliceSpec(size=40, rate=1, seconds=1))
+            with self._desk.lock:
+                self._send(self._first, SliceSpec(size=40, rate=1, seconds=1))
             self._collect(0.1)
             returned += not self._missing
         return returned >= count
@@ -230,11 +248,12 @@ class Sender:
         sent = late = 0
         due = time.monotonic() + period
         while sent < lead + counting and not self.ended:
-            work(self._inbox, max(0.0, due - time.monotonic()))
+            self._desk.turn(max(0.0, due - time.monotonic()))
             behind = time.monotonic() - due
             if behind >= 0:
                 late += sent >= lead and behind > period / 2
-                self._send(self._first + sent, spec)
+                with self._desk.lock:
+                    self._send(self._first + sent, spec)
                 sent, due = sent + 1, due + period
         self._collect(_LAST_S)
         self.trips, self.calls_ns = sent, self._calls[lead:]
@@ -255,7 +274,7 @@ class Sender:
     def _collect(self, timeout: float) -> None:
         end = time.monotonic() + timeout
         while self._missing and time.monotonic() < end and not self.ended:
-            work(self._inbox, _POLL_S)
+            self._desk.turn(_POLL_S)
 
     def _on_message(self, _topic: str, payload: bytes, transport_ns: int) -> None:
         received = self._clock()
@@ -285,31 +304,29 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True):
     inbox: list[float]  # from then until its handler ran
 
 
-def _echo(connection: Connection, inbox: Inbox) -> None:
+def _echo(connection: Connection, desk: Desk) -> None:
     Echo(connection, _WHO, time.monotonic_ns)
-    ended = serve_on_thread(lambda _line: None, inbox.wake)
+    ended = serve_on_thread(lambda _line: None, desk.inbox.wake)
     answer({"ready": True})
     while not ended.is_set():
-        work(inbox)
+        desk.turn()
     connection.close()
 
 
-def _send(connection: Connection, inbox: Inbox) -> None:
-    sender = Sender(connection, _WHO, time.monotonic_ns, inbox)
-
-    def run(line: str) -> None:
-        inbox.post_internal(lambda: answer(msgspec.json.encode(_run(sender, line))))
+def _send(connection: Connection, desk: Desk) -> None:
+    sender, lines = Sender(connection, _WHO, time.monotonic_ns, desk), SimpleQueue[str]()
 
     def end() -> None:
         sender.ended = True
-        inbox.wake()
+        desk.inbox.wake()
+        lines.put("")
 
-    serve_on_thread(run, end)
+    serve_on_thread(lines.put, end)
     if not sender.warm_up(_WARM_UP, _WARM_UP_S):
         raise PebbleError("the echo does not answer")
     answer({"ready": True})
-    while not sender.ended:
-        work(inbox)
+    while line := lines.get():
+        answer(msgspec.json.encode(_run(sender, line)))
     connection.close()
 
 
@@ -328,13 +345,13 @@ def _run(sender: Sender, line: str) -> Answer:
 
 
 def main(role: str, kind: str, settings: str) -> None:
-    inbox, form = Inbox(), ZenohSettings if kind == "zenoh" else MqttSettings
+    desk, form = Desk(), ZenohSettings if kind == "zenoh" else MqttSettings
     where: Any = msgspec.json.decode(settings, type=form, dec_hook=lambda _kind, text: Path(text))
     try:
         connection = (
-            PahoConnection(where.port) if kind == "paho" else TransportConnection(create(kind, role, where), inbox)
+            PahoConnection(where.port) if kind == "paho" else TransportConnection(create(kind, role, where), desk)
         )
-        (_echo if role == "echo" else _send)(connection, inbox)
+        (_echo if role == "echo" else _send)(connection, desk)
     except PebbleError as error:
         sys.exit(str(error))
 

@@ -25,6 +25,7 @@ from pebble.bench.aims import single
 from pebble.bench.comparison import Case, Combine, Run, of_known
 from pebble.bench.control_ends import (
     Clock,
+    Desk,
     Echo,
     Exchange,
     Sender,
@@ -32,13 +33,11 @@ from pebble.bench.control_ends import (
     TransportConnection,
     rate_name,
     size_name,
-    work,
 )
 from pebble.bench.control_report import ROUND_TRIP
 from pebble.bench.results import Cell, Value
 from pebble.bench.tables import Column, Grid, figure
 from pebble.errors import PebbleError
-from pebble.runtime.inbox import Inbox
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import MqttSettings, create
 
@@ -77,8 +76,8 @@ def _quartz_ns() -> int:
 
 def serve(settings: MqttSettings, clock: Clock | None = None) -> int:
     """Runs an echo until Ctrl-C. Raises PebbleError without a broker."""
-    console, inbox = Console(), Inbox()
-    with interrupted_by_signals(), closing(_connection(settings, "echo", inbox)) as connection:
+    console, desk = Console(), Desk()
+    with interrupted_by_signals(), closing(_connection(settings, "echo", desk)) as connection:
         echo, through = Echo(connection, "+", clock or wall_clock()), f"through {settings.host}:{settings.port}"
         console.print(f"Echo {through}, until Ctrl-C", highlight=False)
         with console.status("") as status:
@@ -86,12 +85,12 @@ def serve(settings: MqttSettings, clock: Clock | None = None) -> int:
                 status.update(f"echo {through}, {echo.count} messages so far; Ctrl-C ends it")
                 end = time.monotonic() + _POLL_S
                 while (left := end - time.monotonic()) > 0:
-                    work(inbox, left)
+                    desk.turn(left)
 
 
-def _connection(settings: MqttSettings, what: str, inbox: Inbox) -> TransportConnection:
+def _connection(settings: MqttSettings, what: str, desk: Desk) -> TransportConnection:
     """Opens a connection with a client id of its own: several runs may share one broker."""
-    return TransportConnection(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings), inbox)
+    return TransportConnection(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings), desk)
 
 
 # -- the offset of the clocks
@@ -153,9 +152,9 @@ def _settings(run: Run) -> MqttSettings:
 @contextmanager
 def environment(run: Run) -> Iterator[Sender]:
     """A sender whose echo answers. Raises PebbleError without an echo."""
-    settings, inbox = _settings(run), Inbox()
-    with closing(_connection(settings, "sender", inbox)) as connection:
-        sender = Sender(connection, secrets.token_hex(4), wall_clock(), inbox)
+    settings, desk = _settings(run), Desk()
+    with closing(_connection(settings, "sender", desk)) as connection:
+        sender = Sender(connection, secrets.token_hex(4), wall_clock(), desk)
         run.show("waiting for the echo")
         if not sender.warm_up(_WARM_UP, _ANSWER_S):
             raise PebbleError(

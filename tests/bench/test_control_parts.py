@@ -18,6 +18,7 @@ from pebble.bench.control_ends import (
     REPLIES,
     REQUESTS,
     Answer,
+    Desk,
     Echo,
     Handler,
     Sender,
@@ -36,7 +37,6 @@ from pebble.errors import PebbleError
 from pebble.rig import broker as rig_broker
 from pebble.rig.broker import Broker, BrokerKind
 from pebble.rig.programs import end_all
-from pebble.runtime.inbox import Inbox
 from tests.support import until
 
 
@@ -76,7 +76,7 @@ def run(loop: Loop, spec: SliceSpec) -> tuple[int, int, int]:
     ticks = iter(range(0, 10**9, 1000))
     clock = lambda: next(ticks)  # noqa: E731
     echo = Echo(loop, "me", clock)
-    sender = Sender(loop, "me", clock, Inbox())
+    sender = Sender(loop, "me", clock, Desk())
     assert sender.warm_up(2, 5.0)
     sent, _, received = sender.run(spec)
     assert all(one.t1 < one.t2 < one.t3 < one.t4 for one in received)
@@ -93,7 +93,7 @@ def test_a_slice_counts_what_it_sends_after_the_first_tenth_of_a_second() -> Non
 def test_the_slowed_one_works_between_its_stamp_and_its_publish_call(slowed: bool, least: int) -> None:
     loop = Loop()
     Echo(loop, "me", time.monotonic_ns)
-    sender = Sender(loop, "me", time.monotonic_ns, Inbox())
+    sender = Sender(loop, "me", time.monotonic_ns, Desk())
     _, _, received = sender.run(SliceSpec(size=40, rate=100, seconds=0.05, work_us=2000, slowed=slowed))
     assert min(one.t2 - one.t1 for one in received) >= least
 

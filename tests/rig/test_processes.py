@@ -21,8 +21,14 @@ serve(lambda line: None if line == "quiet" else {"line": line})
 """
 ON_THREAD = """
 from pebble.rig.worker_end import answer, serve_on_thread
-ended = serve_on_thread(lambda line: b'[1]', lambda: answer({"ended": True}))
-ended.wait()
+from threading import Event
+answered = Event()
+def end():
+    answer({"ended": True})
+    answered.set()
+ended = serve_on_thread(lambda line: b'[1]', end)
+answered.wait()
+assert ended.is_set()
 """
 
 
