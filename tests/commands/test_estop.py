@@ -147,6 +147,7 @@ def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) 
 def test_the_first_stop_is_sent_before_anything_is_known_of_the_robot(run: Run, robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     assert run("estop", robot.id, url) == 0
+    assert until(lambda: len(robot.commands) >= 2)  # it may still be on its way when the command has ended
     assert [message.topic.rpartition("/")[2] for message in robot.commands[:2]] == ["estop", "drive-values"]
 
 
