@@ -50,8 +50,9 @@ class Drive(Payload, frozen=True, kw_only=True):
     valid_ms: Annotated[int, Meta(ge=0)] | UnsetType = UNSET  # of a zero, 0: the script must not resume
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        _clamp(self, -1.0, 1.0, "x", "z", "y")
+        if not (-1.0 <= self.x <= 1.0 and -1.0 <= self.z <= 1.0 and -1.0 <= self.y <= 1.0):  # NaN is not within, either
+            super().__post_init__()
+            _clamp(self, -1.0, 1.0, "x", "z", "y")
 
     @property
     def moves(self) -> bool:

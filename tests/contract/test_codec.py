@@ -514,3 +514,33 @@ def test_twenty_thousand_payloads_mean_the_same_to_an_independent_reader(
     assert [result for result in results if result[1] != result[2]] == []
     accepted = sum(result[1] is not REFUSED for result in results)
     assert 500 < accepted < 19_500  # both answers were really tried
+
+
+COMMAND_VALUES = {
+    **{key: ["0", "0.0", "-0.0", "1", "-0.5", "3", "1e999", '"0.5"', "true", "null", "1e3"] for key in ("x", "z", "y")},
+    "source": ['"autonomy"', '"stick"', "null", "1", '""'],
+    "run": ["1", "17", "0", "-1", "1073741823", "1073741824", "2.0", '"3"', "null", "9" * 30],
+    "valid_ms": ["400", "400.0", "1.5", "1", "0", "-1", "999999999999", "1000000000000", "1e300", "null", '"9"'],
+    "other": ["1", "1e999", '"a"'],
+}
+
+
+def test_a_command_in_the_usual_form_means_what_it_means_to_the_reader_of_all_forms() -> None:
+    rng = random.Random(20_262)
+
+    def exact(raw: bytes) -> Any:
+        try:
+            return codec.decode(c.DRIVE, raw)
+        except PayloadError:
+            return REFUSED
+
+    differing, accepted = [], 0
+    for _ in range(20_000):
+        keys = rng.choices(list(COMMAND_VALUES), weights=[3, 3, 1, 1, 1, 1, 0.3], k=rng.randrange(6))
+        raw = ("{" + ", ".join(f'"{key}": {rng.choice(COMMAND_VALUES[key])}' for key in keys) + "}").encode()
+        usual, any_form = exact(raw), exact(raw + b" " * 300)  # no usual form is so long
+        accepted += usual is not REFUSED
+        if usual != any_form:
+            differing.append((raw, usual, any_form))
+    assert differing == []
+    assert 500 < accepted < 19_500  # both answers were really tried

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import struct
+import sys
 import termios
 from contextlib import suppress
 from pathlib import Path
@@ -62,7 +62,7 @@ class Port:
             answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0\0\0\0")
         except (OSError, ValueError) as error:
             raise DeviceError(f"{self.path} has gone: {error}") from error
-        return int(struct.unpack("i", answer)[0])
+        return int.from_bytes(answer, sys.byteorder)
 
     def discard_output(self) -> None:
         """Discard what the kernel holds and has not sent."""

@@ -100,15 +100,15 @@ class SerialLine:
 
         One that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
         """
-        return self._hand_over(lambda now: self.outbox.drive(line, now, valid_s))
+        return self._hand_over(lambda now: self.outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
 
     def halt(self) -> bool:
         """Send the stop in place of any waiting drive line. False: no device; opening it begins with the stop."""
-        return self._hand_over(lambda _now: self.outbox.halt())
+        return self._hand_over(lambda _now: self.outbox.halt(), self._stop)
 
     def send(self, kind: str, line: bytes) -> bool:
         """Send a line that drives nothing; a waiting one of the same ``kind`` is replaced. False: no device."""
-        return self._hand_over(lambda _now: self.outbox.put(kind, line))
+        return self._hand_over(lambda _now: self.outbox.put(kind, line), line)
 
     def close(self, timeout: float = 0.8) -> None:
         """Send the stop as the last line, wait up to 0.3 s until it is sent, and close the device permanently."""
@@ -118,7 +118,8 @@ class SerialLine:
             self._closing = True
             self.outbox.clear()
             self._sending += self._stop if self._port is not None else b""
-            self._try_pump(time.monotonic())
+            with suppress(DeviceError):  # the reading thread will meet it, too
+                self._pump(time.monotonic())
             self._wake()
         if self._thread.ident is not None:
             self._thread.join(timeout)
@@ -130,26 +131,26 @@ class SerialLine:
 
     # -- any thread
 
-    def _hand_over(self, place: Callable[[float], None]) -> bool:
+    def _hand_over(self, place: Callable[[float], None], line: bytes) -> bool:
+        """Write ``line`` at once, on the caller's thread, or ``place`` it in the outbox if it has to wait."""
         now = time.monotonic()
         with self._lock:
             if self._port is None or self._closing:
                 self.refused += 1
                 return False
             was_idle = not self._sending and not self.outbox.waiting
-            place(now)
-            self._try_pump(now)
+            try:
+                if was_idle and line and self._is_free(self._port, now):
+                    self._sending = line
+                else:
+                    place(now)
+                self._pump(now)
+            except DeviceError as error:
+                self._failure = error
+                self._wake()
             if was_idle and (self._sending or self.outbox.waiting):
                 self._wake()  # so that the reading thread sends the rest
             return True
-
-    def _try_pump(self, now: float) -> None:
-        """Write on the caller's thread, so that no thread switch delays a command. Lock held."""
-        try:
-            self._pump(now)
-        except DeviceError as error:
-            self._failure = error
-            self._wake()
 
     def _pump(self, now: float) -> None:
         """Write lines until the kernel accepts no more. Lock held."""
@@ -163,10 +164,14 @@ class SerialLine:
 
     def _next_line(self, port: Port, now: float) -> bool:
         """Take a line from the outbox if it can be sent at once: a line in the kernel cannot be replaced."""
-        if self._state is not LineState.READY or not self.outbox.waiting or now < self._busy_until or port.queued():
+        if not self.outbox.waiting or not self._is_free(port, now):
             return False
         self._sending = self.outbox.take(now) or b""
         return bool(self._sending)
+
+    def _is_free(self, port: Port, now: float) -> bool:
+        """Whether the device has sent all that was written to it. Lock held."""
+        return self._state is LineState.READY and now >= self._busy_until and not port.queued()
 
     def _wake(self) -> None:
         with suppress(BlockingIOError):  # full: it wakes up anyway

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -49,7 +48,7 @@ class MotionInbox:
         self._lock = threading.Lock()
         self._stops: list[EstopCommand] = []
         self._resets: list[ReceivedReset] = []
-        self._drives: OrderedDict[int, list[ReceivedDrive]] = OrderedDict()  # by sender, the newest sender last
+        self._drives: dict[int, list[ReceivedDrive]] = {}  # by sender, the newest sender last
 
     def put_stop(self, stop: EstopCommand) -> bool:
         with self._lock:
@@ -72,11 +71,12 @@ class MotionInbox:
         with self._lock:
             was_empty = self._empty
             sender = run_of(drive)
-            waiting = self._drives.pop(sender, [])
+            waiting = self._drives.pop(sender, None)
             if len(self._drives) >= _SENDERS:
                 del self._drives[next(key for key in self._drives if key != PERSON)]
                 self.dropped += 1
-            self._drives[sender] = _replaced(waiting, ReceivedDrive(drive, now))
+            newest = ReceivedDrive(drive, now)
+            self._drives[sender] = [newest] if waiting is None else _replaced(waiting, newest)
             return was_empty
 
     def take(self) -> Batch:
@@ -84,7 +84,7 @@ class MotionInbox:
         with self._lock:
             drives = [received for waiting in self._drives.values() for received in waiting]
             batch = Batch(self._stops, self._resets, drives)
-            self._stops, self._resets, self._drives = [], [], OrderedDict()
+            self._stops, self._resets, self._drives = [], [], {}
             return batch
 
     @property

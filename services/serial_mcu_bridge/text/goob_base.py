@@ -76,19 +76,20 @@ def mix(x: float, z: float) -> tuple[float, float]:
 
 def drive_line(left: float, right: float) -> bytes:
     """``M <left> <right>``, each −1..1. Raises PayloadError for NaN and infinities."""
-    return _command("M", *(_clamp(speed, -1.0) for speed in _finite(left, right)))
+    _finite(left, right)
+    return _line(b"M %.3f %.3f\n", _clamp(left, -1.0), _clamp(right, -1.0))
 
 
 def lights_line(blue: float, green: float, red: float) -> bytes:
     """``L <b> <g> <r>``, each 0..1. Raises PayloadError for NaN and infinities."""
-    return _command("L", *(_clamp(part, 0.0) for part in _finite(blue, green, red)))
+    return _line(b"L %.3f %.3f %.3f\n", *(_clamp(part, 0.0) for part in _finite(blue, green, red)))
 
 
 def flash_line(blue: float, green: float, red: float, period_s: float) -> bytes:
     """``F <b> <g> <r> <period_s>``: fade from dark to the colour and back once per period, for ever."""
     colour = [_clamp(part, 0.0) for part in _finite(blue, green, red)]
     (period,) = _finite(period_s)
-    return _command("F", *colour, max(SHORTEST_FLASH_S, min(LONGEST_FLASH_S, period)))
+    return _line(b"F %.3f %.3f %.3f %.3f\n", *colour, max(SHORTEST_FLASH_S, min(LONGEST_FLASH_S, period)))
 
 
 def _touch(fields: dict[bytes, bytes]) -> list[Report]:
@@ -113,8 +114,9 @@ def _level(fields: dict[bytes, bytes]) -> list[Report]:
 
 
 def _finite(*values: float) -> tuple[float, ...]:
-    if not all(map(math.isfinite, values)):
-        raise PayloadError(f"not a finite number among {values}")
+    for value in values:
+        if not math.isfinite(value):
+            raise PayloadError(f"not a finite number among {values}")
     return values
 
 
@@ -122,9 +124,9 @@ def _clamp(value: float, lowest: float) -> float:
     return max(lowest, min(1.0, value))
 
 
-def _command(letter: str, *values: float) -> bytes:
+def _line(form: bytes, *values: float) -> bytes:
     # adding 0.0 turns a rounded −0.0 into 0.0: a stop is always the same bytes
-    return " ".join([letter, *(f"{round(value, 3) + 0.0:.3f}" for value in values)]).encode() + b"\n"
+    return form % tuple([round(value, 3) + 0.0 for value in values])
 
 
 STOP = drive_line(0.0, 0.0)

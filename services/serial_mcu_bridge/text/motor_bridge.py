@@ -122,7 +122,7 @@ class MotorBridge(SerialService):
     def _judge(self) -> None:
         """Stops first: they void every drive command that waits with them."""
         batch = self._waiting.take()
-        latches = self._latches
+        latches = not batch.stops or self._latches  # without a stop nothing here depends on it
         for stop in batch.stops:
             self._halt()
             if latches:
