@@ -21,7 +21,7 @@ help:
 	@echo "make page-schedules   200 random sequences of inputs and faults at the operator page in Chromium, 15 minutes"
 	@echo "make check            lint, types, imports and names only"
 	@echo "make firmware         measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md"
-	@echo "make report           run every comparison and pebble impair, a little over an hour; writes docs/results"
+	@echo "make report           run every comparison and pebble impair, an hour and a half; writes docs/results"
 	@echo "make report QUICK=1   fewer cases, less than five minutes; writes build/report-quick"
 	@echo "make lock             write requirements/ anew from pyproject.toml; UPGRADE=1: with the newest versions"
 	@echo "make audit            ask OSV for known vulnerabilities of all packages; without an answer it fails: not checked"

@@ -51,6 +51,7 @@ LEAST_IN_ROUND = {50: 1, 99: 100}  # to assess a ratio over rounds
 _TURN_S, _NULL_TURN_S = 1.0, 0.05  # of driving one robot before the next one
 _STARTUP_S = 1.0  # for start-up work to finish
 _MEDIA_STARTUP_S = 1.0
+_LOADED_S = 4.0  # at most, of driving each robot while media flow
 _PILOT_S = 2.0
 _MODES = ("with-media", "null", "profile")
 
@@ -121,7 +122,7 @@ def _with_media(round_: Round, driven: Mapping[str, DrivenRobot | OneHop]) -> It
             with media_load(robot) as counts:
                 time.sleep(_MEDIA_STARTUP_S)
                 before = counts()
-                segment = robot.drive(case.run["seconds"])
+                segment = robot.drive(min(case.run["seconds"], _LOADED_S))
                 after = counts()
             (arrived,) = robot.match_arrivals([segment])
             yield from cells_of(case, segment, arrived, {name: after[name] - before[name] for name in after})
@@ -217,7 +218,7 @@ def _options(known: Sequence[str]) -> tuple[Option, ...]:
     return (
         Option(name="with-media", kind=bool, help="Also with 1080p pictures and sound, and compare."),
         rounds("How often robots are started."),
-        seconds("Driving time per robot and round, under each load."),
+        seconds("Driving time per robot and round, under each load; at most 4 with media."),
         variants(known, "Some of paho, mqtt and zenoh. [--null: one of mqtt and zenoh, by default zenoh]"),
         Option(
             name="null", kind=bool, recorded=False,
@@ -286,11 +287,11 @@ BRIDGE = Comparison(
     \b
         pebble bench bridge
         pebble bench bridge --with-media --output results
-        pebble bench bridge --rounds 10 --seconds 25
+        pebble bench bridge --seconds 4
         pebble bench bridge --profile
     """,
     options=_options((STAND_IN, *KINDS)),
-    full=Budget(560, **_UNSET, rounds=10, seconds=4.0),
+    full=Budget(1900, **_UNSET, rounds=10, seconds=25.0),
     quick=Budget(22, rounds=2, seconds=0.5),
     constants={"rate_hz": RATE_HZ},
     variants=(STAND_IN, *KINDS),

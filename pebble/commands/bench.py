@@ -76,7 +76,7 @@ def report(
 ) -> int:
     """Run all comparisons and pebble impair, one after the other, and write a report.
 
-    Takes a little over an hour, with --quick less than five minutes. If a comparison fails, the others still run, and
+    Takes an hour and a half, with --quick less than five minutes. If a comparison fails, the others still run, and
     the exit code is 1. Without root, comparisons that need it are left out.
 
     \b
