@@ -75,13 +75,12 @@ class ImpairedNetwork(ABC):
 
     kind: str  # "namespaces" or "proxy"
     broker_host: str  # the address on which the broker must listen
-    module: str  # of the process
 
     def __init__(self, name: str = "") -> None:
         self._log = os.memfd_create("link")  # the log is an unnamed file: nothing is left behind if we are killed
         self._lock = threading.RLock()
         log = Path(f"/proc/self/fd/{self._log}")
-        self._worker = Worker(f"network {name}".strip(), python(self.module), log)
+        self._worker = Worker(f"network {name}".strip(), python("pebble.bench.impair.forwarder", self.kind), log)
         self._open = True
         try:
             self.set_up()
@@ -152,7 +151,6 @@ class ProxyNetwork(ImpairedNetwork):
 
     kind = "proxy"
     broker_host = LOOPBACK
-    module = "pebble.bench.impair.proxy_process"
 
     def broker_address(self, port: int) -> tuple[str, int]:
         return LOOPBACK, int(self.ask(f"listen {port}")["port"])
@@ -163,7 +161,6 @@ class NamespaceNetwork(ImpairedNetwork):
 
     kind = "namespaces"
     broker_host = REMOTE_HOST
-    module = "pebble.bench.impair.forwarder"
 
     def set_up(self) -> dict[str, Any]:
         descriptors = super().set_up()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from pebble.bench import paper
 from pebble.bench.aims import Aim, outcome, single, with_lost
-from pebble.bench.impair import cells as measures
+from pebble.bench.impair import metrics as measures
 from pebble.bench.impair.conditions import chosen
 from pebble.bench.ratios import paired
 from pebble.bench.results import Cell, Judged, percentile

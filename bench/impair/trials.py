@@ -11,25 +11,25 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
 from pebble.bench.comparison import Budget, Comparison, Option, Round, Run
-from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.conditions import TRIALS, Condition, chosen
-from pebble.bench.impair.metrics import OperatorReport, RecoveryRequest, TrialRequest
+from pebble.bench.impair.metrics import OperatorReport, RecoveryRequest, Trial, TrialRequest, cells_of, over_time
 from pebble.bench.impair.network import KINDS, Traffic, open_network, resolved
 from pebble.bench.impair.operator import CLIP
 from pebble.bench.impair.report import AIMS, QUOTED, SENTENCES, TABLES
 from pebble.bench.pictures import Drawn
 from pebble.bench.results import LONGEST_S, Cell
+from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
 from pebble.media.pcm import to_bytes
 from pebble.media.speech import Speech
 from pebble.rig.processes import Processes
 from pebble.rig.programs import Program
-from pebble.rig.robot import BASE, Config, Robot
+from pebble.rig.robot import BASE, Config, Robot, synthetic_media
 from pebble.rig.worker import Worker
 from pebble.simulation.loudspeaker import Playback, playbacks
 from pebble.simulation.trace import Entry
@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 
 CLEAN = Condition("clean")
 QUICK = ("base-start", "256k", "64k+5%", "base-end")
-WIDTH, HEIGHT, FPS = 640, 480, 15  # as the original is configured
+PICTURES = WIDTH, HEIGHT, FPS = 640, 480, 15  # as the original is configured
 CLIP_S = 0.5
 _AUDIO_RATE = 16_000
 _UP_S, _RECOVERED_S, _PHASE_S = 80.0, 30.0, 30.0  # limits for an operator's next report; its own limits are shorter
@@ -52,23 +52,22 @@ _LINKS = {
 class Subject:
     """One robot under test. Encodings are requested by the operator; None: as the robot is configured."""
 
-    name: str
-    transport: str  # inside the robot: "mqtt" or "zenoh"
+    transport: str  # inside the robot
+    form: str  # its encodings in words
     video: str | None = None
     audio: str | None = None
 
     @property
-    def form(self) -> str:
-        """Its encodings: the second part of its name."""
-        return self.name.partition(" ")[2]
+    def name(self) -> str:
+        return f"{self.transport} {self.form}"
 
 
 #: The robots are configured with the original's settings: JSON pictures and PCM.
 SUBJECTS = (
-    Subject("mqtt original", "mqtt"),
-    Subject("zenoh original", "zenoh"),
-    Subject("mqtt h264 opus", "mqtt", "h264", "opus"),
-    Subject("zenoh h264 opus", "zenoh", "h264", "opus"),
+    Subject("mqtt", "original"),
+    Subject("zenoh", "original"),
+    Subject("mqtt", "h264 opus", "h264", "opus"),
+    Subject("zenoh", "h264 opus", "h264", "opus"),
 )
 NAMES = tuple(subject.name for subject in SUBJECTS)
 
@@ -98,7 +97,7 @@ class ImpairedRobot:
             self.subject.transport,
             self.network.broker_address(remote.port),
             folder=self._folder,
-            services=self._services(),
+            services=_services(self._folder, self._played),
             reports=None,
             wrap=self.network.on_robot,
         )
@@ -131,21 +130,33 @@ class ImpairedRobot:
         """All clips that the loudspeaker has played."""
         return playbacks(self._played)
 
-    def _services(self) -> dict[str, Config]:
-        """The original's keys and values where it has them."""
-        video = {"publish_width": WIDTH, "publish_height": HEIGHT, "publish_fps": FPS, "keyframe_interval": 5}
-        audio: dict[str, Any] = {"rate": _AUDIO_RATE, "channels": 1}
-        loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self._played)]
-        sounds = _write_clip(self._folder / "sounds")
-        publishers = {"video_publisher": {**video, "jpeg_quality": 10}, "audio_publisher": {**audio, "chunk_ms": 20}}
-        return {
-            "mqtt_bridge": {"media": publishers},
-            "av_daemon": {
-                "video": {"backend": "synthetic", "width": WIDTH, "height": HEIGHT, "fps": FPS},
-                "audio": {"source": "synthetic", **audio},
-            },
-            "soundboard_handler": {"playback": {"directory": str(sounds), "player_command": loudspeaker}},
-        }
+
+def _services(folder: Path, played: Path) -> dict[str, Config]:
+    """The original's keys and values where it has them; the loudspeaker records into ``played``."""
+    sound: Config = {"rate": _AUDIO_RATE, "channels": 1}
+    publishers = {
+        "video_publisher": {"keyframe_interval": 5, "jpeg_quality": 10},
+        "audio_publisher": {**sound, "chunk_ms": 20},
+    }
+    loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(played)]
+    playback = {"directory": str(_write_clip(folder / "sounds")), "player_command": loudspeaker}
+    own = {
+        "mqtt_bridge": {"media": publishers},
+        "av_daemon": {"audio": sound},
+        "soundboard_handler": {"playback": playback},
+    }
+    services: dict[str, Config] = deep_merge(synthetic_media(PICTURES, PICTURES), own)
+    return services
+
+
+def _write_clip(folder: Path) -> Path:
+    """The folder, with the clip that is played at the end of each trial."""
+    folder.mkdir()
+    samples = Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))
+    with wave.open(str(folder / CLIP), "wb") as file:
+        file.setparams((1, 2, _AUDIO_RATE, len(samples), "NONE", "not compressed"))
+        file.writeframes(to_bytes(samples))
+    return folder
 
 
 class TestBed(Processes):
@@ -172,18 +183,6 @@ class TestBed(Processes):
         """Stops all operators."""
         for operator in self.workers:
             operator.ask_to_end()
-
-
-def _write_clip(folder: Path) -> Path:
-    """The folder, with the clip that is played at the end of each trial."""
-    folder.mkdir()
-    samples = Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))
-    with wave.open(str(folder / CLIP), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(_AUDIO_RATE)
-        file.writeframes(to_bytes(samples))
-    return folder
 
 
 # -- the course of the trials

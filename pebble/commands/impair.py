@@ -100,7 +100,10 @@ class _Command(TyperCommand):
         if "compare" in given:
             wrong, why = [name for name in given if name not in ("compare", "into")], "does not go with --compare"
         elif "robot" in given:
-            wrong, why = [name for name in given if name in simulated], "is for simulated robots, --robot for a real one"
+            wrong, why = (
+                [name for name in given if name in simulated],
+                "is for simulated robots, --robot for a real one",
+            )
         else:
             wrong, why = [name for name in given if name not in simulated], "is for a real robot: add --robot ID"
         if wrong:
