@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby, pairwise
 
 import msgspec
@@ -249,23 +249,16 @@ class Trial:
 
     def cell(self, measure: str, unit: str, samples: list[float], **more: Value) -> Cell:
         figures = {name: rounded(value, 3) if isinstance(value, float) else value for name, value in more.items()}
-        params: dict[str, Value] = {"trial": self.name}
-        return Cell(
-            variant=self.subject, params=params, measure=measure, unit=unit, rounds=[samples], figures=figures
-        )  # fmt: skip
+        about: dict[str, Value] = {"trial": self.name}
+        return Cell(variant=self.subject, params=about, measure=measure, unit=unit, rounds=[samples], figures=figures)
 
     def wire(self, phase: str, window: Window) -> dict[str, Value]:
         """What the network carried and dropped in a phase."""
-        before, after = self.traffic[phase]
-        up, down = after.bytes_up - before.bytes_up, after.bytes_down - before.bytes_down
-        return {
-            "window_s": window.seconds,
-            "bytes_up": up,
-            "kbit_up": 8e-3 * up / window.seconds,
-            "kbit_down": 8e-3 * down / window.seconds,
-            "dropped_up": after.dropped_up - before.dropped_up,
-            "dropped_down": after.dropped_down - before.dropped_down,
-        }
+        before, after = map(asdict, self.traffic[phase])
+        by = {name: after[name] - before[name] for name in after}
+        kbit = {f"kbit_{way}": 8e-3 * by[f"bytes_{way}"] / window.seconds for way in ("up", "down")}
+        counted = {name: by[name] for name in ("bytes_up", "dropped_up", "dropped_down")}
+        return {"window_s": window.seconds, **counted, **kbit}
 
 
 def cells_of(trials: Iterable[Trial], fps: float) -> list[Cell]:
@@ -295,16 +288,10 @@ def _sound(trial: Trial) -> Cell:
     packets = received(sounds, window)
     delivered, on_time = sound_percent(sounds, window), sound_percent(sounds, window, ON_TIME_S)
     return trial.cell(
-        SOUND,
-        "ms",
-        [packet.ms for packet in packets],
-        delivered_percent=delivered,
-        on_time_percent=on_time,
-        late_percent=delivered - on_time,
-        sent=sent_packets(packets, delivered),
-        first_s=window.first_s,
-        **trial.wire("audio", window),
-    )
+        SOUND, "ms", [packet.ms for packet in packets],
+        delivered_percent=delivered, on_time_percent=on_time, late_percent=delivered - on_time,
+        sent=sent_packets(packets, delivered), first_s=window.first_s, **trial.wire("audio", window),
+    )  # fmt: skip
 
 
 def _pictures(trial: Trial, wanted_fps: float) -> Iterator[Cell]:
@@ -312,19 +299,13 @@ def _pictures(trial: Trial, wanted_fps: float) -> Iterator[Cell]:
     pictures = [picture for picture in record.pictures if window.holds(picture.arrived_ns)]
     gaps = gaps_s([picture.arrived_ns for picture in pictures], window)
     fps = len(pictures) / window.seconds
+    latencies = [(one.arrived_ns - one.captured_ns) / 1e6 for one in pictures if one.captured_ns is not None]
     yield trial.cell(
-        PICTURES,
-        "ms",
-        [(one.arrived_ns - one.captured_ns) / 1e6 for one in pictures if one.captured_ns is not None],
-        fps=fps,
-        delivered_percent=min(100.0, 100 * fps / wanted_fps),
-        frozen_s=sum((gap for gap in gaps if gap > FROZEN_S), 0.0),
-        longest_gap_s=max(gaps),
-        decoded=len(record.pictures),
-        arrived=record.payloads,
-        first_s=window.first_s,
-        **trial.wire("video", window),
-    )
+        PICTURES, "ms", latencies,
+        fps=fps, delivered_percent=min(100.0, 100 * fps / wanted_fps),
+        frozen_s=sum((gap for gap in gaps if gap > FROZEN_S), 0.0), longest_gap_s=max(gaps),
+        decoded=len(record.pictures), arrived=record.payloads, first_s=window.first_s, **trial.wire("video", window),
+    )  # fmt: skip
     yield trial.cell(PICTURE_GAP, "s", gaps)
 
 
@@ -332,15 +313,8 @@ def _heartbeats(trial: Trial) -> Iterator[Cell]:
     heartbeats, whole = trial.record.heartbeats, trial.record.whole
     gaps = gaps_s([heartbeat.arrived_ns for heartbeat in heartbeats], whole)
     offline = offline_s(heartbeats, whole)
-    yield trial.cell(
-        HEARTBEAT_GAP,
-        "s",
-        gaps,
-        longest_gap_s=max(gaps),
-        offline_s=sum(offline, 0.0),
-        longest_offline_s=max(offline, default=0.0),
-        window_s=whole.seconds,
-    )
+    longest = {"longest_gap_s": max(gaps), "longest_offline_s": max(offline, default=0.0)}
+    yield trial.cell(HEARTBEAT_GAP, "s", gaps, offline_s=sum(offline, 0.0), window_s=whole.seconds, **longest)
     delays = [heartbeat.ms for heartbeat in heartbeats if whole.holds(heartbeat.arrived_ns)]
     yield trial.cell(HEARTBEAT_DELAY, "ms", delays)
 
@@ -349,16 +323,11 @@ def _drive(trial: Trial) -> Iterator[Cell]:
     record, commands = trial.record, trial.record.commands
     driven, late = driven_ms(commands, trial.entries), overtaken(commands, trial.entries)
     yield trial.cell(
-        DRIVE,
-        "ms",
-        [ms for _, ms in driven],
-        sent=len(commands),
-        delivered_percent=100 * (len(driven) - late) / len(commands) if commands else None,
-        overtaken=late,
-        trips=trips(commands, trial.entries),
-        rest_s=rest_s(commands, trial.entries),
+        DRIVE, "ms", [ms for _, ms in driven],
+        sent=len(commands), delivered_percent=100 * (len(driven) - late) / len(commands) if commands else None,
+        overtaken=late, trips=trips(commands, trial.entries), rest_s=rest_s(commands, trial.entries),
         window_s=record.whole.seconds,
-    )
+    )  # fmt: skip
     for measure, window in ((DRIVE_ALONE, record.alone), (DRIVE_VIDEO, record.video), (DRIVE_AUDIO, record.audio)):
         took = [ms for command, ms in driven if window.holds(command.sent_ns)]
         sent = sum(window.holds(command.sent_ns) for command in commands)

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
+from typing import Any
 
 import msgspec
 
@@ -21,7 +22,7 @@ from pebble.bench.impair.metrics import OperatorReport, Record, RecoveryRequest,
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
 from pebble.contract import DRIVE, ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
-from pebble.contract.payloads import Drive, SoundboardCommand
+from pebble.contract.payloads import Drive, Heartbeat, SoundboardCommand, SoundboardStatus, Status
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.sound import ReceivedSound
@@ -44,9 +45,6 @@ class MediaSubscriber(MediaReceiver):
         self.pictures_seen: list[metrics.Picture] = []
         self.received: list[metrics.Sound] = []
         super().__init__(transport, base)
-
-    def has_received(self, medium: Medium) -> bool:
-        return bool(self.pictures_seen if medium == "video" else self.received)
 
     def on_picture(self, picture: Decoded) -> None:
         now, ms = time.monotonic_ns(), picture.captured_ms
@@ -80,7 +78,7 @@ class TrialOperator:
         if not self._wait(lambda: all(connection.state is State.CONNECTED for connection in connections), _CONNECT_S):
             problem = self._controls.problem or self._media.problem
             raise PebbleError(f"the operator cannot connect to the broker: {problem}")
-        self._subscribe(ONLINE, self._on_heartbeat)
+        self._subscribe(ONLINE, self._on_heartbeat, retained=False)  # a retained heartbeat is not current
         self._subscribe(STATUS, self._on_status)
         self._subscribe(SOUNDBOARD_STATUS, self._on_clip_status)
         if not self._wait(self._is_ready, _UP_S):
@@ -131,9 +129,10 @@ class TrialOperator:
         """Requests a medium, waits for its first message, records a window. Audio, which is last, ends the driving."""
         with closing(MediaSubscriber(self._media, self._base)) as subscriber:
             subscriber.wait_for_capabilities(_KNOWN_S)
+            arrived = subscriber.pictures_seen if medium == "video" else subscriber.received
             asked = time.monotonic()
             subscriber.viewer.request(medium, request.video if medium == "video" else request.audio)
-            started = self._wait(lambda: subscriber.has_received(medium), _FIRST_S, subscriber)
+            started = self._wait(lambda: bool(arrived), _FIRST_S, subscriber)
             first_s = time.monotonic() - asked if started else None
             window = self._measure_phase(medium, request.window_s, subscriber)
             if medium == "audio":
@@ -198,25 +197,24 @@ class TrialOperator:
 
     # -- the transports' threads
 
-    def _subscribe(self, channel: Channel, receive: Callable[[Message, int], None]) -> None:
-        """``receive`` is called with the time of arrival, and may raise PayloadError for a message to ignore."""
+    def _subscribe(self, channel: Channel, receive: Callable[[int, Any], None], *, retained: bool = True) -> None:
+        """``receive`` is called with the time of arrival and the payload; a malformed one is ignored."""
 
         def on_message(message: Message) -> None:
-            with suppress(PayloadError):
-                receive(message, time.monotonic_ns())
+            if retained or not message.retain:
+                with suppress(PayloadError):
+                    receive(time.monotonic_ns(), codec.decode(channel, message.payload))
 
         self._controls.subscribe(channel.topic(self._base), on_message)
 
-    def _on_heartbeat(self, message: Message, now: int) -> None:
-        if not message.retain:  # a retained heartbeat is not current
-            heartbeat = codec.decode(ONLINE, message.payload)
-            self._heartbeats.append(metrics.Heartbeat(_monotonic_ns(heartbeat.t), now, heartbeat.online is not False))
+    def _on_heartbeat(self, now: int, payload: Heartbeat) -> None:
+        self._heartbeats.append(metrics.Heartbeat(_monotonic_ns(payload.t), now, payload.online is not False))
 
-    def _on_clip_status(self, message: Message, now: int) -> None:
-        self._clip_statuses.append((now, codec.decode(SOUNDBOARD_STATUS, message.payload).playing))
+    def _on_clip_status(self, now: int, payload: SoundboardStatus) -> None:
+        self._clip_statuses.append((now, payload.playing))
 
-    def _on_status(self, message: Message, _now: int) -> None:
-        services = codec.decode(STATUS, message.payload).value.get("services", {})
+    def _on_status(self, _now: int, payload: Status) -> None:
+        services = payload.value.get("services", {})
         self._services = {name: service.get("state", "") for name, service in services.items()}
 
 

@@ -222,9 +222,9 @@ def test_a_good_trial_has_all_its_cells() -> None:
     assert of(found, metrics.HEARTBEAT_GAP).figures["longest_offline_s"] == 0
     drive = of(found, metrics.DRIVE)
     assert (drive.figures["sent"], drive.figures["delivered_percent"], drive.figures["trips"]) == (200, 100, 0)
-    assert [len(of(found, name).samples) for name in (metrics.DRIVE_ALONE, metrics.DRIVE_VIDEO, metrics.DRIVE_AUDIO)] == [
-        *(30, 70, 100)
-    ]
+    assert [
+        len(of(found, name).samples) for name in (metrics.DRIVE_ALONE, metrics.DRIVE_VIDEO, metrics.DRIVE_AUDIO)
+    ] == [*(30, 70, 100)]
 
 
 def test_what_is_sent_without_media_is_counted() -> None:
