@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -171,23 +171,21 @@ def _record(plan: Plan, viewer: Viewer, progress: Progress) -> float:
             if recorder.blocked:
                 raise PebbleError(f"{plan.folder}: {recorder.blocked}")
 
-    recorder.start()
-    try:
-        with closing(source):
-            source.start()
-            measurement = Measurement(label=plan.label, robot=viewer.base, since_ns=recorder.clock.now())
+    with ExitStack() as stack:
+        recorder.start()
+        stack.callback(recorder.stop)
+        stack.enter_context(closing(source)).start()
+        measurement = Measurement(label=plan.label, robot=viewer.base, since_ns=recorder.clock.now())
+        measurement.save(plan.folder)
+        try:
+            with suppress(KeyboardInterrupt):  # what was measured until then is the measurement
+                requested = _request(viewer) if plan.media else []
+                watch(_FIRST_S, "waiting for pictures and sound", lambda: recorder.arrived.issuperset(requested))
+                measurement.since_ns = recorder.clock.now()
+                watch(plan.seconds, "measuring", lambda: False)
+        finally:
+            measurement.until_ns = recorder.clock.now()
             measurement.save(plan.folder)
-            try:
-                with suppress(KeyboardInterrupt):  # what was measured until then is the measurement
-                    requested = _request(viewer) if plan.media else []
-                    watch(_FIRST_S, "waiting for pictures and sound", lambda: recorder.arrived.issuperset(requested))
-                    measurement.since_ns = recorder.clock.now()
-                    watch(plan.seconds, "measuring", lambda: False)
-            finally:
-                measurement.until_ns = recorder.clock.now()
-                measurement.save(plan.folder)
-    finally:
-        recorder.stop()
     return (measurement.until_ns - measurement.since_ns) / 1e9
 
 
