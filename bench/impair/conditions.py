@@ -85,17 +85,14 @@ _PAPER = {
     **{f"{kbit}k+{percent}%": Shape(kbit=kbit, loss=percent / 100) for kbit, percent in ((256, 1), (128, 2), (64, 5))},
     "base-end": Shape(),
 }
-_PROFILES = (
-    Condition("starlink", _SATELLITE, _SATELLITE),
-    Condition("wifi-power-save", _AIR, replace(_AIR, beacon_ms=102.4)),
-)
-TRIALS = (*_PAPER, *(profile.name for profile in _PROFILES))
+_PROFILES = {"starlink": (_SATELLITE, _SATELLITE), "wifi-power-save": (_AIR, replace(_AIR, beacon_ms=102.4))}
+TRIALS = (*_PAPER, *_PROFILES)
 
 
 def chosen(names: Sequence[str] = TRIALS, both_ways: bool = False) -> list[Condition]:
     """The conditions of these trials, in order. ``both_ways`` shapes the downlink alike, except in the profiles."""
-    shaped = [Condition(name, shape, shape if both_ways else Shape()) for name, shape in _PAPER.items()]
-    return [condition for condition in (*shaped, *_PROFILES) if condition.name in names]
+    shapes = {name: (shape, shape if both_ways else Shape()) for name, shape in _PAPER.items()} | _PROFILES
+    return [Condition(name, *both) for name, both in shapes.items() if name in names]
 
 
 class Schedule:

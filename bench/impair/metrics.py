@@ -1,4 +1,4 @@
-"""What the operator of a trial records, as JSON lines between processes, and the metrics of it. Pure.
+"""What the operator of a trial records, as JSON lines between processes, and the cells of results made of it. Pure.
 
 All times are ns of CLOCK_MONOTONIC. Late is not lost: sound captured in a window counts as delivered if it arrived
 before the trial's end; its delay is in the latencies.
@@ -8,14 +8,24 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from itertools import groupby, pairwise
 
 import msgspec
 
 from pebble.bench.bridge_operator import arrivals
+from pebble.bench.impair.network import Traffic
+from pebble.bench.results import OVER_TIME, Cell, Value, grouped, rounded
 from pebble.client.discovery import Liveness
+from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
+
+SOUND, PICTURES, PICTURE_GAP = "audio latency", "video latency", "picture gap"
+HEARTBEAT_GAP, HEARTBEAT_DELAY = "heartbeat gap", "heartbeat delay"
+DRIVE, DRIVE_ALONE, DRIVE_VIDEO, DRIVE_AUDIO = "drive", "drive alone", "drive during video", "drive during audio"
+AFTER_VIDEO, AFTER_AUDIO, CLIP = "heartbeat gap after video", "heartbeat gap after audio", "clip"
+SOUND_OVER_TIME, DRIVE_OVER_TIME = f"audio{OVER_TIME}", f"drive{OVER_TIME}"
 
 ON_TIME_S = 1.0  # older sound is useless in a conversation
 FROZEN_S = 1.0  # a picture shown for longer counts as frozen
@@ -49,15 +59,27 @@ class Command(msgspec.Struct, array_like=True, frozen=True):
     sent_ns: int
 
 
-class Heartbeat(msgspec.Struct, array_like=True, frozen=True):
+class Arrival(msgspec.Struct, array_like=True, frozen=True):
+    """What was received; ``sent_ns`` is when it was sent, or its first sample was captured."""
+
     sent_ns: int
     arrived_ns: int
-    online: bool = True
 
     @property
     def ms(self) -> float:
-        """Its delay."""
+        """Its latency."""
         return (self.arrived_ns - self.sent_ns) / 1e6
+
+
+class Heartbeat(Arrival, array_like=True, frozen=True):
+    online: bool = True
+
+
+class Sound(Arrival, array_like=True, frozen=True):
+    """A sound packet."""
+
+    seconds: float
+    sequence: int
 
 
 class Picture(msgspec.Struct, array_like=True, frozen=True):
@@ -65,20 +87,6 @@ class Picture(msgspec.Struct, array_like=True, frozen=True):
 
     captured_ns: int | None
     arrived_ns: int
-
-
-class Sound(msgspec.Struct, array_like=True, frozen=True):
-    """A sound packet."""
-
-    captured_ns: int  # its first sample
-    arrived_ns: int
-    seconds: float
-    sequence: int
-
-    @property
-    def ms(self) -> float:
-        """Its latency."""
-        return (self.arrived_ns - self.captured_ns) / 1e6
 
 
 class Window(msgspec.Struct, frozen=True):
@@ -144,7 +152,7 @@ def received(sounds: Iterable[Sound], window: Window) -> list[Sound]:
 
 def overlap_s(sound: Sound, window: Window) -> float:
     """Seconds of the packet that were captured in the window."""
-    began, ended = sound.captured_ns, sound.captured_ns + round(1e9 * sound.seconds)
+    began, ended = sound.sent_ns, sound.sent_ns + round(1e9 * sound.seconds)
     return max(0, min(ended, window.ended_ns) - max(began, window.began_ns)) / 1e9
 
 
@@ -223,3 +231,118 @@ def rest_s(commands: Sequence[Command], entries: Iterable[Entry]) -> float:
         rest_ns += now - since if rest else 0
         since, rest = now, entry.motors == _STOP
     return rest_ns / 1e9
+
+
+# -- cells
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One subject in one condition. ``traffic``: the network's counters before and after each phase."""
+
+    subject: str
+    name: str
+    record: Record
+    entries: Sequence[Entry]  # of the MCU
+    traffic: dict[str, tuple[Traffic, Traffic]]
+    playbacks: Sequence[Playback] = ()  # of the robot's loudspeaker, in any trial
+
+    def cell(self, measure: str, unit: str, samples: list[float], **more: Value) -> Cell:
+        figures = {name: rounded(value, 3) if isinstance(value, float) else value for name, value in more.items()}
+        about: dict[str, Value] = {"trial": self.name}
+        return Cell(variant=self.subject, params=about, measure=measure, unit=unit, rounds=[samples], figures=figures)
+
+    def wire(self, phase: str, window: Window) -> dict[str, Value]:
+        """What the network carried and dropped in a phase."""
+        before, after = map(asdict, self.traffic[phase])
+        by = {name: after[name] - before[name] for name in after}
+        kbit = {f"kbit_{way}": 8e-3 * by[f"bytes_{way}"] / window.seconds for way in ("up", "down")}
+        counted = {name: by[name] for name in ("bytes_up", "dropped_up", "dropped_down")}
+        return {"window_s": window.seconds, **counted, **kbit}
+
+
+def cells_of(trials: Iterable[Trial], fps: float) -> list[Cell]:
+    """The cells of all trials; ``fps`` is the configured rate of pictures."""
+    return [
+        cell
+        for trial in trials
+        for cell in (_sound(trial), *_pictures(trial, fps), *_heartbeats(trial), *_drive(trial), *_afterwards(trial))
+    ]
+
+
+def over_time(trials: Iterable[Trial], began_ns: int) -> list[Cell]:
+    """Each subject's sound and commands of the whole run. Two rounds: seconds since the start, latencies in ms."""
+    cells = []
+    for subject, own in grouped(trials, lambda trial: trial.subject).items():
+        sounds = [(one.arrived_ns, one.ms) for trial in own for one in trial.record.sounds]
+        driven = [pair for trial in own for pair in driven_ms(trial.record.commands, trial.entries)]
+        arrived = [(command.sent_ns + round(1e6 * ms), ms) for command, ms in driven]
+        for measure, points in ((SOUND_OVER_TIME, sorted(sounds)), (DRIVE_OVER_TIME, sorted(arrived))):
+            rounds = [[(ns - began_ns) / 1e9 for ns, _ in points], [ms for _, ms in points]]
+            cells.append(Cell(variant=subject, measure=measure, unit="ms", rounds=rounds))
+    return cells
+
+
+def _sound(trial: Trial) -> Cell:
+    sounds, window = trial.record.sounds, trial.record.audio
+    packets = received(sounds, window)
+    delivered, on_time = sound_percent(sounds, window), sound_percent(sounds, window, ON_TIME_S)
+    return trial.cell(
+        SOUND, "ms", [packet.ms for packet in packets],
+        delivered_percent=delivered, on_time_percent=on_time, late_percent=delivered - on_time,
+        sent=sent_packets(packets, delivered), first_s=window.first_s, **trial.wire("audio", window),
+    )  # fmt: skip
+
+
+def _pictures(trial: Trial, wanted_fps: float) -> Iterator[Cell]:
+    record, window = trial.record, trial.record.video
+    pictures = [picture for picture in record.pictures if window.holds(picture.arrived_ns)]
+    gaps = gaps_s([picture.arrived_ns for picture in pictures], window)
+    fps = len(pictures) / window.seconds
+    latencies = [(one.arrived_ns - one.captured_ns) / 1e6 for one in pictures if one.captured_ns is not None]
+    yield trial.cell(
+        PICTURES, "ms", latencies,
+        fps=fps, delivered_percent=min(100.0, 100 * fps / wanted_fps),
+        frozen_s=sum((gap for gap in gaps if gap > FROZEN_S), 0.0), longest_gap_s=max(gaps),
+        decoded=len(record.pictures), arrived=record.payloads, first_s=window.first_s, **trial.wire("video", window),
+    )  # fmt: skip
+    yield trial.cell(PICTURE_GAP, "s", gaps)
+
+
+def _heartbeats(trial: Trial) -> Iterator[Cell]:
+    heartbeats, whole = trial.record.heartbeats, trial.record.whole
+    gaps = gaps_s([heartbeat.arrived_ns for heartbeat in heartbeats], whole)
+    offline = offline_s(heartbeats, whole)
+    longest = {"longest_gap_s": max(gaps), "longest_offline_s": max(offline, default=0.0)}
+    yield trial.cell(HEARTBEAT_GAP, "s", gaps, offline_s=sum(offline, 0.0), window_s=whole.seconds, **longest)
+    delays = [heartbeat.ms for heartbeat in heartbeats if whole.holds(heartbeat.arrived_ns)]
+    yield trial.cell(HEARTBEAT_DELAY, "ms", delays)
+
+
+def _drive(trial: Trial) -> Iterator[Cell]:
+    record, commands = trial.record, trial.record.commands
+    driven, late = driven_ms(commands, trial.entries), overtaken(commands, trial.entries)
+    yield trial.cell(
+        DRIVE, "ms", [ms for _, ms in driven],
+        sent=len(commands), delivered_percent=100 * (len(driven) - late) / len(commands) if commands else None,
+        overtaken=late, trips=trips(commands, trial.entries), rest_s=rest_s(commands, trial.entries),
+        window_s=record.whole.seconds,
+    )  # fmt: skip
+    for measure, window in ((DRIVE_ALONE, record.alone), (DRIVE_VIDEO, record.video), (DRIVE_AUDIO, record.audio)):
+        took = [ms for command, ms in driven if window.holds(command.sent_ns)]
+        sent = sum(window.holds(command.sent_ns) for command in commands)
+        wire = trial.wire("alone", window) if measure == DRIVE_ALONE else {"window_s": window.seconds}
+        yield trial.cell(measure, "ms", took, sent=sent, **wire)
+
+
+def _afterwards(trial: Trial) -> Iterator[Cell]:
+    """What is sent and received while nothing is requested any more, and the clip."""
+    record, clip = trial.record, trial.record.clip
+    off = ((AFTER_VIDEO, "video off", record.video_off), (AFTER_AUDIO, "audio off", record.audio_off))
+    for measure, phase, window in off:
+        times = [heartbeat.arrived_ns for heartbeat in record.heartbeats if window.holds(heartbeat.arrived_ns)]
+        gaps, wire = gaps_s(times, window), trial.wire(phase, window)
+        yield trial.cell(measure, "s", gaps, heartbeats=len(times), longest_gap_s=max(gaps), **wire)
+    played = [(one.began_ns - clip.sent_ns) / 1e6 for one in trial.playbacks if one.began_ns >= clip.sent_ns]
+    status_ms = None if clip.playing_ns is None else (clip.playing_ns - clip.sent_ns) / 1e6
+    yield trial.cell(CLIP, "ms", sorted(played)[:1], sent=1, status_ms=status_ms)

@@ -13,7 +13,6 @@ import os
 import shutil
 import subprocess
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -29,7 +28,6 @@ from pebble.rig.processes import python
 from pebble.rig.worker import Worker, end_workers
 
 KINDS = ("auto", "namespaces", "proxy")
-LOOPBACK = "127.0.0.1"
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
 _PREFIX = 30
 _MTU = 1500
@@ -67,7 +65,7 @@ class UnavailableError(PebbleError):
     """This machine or user does not permit such a network."""
 
 
-class ImpairedNetwork(ABC):
+class ImpairedNetwork:
     """One robot's network, and the process that impairs it; thread-safe. ``name`` is for messages.
 
     Several may be open at the same time, independent. Raises UnavailableError if the process cannot make one.
@@ -75,32 +73,30 @@ class ImpairedNetwork(ABC):
 
     kind: str  # "namespaces" or "proxy"
     broker_host: str  # the address on which the broker must listen
-    module: str  # of the process
 
     def __init__(self, name: str = "") -> None:
         self._log = os.memfd_create("link")  # the log is an unnamed file: nothing is left behind if we are killed
         self._lock = threading.RLock()
-        log = Path(f"/proc/self/fd/{self._log}")
-        self._worker = Worker(f"network {name}".strip(), python(self.module), log)
+        command, log = python("pebble.bench.impair.forwarder", self.kind), Path(f"/proc/self/fd/{self._log}")
+        self._worker = Worker(f"network {name}".strip(), command, log)
         self._open = True
         try:
-            self.set_up()
+            answer = self._worker.answer(_ANSWER_S)
+            if "unavailable" in answer:
+                raise UnavailableError(str(answer["unavailable"]))
+            if "error" in answer:
+                raise PebbleError(str(answer["error"]))
+            self.set_up(answer)
         except BaseException:
             self.close()
             raise
 
-    def set_up(self) -> dict[str, Any]:
-        """The first answer. Raises PebbleError for ``{"error": …}``, UnavailableError for ``{"unavailable": …}``."""
-        answer = self._worker.answer(_ANSWER_S)
-        if "unavailable" in answer:
-            raise UnavailableError(str(answer["unavailable"]))
-        if "error" in answer:
-            raise PebbleError(str(answer["error"]))
-        return answer
+    def set_up(self, answer: dict[str, Any]) -> None:
+        """What is left to do after the first answer of the process."""
 
-    @abstractmethod
     def broker_address(self, port: int) -> tuple[str, int]:
         """The robot's address for a broker that listens on ``broker_host:port``."""
+        return self.broker_host, port
 
     def traffic(self) -> Traffic:
         return msgspec.convert(self.ask("count"), Traffic)
@@ -151,11 +147,10 @@ class ProxyNetwork(ImpairedNetwork):
     """A TCP proxy on loopback, which models loss as delay; only connections through `broker_address` are impaired."""
 
     kind = "proxy"
-    broker_host = LOOPBACK
-    module = "pebble.bench.impair.proxy_process"
+    broker_host = "127.0.0.1"
 
     def broker_address(self, port: int) -> tuple[str, int]:
-        return LOOPBACK, int(self.ask(f"listen {port}")["port"])
+        return self.broker_host, int(self.ask(f"listen {port}")["port"])
 
 
 class NamespaceNetwork(ImpairedNetwork):
@@ -163,19 +158,13 @@ class NamespaceNetwork(ImpairedNetwork):
 
     kind = "namespaces"
     broker_host = REMOTE_HOST
-    module = "pebble.bench.impair.forwarder"
 
-    def set_up(self) -> dict[str, Any]:
-        descriptors = super().set_up()
-        robot, remote = (f"/proc/{self.pid}/fd/{descriptors[side]}" for side in ("robot", "remote"))
+    def set_up(self, answer: dict[str, Any]) -> None:
+        robot, remote = (f"/proc/{self.pid}/fd/{answer[side]}" for side in ("robot", "remote"))
         self._robot, self._remote = _Side(robot, ROBOT_HOST, REMOTE_HOST), _Side(remote, REMOTE_HOST, ROBOT_HOST)
         self._robot.batch("ip", f"link add {WIRE} type veth peer name {WIRE} netns {remote}")
         self._robot.set_up()
         self._remote.set_up()
-        return descriptors
-
-    def broker_address(self, port: int) -> tuple[str, int]:
-        return REMOTE_HOST, port
 
     def on_robot(self, command: Sequence[str]) -> list[str]:
         return self._robot.inside(command)
@@ -211,16 +200,14 @@ class _Side:
         return [_program("nsenter"), f"--net={self._path}", "--", *command]
 
     def set_up(self) -> None:
-        devices = [
-            line
-            for device in (WIRE, TIMED)
-            for line in (
+        self.batch("ip", "link set lo up", f"address add {self._address}/{_PREFIX} dev {WIRE}")
+        for device in (WIRE, TIMED):
+            self.batch(
+                "ip",
                 f"link set {device} mtu {_MTU} addrgenmode none",  # no IPv6 traffic of its own
                 f"link set {device} gso_max_segs 1",  # otherwise packets of 64 KB are limited and dropped as one
                 f"link set {device} up",
             )
-        ]
-        self.batch("ip", "link set lo up", f"address add {self._address}/{_PREFIX} dev {WIRE}", *devices)
         self.send_over(WIRE)
         self._run("nft", "-f", "-", stdin=_TABLE)
 
@@ -254,7 +241,7 @@ class _Side:
 
     def _run(self, program: str, *arguments: str, stdin: str = "") -> str:
         command = self.inside([_program(program), *arguments])
-        env = {**os.environ, "LC_ALL": "C"}  # `_not_permitted` parses its messages
+        env = {**os.environ, "LC_ALL": "C"}  # its messages are read below
         try:
             done = subprocess.run(
                 command, input=stdin, capture_output=True, text=True, timeout=_COMMAND_S, check=False, env=env
@@ -263,8 +250,9 @@ class _Side:
             raise PebbleError(f"{program} did not end within {_COMMAND_S:.0f} s") from None
         if done.returncode:
             answer = done.stderr.strip().splitlines() or [f"code {done.returncode}"]
-            problem = f"{program} {' '.join(arguments)}: {answer[0]}"
-            raise UnavailableError(problem) if _not_permitted(answer[0]) else PebbleError(problem)
+            not_permitted = any(os.strerror(number) in answer[0] for number in (errno.EPERM, errno.EACCES))
+            kind = UnavailableError if not_permitted else PebbleError
+            raise kind(f"{program} {' '.join(arguments)}: {answer[0]}")
         return done.stdout
 
 
@@ -283,10 +271,6 @@ def _program(name: str) -> str:
     if found is None:
         raise UnavailableError(f"{name} is not installed: apt-get install {_PACKAGES[name]}")
     return found
-
-
-def _not_permitted(answer: str) -> bool:
-    return any(os.strerror(number) in answer for number in (errno.EPERM, errno.EACCES))
 
 
 def open_network(kind: str = "auto", *, name: str = "") -> ImpairedNetwork:

@@ -12,26 +12,17 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
+from typing import Any
 
 import msgspec
 
 from pebble.bench.bridge_operator import wheels
-from pebble.bench.impair.metrics import (
-    ClipCommand,
-    Command,
-    Heartbeat,
-    OperatorReport,
-    Picture,
-    Record,
-    RecoveryRequest,
-    Sound,
-    TrialRequest,
-    Window,
-)
+from pebble.bench.impair import metrics
+from pebble.bench.impair.metrics import OperatorReport, Record, RecoveryRequest, TrialRequest, Window
 from pebble.client.media_receiver import MediaReceiver
 from pebble.client.viewer import Medium
 from pebble.contract import DRIVE, ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
-from pebble.contract.payloads import Drive, SoundboardCommand
+from pebble.contract.payloads import Drive, Heartbeat, SoundboardCommand, SoundboardStatus, Status
 from pebble.errors import PayloadError, PebbleError
 from pebble.media.decode import Decoded
 from pebble.media.sound import ReceivedSound
@@ -51,21 +42,17 @@ class MediaSubscriber(MediaReceiver):
     """Records when each picture and each sound packet arrived."""
 
     def __init__(self, transport: Transport, base: str) -> None:
-        self.pictures_seen: list[Picture] = []
-        self.received: list[Sound] = []
+        self.pictures_seen: list[metrics.Picture] = []
+        self.received: list[metrics.Sound] = []
         super().__init__(transport, base)
 
-    def has_received(self, medium: Medium) -> bool:
-        return bool(self.pictures_seen if medium == "video" else self.received)
-
-    def on_picture(self, seen: Decoded) -> None:
-        now = time.monotonic_ns()
-        self.pictures_seen.append(Picture(None if seen.captured_ms is None else _monotonic_ns(seen.captured_ms), now))
+    def on_picture(self, picture: Decoded) -> None:
+        now, ms = time.monotonic_ns(), picture.captured_ms
+        self.pictures_seen.append(metrics.Picture(None if ms is None else _monotonic_ns(ms), now))
 
     def on_sound(self, received: ReceivedSound) -> None:
-        now = time.monotonic_ns()
-        seconds = len(received.samples) / received.rate
-        self.received.append(Sound(_monotonic_ns(received.captured_ms), now, seconds, received.sequence))
+        now, seconds = time.monotonic_ns(), len(received.samples) / received.rate
+        self.received.append(metrics.Sound(_monotonic_ns(received.captured_ms), now, seconds, received.sequence))
 
 
 class TrialOperator:
@@ -77,8 +64,8 @@ class TrialOperator:
         self._controls = create("mqtt", "pebble-impair-controls", settings)
         self._media = create("mqtt", "pebble-impair-media", settings)
         self._number = 0
-        self._commands: list[Command] = []
-        self._heartbeats: list[Heartbeat] = []
+        self._commands: list[metrics.Command] = []
+        self._heartbeats: list[metrics.Heartbeat] = []
         self._services: dict[str, str] = {}  # their states
         self._clip_statuses: list[tuple[int, bool]] = []  # when they arrived, and whether a clip plays
         self._over_at = time.monotonic()
@@ -91,7 +78,7 @@ class TrialOperator:
         if not self._wait(lambda: all(connection.state is State.CONNECTED for connection in connections), _CONNECT_S):
             problem = self._controls.problem or self._media.problem
             raise PebbleError(f"the operator cannot connect to the broker: {problem}")
-        self._subscribe(ONLINE, self._on_heartbeat)
+        self._subscribe(ONLINE, self._on_heartbeat, retained=False)  # a retained heartbeat is not current
         self._subscribe(STATUS, self._on_status)
         self._subscribe(SOUNDBOARD_STATUS, self._on_clip_status)
         if not self._wait(self._is_ready, _UP_S):
@@ -101,14 +88,19 @@ class TrialOperator:
         self._controls.close()
         self._media.close()
 
-    def recover(self, request: RecoveryRequest) -> OperatorReport:
-        """Waits until the network delivers no old messages. Raises PebbleError if the robot does not recover."""
+    def serve(self, request: TrialRequest | RecoveryRequest) -> OperatorReport:
+        """Runs a trial, or waits until the network delivers no old messages.
+
+        Raises PebbleError if the robot does not recover.
+        """
+        if isinstance(request, TrialRequest):
+            return OperatorReport(record=self._run_trial(request))
         self._wait(lambda: time.monotonic() - self._over_at >= request.quiet_s, request.quiet_s)
         if not self._wait(self._is_fresh, _STARTUP_S):
             raise PebbleError(f"no fresh heartbeat {_STARTUP_S:.0f} s after the network was restored")
         return OperatorReport(ready=True)
 
-    def run_trial(self, request: TrialRequest) -> OperatorReport:
+    def _run_trial(self, request: TrialRequest) -> Record:
         first_heartbeat = max(0, len(self._heartbeats) - _HEARTBEATS_BEFORE)
         self._commands.clear()
         enough = threading.Event()
@@ -125,20 +117,11 @@ class TrialOperator:
         audio_off = self._measure_phase("audio off", request.off_s)
         clip = self._play_clip(request.clip_s)
         self._over_at = time.monotonic()
-        record = Record(
-            commands=list(self._commands),
-            heartbeats=self._heartbeats[first_heartbeat:],
-            pictures=seen.pictures_seen,
-            sounds=received.received,
-            alone=alone,
-            video=video,
-            audio=audio,
-            video_off=video_off,
-            audio_off=audio_off,
-            clip=clip,
-            payloads=seen.pictures.count,
-        )
-        return OperatorReport(record=record)
+        return Record(
+            commands=list(self._commands), heartbeats=self._heartbeats[first_heartbeat:],
+            pictures=seen.pictures_seen, payloads=seen.pictures.count, sounds=received.received,
+            alone=alone, video=video, audio=audio, video_off=video_off, audio_off=audio_off, clip=clip,
+        )  # fmt: skip
 
     # -- phases
 
@@ -146,9 +129,10 @@ class TrialOperator:
         """Requests a medium, waits for its first message, records a window. Audio, which is last, ends the driving."""
         with closing(MediaSubscriber(self._media, self._base)) as subscriber:
             subscriber.wait_for_capabilities(_KNOWN_S)
+            arrived = subscriber.pictures_seen if medium == "video" else subscriber.received
             asked = time.monotonic()
             subscriber.viewer.request(medium, request.video if medium == "video" else request.audio)
-            started = self._wait(lambda: subscriber.has_received(medium), _FIRST_S, subscriber)
+            started = self._wait(lambda: bool(arrived), _FIRST_S, subscriber)
             first_s = time.monotonic() - asked if started else None
             window = self._measure_phase(medium, request.window_s, subscriber)
             if medium == "audio":
@@ -156,7 +140,7 @@ class TrialOperator:
                 self._wait(lambda: False, request.grace_s, subscriber)
         return subscriber, Window(window.began_ns, window.ended_ns, first_s)
 
-    def _play_clip(self, seconds: float) -> ClipCommand:
+    def _play_clip(self, seconds: float) -> metrics.ClipCommand:
         """Commands it, and waits until it was played to its end, as far as the statuses arrive."""
         self._clip_statuses.clear()
         sent_ns = time.monotonic_ns()
@@ -167,7 +151,7 @@ class TrialOperator:
             return next((ns for ns, playing in list(self._clip_statuses) if playing), None)
 
         self._wait(lambda: playing_ns() is not None and not self._clip_statuses[-1][1], seconds)
-        return ClipCommand(sent_ns, playing_ns())
+        return metrics.ClipCommand(sent_ns, playing_ns())
 
     def _measure_phase(self, phase: str, seconds: float, subscriber: MediaSubscriber | None = None) -> Window:
         write_report(OperatorReport(phase=phase))
@@ -206,32 +190,31 @@ class TrialOperator:
             self._number += 1
             left, right = wheels(self._number)
             payload = codec.encode(DRIVE, Drive(x=(left - right) / 2, z=(left + right) / 2))
-            self._commands.append(Command(left, right, time.monotonic_ns()))
+            self._commands.append(metrics.Command(left, right, time.monotonic_ns()))
             self._controls.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
             due += _PERIOD_S
             enough.wait(max(0.0, due - time.monotonic()))
 
     # -- the transports' threads
 
-    def _subscribe(self, channel: Channel, receive: Callable[[Message, int], None]) -> None:
-        """``receive`` is called with the time of arrival, and may raise PayloadError for a message to ignore."""
+    def _subscribe(self, channel: Channel, receive: Callable[[int, Any], None], *, retained: bool = True) -> None:
+        """``receive`` is called with the time of arrival and the payload; a malformed one is ignored."""
 
         def on_message(message: Message) -> None:
-            with suppress(PayloadError):
-                receive(message, time.monotonic_ns())
+            if retained or not message.retain:
+                with suppress(PayloadError):
+                    receive(time.monotonic_ns(), codec.decode(channel, message.payload))
 
         self._controls.subscribe(channel.topic(self._base), on_message)
 
-    def _on_heartbeat(self, message: Message, now: int) -> None:
-        if not message.retain:  # a retained heartbeat is not current
-            heartbeat = codec.decode(ONLINE, message.payload)
-            self._heartbeats.append(Heartbeat(_monotonic_ns(heartbeat.t), now, heartbeat.online is not False))
+    def _on_heartbeat(self, now: int, payload: Heartbeat) -> None:
+        self._heartbeats.append(metrics.Heartbeat(_monotonic_ns(payload.t), now, payload.online is not False))
 
-    def _on_clip_status(self, message: Message, now: int) -> None:
-        self._clip_statuses.append((now, codec.decode(SOUNDBOARD_STATUS, message.payload).playing))
+    def _on_clip_status(self, now: int, payload: SoundboardStatus) -> None:
+        self._clip_statuses.append((now, payload.playing))
 
-    def _on_status(self, message: Message, _now: int) -> None:
-        services = codec.decode(STATUS, message.payload).value.get("services", {})
+    def _on_status(self, _now: int, payload: Status) -> None:
+        services = payload.value.get("services", {})
         self._services = {name: service.get("state", "") for name, service in services.items()}
 
 
@@ -244,8 +227,7 @@ def write_report(report: OperatorReport) -> None:
     answer(msgspec.json.encode(report))
 
 
-def main(arguments: list[str]) -> int:
-    host, port, base = arguments
+def main(host: str, port: str, base: str) -> int:
     lines: queue.SimpleQueue[str] = queue.SimpleQueue()
     ended = serve_on_thread(lines.put, lambda: lines.put(""))
     try:
@@ -253,10 +235,7 @@ def main(arguments: list[str]) -> int:
             operator.open()
             write_report(OperatorReport(ready=True))
             while line := lines.get():
-                request = msgspec.json.decode(line, type=TrialRequest | RecoveryRequest)
-                write_report(
-                    operator.recover(request) if isinstance(request, RecoveryRequest) else operator.run_trial(request)
-                )
+                write_report(operator.serve(msgspec.json.decode(line, type=TrialRequest | RecoveryRequest)))
     except PebbleError as error:
         write_report(OperatorReport(problem=str(error)))
         return 1
@@ -264,4 +243,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(*sys.argv[1:]))

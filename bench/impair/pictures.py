@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,8 +17,8 @@ from matplotlib.lines import Line2D
 from pebble.bench import paper
 from pebble.bench.aims import single, with_lost
 from pebble.bench.impair.report import arrived
-from pebble.bench.plots import Picture, around, finite, guide, legend, log_axis, panels, short, styles, unique
-from pebble.bench.results import OVER_TIME, Cell, Results
+from pebble.bench.plots import Picture, Style, around, finite, guide, legend, log_axis, panels, short, styles, unique
+from pebble.bench.results import OVER_TIME, Cell, Results, grouped
 
 _QUOTED = Line2D([], [], color="#1a1a1a", marker="x", linestyle="", markersize=7, markeredgewidth=2,
                  label="the original program itself, measured once elsewhere")  # fmt: skip
@@ -85,7 +86,7 @@ _OVER_TRIALS: Final[dict[str, tuple[str, float, tuple[Panel, ...]]]] = {
 
 def over_trials(results: Results) -> list[Picture]:
     """Audio, video and commands over the trials."""
-    cells = [cell for cell in results.cells if "trial" in cell.params and not cell.measure.endswith(OVER_TIME)]
+    cells = [cell for cell in results.cells if "trial" in cell.params]
     if not cells:
         return []
     options = results.options
@@ -100,42 +101,38 @@ def over_trials(results: Results) -> list[Picture]:
 
 def _trials(cells: Sequence[Cell], title: str, height: float, shown: Sequence[Panel]) -> Figure:
     figure, every = panels(len(shown), 1, (10.5, height), title)
-    trials, subjects = (unique([str(one) for one in found]) for found in zip(
-        *((cell.params["trial"], cell.variant) for cell in cells), strict=True
-    ))  # fmt: skip
-    seen = [_lines(axes, cells, trials, subjects, panel) for axes, panel in zip(every, shown, strict=True)]
+    trials = unique([str(cell.params["trial"]) for cell in cells])
+    style_of = styles(unique([cell.variant for cell in cells]))
+    seen = [_lines(axes, cells, trials, style_of, panel) for axes, panel in zip(every, shown, strict=True)]
     for axes, panel, values in zip(every, shown, seen, strict=True):
         if panel.log:  # panels with the same aim have one scale, to show waiting behind media
             same = [one for other, found in zip(shown, seen, strict=True) for one in found if other.aim == panel.aim]
             log_axis(axes, "y", panel.label, *around([*(same if panel.aim else values), panel.aim]))
         else:
-            top = 1.15 * max(finite([*values, panel.least_top]))
-            axes.set_ylim(*(panel.ends or (-0.1, top)))
+            axes.set_ylim(*(panel.ends or (-0.1, 1.15 * max(finite([*values, panel.least_top])))))
             axes.set_ylabel(panel.label)
         if panel.aim is not None:
             guide(axes, panel.aim, panel.aim_text)
-        for trial, word in panel.words.items():
-            if trial in trials:
-                at = trials.index(trial)
-                axes.axvspan(at - 0.5, at + 0.5, color="#f2efe6", zorder=0)
-                axes.annotate(
-                    f"paper:\n{word}", (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555",
-                    ha="center", va="bottom",
-                )  # fmt: skip
+        for at, word in ((trials.index(trial), word) for trial, word in panel.words.items() if trial in trials):
+            axes.axvspan(at - 0.5, at + 0.5, color="#f2efe6", zorder=0)
+            axes.annotate(
+                f"paper:\n{word}", (at, 1.0), xycoords=("data", "axes fraction"), fontsize=8, color="#555",
+                ha="center", va="bottom",
+            )  # fmt: skip
         axes.set_xlim(-0.6, len(trials) - 0.4)
         named = trials if axes is every[-1] else [""] * len(trials)
         axes.set_xticks(range(len(trials)), named, rotation=40, ha="right", rotation_mode="anchor")
     every[-1].set_xlabel("trial: condition of the network, in the order of the run")
-    legend(figure, styles(subjects), more=[_QUOTED] if any(panel.crosses for panel in shown) else [])
+    legend(figure, style_of, more=[_QUOTED] if any(panel.crosses for panel in shown) else [])
     return figure
 
 
 def _lines(
-    axes: Axes, cells: Sequence[Cell], trials: Sequence[str], subjects: Sequence[str], panel: Panel
+    axes: Axes, cells: Sequence[Cell], trials: Sequence[str], style_of: Mapping[str, Style], panel: Panel
 ) -> list[float]:
     """Draws one line per subject; returns all values."""
     ours = [cell for cell in cells if cell.measure.startswith(panel.measures)]
-    style_of, seen = styles(subjects), list[float]()
+    seen = list[float]()
     for number, (subject, style) in enumerate(style_of.items()):
         beside = 0.06 * (number - (len(style_of) - 1) / 2)  # keeps equal values visible
         heights = []
@@ -160,24 +157,18 @@ def _lines(
 def over_time(results: Results) -> list[Picture]:
     """One picture for each measure ``… over time``, whose cells hold two rounds: seconds, and milliseconds."""
     found = []
-    cells = [cell for cell in results.cells if len(cell.rounds) == 2 and finite(cell.rounds[0])]
-    for measure in unique([cell.measure for cell in cells if cell.measure.endswith(OVER_TIME)]):
+    curves = [one for one in results.cells if one.measure.endswith(OVER_TIME) and len(one.rounds) == 2]
+    known = [curve for curve in curves if finite(curve.rounds[0])]
+    for measure, shown in grouped(known, lambda cell: cell.measure).items():
         what = measure.removesuffix(OVER_TIME)
         caption = f"Latency of {what} over time, with the trials marked: a dot for each message that arrived"
-        shown = [cell for cell in cells if cell.measure == measure]
         found.append(Picture(f"{results.bench}-{what}-over-time", caption, partial(_series, shown, results, caption)))
     return found
 
 
 def marks(text: str) -> list[tuple[str, float]]:
     """Parses ``256k@37.2;512k@60`` into names and seconds; skips invalid parts."""
-    found = []
-    for part in text.split(";"):
-        name, _, second = part.rpartition("@")
-        try:
-            found.append((name.strip(), float(second)))
-        except ValueError:
-            continue
+    found = ((name, float(second)) for name, second in re.findall(r"([^;@]+)@(\d+(?:\.\d+)?)", text))
     return sorted(found, key=lambda mark: mark[1])
 
 
@@ -188,9 +179,8 @@ def _series(cells: Sequence[Cell], results: Results, title: str) -> Figure:
     ends = around([latency for cell in cells for latency in cell.rounds[1]])
     last = max(second for cell in cells for second in finite(cell.rounds[0]))
     for axes, cell in zip(every, cells, strict=True):
-        seconds, latencies = cell.rounds[0], cell.rounds[1]
         _bands(axes, begun, last, named=axes is every[0])
-        axes.plot(seconds, latencies, ".", color=style_of[cell.variant].colour, markersize=2.2, antialiased=False)
+        axes.plot(*cell.rounds, ".", color=style_of[cell.variant].colour, markersize=2.2, antialiased=False)
         log_axis(axes, "y", f"{short(cell.variant, 18)}\nlatency, ms", *ends)
     every[-1].set_xlabel("seconds since the first trial began")
     return figure

@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -22,8 +22,9 @@ from rich.table import Table
 from rich.text import Text
 
 from pebble.bench.engine import check_folder
+from pebble.bench.results import named
 from pebble.client.connection import Target, connected, resolve
-from pebble.client.names import id_of
+from pebble.client.names import ANY_ROBOT, id_of
 from pebble.client.viewer import Medium, Viewer
 from pebble.contract import AUDIO, CAMERA, ONLINE
 from pebble.contract.identity import parse_topic
@@ -35,7 +36,7 @@ from pebble.recordings.recorder.source import Source
 from pebble.recordings.traffic.analysis import analyse
 from pebble.recordings.traffic.duck import require_packages
 from pebble.recordings.traffic.report import remarks
-from pebble.recordings.traffic.results import FAMILIES, RobotTraffic, Stream, Traffic
+from pebble.recordings.traffic.results import FAMILIES, Stream, Traffic
 from pebble.recordings.traffic.sources import sources
 from pebble.transports import Message, QoS, Transport
 
@@ -58,9 +59,9 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     target: Target
     label: str
     into: Path
-    seconds: float = 120.0
-    media: bool = True
-    replace: bool = False
+    seconds: float
+    media: bool
+    replace: bool
 
     @property
     def folder(self) -> Path:
@@ -80,8 +81,8 @@ class Measurement(msgspec.Struct, kw_only=True):
         (folder / NAME).write_bytes(msgspec.json.format(msgspec.json.encode(self)) + b"\n")
 
 
-def measure(plan: Plan, progress: Progress) -> Measurement:
-    """Record the robot for the plan's time, or until KeyboardInterrupt. Raises PebbleError.
+def measure(plan: Plan, progress: Progress) -> float:
+    """Record the robot for the plan's time, or until KeyboardInterrupt; returns the seconds. Raises PebbleError.
 
     Nothing is measured before all requested media have arrived, for at most 15 s. At the end the requests are
     withdrawn.
@@ -93,8 +94,11 @@ def measure(plan: Plan, progress: Progress) -> Measurement:
         with closing(Viewer(transport, names.base, None)) as viewer:
             if plan.media:
                 viewer.wait_for_capabilities(_CAPABILITIES_S)
-            _make_folder(plan)
-            return _Course(plan, viewer, progress).run()
+            if plan.folder.exists():
+                with named(plan.folder):
+                    shutil.rmtree(plan.folder)
+            check_folder(plan.folder)
+            return _record(plan, viewer, progress)
 
 
 def _check(plan: Plan) -> None:
@@ -109,15 +113,6 @@ def _check(plan: Plan) -> None:
         raise PebbleError(f"{plan.folder} is no measurement, so it is not replaced: use another --label or --into")
 
 
-def _make_folder(plan: Plan) -> None:
-    if plan.folder.exists():
-        try:
-            shutil.rmtree(plan.folder)
-        except OSError as error:
-            raise PebbleError(f"{error.filename}: {error.strerror}") from None
-    check_folder(plan.folder)
-
-
 def _require_heartbeat(transport: Transport, base: str) -> None:
     """Wait for a heartbeat of the robot. Raises PebbleError that names the robots that were received instead."""
     received: set[str] = set()
@@ -127,7 +122,7 @@ def _require_heartbeat(transport: Transport, base: str) -> None:
         if address is not None and not message.retain:  # a retained heartbeat may be old
             received.add(address.identity.base)
 
-    with closing(transport.subscribe(ONLINE.filter("+/+/+"), on_heartbeat, qos=QoS.LATEST, direct=True)):
+    with closing(transport.subscribe(ONLINE.filter(ANY_ROBOT), on_heartbeat, qos=QoS.LATEST, direct=True)):
         end = time.monotonic() + _HEARTBEAT_S
         while base not in received and time.monotonic() < end:
             time.sleep(_TURN_S)
@@ -156,63 +151,51 @@ class _Recorder(Recorder):
         super().receive(topic, payload, *about, retained=retained, **more)
 
 
-class _Course:
-    """The course of one measurement."""
+def _record(plan: Plan, viewer: Viewer, progress: Progress) -> float:
+    kind, settings, _, _ = resolve(plan.target)
+    settings = replace(settings, protocol="5") if kind == "mqtt" else settings
+    recorder = _Recorder(plan, viewer)
+    source = Source(recorder, kind, settings, [f"{viewer.base}/#"])
 
-    def __init__(self, plan: Plan, viewer: Viewer, progress: Progress) -> None:
-        self._plan, self._viewer, self._progress = plan, viewer, progress
-        kind, settings, _, _ = resolve(plan.target)
-        settings = replace(settings, protocol="5") if kind == "mqtt" else settings
-        self._recorder = _Recorder(plan, viewer)
-        self._source = Source(self._recorder, kind, settings, [f"{viewer.base}/#"])
-
-    def run(self) -> Measurement:
-        self._recorder.start()
-        try:
-            with closing(self._source):
-                self._source.start()
-                return self._measured()
-        finally:
-            self._recorder.stop()
-
-    def _measured(self) -> Measurement:
-        measurement = Measurement(label=self._plan.label, robot=self._viewer.base, since_ns=self._recorder.clock.now())
-        measurement.save(self._plan.folder)
-        try:
-            requested = self._request()
-            self._watch(_FIRST_S, "waiting for pictures and sound", lambda: requested <= self._recorder.arrived)
-            measurement.since_ns = self._recorder.clock.now()
-            self._watch(self._plan.seconds, "measuring", lambda: False)
-        except KeyboardInterrupt:
-            pass  # what was measured until now is the measurement
-        finally:
-            measurement.until_ns = self._recorder.clock.now()
-            measurement.save(self._plan.folder)
-        return measurement
-
-    def _request(self) -> set[Medium]:
-        sections = self._viewer.capabilities if self._plan.media else {}
-        offered = [one for one in _MEDIA if sections.get(one, {}).get("available") and sections[one].get("controls")]
-        for medium in offered:
-            self._viewer.request(medium)
-        return set(offered)
-
-    def _watch(self, seconds: float, what: str, is_over: Callable[[], bool]) -> None:
+    def watch(seconds: float, what: str, is_over: Callable[[], bool]) -> None:
         began = checked = time.monotonic()
         while not is_over() and (now := time.monotonic()) - began < seconds:
             time.sleep(_TURN_S)
             if now - checked >= 1.0:
                 checked = now
-                self._source.check()
-                self._viewer.repeat_requests()
-            self._progress(f"{what}: {now - began:.0f} of {seconds:g} s{self._state()}")
-            if self._recorder.blocked:
-                raise PebbleError(f"{self._plan.folder}: {self._recorder.blocked}")
+                source.check()
+                viewer.repeat_requests()
+            count = f"{recorder.counters['messages']:,} messages, {recorder.counters['bytes'] / 1e6:.1f} MB"
+            problem = "" if source.connected else f", not connected: {source.problem or 'no answer'}"
+            progress(f"{what}: {now - began:.0f} of {seconds:g} s, {count}{problem}")
+            if recorder.blocked:
+                raise PebbleError(f"{plan.folder}: {recorder.blocked}")
 
-    def _state(self) -> str:
-        counters = self._recorder.counters
-        problem = "" if self._source.connected else f", not connected: {self._source.problem or 'no answer'}"
-        return f", {counters['messages']:,} messages, {counters['bytes'] / 1e6:.1f} MB{problem}"
+    with ExitStack() as stack:
+        recorder.start()
+        stack.callback(recorder.stop)
+        stack.enter_context(closing(source)).start()
+        measurement = Measurement(label=plan.label, robot=viewer.base, since_ns=recorder.clock.now())
+        measurement.save(plan.folder)
+        try:
+            with suppress(KeyboardInterrupt):  # what was measured until then is the measurement
+                requested = _request(viewer) if plan.media else []
+                watch(_FIRST_S, "waiting for pictures and sound", lambda: recorder.arrived.issuperset(requested))
+                measurement.since_ns = recorder.clock.now()
+                watch(plan.seconds, "measuring", lambda: False)
+        finally:
+            measurement.until_ns = recorder.clock.now()
+            measurement.save(plan.folder)
+    return (measurement.until_ns - measurement.since_ns) / 1e9
+
+
+def _request(viewer: Viewer) -> list[Medium]:
+    """Requests all media that the robot offers."""
+    sections = viewer.capabilities
+    offered = [one for one in _MEDIA if sections.get(one, {}).get("available") and sections[one].get("controls")]
+    for medium in offered:
+        viewer.request(medium)
+    return offered
 
 
 # -- all measurements side by side
@@ -221,27 +204,9 @@ class _Course:
 class Column(msgspec.Struct):
     """One measurement, analysed."""
 
-    measurement: Measurement
-    traffic: Traffic | None  # None: no message arrived
-    problem: str = ""
-
-    @property
-    def robot(self) -> RobotTraffic | None:
-        return None if self.traffic is None else self.traffic.robots[0]
-
-    @property
-    def seconds(self) -> float:
-        until_ns = self.measurement.until_ns
-        if until_ns == FOREVER_NS and self.traffic is not None:  # the program was killed
-            until_ns = self.traffic.until_ns
-        return 0.0 if until_ns == FOREVER_NS else (until_ns - self.measurement.since_ns) / 1e9
-
-    def stream(self, metric: str) -> Stream | None:
-        return None if self.robot is None else next((one for one in self.robot.streams if one.metric == metric), None)
-
-    @property
-    def remarks(self) -> list[str]:
-        return [self.problem] if self.traffic is None else remarks(self.traffic)
+    label: str
+    rows: list[dict[str, str]]  # in groups
+    remarks: list[str]
 
 
 def columns(into: Path) -> list[Column]:
@@ -255,93 +220,74 @@ def columns(into: Path) -> list[Column]:
 
 def _load(path: Path) -> Measurement:
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Measurement)
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror}") from None
+        with named(path):
+            return msgspec.json.decode(path.read_bytes(), type=Measurement)
     except msgspec.DecodeError as error:
         raise PebbleError(f"{path}: {error}") from None
 
 
-def _column(measurement: Measurement, folder: Path) -> Column:
-    since_ns, until_ns = measurement.since_ns, measurement.until_ns
+def _column(one: Measurement, folder: Path) -> Column:
     with tempfile.TemporaryDirectory(prefix="pebble-impair-") as name:
         scratch = Path(name)
         try:
-            found = sources([folder], scratch, robots=[measurement.robot], since_ns=since_ns, until_ns=until_ns)
-            return Column(measurement, analyse(found, scratch, since_ns=since_ns, until_ns=until_ns))
-        except RecordingError as error:
-            return Column(measurement, None, str(error))
+            found = sources([folder], scratch, robots=[one.robot], since_ns=one.since_ns, until_ns=one.until_ns)
+            traffic = analyse(found, scratch, since_ns=one.since_ns, until_ns=one.until_ns)
+        except RecordingError as error:  # no message arrived
+            return Column(one.label, [_head(one, one.until_ns)], [str(error)])
+    until_ns = traffic.until_ns if one.until_ns == FOREVER_NS else one.until_ns  # the program was killed
+    return Column(one.label, [_head(one, until_ns), *_rows(traffic, until_ns - one.since_ns)], remarks(traffic))
 
 
 def table(found: list[Column]) -> Table:
-    """Rows are the figures of the paper, columns the labels."""
+    """Rows are the figures of the paper, columns the labels; a row that would be empty is left out."""
     made = Table(box=box.SIMPLE_HEAD)
     made.add_column("", no_wrap=True)
     for column in found:
-        made.add_column(Text(column.measurement.label), justify="right", no_wrap=True)
-    for group in _GROUPS:
-        rows = [(name, [cell(column) for column in found]) for name, cell in group]
-        shown = [(name, cells) for name, cells in rows if any(one != _NONE for one in cells)]
-        for number, (name, cells) in enumerate(shown, 1):
-            made.add_row(name, *map(Text, cells), end_section=number == len(shown))
+        made.add_column(Text(column.label), justify="right", no_wrap=True)
+    for at in range(max(len(column.rows) for column in found)):
+        groups = [column.rows[at] if at < len(column.rows) else {} for column in found]
+        for name in dict.fromkeys(name for group in groups for name in group):
+            cells = [group.get(name, _NONE) for group in groups]
+            if any(cell != _NONE for cell in cells):
+                made.add_row(name, *map(Text, cells))
+        made.add_section()
     return made
 
 
-_Row = tuple[str, Callable[[Column], str]]
+def _head(one: Measurement, until_ns: int) -> dict[str, str]:
+    seconds = 0.0 if until_ns == FOREVER_NS else (until_ns - one.since_ns) / 1e9
+    return {"robot": id_of(one.robot), "measured, s": f"{seconds:.0f}"}
 
 
-def _of_robot(name: str, text: Callable[[RobotTraffic], str]) -> _Row:
-    return name, lambda column: _NONE if column.robot is None else text(column.robot)
+def _rows(traffic: Traffic, length_ns: int) -> list[dict[str, str]]:
+    robot = traffic.robots[0]
+    pictures, sound = ({one.metric: one for one in robot.streams}.get(channel.metric) for channel in (CAMERA, AUDIO))
+    latency, outages = robot.latency, [one.length_ms for one in robot.outages]
+    rate = _NONE if pictures is None or not length_ns else f"{1e9 * pictures.messages / length_ns:.1f}"
+    bandwidths = {family: robot.of(family) for family in FAMILIES}
+    return [
+        {
+            "heartbeat latency p50, ms": _ms(latency.median_ms if latency else None),
+            "heartbeat latency p95, ms": _ms(latency.p95_ms if latency else None),
+            "heartbeat intervals": str(robot.intervals.count if robot.intervals else 0),
+            "outages": str(len(outages)),
+            "outage, median, ms": _ms(median(outages) if outages else None),
+            "outage, longest, ms": _ms(max(outages, default=None)),
+            "offline, times": str(robot.offline or _NONE),
+        },
+        {"pictures a second": rate, **_stream("pictures", pictures)},
+        _stream("sound", sound),
+        {f"{family}, kbit/s": f"{one.median_kbps:.1f}" if one else _NONE for family, one in bandwidths.items()},
+    ]
 
 
-def _of_stream(name: str, metric: str, text: Callable[[Stream], str]) -> _Row:
-    return name, lambda column: _NONE if (stream := column.stream(metric)) is None else text(stream)
-
-
-def _media(name: str, metric: str) -> tuple[_Row, ...]:
-    return (
-        _of_stream(f"{name} lost", metric, lambda stream: f"{stream.lost_share:.1%}"),
-        _of_stream(f"{name}, jitter p50, ms", metric, lambda stream: _ms(stream.jitter_median_ms)),
-        _of_stream(f"{name}, jitter p95, ms", metric, lambda stream: _ms(stream.jitter_p95_ms)),
-    )
-
-
-def _rate(column: Column) -> str:
-    stream = column.stream(CAMERA.metric)
-    return _NONE if stream is None or not column.seconds else f"{stream.messages / column.seconds:.1f}"
-
-
-def _outage(robot: RobotTraffic, which: Callable[[list[float]], float]) -> str:
-    return _ms(which([one.length_ms for one in robot.outages])) if robot.outages else _NONE
-
-
-def _bandwidth(family: str) -> _Row:
-    def text(robot: RobotTraffic) -> str:
-        one = robot.of(family)
-        return _NONE if one is None else f"{one.median_kbps:.1f}"
-
-    return _of_robot(f"{family}, kbit/s", text)
+def _stream(name: str, stream: Stream | None) -> dict[str, str]:
+    return {
+        f"{name} lost": f"{stream.lost_share:.1%}" if stream else _NONE,
+        f"{name}, jitter p50, ms": _ms(stream.jitter_median_ms if stream else None),
+        f"{name}, jitter p95, ms": _ms(stream.jitter_p95_ms if stream else None),
+    }
 
 
 def _ms(value: float | None) -> str:
     return _NONE if value is None else f"{value:.0f}" if abs(value) >= 10 else f"{value:.1f}"
-
-
-_GROUPS: Final[tuple[tuple[_Row, ...], ...]] = (
-    (
-        ("robot", lambda column: id_of(column.measurement.robot)),
-        ("measured, s", lambda column: f"{column.seconds:.0f}"),
-    ),
-    (
-        _of_robot("heartbeat latency p50, ms", lambda robot: _ms(getattr(robot.latency, "median_ms", None))),
-        _of_robot("heartbeat latency p95, ms", lambda robot: _ms(getattr(robot.latency, "p95_ms", None))),
-        _of_robot("heartbeat intervals", lambda robot: str(robot.intervals.count if robot.intervals else 0)),
-        _of_robot("outages", lambda robot: str(len(robot.outages))),
-        _of_robot("outage, median, ms", lambda robot: _outage(robot, median)),
-        _of_robot("outage, longest, ms", lambda robot: _outage(robot, max)),
-        _of_robot("offline, times", lambda robot: str(robot.offline or _NONE)),
-    ),
-    (("pictures a second", _rate), *_media("pictures", CAMERA.metric)),
-    _media("sound", AUDIO.metric),
-    tuple(map(_bandwidth, FAMILIES)),
-)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from pebble.bench import paper
 from pebble.bench.aims import Aim, outcome, single, with_lost
-from pebble.bench.impair import cells as measures
+from pebble.bench.impair import metrics as measures
 from pebble.bench.impair.conditions import chosen
 from pebble.bench.ratios import paired
 from pebble.bench.results import Cell, Judged, percentile
@@ -37,9 +37,7 @@ def arrived(percent: float) -> _Value:
 def _column(head: str, measure: str, value: _Value, *, whole: bool = False) -> Column:
     def shown(cell: Cell) -> str:
         found = value(cell)
-        if math.isinf(found):
-            return "never"
-        return f"{found:.0f}" if whole and not math.isnan(found) else figure(found)
+        return "never" if math.isinf(found) else f"{found:.0f}" if whole and not math.isnan(found) else figure(found)
 
     return Column(head, shown, measure)
 
@@ -129,13 +127,13 @@ def behind_media(cells: Sequence[Cell]) -> Iterator[Judged]:
             if math.isfinite(alone_ms.get(trial, math.nan))
         }
         if waits and subject.endswith(_OURS):
-            longest = max(waits, key=lambda name: waits[name])
-            most = f"most: {waits[longest]:+.0f} ms" if math.isfinite(waits[longest]) else "some were lost"
+            where, longest_ms = max(waits.items(), key=lambda one: one[1])
+            most = f"most: {longest_ms:+.0f} ms" if math.isfinite(longest_ms) else "some were lost"
             yield Judged(
                 what=f"{subject}, drive commands wait at most one command's time ({_DRIVE_WAITS_MS:g} ms) behind media"
                 ", p95 against the same trial without",
-                outcome=outcome(waits[longest] <= _DRIVE_WAITS_MS),
-                measured=f"{most}, {longest}",
+                outcome=outcome(longest_ms <= _DRIVE_WAITS_MS),
+                measured=f"{most}, {where}",
             )
 
 

@@ -5,70 +5,63 @@ from __future__ import annotations
 import sys
 import time
 import wave
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
 
 import msgspec
 
 from pebble.bench.comparison import Budget, Comparison, Option, Round, Run
-from pebble.bench.impair.cells import Trial, cells_of, over_time
 from pebble.bench.impair.conditions import TRIALS, Condition, chosen
-from pebble.bench.impair.metrics import OperatorReport, RecoveryRequest, TrialRequest
+from pebble.bench.impair.metrics import OperatorReport, RecoveryRequest, Trial, TrialRequest, cells_of, over_time
 from pebble.bench.impair.network import KINDS, Traffic, open_network, resolved
 from pebble.bench.impair.operator import CLIP
 from pebble.bench.impair.report import AIMS, QUOTED, SENTENCES, TABLES
 from pebble.bench.pictures import Drawn
-from pebble.bench.results import LONGEST_S, Cell
+from pebble.bench.results import LONGEST_S, Cell, grouped
+from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
 from pebble.media.pcm import to_bytes
 from pebble.media.speech import Speech
 from pebble.rig.processes import Processes
 from pebble.rig.programs import Program
-from pebble.rig.robot import BASE, Config, Robot
+from pebble.rig.robot import BASE, Config, Robot, synthetic_media
 from pebble.rig.worker import Worker
 from pebble.simulation.loudspeaker import Playback, playbacks
 from pebble.simulation.trace import Entry
 
-_T = TypeVar("_T")
-
 CLEAN = Condition("clean")
 QUICK = ("base-start", "256k", "64k+5%", "base-end")
-WIDTH, HEIGHT, FPS = 640, 480, 15  # as the original is configured
+PICTURES = WIDTH, HEIGHT, FPS = 640, 480, 15  # as the original is configured
 CLIP_S = 0.5
 _AUDIO_RATE = 16_000
 _UP_S, _RECOVERED_S, _PHASE_S = 80.0, 30.0, 30.0  # limits for an operator's next report; its own limits are shorter
-_LINKS = {
-    "namespaces": "network namespaces, {} impaired",
-    "proxy": "a userspace proxy, loss modelled; {} impaired",
-}
+_LINKS = {"namespaces": "network namespaces,", "proxy": "a userspace proxy, loss modelled;"}
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
     """One robot under test. Encodings are requested by the operator; None: as the robot is configured."""
 
-    name: str
-    transport: str  # inside the robot: "mqtt" or "zenoh"
+    transport: str  # inside the robot
+    form: str  # its encodings in words
     video: str | None = None
     audio: str | None = None
 
     @property
-    def form(self) -> str:
-        """Its encodings: the second part of its name."""
-        return self.name.partition(" ")[2]
+    def name(self) -> str:
+        return f"{self.transport} {self.form}"
 
 
 #: The robots are configured with the original's settings: JSON pictures and PCM.
 SUBJECTS = (
-    Subject("mqtt original", "mqtt"),
-    Subject("zenoh original", "zenoh"),
-    Subject("mqtt h264 opus", "mqtt", "h264", "opus"),
-    Subject("zenoh h264 opus", "zenoh", "h264", "opus"),
+    Subject("mqtt", "original"),
+    Subject("zenoh", "original"),
+    Subject("mqtt", "h264 opus", "h264", "opus"),
+    Subject("zenoh", "h264 opus", "h264", "opus"),
 )
 NAMES = tuple(subject.name for subject in SUBJECTS)
 
@@ -98,7 +91,7 @@ class ImpairedRobot:
             self.subject.transport,
             self.network.broker_address(remote.port),
             folder=self._folder,
-            services=self._services(),
+            services=_services(self._folder, self._played),
             reports=None,
             wrap=self.network.on_robot,
         )
@@ -131,21 +124,33 @@ class ImpairedRobot:
         """All clips that the loudspeaker has played."""
         return playbacks(self._played)
 
-    def _services(self) -> dict[str, Config]:
-        """The original's keys and values where it has them."""
-        video = {"publish_width": WIDTH, "publish_height": HEIGHT, "publish_fps": FPS, "keyframe_interval": 5}
-        audio: dict[str, Any] = {"rate": _AUDIO_RATE, "channels": 1}
-        loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self._played)]
-        sounds = _write_clip(self._folder / "sounds")
-        publishers = {"video_publisher": {**video, "jpeg_quality": 10}, "audio_publisher": {**audio, "chunk_ms": 20}}
-        return {
-            "mqtt_bridge": {"media": publishers},
-            "av_daemon": {
-                "video": {"backend": "synthetic", "width": WIDTH, "height": HEIGHT, "fps": FPS},
-                "audio": {"source": "synthetic", **audio},
-            },
-            "soundboard_handler": {"playback": {"directory": str(sounds), "player_command": loudspeaker}},
-        }
+
+def _services(folder: Path, played: Path) -> dict[str, Config]:
+    """The original's keys and values where it has them; the loudspeaker records into ``played``."""
+    sound: Config = {"rate": _AUDIO_RATE, "channels": 1}
+    publishers = {
+        "video_publisher": {"keyframe_interval": 5, "jpeg_quality": 10},
+        "audio_publisher": {**sound, "chunk_ms": 20},
+    }
+    loudspeaker = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(played)]
+    playback = {"directory": str(_write_clip(folder / "sounds")), "player_command": loudspeaker}
+    own = {
+        "mqtt_bridge": {"media": publishers},
+        "av_daemon": {"audio": sound},
+        "soundboard_handler": {"playback": playback},
+    }
+    services: dict[str, Config] = deep_merge(synthetic_media(PICTURES, PICTURES), own)
+    return services
+
+
+def _write_clip(folder: Path) -> Path:
+    """The folder, with the clip that is played at the end of each trial."""
+    folder.mkdir()
+    samples = Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))
+    with wave.open(str(folder / CLIP), "wb") as file:
+        file.setparams((1, 2, _AUDIO_RATE, len(samples), "NONE", "not compressed"))
+        file.writeframes(to_bytes(samples))
+    return folder
 
 
 class TestBed(Processes):
@@ -174,18 +179,6 @@ class TestBed(Processes):
             operator.ask_to_end()
 
 
-def _write_clip(folder: Path) -> Path:
-    """The folder, with the clip that is played at the end of each trial."""
-    folder.mkdir()
-    samples = Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))
-    with wave.open(str(folder / CLIP), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(_AUDIO_RATE)
-        file.writeframes(to_bytes(samples))
-    return folder
-
-
 # -- the course of the trials
 
 
@@ -193,9 +186,9 @@ def prepare(run: Run) -> None:
     """Chooses the kind of network; the recorded command line uses the same kind. Raises PebbleError."""
     run.options["link"], why_proxy = resolved(run["link"])
     if why_proxy is not None:
-        why = f"A proxy replaces the network namespaces: {why_proxy}"
-        run.console.print(why, highlight=False, soft_wrap=True)
-    words = _LINKS[run["link"]].format("both directions" if run["both_ways"] else "robot's uplink")
+        run.console.print(f"A proxy replaces the network namespaces: {why_proxy}", highlight=False, soft_wrap=True)
+    impaired = "both directions impaired" if run["both_ways"] else "robot's uplink impaired"
+    words = f"{_LINKS[run['link']]} {impaired}"
     run.recorded |= {"link_words": words, "why_proxy": why_proxy}  # None: no proxy, or a requested one
 
 
@@ -211,10 +204,7 @@ def test_bed(run: Run) -> TestBed:
 
 def groups(run: Run, robots: Sequence[ImpairedRobot]) -> list[list[ImpairedRobot]]:
     """Those that run at the same time: the transports of one form, to limit the load on small machines; or all."""
-    if run["all_at_once"]:
-        return [list(robots)]
-    forms = dict.fromkeys(robot.subject.form for robot in robots)
-    return [[robot for robot in robots if robot.subject.form == form] for form in forms]
+    return [list(robots)] if run["all_at_once"] else [*grouped(robots, lambda robot: robot.subject.form).values()]
 
 
 def measure(round_: Round) -> Iterator[Cell]:
@@ -222,21 +212,20 @@ def measure(round_: Round) -> Iterator[Cell]:
     run, bed = round_.run, round_.env
     began_ns, trials, marks = time.monotonic_ns(), list[Trial](), list[str]()
     with ThreadPoolExecutor(len(bed.robots), thread_name_prefix="subject") as pool:
-        at_once = partial(_at_once, pool)
         try:
-            at_once(bed.robots, lambda robot: robot.next_report(_UP_S))
+            list(pool.map(lambda robot: robot.next_report(_UP_S), bed.robots))
             cases = round_.cases()
             for number, condition in enumerate(conditions(run)):
                 list(islice(cases, len(bed.robots)))  # for the progress that is shown
                 turn = slice(None, None, -1 if number % 2 else 1)
-                for place, group in enumerate(groups(run, bed.robots)[turn]):
+                for place, group in enumerate(one[turn] for one in groups(run, bed.robots)[turn]):
                     run.show(f"{condition.name}: {', '.join(robot.subject.name for robot in group)}")
-                    at_once(group[turn], partial(_recover, run))
+                    list(pool.map(partial(_recover, run), group))
                     if not place:
                         marks.append(f"{condition.name}@{(time.monotonic_ns() - began_ns) / 1e9:.1f}")
-                    at_once(group[turn], partial(_apply, condition))
-                    trials += at_once(group[turn], partial(_trial, run, condition.name))
-                    at_once(group[turn], partial(_apply, CLEAN))
+                    list(pool.map(partial(_apply, condition), group))
+                    trials += list(pool.map(partial(_trial, run, condition.name), group))
+                    list(pool.map(partial(_apply, CLEAN), group))
         except PebbleError as error:
             if not trials:
                 raise
@@ -246,14 +235,6 @@ def measure(round_: Round) -> Iterator[Cell]:
     run.recorded["marks"] = ";".join(marks)
     yield from cells_of(trials, FPS)
     yield from over_time(trials, began_ns)
-
-
-def _at_once(pool: ThreadPoolExecutor, robots: Sequence[ImpairedRobot], act: Callable[[ImpairedRobot], _T]) -> list[_T]:
-    """Runs ``act`` for all robots at the same time; the first error ends it."""
-    futures = [pool.submit(act, robot) for robot in robots]
-    for future in wait(futures, return_when=FIRST_EXCEPTION).done:
-        future.result()
-    return [future.result() for future in futures]
 
 
 def _recover(run: Run, robot: ImpairedRobot) -> None:

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import engine
-from pebble.bench.impair import cells
+from pebble.bench.impair import metrics
 from pebble.bench.impair.network import why_no_namespaces
 from pebble.bench.impair.trials import IMPAIR
 from pebble.bench.results import load
@@ -23,7 +23,7 @@ from tests.support import ROOT, until
 
 pytestmark = pytest.mark.alone  # whole robots
 
-MEASURES = (cells.SOUND, cells.PICTURES, cells.DRIVE, cells.HEARTBEAT_GAP)
+MEASURES = (metrics.SOUND, metrics.PICTURES, metrics.DRIVE, metrics.HEARTBEAT_GAP)
 SHORT = {"quiet_s": 0.1, "alone_s": 0.3, "window_s": 1.0, "grace_s": 0.2, "off_s": 0.6, "clip_s": 20.0}
 
 
@@ -51,7 +51,7 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(
     results = load(tmp_path / "impair.json")
     sound, video, drive, heartbeat, after_video, after_audio, clip = (
         results.find(subject, measure, trial="512k")
-        for measure in (*MEASURES, cells.AFTER_VIDEO, cells.AFTER_AUDIO, cells.CLIP)
+        for measure in (*MEASURES, metrics.AFTER_VIDEO, metrics.AFTER_AUDIO, metrics.CLIP)
     )
     assert sound is not None
     assert sound.samples

@@ -11,9 +11,19 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
-from pebble.bench.impair import cells, metrics
-from pebble.bench.impair.cells import Trial, cells_of, over_time
-from pebble.bench.impair.metrics import ClipCommand, Command, Heartbeat, Picture, Record, Sound, Window
+from pebble.bench.impair import metrics
+from pebble.bench.impair.metrics import (
+    ClipCommand,
+    Command,
+    Heartbeat,
+    Picture,
+    Record,
+    Sound,
+    Trial,
+    Window,
+    cells_of,
+    over_time,
+)
 from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.trials import IMPAIR, NAMES, QUICK, SUBJECTS, ImpairedRobot, conditions, groups
 from pebble.bench.results import Cell
@@ -203,23 +213,23 @@ def of(found: list[Cell], measure: str) -> Cell:
 def test_a_good_trial_has_all_its_cells() -> None:
     found = cells_of([trial()], fps=10)
     assert len({cell.measure for cell in found}) == len(found) == 12
-    sound, video = of(found, cells.SOUND), of(found, cells.PICTURES)
+    sound, video = of(found, metrics.SOUND), of(found, metrics.PICTURES)
     assert sound.figures["delivered_percent"] == sound.figures["on_time_percent"] == 100
     assert (sound.lost, sound.percentile(95), sound.figures["window_s"]) == (0, 50, 10)
     assert (sound.figures["kbit_up"], sound.figures["dropped_up"]) == (100, 3)
     assert video.figures["fps"] == pytest.approx(10, abs=0.2)
-    assert (video.figures["frozen_s"], of(found, cells.PICTURE_GAP).unit) == (0, "s")
-    assert of(found, cells.HEARTBEAT_GAP).figures["longest_offline_s"] == 0
-    drive = of(found, cells.DRIVE)
+    assert (video.figures["frozen_s"], of(found, metrics.PICTURE_GAP).unit) == (0, "s")
+    assert of(found, metrics.HEARTBEAT_GAP).figures["longest_offline_s"] == 0
+    drive = of(found, metrics.DRIVE)
     assert (drive.figures["sent"], drive.figures["delivered_percent"], drive.figures["trips"]) == (200, 100, 0)
-    assert [len(of(found, name).samples) for name in (cells.DRIVE_ALONE, cells.DRIVE_VIDEO, cells.DRIVE_AUDIO)] == [
-        *(30, 70, 100)
-    ]
+    assert [
+        len(of(found, name).samples) for name in (metrics.DRIVE_ALONE, metrics.DRIVE_VIDEO, metrics.DRIVE_AUDIO)
+    ] == [*(30, 70, 100)]
 
 
 def test_what_is_sent_without_media_is_counted() -> None:
     found = cells_of([trial(heartbeats=[heartbeat(number / 4) for number in range(77)])], fps=10)
-    video, audio = of(found, cells.AFTER_VIDEO), of(found, cells.AFTER_AUDIO)
+    video, audio = of(found, metrics.AFTER_VIDEO), of(found, metrics.AFTER_AUDIO)
     assert (video.figures["heartbeats"], video.figures["longest_gap_s"], video.figures["bytes_up"]) == (
         8,
         0.25,
@@ -229,11 +239,11 @@ def test_what_is_sent_without_media_is_counted() -> None:
 
 
 def test_a_clip_is_timed_from_its_command_to_its_first_sample() -> None:
-    clip = of(cells_of([trial()], fps=10), cells.CLIP)
+    clip = of(cells_of([trial()], fps=10), metrics.CLIP)
     assert (clip.samples, clip.lost, clip.figures["status_ms"]) == ([70], 0, 30)
     never = trial(name="64k", clip=ClipCommand(21 * S))
     found = cells_of([trial(), never], fps=10)
-    (silent,) = (cell for cell in found if cell.measure == cells.CLIP and cell.params["trial"] == "64k")
+    (silent,) = (cell for cell in found if cell.measure == metrics.CLIP and cell.params["trial"] == "64k")
     assert (silent.samples, silent.lost, silent.figures["status_ms"]) == ([], 1, None)
     line = "Clips that the loudspeaker played when commanded: zenoh h264 opus 1 of 2 (p50 70.0 ms, longest 70.0 ms)."
     assert line in lines_of(found)
@@ -242,16 +252,16 @@ def test_a_clip_is_timed_from_its_command_to_its_first_sample() -> None:
 def test_a_trial_in_which_nothing_arrived_has_metrics_too() -> None:
     nothing = trial(pictures=[], sounds=[], heartbeats=[], payloads=0)
     found = cells_of([nothing], fps=10)
-    assert of(found, cells.SOUND).figures["delivered_percent"] == 0
-    assert math.isnan(of(found, cells.SOUND).percentile(95))
-    assert of(found, cells.PICTURES).figures["frozen_s"] == 7
-    assert of(found, cells.HEARTBEAT_GAP).figures["longest_gap_s"] == 20
+    assert of(found, metrics.SOUND).figures["delivered_percent"] == 0
+    assert math.isnan(of(found, metrics.SOUND).percentile(95))
+    assert of(found, metrics.PICTURES).figures["frozen_s"] == 7
+    assert of(found, metrics.HEARTBEAT_GAP).figures["longest_gap_s"] == 20
     assert any("nothing arrived" in sentence and "missed" in sentence for sentence in lines_of(found))
 
 
 def test_series_over_time_are_ordered_and_begin_with_the_run() -> None:
     sound, drive = over_time([trial(), trial(name="64k+5%")], began_ns=-5 * S)
-    assert (sound.measure, drive.measure) == (cells.SOUND_OVER_TIME, cells.DRIVE_OVER_TIME)
+    assert (sound.measure, drive.measure) == (metrics.SOUND_OVER_TIME, metrics.DRIVE_OVER_TIME)
     times, latencies = sound.rounds
     assert len(times) == len(latencies) == 500
     assert times == sorted(times)

@@ -88,7 +88,7 @@ def test_namespaces_that_fail_are_an_error_and_not_replaced_by_a_proxy(monkeypat
 
 
 def test_a_user_without_permission_gets_the_reason() -> None:
-    forwarder = [sys.executable, "-m", "pebble.bench.impair.forwarder"]
+    forwarder = [sys.executable, "-m", "pebble.bench.impair.forwarder", "namespaces"]
     uid = ["setpriv", "--bounding-set=-all", "--inh-caps=-all", "--", *forwarder]
     printed = json.loads(subprocess.run(uid, stdin=subprocess.DEVNULL, capture_output=True, check=False).stdout)
     assert "not permitted: run it as root" in printed["unavailable"]

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from pebble.bench.impair.conditions import Condition, Shape
+from pebble.bench.impair.forwarder import HEADERS, SEGMENT, Stream
 from pebble.bench.impair.network import ProxyNetwork
-from pebble.bench.impair.proxy_process import _HEADERS, _SEGMENT, Direction
 from tests.support import free_port, until
 
 
@@ -87,21 +87,21 @@ def test_a_lost_segment_delays_the_ones_behind_it(network: ProxyNetwork, listene
 
 
 def test_a_retransmission_is_counted_and_uses_the_rate() -> None:
-    direction, pieces, kbit = Direction("up"), 50, 10_000
+    direction, pieces, kbit = Stream("up"), 50, 10_000
     direction.apply(Shape(kbit=kbit, loss=0.5), 0.0)
 
     async def carry() -> float:
         began = time.monotonic()
         for _ in range(pieces):
-            await direction.carry(_SEGMENT)
+            await direction.carry(SEGMENT)
         before = direction.packets
         await direction.carry(1)  # waits for all of them
-        return (time.monotonic() - began) * kbit * 1000 / 8 - (before - 5) * (_SEGMENT + _HEADERS)
+        return (time.monotonic() - began) * kbit * 1000 / 8 - (before - 5) * (SEGMENT + HEADERS)
 
     assert asyncio.run(carry()) > 0
     assert direction.dropped > pieces / 4
     assert direction.packets == pieces + 1 + direction.dropped
-    assert direction.bytes > (pieces + direction.dropped / 2) * (_SEGMENT + _HEADERS)
+    assert direction.bytes > (pieces + direction.dropped / 2) * (SEGMENT + HEADERS)
 
 
 def test_connections_share_the_rate(network: ProxyNetwork, listener: socket.socket) -> None:
