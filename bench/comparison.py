@@ -11,14 +11,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench.pictures import Drawn
 from pebble.bench.results import LONGEST_S, Cell, Judged, Value
 from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from pebble.bench.pictures import Declared
 
 FOLDER: Final = Path("bench-results")
 
@@ -145,7 +147,7 @@ class Comparison:
     legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
-    pictures: Sequence[Drawn] = ()
+    pictures: Sequence[Declared] = ()
 
     folder: Path = FOLDER  # of the results, by default
     is_null: bool = False  # one variant in three roles: see pebble.bench.null

@@ -286,7 +286,7 @@ def _finish(results: Results, folder: Path, console: Console) -> None:
     if find_spec("matplotlib") is None:
         console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
     else:
-        from pebble.bench.plots import draw
+        from pebble.bench.pictures import draw
 
         written += draw(results, folder)
     console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)

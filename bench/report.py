@@ -110,7 +110,7 @@ def _check_not_foreign(folder: Path) -> None:
 
 def _section(comparison: Comparison, folder: Path, known: Run, redraw: bool) -> Section | None:
     """None for a comparison without results and output."""
-    from pebble.bench.plots import draw, pictures
+    from pebble.bench.pictures import draw, pictures
 
     output, measured = folder / f"{comparison.name}.txt", folder / f"{comparison.name}.json"
     words = output.read_text(errors="replace") if output.exists() else ""
@@ -171,7 +171,7 @@ def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[floa
 
 def _delete_results(comparison: Comparison, folder: Path) -> None:
     """Deletes the results of an earlier run, so that a failure is not hidden by them."""
-    from pebble.bench.plots import pictures
+    from pebble.bench.pictures import pictures
 
     measured = folder / f"{comparison.name}.json"
     try:
