@@ -68,10 +68,10 @@ class Option:
             raise PebbleError(f"--{self.name}: unknown {', '.join(unknown)}: there are {', '.join(self.known)}")
         if not values or len(set(values)) < len(values):
             raise PebbleError(f"--{self.name}: name {'each one once' if values else 'at least one'}")
+        limits = {name: limit for name, limit in (("least", self.least), ("most", self.most)) if limit is not None}
         for one in values:
-            if (self.least is not None and not one >= self.least) or (self.most is not None and not one <= self.most):
-                limits = (("at least", self.least), ("at most", self.most))
-                words = " and ".join(f"{word} {limit:g}" for word, limit in limits if limit is not None)
+            if not limits.get("least", one) <= one <= limits.get("most", one):
+                words = " and ".join(f"at {name} {limit:g}" for name, limit in limits.items())
                 raise PebbleError(f"--{self.name} {one}: must be {words}")
 
     def words(self, value: Any, default: Any) -> list[str]:
@@ -160,8 +160,8 @@ class Comparison:
 
     def arguments(self, quick: bool) -> list[str]:
         """The command line in a report, without ``pebble``."""
-        words = [*(self.words or ("bench", self.name)), *(self.reported or ())]
-        return [*words, *((["--quick"] if self.has_quick else []) if quick else self.reported_full)]
+        more = self.reported_full if not quick else ["--quick"] if self.has_quick else []
+        return [*(self.words or ("bench", self.name)), *(self.reported or ()), *more]
 
     @property
     def has_quick(self) -> bool:

@@ -30,23 +30,20 @@ def latency_table(title: str, cells: Sequence[Cell], baseline: str) -> Table:
     columns += [COUNT, LOST]
     heads = [*(column.head for column in columns), f"p50 / {baseline}"]
     table = plain_table(title, ["conditions", "variant", *heads], left=2)
-    before = None
-    for cell in cells:
-        conditions = f"{cell.measure}, {cell.conditions()}"
-        base = base_of(cell, cells, baseline)
-        ratio = "" if base is None else str(paired(cell.rounds, base.rounds))
-        if before not in (None, conditions):
-            table.add_section()
-        values = [column.value(cell) for column in columns]
-        table.add_row("" if conditions == before else conditions, cell.variant, *values, ratio)
-        before = conditions
+    for conditions, some in grouped(cells, lambda cell: f"{cell.measure}, {cell.conditions()}").items():
+        table.add_section()
+        for cell in some:
+            base = base_of(cell, cells, baseline)
+            ratio = "" if base is None else str(paired(cell.rounds, base.rounds))
+            values = [column.value(cell) for column in columns]
+            table.add_row(conditions if cell is some[0] else "", cell.variant, *values, ratio)
     return table
 
 
 def base_of(cell: Cell, cells: Sequence[Cell], baseline: str) -> Cell | None:
     """The baseline's cell under the same conditions; None for a cell of the baseline."""
-    same = (one for one in cells if one.params == cell.params and one.measure == cell.measure)
-    return None if cell.variant == baseline else next((one for one in same if one.variant == baseline), None)
+    same = (one for one in cells if one.variant == baseline and one.case == cell.case)
+    return None if cell.variant == baseline else next(same, None)
 
 
 def figure(value: float) -> str:
@@ -228,7 +225,7 @@ class Claims:
     judged: Callable[[Cell], bool] = lambda _cell: True  # the cells whose number of rounds is noted if it is too small
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[str]:
-        for group in grouped(filter(self.of, cells), lambda cell: (*cell.params.items(), cell.measure)).values():
+        for group in grouped(filter(self.of, cells), lambda cell: cell.case).values():
             quantity = self.quantity.get(group[0].measure, "time")
             group.sort(key=lambda cell: self.order.index(cell.variant) if self.order else 0)
             what = self.what.format(measure=group[0].measure, quantity=quantity, **group[0].params)
