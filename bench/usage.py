@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from statistics import median_low
 
@@ -23,26 +24,20 @@ def cpu_s(pids: Iterable[int]) -> float:
 
     In nanoseconds: /proc counts in ticks of 10 ms, too coarse for slices of less than a second.
     """
-    return sum(map(_cpu_s, pids))
-
-
-def _cpu_s(pid: int) -> float:
-    try:
-        return time.clock_gettime(~pid << 3 | 2)  # the number that clock_getcpuclockid(3) makes of a pid
-    except OSError:
-        return 0.0
+    seconds = 0.0
+    for pid in pids:
+        with suppress(OSError):
+            seconds += time.clock_gettime(~pid << 3 | 2)  # the number that clock_getcpuclockid(3) makes of a pid
+    return seconds
 
 
 def wake_ups(pids: Iterable[int]) -> int:
     """How often threads of these processes have been woken up so far; 0 for processes that have ended."""
-    return sum(_switches(task) for pid in pids for task in _PROC.glob(f"{pid}/task/*"))
-
-
-def _switches(task: Path) -> int:
-    try:
-        return _sum(task / "status", "voluntary_ctxt_switches:")
-    except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-        return 0
+    count = 0
+    for status in (found for pid in pids for found in _PROC.glob(f"{pid}/task/*/status")):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            count += _sum(status, "voluntary_ctxt_switches:")
+    return count
 
 
 def _sum(file: Path, *fields: str) -> int:
