@@ -91,8 +91,8 @@ def certainty(figures: int) -> float:
 
 def differences(a: Results, b: Results) -> list[str]:
     """Other differences between two runs, one line each: the program may then not be the only cause."""
-    about: list[dict[str, Any]] = [{"pebble": one.pebble, "quick": one.quick} for one in (a, b)]
-    groups = {"machine ": [a.machine, b.machine], "option ": [a.options, b.options], "": about}
+    about = [{"pebble": one.pebble, "quick": one.quick} for one in (a, b)]
+    groups: dict[str, Any] = {"machine ": (a.machine, b.machine), "option ": (a.options, b.options), "": about}
     return [
         f"{what}{name}: {one.get(name)} in A, {other.get(name)} in B"
         for what, (one, other) in groups.items()
@@ -103,10 +103,10 @@ def differences(a: Results, b: Results) -> list[str]:
 
 def _by_key(cells: Sequence[Cell]) -> tuple[dict[Hashable, Cell], dict[Hashable, Cell]]:
     """The cells with samples, and those without."""
-    keyed = {(cell.variant, cell.case): cell for cell in cells if not cell.measure.endswith(OVER_TIME)}
-    full, silent = (
-        {key: cell for key, cell in keyed.items() if bool(cell.samples) is there} for there in (True, False)
-    )
+    full: dict[Hashable, Cell] = {}
+    silent: dict[Hashable, Cell] = {}
+    for cell in (cell for cell in cells if not cell.measure.endswith(OVER_TIME)):
+        (full if cell.samples else silent)[cell.variant, cell.case] = cell
     return full, silent
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterable
 from contextlib import suppress
@@ -76,13 +75,11 @@ def _memory_mb(pid: int, *fields: str) -> float:
 
 
 def wake_up_us() -> tuple[float, float]:
-    """The time to wake up a waiting process on the same core and on another one, us; equal if there is only one core.
+    """The time to wake up a waiting process on the same core and on another one, us; alike if there is only one core.
 
     It is half of the median round trip of a byte through a socket to ``cat``: a round trip is two wake-ups and little
     else. Raises PebbleError without ``cat``.
     """
-    if sys.platform != "linux":  # cores cannot be chosen
-        return _wake_up_us(), _wake_up_us()
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, cores[:1])  # only this thread, and processes that it starts meanwhile
     try:
@@ -91,7 +88,7 @@ def wake_up_us() -> tuple[float, float]:
         os.sched_setaffinity(0, cores)
 
 
-def _wake_up_us(core: int | None = None) -> float:
+def _wake_up_us(core: int) -> float:
     near, far = socket.socketpair()
     with near, far:
         try:
@@ -99,8 +96,7 @@ def _wake_up_us(core: int | None = None) -> float:
         except OSError as error:
             raise PebbleError(f"cat: {error.strerror}") from None
         with cat:
-            if core is not None:
-                os.sched_setaffinity(cat.pid, {core})
+            os.sched_setaffinity(cat.pid, {core})
             ways = []
             for _ in range(_PINGS):
                 time.sleep(_PERIOD_S)
