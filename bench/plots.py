@@ -72,33 +72,26 @@ _GREYS = ("#4d4d4d", "#8a8a8a", "#1a1a1a", "#b3b3b3")
 _GREENS = ("#117733", "#6DBE8B")
 _DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "D", "v", "P")
-_KNOWN = {
-    "zenoh": Style(_BLUES[0]),
-    "zenoh-p2p": Style(_BLUES[0]),
-    "zenoh-shm": Style(_BLUES[0]),
-    "zenoh-hub": Style(_BLUES[1], "--", "s"),
-    "zenoh-copy": Style(_BLUES[1], "--", "s"),
-    "zenoh-net": Style(_BLUES[2], "-.", "^"),
-    "mqtt": Style(_REDS[0], marker="D"),
-    "mqtt-nodelay": Style(_REDS[1], "--", "v"),
-    "mqtt5": Style(_REDS[2], "-.", "P"),
-    "paho": Style(_REDS[3], ":", "X"),
-    "one hop": Style(_GREYS[0], ":", "X"),
-    "memcpy": Style(_GREYS[0], ":", "X"),
-    "gstreamer-shm": Style(_GREYS[1], "--", "v"),
-    "reference": Style(_GREYS[3]),
-    "json": Style(_GREYS[1]),
-    "pcm": Style(_GREYS[1]),
-    "pbvd": Style("#CC79A7", "--", "s"),
-    "pbvz": Style("#7B4F9E", "-.", "^"),
-    "h264": Style(_GREENS[0], marker="D"),
-    "h264, key/5": Style(_GREENS[1], ":", "v"),
-    "opus": Style(_GREENS[0], marker="D"),
-    "zenoh original": Style(_BLUES[2], "--", "s", hollow=True),
-    "zenoh h264 opus": Style(_BLUES[0]),
-    "mqtt original": Style(_REDS[1], "--", "v", hollow=True),
-    "mqtt h264 opus": Style(_REDS[0], marker="D"),
+_SHARED = {
+    Style(_BLUES[0]): ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
+    Style(_BLUES[1], "--", "s"): ("zenoh-hub", "zenoh-copy"),
+    Style(_BLUES[2], "-.", "^"): ("zenoh-net",),
+    Style(_BLUES[2], "--", "s", hollow=True): ("zenoh original",),
+    Style(_REDS[0], marker="D"): ("mqtt", "mqtt h264 opus"),
+    Style(_REDS[1], "--", "v"): ("mqtt-nodelay",),
+    Style(_REDS[1], "--", "v", hollow=True): ("mqtt original",),
+    Style(_REDS[2], "-.", "P"): ("mqtt5",),
+    Style(_REDS[3], ":", "X"): ("paho",),
+    Style(_GREYS[0], ":", "X"): ("one hop", "memcpy"),
+    Style(_GREYS[1], "--", "v"): ("gstreamer-shm",),
+    Style(_GREYS[1]): ("json", "pcm"),
+    Style(_GREYS[3]): ("reference",),
+    Style("#CC79A7", "--", "s"): ("pbvd",),
+    Style("#7B4F9E", "-.", "^"): ("pbvz",),
+    Style(_GREENS[0], marker="D"): ("h264", "opus"),
+    Style(_GREENS[1], ":", "v"): ("h264, key/5",),
 }
+_KNOWN = {name: style for style, names in _SHARED.items() for name in names}
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -48,9 +47,8 @@ def run(
     cannot be written.
     """
     console = console or Console()
-    _require_matplotlib()  # before an hour of measuring, not after it
     check_folder(folder)
-    _check_not_foreign(folder)
+    _check(folder)  # before an hour of measuring, not after it
     expected = sum(one.expected_s(quick) for one in comparisons)
     about = f"{expected / 60:.0f} min" if expected > 120 else f"{expected} s"
     console.print(f"{len(comparisons)} comparisons: about {about}", highlight=False)
@@ -81,11 +79,9 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
 
     Raises PebbleError.
     """
-    _require_matplotlib()
-    _check_not_foreign(folder)
+    _check(folder)
     known = _known(folder)
-    every = (_section(one, folder, known, redraw) for one in catalogue.reported())
-    sections = [section for section in every if section is not None]
+    sections = [found for one in catalogue.reported() if (found := _section(one, folder, known, redraw)) is not None]
     if not sections:
         raise PebbleError(f"{folder} has no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME
@@ -94,13 +90,10 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
     return path
 
 
-def _require_matplotlib() -> None:
+def _check(folder: Path) -> None:
+    """Raises PebbleError without matplotlib, or if README.md is not one of our reports and would be overwritten."""
     if find_spec("matplotlib") is None:
         raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
-
-
-def _check_not_foreign(folder: Path) -> None:
-    """Raises PebbleError if README.md is not one of our reports, which would be overwritten."""
     path = folder / NAME
     with named(path):
         ours = not path.exists() or path.read_text(errors="replace").startswith(HEADING)
@@ -133,19 +126,20 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task("", total=sum(expected))
-
-        def tick(number: int, since_s: float) -> None:
-            name, expected_s = comparisons[number].name, expected[number]
-            text = f"{number + 1} of {len(comparisons)}: {name}, {since_s:.0f} s of about {expected_s}"
-            progress.update(bar, description=text, completed=sum(expected[:number]) + min(since_s, expected_s))
-
         for number, one in enumerate(comparisons):
+            before = f"{number + 1} of {len(comparisons)}: {one.name}"
+
+            def tick(since_s: float, number: int = number, before: str = before) -> None:
+                text = f"{before}, {since_s:.0f} s of about {expected[number]}"
+                completed = sum(expected[:number]) + min(since_s, expected[number])
+                progress.update(bar, description=text, completed=completed)
+
             _delete_results(one, folder)
             known.ended[one.name] = Outcome(code=INTERRUPTED, took_s=0.0)  # until it ends
             known.interrupted = f"in {one.name}, after {number} of {len(comparisons)}"
             _save(known, folder)
             began = time.monotonic()
-            code = _run(one, folder, quick, partial(tick, number))
+            code = _run(one, folder, quick, tick)
             left = (folder / f"{one.name}.json").exists()
             ended = Outcome(code=code, took_s=round(time.monotonic() - began, 1), results=left)
             known.ended[one.name], known.interrupted = ended, ""
@@ -173,11 +167,9 @@ def _delete_results(comparison: Comparison, folder: Path) -> None:
     """Deletes the results of an earlier run, so that a failure is not hidden by them."""
     from pebble.bench.pictures import pictures
 
-    measured = folder / f"{comparison.name}.json"
-    try:
+    measured, old = folder / f"{comparison.name}.json", list[str]()
+    with suppress(PebbleError):  # of another format: its pictures, if any, will be overwritten
         old = [f"{picture.name}.png" for picture in pictures(load(measured))] if measured.exists() else []
-    except PebbleError:  # of another format: its pictures, if any, will be overwritten
-        old = []
     for name in (*old, measured.name, f"{comparison.name}.txt"):
         (folder / name).unlink(missing_ok=True)
 

@@ -70,6 +70,11 @@ class Cell(msgspec.Struct, kw_only=True):
         """How many samples each round had, before the cell was thinned."""
         return self.counts or [len(one) for one in self.rounds]
 
+    def single(self, name: str) -> float:
+        """A single value; NaN without one."""
+        found = self.figures.get(name)
+        return float(found) if isinstance(found, (int, float)) else math.nan
+
     def percentile(self, percent: float) -> float:
         """A percentile of all samples; NaN without samples."""
         known = self.percentiles.get(f"{percent:g}")

@@ -68,9 +68,9 @@ def spread(cell: Cell) -> str:
 
 
 def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
-    """Compares the robots in one measure; ``quantity`` as in "takes 0.9× the time".
+    """Compares one or two robots in one measure, the baseline first; ``quantity`` as in "takes 0.9× the time".
 
-    ``cells`` are one or two, the baseline first.
+    Without an interval it states whether all rounds of one robot lie below those of the other.
     """
     unit = f" {cells[0].unit}" if cells[0].unit else ""
     values = ", ".join(f"{cell.variant} {spread(cell)}{unit}" for cell in cells)
@@ -80,13 +80,16 @@ def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
     if enough(cells):
         words = paired(ours.rounds, theirs.rounds).words(ours.variant, theirs.variant, quantity)
         return f"{what}: {words}; {values}"
-    return f"{what}: {values}{_without_interval(ours, theirs, quantity)}"
+    a, b = medians(ours), medians(theirs)
+    if min(len(a), len(b)) < _LEAST_APART:
+        return f"{what}: {values}"
+    less = ours.variant if max(a) < min(b) else theirs.variant if max(b) < min(a) else None
+    return f"{what}: {values}: " + (f"{less} takes less {quantity} in every round" if less else "no clear difference")
 
 
 def against(cells: Sequence[Cell]) -> str:
     """The second robot's value divided by the first's, with an interval if there are enough rounds."""
-    interval = paired(cells[1].rounds, cells[0].rounds)
-    return str(interval) if enough(cells) else figure(interval.ratio)
+    return str(paired(cells[1].rounds, cells[0].rounds))
 
 
 def enough(cells: Sequence[Cell]) -> bool:
@@ -98,23 +101,10 @@ def caveat(cells: Sequence[Cell]) -> list[str]:
     """A note below sentences without intervals."""
     if enough(cells):
         return []
-    few = min(len(medians(cell)) for cell in cells)
+    few, needs = min(len(medians(cell)) for cell in cells), f"a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
     if few < 2:
-        return [f"One round is not enough to compare; a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}."]
-    return [
-        f"{few} rounds, and a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}:"
-        " these are medians, with minimum and maximum."
-    ]
-
-
-def _without_interval(ours: Cell, theirs: Cell, quantity: str) -> str:
-    """States whether all rounds of one robot lie below those of the other."""
-    a, b = medians(ours), medians(theirs)
-    if min(len(a), len(b)) < _LEAST_APART:
-        return ""
-    if max(a) < min(b):
-        return f": {ours.variant} takes less {quantity} in every round"
-    return f": {theirs.variant} takes less {quantity} in every round" if max(b) < min(a) else ": no clear difference"
+        return [f"One round is not enough to compare; {needs}."]
+    return [f"{few} rounds, and {needs}: these are medians, with minimum and maximum."]
 
 
 # -- tables and sentences as data
@@ -136,11 +126,7 @@ def percentile_column(percent: float, head: str = "") -> Column:
 def single_column(head: str, name: str, how: str = "g") -> Column:
     """A single value of the cell, formatted as ``how``; empty without one."""
 
-    def value(cell: Cell) -> str:
-        found = cell.figures.get(name)
-        return format(found, how) if isinstance(found, (int, float)) else ""
-
-    return Column(head, value)
+    return Column(head, lambda cell: "" if math.isnan(value := cell.single(name)) else format(value, how))
 
 
 COUNT = Column("n", lambda cell: str(len(cell.samples)))
