@@ -171,21 +171,21 @@ class Grid:
         heads = [" ".join(filter(None, (one, column.head))) for one in named for column in self.columns]
         heads += [f"{variants[1]} / {variants[0]}"] if self.ratio and len(variants) > 1 else []
         table = plain_table(title, [*(self.heads or self.rows), *heads], left=len(self.rows))
-        firsts, before = [row[0] for row in groups], None
-        for row in sorted(groups, key=lambda names: self._order(names, list(groups))):
-            if before not in (None, row[0]) and max(map(firsts.count, (before, row[0]))) > 1:
+        before = 1
+        for first, rows in grouped(groups, lambda row: row[0]).items():
+            if max(before, before := len(rows)) > 1:
                 table.add_section()
-            shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
-            shown += [against(groups[row])] if self.ratio and len(variants) > 1 else []
-            names = ["" if row[0] == before and len(row) > 1 else row[0], *row[1:]]
-            table.add_row(*names, *shown, style="bold" if self.last in row and self.last else None)
-            before = row[0]
+            for row in sorted(rows, key=self._is_last):
+                shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
+                shown += [against(groups[row])] if self.ratio and len(variants) > 1 else []
+                style = "bold" if self._is_last(row) else None
+                table.add_row(first, *row[1:], *shown, style=style)
+                first = ""
         table.caption, table.caption_justify = self.caption or None, "left"
         return table
 
-    def _order(self, row: tuple[str, ...], rows: list[tuple[str, ...]]) -> tuple[int, bool, int]:
-        """Rows of the same first name stay together, and the last one comes last."""
-        return next(at for at, one in enumerate(rows) if one[0] == row[0]), self.last in row, rows.index(row)
+    def _is_last(self, row: Sequence[str]) -> bool:
+        return bool(self.last) and self.last in row
 
     def _value(self, group: Sequence[Cell], variant: str | None, column: Column) -> str:
         found = [one for one in group if variant in (None, one.variant) and column.measure in (None, one.measure)]
