@@ -26,18 +26,9 @@ def plain_table(title: str, columns: Sequence[str], *, left: int = 1) -> Table:
 
 def latency_table(title: str, cells: Sequence[Cell], baseline: str) -> Table:
     """Rows in the order of the cells. Last column: ratio of the median to ``baseline``'s under the same conditions."""
-    columns = [percentile_column(50, f"p50 {cells[0].unit if cells else 'us'}"), *map(percentile_column, (95, 99, 100))]
-    columns += [COUNT, LOST]
-    heads = [*(column.head for column in columns), f"p50 / {baseline}"]
-    table = plain_table(title, ["conditions", "variant", *heads], left=2)
-    for conditions, some in grouped(cells, lambda cell: f"{cell.measure}, {cell.conditions()}").items():
-        table.add_section()
-        for cell in some:
-            base = base_of(cell, cells, baseline)
-            ratio = "" if base is None else str(paired(cell.rounds, base.rounds))
-            values = [column.value(cell) for column in columns]
-            table.add_row(conditions if cell is some[0] else "", cell.variant, *values, ratio)
-    return table
+    first = percentile_column(50, f"p50 {cells[0].unit if cells else 'us'}")
+    columns = (first, *map(percentile_column, (95, 99, 100)), COUNT, LOST)
+    return next(Grid(title=title, rows=("conditions", "variant"), columns=columns, baseline=baseline)(cells))
 
 
 def base_of(cell: Cell, cells: Sequence[Cell], baseline: str) -> Cell | None:
@@ -141,11 +132,12 @@ def median_column(head: str, measure: str | None = None, how: Callable[[float], 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """A table: a row for each value of the ``rows`` (parameters, ``measure``, ``unit`` or ``variant``).
+    """A table: a row for each value of the ``rows`` (parameters, ``conditions``, ``measure``, ``unit`` or ``variant``).
 
-    The columns are repeated side by side for each variant, unless it is one of the rows; with ``ratio`` the second
-    variant's value as a ratio to the first's comes last. A row of the name ``last`` comes last, in bold. There is one
-    table for all values of ``each`` of these parameters, which the title may name.
+    The columns are repeated side by side for each variant, unless it is one of the rows. The last one is with ``ratio``
+    that of the second variant to the first, with ``baseline`` that of the row's variant to this one. A row of the name
+    ``last`` comes last, in bold. There is one table for all values of ``each`` of these parameters, which the title may
+    name.
     """
 
     title: str
@@ -154,6 +146,7 @@ class Grid:
     heads: Sequence[str] | None = None  # of the rows
     of: Callable[[Cell], bool] = lambda _cell: True
     ratio: bool = False
+    baseline: str = ""
     last: str = ""
     caption: str = ""
     each: Sequence[str] = ()
@@ -169,7 +162,10 @@ class Grid:
         groups = grouped(cells, lambda cell: _fields(cell, self.rows))
         named = variants if len(variants) > 1 or self.ratio else [None]
         heads = [" ".join(filter(None, (one, column.head))) for one in named for column in self.columns]
-        heads += [f"{variants[1]} / {variants[0]}"] if self.ratio and len(variants) > 1 else []
+        if ratio := self.ratio and len(variants) > 1:
+            heads.append(f"{variants[1]} / {variants[0]}")
+        elif self.baseline:
+            heads.append(f"p50 / {self.baseline}")
         table = plain_table(title, [*(self.heads or self.rows), *heads], left=len(self.rows))
         before = 1
         for first, rows in grouped(groups, lambda row: row[0]).items():
@@ -177,7 +173,8 @@ class Grid:
                 table.add_section()
             for row in sorted(rows, key=self._is_last):
                 shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
-                shown += [against(groups[row])] if self.ratio and len(variants) > 1 else []
+                base = base_of(groups[row][0], cells, self.baseline)
+                shown += [against(groups[row])] if ratio else [against((base, groups[row][0]))] if base else []
                 style = "bold" if self._is_last(row) else None
                 table.add_row(first, *row[1:], *shown, style=style)
                 first = ""
@@ -193,7 +190,8 @@ class Grid:
 
 
 def _fields(cell: Cell, names: Sequence[str]) -> tuple[str, ...]:
-    own = {"measure": cell.measure, "unit": cell.unit, "variant": cell.variant}
+    conditions = f"{cell.measure}, {cell.conditions()}"
+    own = {"conditions": conditions, "measure": cell.measure, "unit": cell.unit, "variant": cell.variant}
     return tuple(str(own[name] if name in own else cell.params.get(name, "")) for name in names)
 
 
