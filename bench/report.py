@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -127,19 +128,14 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task("", total=sum(expected))
         for number, one in enumerate(comparisons):
-            before = f"{number + 1} of {len(comparisons)}: {one.name}"
-
-            def tick(since_s: float, number: int = number, before: str = before) -> None:
-                text = f"{before}, {since_s:.0f} s of about {expected[number]}"
-                completed = sum(expected[:number]) + min(since_s, expected[number])
-                progress.update(bar, description=text, completed=completed)
-
+            about = f"{number + 1} of {len(comparisons)}: {one.name}, about {expected[number]} s"
+            progress.update(bar, description=about, completed=sum(expected[:number]))
             _delete_results(one, folder)
             known.ended[one.name] = Outcome(code=INTERRUPTED, took_s=0.0)  # until it ends
             known.interrupted = f"in {one.name}, after {number} of {len(comparisons)}"
             _save(known, folder)
             began = time.monotonic()
-            code = _run(one, folder, quick, tick)
+            code = _run(one, folder, quick, partial(progress.advance, bar))
             left = (folder / f"{one.name}.json").exists()
             ended = Outcome(code=code, took_s=round(time.monotonic() - began, 1), results=left)
             known.ended[one.name], known.interrupted = ended, ""
@@ -148,16 +144,15 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
             console.print(", ".join(filter(None, (took, ended.problem))), highlight=False, soft_wrap=True)
 
 
-def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[float], None]) -> int:
+def _run(comparison: Comparison, folder: Path, quick: bool, advance: Callable[[float], None]) -> int:
     """Runs a comparison's command line and returns its exit code. The process ends with this one."""
     words = python("pebble.cli", *comparison.arguments(quick), "--output", folder)
-    longest = _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
+    until = time.monotonic() + _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
     program = Program(comparison.name, [*_PLAIN, *words], folder / f"{comparison.name}.txt")
-    began = time.monotonic()
     try:
-        while program.code is None and (since_s := time.monotonic() - began) < longest:
-            tick(since_s)
+        while program.code is None and time.monotonic() < until:
             time.sleep(_POLL_S)
+            advance(_POLL_S)
         return HUNG if program.code is None else program.code
     finally:
         end_all([program], _END_S)
