@@ -6,7 +6,7 @@ A declared picture is a function of results. matplotlib is imported only when on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,24 +14,8 @@ from pkgutil import resolve_name
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
-from pebble.bench import catalogue, null
-from pebble.bench.plots import (
-    Picture,
-    Style,
-    around,
-    file_name,
-    finite,
-    guide,
-    legend,
-    log_axis,
-    panels,
-    place,
-    save,
-    short,
-    styles,
-    unique,
-    unit_of,
-)
+from pebble.bench import catalogue, null, plots
+from pebble.bench.plots import Picture, Style, finite, place, short, unique
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Results, grouped, percentile
 from pebble.bench.tables import base_of
@@ -63,7 +47,7 @@ def draw(results: Results, folder: Path) -> list[Path]:
     """Draws the pictures of a comparison; returns the files. Raises PebbleError if they cannot be written."""
     found = {folder / f"{picture.name}.png": picture for picture in pictures(results)}
     for path, picture in found.items():
-        save(picture, path, results)
+        plots.save(picture, path, results)
     return list(found)
 
 
@@ -97,7 +81,7 @@ def ecdf(title: str, *, measures: Sequence[str] = ()) -> Declared:
             caption = f"{about}. Share of all messages within the time on the x-axis"
             if any(map(_lost, cells)):
                 caption += "; lost messages are missing from 100 %"
-            made.append(Picture(file_name(results.bench, measure), caption, partial(_curves, cells, about)))
+            made.append(Picture(plots.file_name(results.bench, measure), caption, partial(_curves, cells, about)))
         return made
 
     return found
@@ -138,7 +122,7 @@ def bars(title: str, *, measures: Sequence[str] = (), panel: str = "", group: st
         made = []
         for measure, cells in _by_measure(results, measures).items():
             what = f"{measure}, medians" if panel else _WORDS.get(measure, measure)
-            made += _picture(file_name(results.bench, measure), f"{title}: {what}", cells, make)
+            made += _picture(plots.file_name(results.bench, measure), f"{title}: {what}", cells, make)
         return made
 
     return found
@@ -187,23 +171,23 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
     """The curves end below 100 % by the lost share; the slowest few are cut off."""
     by_place, style_of = grouped(cells, place), _styles(cells)
     conditions = sorted(by_place, key=lambda name: name == _WHOLE)
-    figure, every = panels(len(conditions), 3, (3.9, 2.7), title)
+    figure, every = plots.panels(len(conditions), 3, (3.9, 2.7), title)
     positive = [[sample for sample in finite(cell.samples) if sample > 0] for cell in cells]
-    ends = around([percentile(some, percent) for some in positive for percent in (0.1, 99.8)])
+    ends = plots.around([percentile(some, percent) for some in positive for percent in (0.1, 99.8)])
     for number, (axes, condition) in enumerate(zip(every, conditions, strict=True)):
         for cell in by_place[condition]:
             times, style, arrived = sorted(finite(cell.samples)), style_of[cell.variant], sum(cell.sizes)
             step = 100 * arrived / (arrived + _lost(cell)) / len(times)
             shares = [step * count for count in range(1, len(times) + 1)]
             axes.plot(times, shares, color=style.colour, linestyle=style.dash)
-        log_axis(axes, "x", f"latency, {unit_of(cells[0].unit)}", *ends)
+        plots.log_axis(axes, "x", f"latency, {plots.unit_of(cells[0].unit)}", *ends)
         axes.set_ylim(0, 101)
         axes.set_title(short(condition, 44), loc="left")
         for percent in (50, 99):
-            guide(axes, percent, f"p{percent}")
+            plots.guide(axes, percent, f"p{percent}")
         if number % 3 == 0:
             axes.set_ylabel("share of messages, %")
-    legend(figure, {name: Style(style.colour, style.dash, "") for name, style in style_of.items()})
+    plots.legend(figure, {name: Style(style.colour, style.dash, "") for name, style in style_of.items()})
     return figure
 
 
@@ -214,7 +198,7 @@ def _lost(cell: Cell) -> int:
 
 def _dots(cells: Sequence[Cell], title: str) -> Figure:
     kinds, style_of = grouped(cells, lambda cell: f"{cell.measure}\n{place(cell)}".strip()), _styles(cells)
-    figure, every = panels(len(kinds), 3, (3.6, 2.9), title)
+    figure, every = plots.panels(len(kinds), 3, (3.6, 2.9), title)
     for axes, (kind, shown) in zip(every, kinds.items(), strict=True):
         for at, cell in enumerate(shown):
             samples, style = finite(cell.samples), style_of[cell.variant]
@@ -228,7 +212,7 @@ def _dots(cells: Sequence[Cell], title: str) -> Figure:
         axes.set_ylim(0, 1.08 * max(sample for cell in shown for sample in finite(cell.samples)) or 1.0)
         axes.grid(visible=False, axis="x")
         axes.set_title("\n".join(short(line, 40) for line in kind.split("\n")), loc="left")
-        axes.set_ylabel(f"time, {unit_of(shown[0].unit)}")
+        axes.set_ylabel(f"time, {plots.unit_of(shown[0].unit)}")
     return figure
 
 
@@ -242,9 +226,14 @@ class _Bar(NamedTuple):
     text: str = ""
 
 
-def _bars(axes: Axes, rows: Mapping[str, Sequence[_Bar]], style_of: dict[str, Style]) -> None:
-    """The bars of a row have no gaps between them."""
-    for at, row in enumerate(rows.values()):
+def _bars(
+    axes: Axes, rows: Sequence[str], bars: Sequence[tuple[str, _Bar]], style_of: dict[str, Style], none: str = ""
+) -> None:
+    """Draws bars in the rows of these names, without gaps in a row, and a text in a row that has ``none``."""
+    for at, name in enumerate(rows):
+        row = [bar for one, bar in bars if one == name]
+        if not row:
+            axes.annotate(none, (0, at), fontsize=8, va="center", color="#777")
         for number, bar in enumerate(row):
             y, height = at + _BAR * ((number + 0.5) / len(row) - 0.5), min(0.5, 0.9 * _BAR / len(row))
             colour = style_of[bar.variant].colour
@@ -252,7 +241,7 @@ def _bars(axes: Axes, rows: Mapping[str, Sequence[_Bar]], style_of: dict[str, St
             if bar.line is not None:
                 axes.plot(bar.line, (y, y), color=_DARK, linewidth=1.1, marker="|", markersize=6)
             axes.annotate(bar.text, (bar.line[1] if bar.line else bar.value, y), fontsize=8, va="center")
-    axes.set_yticks(range(len(rows)), [short(name, _LONGEST) for name in rows])
+    axes.set_yticks(range(len(rows)), [short(name or "all", _LONGEST) for name in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
 
@@ -261,18 +250,16 @@ def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: s
     by_measure = grouped(judged, lambda one: one[0].measure)
     variants, places = (unique([of(cell) for cell, _ in judged]) for of in (lambda cell: cell.variant, place))
     height = 0.9 + len(places) * (0.22 + 0.2 * len(variants))
-    figure, every = panels(len(by_measure), 2, (5.6, max(1.9, height)), title)
+    figure, every = plots.panels(len(by_measure), 2, (5.6, max(1.9, height)), title)
     # a role has the same colour with and without the plain one
-    style_of = styles(unique([*map(null.variant_of, variants), *variants]))
+    style_of = plots.styles(unique([*map(null.variant_of, variants), *variants]))
     lows, highs = zip(*(_line(interval) for _, interval in judged), strict=True)
     low, high = max(0.02, 0.93 * min(0.95, *lows)), min(50.0, 1.07 * max(1.25, *highs))
     ticks = next(ratios for span, ratios in _RATIOS.items() if high / low < span)
     for number, (axes, (measure, some)) in enumerate(zip(every, by_measure.items(), strict=True)):
-        rows: dict[str, list[_Bar]] = {name: [] for name in places}
-        for cell, interval in some:
-            rows[place(cell)].append(_Bar(cell.variant, 1.0, interval.ratio, _line(interval)))
-        _bars(axes, rows, style_of)
-        log_axis(axes, "x", f"median as a ratio to {baseline} (log); left of 1 is faster", low, high)
+        drawn = [(place(cell), _Bar(cell.variant, 1.0, one.ratio, _line(one))) for cell, one in some]
+        _bars(axes, places, drawn, style_of)
+        plots.log_axis(axes, "x", f"median as a ratio to {baseline} (log); left of 1 is faster", low, high)
         axes.set_xticks([ratio for ratio in ticks if low <= ratio <= high])
         axes.axvline(1.0, color=_DARK, linewidth=0.9)
         if baseline == _ITSELF:
@@ -297,16 +284,11 @@ def _amounts(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Fi
         row_of = _name
     names = sorted(grouped(cells, row_of), key=lambda name: name == _SUM)
     size = (5.2 if panel else 8.5, 0.9 + 0.17 * max(map(len, by_panel.values())) + 0.15 * len(names))
-    figure, every = panels(len(by_panel), 2, size, title)
-    unit = "% of one core" if (cells[0].measure, cells[0].unit) == ("CPU", "%") else unit_of(cells[0].unit)
+    figure, every = plots.panels(len(by_panel), 2, size, title)
+    unit = "% of one core" if (cells[0].measure, cells[0].unit) == ("CPU", "%") else plots.unit_of(cells[0].unit)
     for axes, (panel_name, some) in zip(every, by_panel.items(), strict=True):
-        rows: dict[str, list[_Bar]] = {name: [] for name in names}
-        for cell in some:
-            middle = _p(50, cell)
-            rows[row_of(cell)].append(_Bar(cell.variant, 0.0, middle, text=f" {digits(middle)}"))
-        _bars(axes, {name or "all": row for name, row in rows.items()}, style_of)
-        for at in (at for at, row in enumerate(rows.values()) if not row):
-            axes.annotate(" not running", (0, at), fontsize=8, va="center", color="#777")
+        drawn = [(row_of(one), _Bar(one.variant, 0.0, _p(50, one), text=f" {digits(_p(50, one))}")) for one in some]
+        _bars(axes, names, drawn, style_of, " not running")
         axes.set_xlim(0, 1.14 * max(_p(50, cell) for cell in cells) or 1.0)
         axes.set_title(short(panel_name, 50), loc="left")
         axes.set_xlabel(", ".join(filter(None, (_WORDS.get(cells[0].measure, cells[0].measure), unit))))
@@ -321,16 +303,15 @@ def _name(cell: Cell) -> str:
 
 def _tails(cells: Sequence[Cell], title: str) -> Figure:
     by_place, style_of = grouped(cells, place), _styles(cells)
-    figure, every = panels(len(by_place), 2, (5.0, 0.9 + 0.32 * len(style_of)), title)
+    figure, every = plots.panels(len(by_place), 2, (5.0, 0.9 + 0.32 * len(style_of)), title)
     left = 0.5 * min((middle for cell in cells if (middle := _p(50, cell)) > 0), default=1.0)
     for axes, (condition, some) in zip(every, by_place.items(), strict=True):
-        log_axis(axes, "x", f"latency, {unit_of(cells[0].unit)}", left, 9 * max(_p(99, cell) for cell in cells))
-        rows: dict[str, list[_Bar]] = {name: [] for name in style_of}
-        for cell in some:
-            middle, high = _p(50, cell), _p(99, cell)
-            text = f"  {digits(middle)} / {digits(high)}"
-            rows[cell.variant].append(_Bar(cell.variant, left, middle, (middle, high), text))
-        _bars(axes, rows, style_of)
+        plots.log_axis(
+            axes, "x", f"latency, {plots.unit_of(cells[0].unit)}", left, 9 * max(_p(99, cell) for cell in cells)
+        )
+        ends = [(cell.variant, _p(50, cell), _p(99, cell)) for cell in some]
+        drawn = [(one, _Bar(one, left, p50, (p50, p99), f"  {digits(p50)} / {digits(p99)}")) for one, p50, p99 in ends]
+        _bars(axes, list(style_of), drawn, style_of)
         axes.set_title(short(condition, 50), loc="left")
     return figure
 
@@ -340,9 +321,9 @@ def _p(percent: float, cell: Cell) -> float:
 
 
 def _styles(cells: Sequence[Cell]) -> dict[str, Style]:
-    return styles(unique([cell.variant for cell in cells]))
+    return plots.styles(unique([cell.variant for cell in cells]))
 
 
 def _squares(figure: Figure, style_of: dict[str, Style]) -> None:
     """A legend of colours only."""
-    legend(figure, {name: Style(style.colour, "", "s") for name, style in style_of.items()})
+    plots.legend(figure, {name: Style(style.colour, "", "s") for name, style in style_of.items()})

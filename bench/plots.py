@@ -123,16 +123,15 @@ def finite(samples: Sequence[float | None]) -> list[float]:
 
 def place(cell: Cell) -> str:
     """The conditions of a cell as text: ``40 B, 200 Hz, with media``."""
-    words = ", ".join(filter(None, (_answers(*one) for one in cell.params.items())))
-    return words or ("unloaded" if "load" in cell.params else "")
-
-
-def _answers(name: str, value: object) -> str:
-    if name == "load":
-        return "" if value in (None, "none") else f"with {value}"
-    if value is None or isinstance(value, str):
-        return value or ""
-    return f"{value} {name.removesuffix('s') if value == 1 else name}"
+    words = []
+    for name, value in cell.params.items():
+        if name == "load":
+            words.append("" if value in (None, "none") else f"with {value}")
+        elif value is None or isinstance(value, str):
+            words.append(value or "")
+        else:
+            words.append(f"{value} {name.removesuffix('s') if value == 1 else name}")
+    return ", ".join(filter(None, words)) or ("unloaded" if "load" in cell.params else "")
 
 
 def short(text: str, width: int = 30) -> str:
