@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rich.console import Console
 from rich.table import Table
 
+from pebble.bench import null
 from pebble.bench.results import LONGEST_S, Cell, Judged, Value
 from pebble.errors import PebbleError
 
@@ -274,10 +275,27 @@ class Round:
     run: Run
     number: int  # from 0
     env: Any
-    plan: Callable[[Round, Sequence[Mapping[str, Value]] | None, int | None], Iterator[Case]]
+    roles: Sequence[str]
+    planted_us: Callable[[Mapping[str, Value]], float]
+    advance: Callable[[], None]  # after each case
 
     def cases(
         self, conditions: Sequence[Mapping[str, Value]] | None = None, passes: int | None = None
     ) -> Iterator[Case]:
-        """Of all conditions, or only of these; ``passes`` replaces that of the options."""
-        return self.plan(self, conditions, passes)
+        """Of all conditions, or only of these; ``passes`` replaces that of the options.
+
+        Roles of each condition run one after another, so that a temporary disturbance affects all of them.
+        """
+        run, number = self.run, self.number
+        conditions = run.comparison.conditions(run) if conditions is None else conditions
+        for pass_ in range(run.options.get("passes", 1) if passes is None else passes):
+            step = -1 if (number + pass_) % 2 else 1
+            for condition in conditions[::step]:
+                for role in self.roles[::step]:
+                    case = Case(
+                        run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
+                        slowed=null.is_slowed(role), planted_us=self.planted_us(condition), env=self.env,
+                    )  # fmt: skip
+                    run.show(str(case))
+                    yield case
+                    self.advance()

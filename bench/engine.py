@@ -6,6 +6,7 @@ import tempfile
 import time
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pebble.bench import null
-from pebble.bench.comparison import Case, Combine, Comparison, Round, Run
+from pebble.bench.comparison import Combine, Comparison, Round, Run
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import OVER_TIME, Cell, Judged, Results, Value, begin, grouped, named, percentile
 from pebble.errors import PebbleError
@@ -94,18 +95,15 @@ def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
         cases = len(collected.roles) * len(about.conditions(run)) * run.options.get("passes", 1)
         bar = progress.add_task("", total=run.rounds * cases)
 
-        def plan(round_: Round, *some: Any) -> Iterator[Case]:
-            for case in _cases(round_, collected, *some):
-                run.show(str(case))
-                yield case
-                progress.advance(bar)
-
         for number in range(run.rounds):
             progress.update(bar, completed=number * cases)
             before = f"round {number + 1} of {run.rounds}: "
             run.show = lambda what, before=before: progress.update(bar, description=before + what)  # type: ignore[misc]
             with rounds.attempt(number), environment.of(number) as env:
-                round_ = Round(run=run, number=number, env=env, plan=plan)
+                round_ = Round(
+                    run=run, number=number, env=env, roles=collected.roles, planted_us=collected.planted_us,
+                    advance=partial(progress.advance, bar),
+                )  # fmt: skip
                 if about.is_null and about.measure is not None and not collected.pilot:
                     collected.pilot = list(about.measure(next(round_.cases())))
                 collected.add(_round(round_))
@@ -124,22 +122,6 @@ def _round(round_: Round) -> Iterator[Cell]:
                     raise
                 round_.run.console.print(f"{case}: {error}", style="red", highlight=False, markup=False, soft_wrap=True)
                 yield from (case.cell(measure, "", []) for measure in about.measures)
-
-
-def _cases(
-    round_: Round, collected: Collected, some: Sequence[Mapping[str, Value]] | None, passes: int | None
-) -> Iterator[Case]:
-    """Roles of each condition one after another, so that a temporary disturbance affects all of them."""
-    run, number = round_.run, round_.number
-    conditions = list(run.comparison.conditions(run) if some is None else some)
-    for pass_ in range(run.options.get("passes", 1) if passes is None else passes):
-        step = -1 if (number + pass_) % 2 else 1
-        for condition in conditions[::step]:
-            for role in collected.roles[::step]:
-                yield Case(
-                    run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
-                    slowed=null.is_slowed(role), planted_us=collected.planted_us(condition), env=round_.env,
-                )  # fmt: skip
 
 
 class _Environment(ExitStack):
