@@ -61,15 +61,14 @@ def run(run: Run) -> int:
 
 def _leave_out_missing(run: Run) -> None:
     """Prints why a variant cannot be measured on this machine. Raises PebbleError if none can."""
-    reasons = {name: run.comparison.missing(name) for name in _named(run)}
+    named = _named(run)
+    reasons = {name: reason for name in named if (reason := run.comparison.missing(name)) is not None}
     for name, reason in reasons.items():
-        if reason is not None:
-            run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
-    left = [name for name, reason in reasons.items() if reason is None]
-    if reasons and not left:
-        raise PebbleError("no variant can be measured on this machine")
-    if len(left) < len(reasons):
-        run.options["variants"] = left
+        run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
+    if reasons:
+        run.options["variants"] = [name for name in named if name not in reasons]
+        if not run.options["variants"]:
+            raise PebbleError("no variant can be measured on this machine")
 
 
 def _named(run: Run) -> Sequence[str]:
