@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
+from pebble.bench.ratios import LEAST_ROUNDS, paired
 from pebble.bench.results import Cell, Judged, percentile
 from pebble.bench.tables import base_of, figure
 
@@ -20,12 +20,7 @@ def with_lost(percent: float) -> Callable[[Cell], float]:
 
 def single(name: str) -> Callable[[Cell], float]:
     """A single value of a cell; NaN without one."""
-
-    def value(cell: Cell) -> float:
-        found = cell.figures.get(name)
-        return float(found) if isinstance(found, (int, float)) else math.nan
-
-    return value
+    return lambda cell: cell.single(name)
 
 
 def outcome(met: bool, *, judged: bool = True) -> str:
@@ -54,28 +49,25 @@ class Aim:
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Judged]:
         found = [cell for cell in cells if self.of(cell)]
-        if self.worst and found:
-            found = [max(found, key=self._beyond)]
-        yield from map(self._judged, found)
+        yield from map(self._judged, [max(found, key=self._beyond)] if self.worst and found else found)
 
     def _beyond(self, cell: Cell) -> float:
         value = self.value(cell)
         return self.at_least - value if self.at_least is not None else value - (self.at_most or 0.0)
 
     def _judged(self, cell: Cell) -> Judged:
-        value = self.value(cell)
+        value, words = self.value(cell), self.never
+        if math.isnan(value):
+            words = "nothing arrived"
+        elif math.isfinite(value):
+            words = f"{self.shown(value)} {self.unit}".strip()
         enough = len(cell.samples) + (cell.lost or 0) >= self.least and len(cell.rounds) >= self.least_rounds
         bound = self.at_most if self.at_least is None else self.at_least
         return Judged(
             what=self.what.format(variant=cell.variant, measure=cell.measure, bound=bound, **cell.params),
             outcome=outcome(self._beyond(cell) <= 0, judged=enough),
-            measured=f"{self._words(value)}{self.beside(cell)}",
+            measured=f"{words}{self.beside(cell)}",
         )
-
-    def _words(self, value: float) -> str:
-        if math.isfinite(value):
-            return f"{self.shown(value)} {self.unit}".strip()
-        return "nothing arrived" if math.isnan(value) else self.never
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,21 +92,19 @@ class RatioAim:
                 yield self._judged(cell, base)
 
     def _judged(self, cell: Cell, base: Cell) -> Judged:
-        rounds = [rounds_with_lost(one) for one in (cell, base)]
-        interval = paired(rounds[0], rounds[1], self.percent)
-        few = interval.few or min(len(one) for some in rounds for one in some) < self.least
-        decided = not few and (interval.high <= self.at_most or interval.low > self.at_most)
+        ours, theirs = map(rounds_with_lost, (cell, base))
+        interval, why = paired(ours, theirs, self.percent), ""
+        if interval.few:
+            why = f", {interval.rounds} of {LEAST_ROUNDS} rounds"
+        elif min(map(len, (*ours, *theirs))) < self.least:
+            why = ", too few samples in a round"
+        elif interval.low <= self.at_most < interval.high:
+            why = ", the interval includes the bound"
         return Judged(
             what=self.what.format(variant=cell.variant, measure=cell.measure, bound=self.at_most, **cell.params),
-            outcome=outcome(interval.high <= self.at_most, judged=decided),
-            measured=str(interval) + ("" if decided else _why(interval, few=few)),
+            outcome=outcome(interval.high <= self.at_most, judged=not why),
+            measured=f"{interval}{why}",
         )
-
-
-def _why(interval: Interval, *, few: bool) -> str:
-    if interval.few:
-        return f", {interval.rounds} of {LEAST_ROUNDS} rounds"
-    return ", too few samples in a round" if few else ", the interval includes the bound"
 
 
 def rounds_with_lost(cell: Cell) -> list[list[float]]:

@@ -51,8 +51,7 @@ def chosen(names: list[str]) -> list[Comparison]:
 
     Raises PebbleError for unknown names.
     """
-    known = reported()
-    if unknown := [name for name in names if name not in [one.name for one in known]]:
-        there = ", ".join(one.name for one in known)
-        raise PebbleError(f"there is no {', '.join(unknown)} in the report: there are {there}")
-    return [one for one in known if (one.name in names if names else not one.needs_more_rights)]
+    known = {one.name: one for one in reported()}
+    if unknown := [name for name in names if name not in known]:
+        raise PebbleError(f"there is no {', '.join(unknown)} in the report: there are {', '.join(known)}")
+    return [one for one in known.values() if (one.name in names if names else not one.needs_more_rights)]

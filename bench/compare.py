@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -26,7 +26,6 @@ CHANCE = 0.01
 #: Memory layout and core placement of new processes shift medians by this factor between runs, which no number of
 #: rounds within one run shows.
 THRESHOLD = 1.05
-_PERCENTS = (50, 99)
 _SAME_EVERY_TIME = ("kB/s", "kbit/s")  # encoder output is deterministic: one value is exact
 _MORE_IS_BETTER = ("1/s",)
 _LEAST_SAMPLES = 100  # of a round: with fewer, p99 is the maximum
@@ -71,18 +70,17 @@ class Finding:
 
 def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Finding]:
     """All findings, the worst first. Each metric that both runs have is judged at the level of :func:`certainty`."""
-    before, after = _by_key(a.cells), _by_key(b.cells)
-    silent = {_key(cell) for cell in b.cells if not cell.samples}
-    both = [(before[key], after[key]) for key in before if key in after]
+    (before, _), (after, silent) = (_by_key(one.cells) for one in (a, b))
+    both = [(cell, after[key]) for key, cell in before.items() if key in after]
     asked = [(one, other, percent) for one, other in both for percent in _percents(one, other)]
-    losing = [(one, other) for one, other in both if _counts(one) and _counts(other) and (one.lost or other.lost)]
-    level = certainty(len(asked) + len(losing))
+    level = certainty(len(asked))
     findings = [_judged(one, other, percent, level, threshold) for one, other, percent in asked]
-    findings += [_lost(one, other, level) for one, other in losing]
-    findings += [
-        _alone(before[key], Kind.NO_SAMPLES if key in silent else Kind.ONLY_A) for key in before if key not in after
-    ]
-    findings += [_alone(after[key], Kind.ONLY_B) for key in after if key not in before]
+    for key, cell in {**before, **after}.items():
+        if key not in after:
+            kind = Kind.NO_SAMPLES if key in silent else Kind.ONLY_A
+            findings.append(Finding(cell, 50, _figure(cell, 50), math.nan, Interval(), kind))
+        elif key not in before:
+            findings.append(Finding(cell, 50, math.nan, _figure(cell, 50), Interval(), Kind.ONLY_B))
     return sorted(findings, key=lambda one: (list(Kind).index(one.kind), -one.ratio.ratio if one.ratio.known else 0.0))
 
 
@@ -93,11 +91,8 @@ def certainty(figures: int) -> float:
 
 def differences(a: Results, b: Results) -> list[str]:
     """Other differences between two runs, one line each: the program may then not be the only cause."""
-    groups: dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]] = {
-        "machine ": (a.machine, b.machine),
-        "option ": (a.options, b.options),
-        "": ({"pebble": a.pebble, "quick": a.quick}, {"pebble": b.pebble, "quick": b.quick}),
-    }
+    about = [{"pebble": one.pebble, "quick": one.quick} for one in (a, b)]
+    groups: dict[str, Any] = {"machine ": (a.machine, b.machine), "option ": (a.options, b.options), "": about}
     return [
         f"{what}{name}: {one.get(name)} in A, {other.get(name)} in B"
         for what, (one, other) in groups.items()
@@ -106,74 +101,62 @@ def differences(a: Results, b: Results) -> list[str]:
     ]
 
 
-def _by_key(cells: Sequence[Cell]) -> dict[Hashable, Cell]:
-    """The cells that have samples, by key."""
-    return {_key(cell): cell for cell in cells if cell.samples and not cell.measure.endswith(OVER_TIME)}
+def _by_key(cells: Sequence[Cell]) -> tuple[dict[Hashable, Cell], dict[Hashable, Cell]]:
+    """The cells with samples, and those without."""
+    full: dict[Hashable, Cell] = {}
+    silent: dict[Hashable, Cell] = {}
+    for cell in (cell for cell in cells if not cell.measure.endswith(OVER_TIME)):
+        (full if cell.samples else silent)[cell.variant, cell.case] = cell
+    return full, silent
 
 
-def _key(cell: Cell) -> Hashable:
-    return cell.variant, frozenset(cell.params.items()), cell.measure
+def _percents(one: Cell, other: Cell) -> Iterator[int | None]:
+    """The percentiles for which most rounds have enough samples; None for the lost share, if one is known."""
+    yield 50
+    if all(statistics.median(size for size in cell.sizes if size) >= _LEAST_SAMPLES for cell in (one, other)):
+        yield 99
+    losses = [cell.lost for cell in (one, other) if cell.lost is not None and cell.lost >= 0]
+    if len(losses) == 2 and any(losses):
+        yield None
 
 
-def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
-    """The percentiles for which most rounds have enough samples."""
-    fewest = min(statistics.median(size for size in cell.sizes if size) for cell in (one, other))
-    return _PERCENTS if fewest >= _LEAST_SAMPLES else _PERCENTS[:1]
-
-
-def _alone(cell: Cell, kind: Kind) -> Finding:
-    figure = _figure(cell, _PERCENTS[0])
-    a, b = (math.nan, figure) if kind is Kind.ONLY_B else (figure, math.nan)
-    return Finding(cell, _PERCENTS[0], a, b, Interval(), kind)
-
-
-def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float) -> Finding:
+def _judged(one: Cell, other: Cell, percent: int | None, level: float, threshold: float) -> Finding:
+    if percent is None:
+        return _lost(one, other, level)
     ratio = unpaired(other.rounds, one.rounds, percent, level)
-    if other.unit in _SAME_EVERY_TIME:
+    exact = other.unit in _SAME_EVERY_TIME
+    if exact:
         ratio = replace(ratio, low=ratio.ratio, high=ratio.ratio)
     a, b = _figure(one, percent), _figure(other, percent)
     if other.unit in _MORE_IS_BETTER and a > 0 and not b:
-        return Finding(other, percent, a, b, ratio, Kind.NO_SAMPLES)
-    judged = not ratio.few or other.unit in _SAME_EVERY_TIME
-    kind = _kind(ratio, threshold, other.unit) if judged else Kind.UNKNOWN
+        kind = Kind.NO_SAMPLES
+    elif (ratio.few and not exact) or not ratio.known:  # too few rounds, or values that are 0
+        kind = Kind.UNKNOWN
+    elif ratio.equal or 1 / threshold < ratio.ratio < threshold:
+        kind = Kind.EQUAL
+    else:
+        kind = Kind.WORSE if (ratio.ratio > 1) != (other.unit in _MORE_IS_BETTER) else Kind.BETTER
     return Finding(other, percent, a, b, ratio, kind)
 
 
 def _lost(one: Cell, other: Cell, level: float) -> Finding:
     """Compares lost shares by the variance between rounds: losses come in bursts. Each round sends equally many."""
-    a, b = _lost_shares(one), _lost_shares(other)
-    rounds = min(len(a), len(b))
-    grown, kind = statistics.fmean(b) - statistics.fmean(a), Kind.UNKNOWN
+    shares = []
+    for cell in (one, other):
+        arrived = [size for size in cell.sizes if size]
+        each = int(cell.figures["sent"] or 0) / len(arrived)
+        shares.append([1 - count / each for count in arrived])
+    rounds, (a, b), kind = min(map(len, shares)), map(statistics.fmean, shares), Kind.UNKNOWN
     if rounds >= LEAST_ROUNDS:
-        error = math.sqrt(sum(statistics.variance(shares) / len(shares) for shares in (a, b)))
-        changed = abs(grown) > max(_LOSS, student(level, rounds) * error)
-        kind = Kind.EQUAL if not changed else Kind.WORSE if grown > 0 else Kind.BETTER
-    shares = (100 * statistics.fmean(a), 100 * statistics.fmean(b))
-    return Finding(other, None, *shares, Interval(level=level, rounds=rounds), kind)
-
-
-def _counts(cell: Cell) -> bool:
-    """Whether the number of sent messages is known."""
-    return cell.lost is not None and cell.lost >= 0
-
-
-def _lost_shares(cell: Cell) -> list[float]:
-    arrived = [size for size in cell.sizes if size]
-    each = int(cell.figures["sent"] or 0) / len(arrived)
-    return [1 - count / each for count in arrived]
+        error = math.sqrt(sum(statistics.variance(some) / len(some) for some in shares))
+        changed = abs(b - a) > max(_LOSS, student(level, rounds) * error)
+        kind = Kind.EQUAL if not changed else Kind.WORSE if b > a else Kind.BETTER
+    return Finding(other, None, 100 * a, 100 * b, Interval(level=level, rounds=rounds), kind)
 
 
 def _figure(cell: Cell, percent: int) -> float:
     """The percentile as the median over the rounds, as in the ratio."""
     return statistics.median(percentile(samples, percent) for samples in cell.rounds if samples)
-
-
-def _kind(ratio: Interval, threshold: float, unit: str) -> Kind:
-    if not ratio.known:  # of values that are 0
-        return Kind.UNKNOWN
-    if ratio.equal or 1 / threshold < ratio.ratio < threshold:
-        return Kind.EQUAL
-    return Kind.WORSE if (ratio.ratio > 1) != (unit in _MORE_IS_BETTER) else Kind.BETTER
 
 
 def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
@@ -190,7 +173,7 @@ def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[s
             f" 1.00; random variation within the runs shows any change with a chance of about {100 * CHANCE:g} %, and"
             " variation between runs adds to that"
         )
-    if ratios := [one.ratio for one in judged if one.percent == _PERCENTS[0]]:
+    if ratios := [one.ratio for one in judged if one.percent == 50]:
         seen = max(threshold, statistics.median(max(one.high / one.ratio, one.ratio / one.low) for one in ratios))
         lines.append(f"Half of the medians would have shown a change by a factor of {seen:.2f}")
     notes = {
@@ -240,14 +223,8 @@ def _table(findings: Sequence[Finding], bench: str) -> Table:
     table.columns[0].no_wrap = False  # long names wrap, so that the outcome is never cut off
     for finding in findings:
         cell = finding.cell
-        table.add_row(
-            ", ".join(filter(None, (cell.variant, cell.measure, cell.conditions()))),
-            finding.what,
-            figure(finding.a),
-            figure(finding.b),
-            str(finding.ratio),
-            finding.kind,
-            style=_COLOURS.get(finding.kind),
-        )
+        where = ", ".join(filter(None, (cell.variant, cell.measure, cell.conditions())))
+        values = (figure(finding.a), figure(finding.b), str(finding.ratio))
+        table.add_row(where, finding.what, *values, finding.kind, style=_COLOURS.get(finding.kind))
     table.columns[-1].justify = "left"
     return table

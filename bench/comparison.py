@@ -11,14 +11,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench.pictures import Drawn
+from pebble.bench import null
 from pebble.bench.results import LONGEST_S, Cell, Judged, Value
 from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from pebble.bench.pictures import Declared
 
 FOLDER: Final = Path("bench-results")
 
@@ -66,10 +69,10 @@ class Option:
             raise PebbleError(f"--{self.name}: unknown {', '.join(unknown)}: there are {', '.join(self.known)}")
         if not values or len(set(values)) < len(values):
             raise PebbleError(f"--{self.name}: name {'each one once' if values else 'at least one'}")
+        limits = {name: limit for name, limit in (("least", self.least), ("most", self.most)) if limit is not None}
         for one in values:
-            if (self.least is not None and not one >= self.least) or (self.most is not None and not one <= self.most):
-                limits = (("at least", self.least), ("at most", self.most))
-                words = " and ".join(f"{word} {limit:g}" for word, limit in limits if limit is not None)
+            if not limits.get("least", one) <= one <= limits.get("most", one):
+                words = " and ".join(f"at {name} {limit:g}" for name, limit in limits.items())
                 raise PebbleError(f"--{self.name} {one}: must be {words}")
 
     def words(self, value: Any, default: Any) -> list[str]:
@@ -145,7 +148,7 @@ class Comparison:
     legend: Callable[[Sequence[Cell]], Iterable[str]] = lambda _cells: ()
     assessment: Sequence[Assess] = ()  # Claims, Aims and functions, the most important first
     complete: Callable[[Sequence[Cell]], bool] = lambda cells: all(cell.samples for cell in cells)  # else exit code 1
-    pictures: Sequence[Drawn] = ()
+    pictures: Sequence[Declared] = ()
 
     folder: Path = FOLDER  # of the results, by default
     is_null: bool = False  # one variant in three roles: see pebble.bench.null
@@ -158,8 +161,8 @@ class Comparison:
 
     def arguments(self, quick: bool) -> list[str]:
         """The command line in a report, without ``pebble``."""
-        words = [*(self.words or ("bench", self.name)), *(self.reported or ())]
-        return [*words, *((["--quick"] if self.has_quick else []) if quick else self.reported_full)]
+        more = self.reported_full if not quick else ["--quick"] if self.has_quick else []
+        return [*(self.words or ("bench", self.name)), *(self.reported or ()), *more]
 
     @property
     def has_quick(self) -> bool:
@@ -272,10 +275,27 @@ class Round:
     run: Run
     number: int  # from 0
     env: Any
-    plan: Callable[[Round, Sequence[Mapping[str, Value]] | None, int | None], Iterator[Case]]
+    roles: Sequence[str]
+    planted_us: Callable[[Mapping[str, Value]], float]
+    advance: Callable[[], None]  # after each case
 
     def cases(
         self, conditions: Sequence[Mapping[str, Value]] | None = None, passes: int | None = None
     ) -> Iterator[Case]:
-        """Of all conditions, or only of these; ``passes`` replaces that of the options."""
-        return self.plan(self, conditions, passes)
+        """Of all conditions, or only of these; ``passes`` replaces that of the options.
+
+        Roles of each condition run one after another, so that a temporary disturbance affects all of them.
+        """
+        run, number = self.run, self.number
+        conditions = run.comparison.conditions(run) if conditions is None else conditions
+        for pass_ in range(run.options.get("passes", 1) if passes is None else passes):
+            step = -1 if (number + pass_) % 2 else 1
+            for condition in conditions[::step]:
+                for role in self.roles[::step]:
+                    case = Case(
+                        run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
+                        slowed=null.is_slowed(role), planted_us=self.planted_us(condition), env=self.env,
+                    )  # fmt: skip
+                    run.show(str(case))
+                    yield case
+                    self.advance()

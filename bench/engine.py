@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import tempfile
 import time
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pebble.bench import null
-from pebble.bench.comparison import Case, Combine, Comparison, Round, Run
+from pebble.bench.comparison import Combine, Comparison, Round, Run
 from pebble.bench.ratios import LEAST_ROUNDS
 from pebble.bench.results import OVER_TIME, Cell, Judged, Results, Value, begin, grouped, named, percentile
 from pebble.errors import PebbleError
@@ -48,7 +48,8 @@ def run(run: Run) -> int:
         console.print(table)
     for line in about.legend(cells):
         console.print(line, style="dim", highlight=False, soft_wrap=True)
-    lines = [*_early(run), *rounds.notes(), *about.assessed(cells), *run.notes]
+    early = [] if run.problem is None else [str(run.problem).splitlines()[0]]
+    lines = [*(f"{why[0].upper()}{why[1:]}" for why in early), *rounds.notes(), *about.assessed(cells), *run.notes]
     results.assessment = [line for line in lines if isinstance(line, str)]
     results.aims = [line for line in lines if isinstance(line, Judged)]
     results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
@@ -58,25 +59,16 @@ def run(run: Run) -> int:
     return int(not (rounds.enough and about.complete(cells)))
 
 
-def _early(run: Run) -> list[str]:
-    """A sentence for the assessment: why the run ended early, if it did."""
-    if run.problem is None:
-        return []
-    why = str(run.problem).splitlines()[0]
-    return [f"{why[0].upper()}{why[1:]}"]
-
-
 def _leave_out_missing(run: Run) -> None:
     """Prints why a variant cannot be measured on this machine. Raises PebbleError if none can."""
-    reasons = {name: run.comparison.missing(name) for name in _named(run)}
+    named = _named(run)
+    reasons = {name: reason for name in named if (reason := run.comparison.missing(name)) is not None}
     for name, reason in reasons.items():
-        if reason is not None:
-            run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
-    left = [name for name, reason in reasons.items() if reason is None]
-    if reasons and not left:
-        raise PebbleError("no variant can be measured on this machine")
-    if len(left) < len(reasons):
-        run.options["variants"] = left
+        run.console.print(f"{name} is left out: {reason}", style="yellow", highlight=False, soft_wrap=True)
+    if reasons:
+        run.options["variants"] = [name for name in named if name not in reasons]
+        if not run.options["variants"]:
+            raise PebbleError("no variant can be measured on this machine")
 
 
 def _named(run: Run) -> Sequence[str]:
@@ -101,21 +93,16 @@ def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
     with Progress(*columns, console=run.console, transient=True) as progress, _Environment(run) as environment:
         cases = len(collected.roles) * len(about.conditions(run)) * run.options.get("passes", 1)
         bar = progress.add_task("", total=run.rounds * cases)
+
         for number in range(run.rounds):
-            done = itertools.count(number * cases)
-
-            def show(text: str, number: int = number) -> None:
-                progress.update(bar, description=f"round {number + 1} of {run.rounds}: {text}")
-
-            def plan(round_: Round, *some: Any, done: Iterator[int] = done) -> Iterator[Case]:
-                for case in _cases(round_, collected, *some):
-                    progress.update(bar, completed=next(done))
-                    run.show(str(case))
-                    yield case
-
-            run.show = show
+            progress.update(bar, completed=number * cases)
+            before = f"round {number + 1} of {run.rounds}: "
+            run.show = lambda what, before=before: progress.update(bar, description=before + what)  # type: ignore[misc]
             with rounds.attempt(number), environment.of(number) as env:
-                round_ = Round(run=run, number=number, env=env, plan=plan)
+                round_ = Round(
+                    run=run, number=number, env=env, roles=collected.roles, planted_us=collected.planted_us,
+                    advance=partial(progress.advance, bar),
+                )  # fmt: skip
                 if about.is_null and about.measure is not None and not collected.pilot:
                     collected.pilot = list(about.measure(next(round_.cases())))
                 collected.add(_round(round_))
@@ -136,22 +123,6 @@ def _round(round_: Round) -> Iterator[Cell]:
                 yield from (case.cell(measure, "", []) for measure in about.measures)
 
 
-def _cases(
-    round_: Round, collected: Collected, some: Sequence[Mapping[str, Value]] | None, passes: int | None
-) -> Iterator[Case]:
-    """Roles of each condition one after another, so that a temporary disturbance affects all of them."""
-    run, number = round_.run, round_.number
-    conditions = list(run.comparison.conditions(run) if some is None else some)
-    for pass_ in range(run.options.get("passes", 1) if passes is None else passes):
-        step = -1 if (number + pass_) % 2 else 1
-        for condition in conditions[::step]:
-            for role in collected.roles[::step]:
-                yield Case(
-                    run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
-                    slowed=null.is_slowed(role), planted_us=collected.planted_us(condition), env=round_.env,
-                )  # fmt: skip
-
-
 class _Environment(ExitStack):
     """What the rounds share: a new one every ``fresh_every`` rounds, and after a round that failed."""
 
@@ -163,18 +134,15 @@ class _Environment(ExitStack):
     @contextmanager
     def of(self, number: int) -> Iterator[Any]:
         if number % self._run.options.get("fresh_every", 1) == 0:
-            self._leave()
+            self.close()
         if not self._current:
+            self.callback(self._current.clear)
             self._current.append(self.enter_context(self._run.comparison.environment(self._run)))
         try:
             yield self._current[0]
         except BaseException:
-            self._leave()
+            self.close()
             raise
-
-    def _leave(self) -> None:
-        self._current.clear()
-        self.close()
 
 
 class Collected:
@@ -183,15 +151,15 @@ class Collected:
     def __init__(
         self, comparison: Comparison, roles: Sequence[str], conditions: Sequence[Mapping[str, Value]] = ()
     ) -> None:
-        self.roles, self._conditions = roles, conditions
-        self._about = comparison
+        self._about, self.roles, self._conditions = comparison, roles, conditions
         self._cells: dict[Hashable, Cell] = {}
-        self._figures: dict[tuple[Hashable, str], list[Value]] = {}
+        self._figures: dict[Hashable, dict[str, list[Value]]] = {}
         self.pilot: list[Cell] = []  # of a null test, before the first round
 
     def add(self, cells: Iterable[Cell]) -> None:
         """Adds a round: all of it, or nothing if an error is raised meanwhile. Passes of a round are one."""
-        for key, parts in sorted(grouped(cells, _key).items(), key=lambda one: self._place(one[1][0])):
+        by_key = grouped(cells, lambda cell: (cell.variant, cell.case))
+        for key, parts in sorted(by_key.items(), key=lambda one: self._place(one[1][0])):
             cell = self._cells.setdefault(key, msgspec.structs.replace(parts[0], rounds=[], figures={}))
             cell.unit = cell.unit or parts[0].unit  # a case that failed has none
             if cell.measure.endswith(OVER_TIME):
@@ -200,7 +168,7 @@ class Collected:
                 cell.rounds.append([sample for part in parts for sample in part.samples])
             for part in parts:
                 for name, value in part.figures.items():
-                    self._figures.setdefault((key, name), []).append(value)
+                    self._figures.setdefault(key, {}).setdefault(name, []).append(value)
 
     def _place(self, cell: Cell) -> tuple[int, int]:
         """The order of the cases, of which every other round has the reverse."""
@@ -211,7 +179,7 @@ class Collected:
         """In the order of the declared measures, if there is one."""
         combine = {**_JOINED, **self._about.figures}
         for key, cell in self._cells.items():
-            known = {name: values for (whose, name), values in self._figures.items() if whose == key}
+            known = self._figures.get(key, {})
             cell.figures = {name: combine.get(name, _last)(values) for name, values in known.items()}
         order = {measure: at for at, measure in enumerate(self._about.measures)}
         return sorted(self._cells.values(), key=lambda cell: order.get(cell.measure, 0))
@@ -226,10 +194,6 @@ class Collected:
             if not null.is_slowed(cell.variant) and cell.samples and condition.items() <= cell.params.items()
         ]
         return null.SLOWDOWN * percentile(usual, 50) if usual else 0.0
-
-
-def _key(cell: Cell) -> Hashable:
-    return cell.variant, tuple(cell.params.items()), cell.measure
 
 
 def _last(values: Sequence[Value]) -> Value:
@@ -286,7 +250,7 @@ def _finish(results: Results, folder: Path, console: Console) -> None:
     if find_spec("matplotlib") is None:
         console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
     else:
-        from pebble.bench.plots import draw
+        from pebble.bench.pictures import draw
 
         written += draw(results, folder)
     console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Draws the pictures that a comparison declares, in the common style: colours of the variants, panels, legends."""
+"""The common style of all pictures: colours of the variants, panels, axes, legends. matplotlib is imported to draw."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import matplotlib as mpl
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
-from PIL import Image
-
-from pebble.bench import catalogue
-from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell, Results, named
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 _DPI = 150
 _COLOURS = 255  # of the palette, which reduces files to a third
@@ -49,7 +44,6 @@ _SETTINGS: dict[Any, Any] = {
     "figure.facecolor": _BACKGROUND,
 }
 
-
 Dash = Literal["-", "--", "-.", ":", ""]
 
 
@@ -72,53 +66,32 @@ class Picture:
     make: Callable[[], Figure]
 
 
-def draw(results: Results, folder: Path) -> list[Path]:
-    """Draws the pictures of a comparison; returns the files. Raises PebbleError if they cannot be written."""
-    found = {folder / f"{picture.name}.png": picture for picture in pictures(results)}
-    for path, picture in found.items():
-        save(picture, path, results)
-    return list(found)
-
-
-def pictures(results: Results) -> list[Picture]:
-    known = results.bench in catalogue.MODULES
-    drawn = catalogue.find(results.bench).pictures if known else (ecdf(results.bench.replace("-", " ").capitalize()),)
-    return [picture for one in drawn for picture in one.pictures(results)]
-
-
 _BLUES = ("#0072B2", "#2AA198", "#56B4E9", "#1B3A6B")
 _REDS = ("#D55E00", "#E69F00", "#A4133C", "#8C510A")
 _GREYS = ("#4d4d4d", "#8a8a8a", "#1a1a1a", "#b3b3b3")
 _GREENS = ("#117733", "#6DBE8B")
 _DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 _MARKERS = ("o", "s", "^", "D", "v", "P")
-_KNOWN = {
-    "zenoh": Style(_BLUES[0]),
-    "zenoh-p2p": Style(_BLUES[0]),
-    "zenoh-shm": Style(_BLUES[0]),
-    "zenoh-hub": Style(_BLUES[1], "--", "s"),
-    "zenoh-copy": Style(_BLUES[1], "--", "s"),
-    "zenoh-net": Style(_BLUES[2], "-.", "^"),
-    "mqtt": Style(_REDS[0], marker="D"),
-    "mqtt-nodelay": Style(_REDS[1], "--", "v"),
-    "mqtt5": Style(_REDS[2], "-.", "P"),
-    "paho": Style(_REDS[3], ":", "X"),
-    "one hop": Style(_GREYS[0], ":", "X"),
-    "memcpy": Style(_GREYS[0], ":", "X"),
-    "gstreamer-shm": Style(_GREYS[1], "--", "v"),
-    "reference": Style(_GREYS[3]),
-    "json": Style(_GREYS[1]),
-    "pcm": Style(_GREYS[1]),
-    "pbvd": Style("#CC79A7", "--", "s"),
-    "pbvz": Style("#7B4F9E", "-.", "^"),
-    "h264": Style(_GREENS[0], marker="D"),
-    "h264, key/5": Style(_GREENS[1], ":", "v"),
-    "opus": Style(_GREENS[0], marker="D"),
-    "zenoh original": Style(_BLUES[2], "--", "s", hollow=True),
-    "zenoh h264 opus": Style(_BLUES[0]),
-    "mqtt original": Style(_REDS[1], "--", "v", hollow=True),
-    "mqtt h264 opus": Style(_REDS[0], marker="D"),
+_SHARED = {
+    Style(_BLUES[0]): ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
+    Style(_BLUES[1], "--", "s"): ("zenoh-hub", "zenoh-copy"),
+    Style(_BLUES[2], "-.", "^"): ("zenoh-net",),
+    Style(_BLUES[2], "--", "s", hollow=True): ("zenoh original",),
+    Style(_REDS[0], marker="D"): ("mqtt", "mqtt h264 opus"),
+    Style(_REDS[1], "--", "v"): ("mqtt-nodelay",),
+    Style(_REDS[1], "--", "v", hollow=True): ("mqtt original",),
+    Style(_REDS[2], "-.", "P"): ("mqtt5",),
+    Style(_REDS[3], ":", "X"): ("paho",),
+    Style(_GREYS[0], ":", "X"): ("one hop", "memcpy"),
+    Style(_GREYS[1], "--", "v"): ("gstreamer-shm",),
+    Style(_GREYS[1]): ("json", "pcm"),
+    Style(_GREYS[3]): ("reference",),
+    Style("#CC79A7", "--", "s"): ("pbvd",),
+    Style("#7B4F9E", "-.", "^"): ("pbvz",),
+    Style(_GREENS[0], marker="D"): ("h264", "opus"),
+    Style(_GREENS[1], ":", "v"): ("h264, key/5",),
 }
+_KNOWN = {name: style for style, names in _SHARED.items() for name in names}
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
@@ -127,9 +100,8 @@ def styles(variants: Sequence[str]) -> dict[str, Style]:
     for name in variants:
         if name not in found:
             family = _BLUES if name.startswith("zenoh") else _REDS if name.startswith(("mqtt", "paho")) else _GREYS
-            used = {style.colour for style in found.values()}
-            colour = next((one for one in family if one not in used), family[len(found) % len(family)])
-            turn = len(found)
+            used, turn = {style.colour for style in found.values()}, len(found)
+            colour = next((one for one in family if one not in used), family[turn % len(family)])
             found[name] = Style(colour, _DASHES[turn % len(_DASHES)], _MARKERS[turn % len(_MARKERS)])
     return {name: found[name] for name in variants}
 
@@ -151,16 +123,15 @@ def finite(samples: Sequence[float | None]) -> list[float]:
 
 def place(cell: Cell) -> str:
     """The conditions of a cell as text: ``40 B, 200 Hz, with media``."""
-    words = ", ".join(filter(None, (_answers(*one) for one in cell.params.items())))
-    return words or ("unloaded" if "load" in cell.params else "")
-
-
-def _answers(name: str, value: object) -> str:
-    if name == "load":
-        return "" if value in (None, "none") else f"with {value}"
-    if value is None or isinstance(value, str):
-        return value or ""
-    return f"{value} {name.removesuffix('s') if value == 1 else name}"
+    words = []
+    for name, value in cell.params.items():
+        if name == "load":
+            words.append("" if value in (None, "none") else f"with {value}")
+        elif value is None or isinstance(value, str):
+            words.append(value or "")
+        else:
+            words.append(f"{value} {name.removesuffix('s') if value == 1 else name}")
+    return ", ".join(filter(None, words)) or ("unloaded" if "load" in cell.params else "")
 
 
 def short(text: str, width: int = 30) -> str:
@@ -170,6 +141,8 @@ def short(text: str, width: int = 30) -> str:
 
 def panels(count: int, columns: int, size: tuple[float, float], title: str) -> tuple[Figure, list[Axes]]:
     """A figure with ``count`` panels of ``size`` inches each, as many in a row as fit."""
+    from matplotlib.figure import Figure
+
     columns = max(1, min(columns, count))
     rows = math.ceil(count / columns)
     width = max(5.5, min(_WIDEST, columns * size[0]))
@@ -181,6 +154,8 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
 
 def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] = ()) -> None:
     """Adds a legend below the panels."""
+    from matplotlib.lines import Line2D
+
     handles = [
         Line2D(
             [], [], color=style.colour, label=short(name, 40), linestyle=style.dash,
@@ -195,6 +170,9 @@ def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] 
 
 def save(picture: Picture, path: Path, results: Results) -> None:
     """Draws a PNG with a palette; a quick run is marked in the corner. Raises PebbleError if it cannot be written."""
+    import matplotlib as mpl
+    from PIL import Image
+
     buffer = io.BytesIO()
     with mpl.rc_context(_SETTINGS):
         figure = picture.make()
@@ -209,17 +187,18 @@ def save(picture: Picture, path: Path, results: Results) -> None:
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
     """Sets a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
+    from matplotlib.ticker import LogLocator
+
     limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high)}
     axes.set(**limits)
-    axis: Axis = axes.xaxis if which == "x" else axes.yaxis
-    decades = math.log10(high / low)
+    axis, decades = axes.xaxis if which == "x" else axes.yaxis, math.log10(high / low)
     few = decades <= _FEW_DECADES[which]
     steps = (1.0,) if not few else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
     axis.set_major_locator(LogLocator(subs=steps, numticks=20))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter("{x:,.12g}")
+    axis.set_minor_formatter("")
     if few:
-        axis.set_minor_locator(NullLocator())
+        axis.set_ticks([], minor=True)
     axis.set_label_text(label)
 
 

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
 
 from pebble.bench.results import percentile
 
@@ -21,11 +20,6 @@ _RESAMPLES = 20_000
 _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
 _SEED = 1  # the same samples give the same interval
-
-if TYPE_CHECKING:  # importing numpy earlier than it is needed would change the memory of measured processes
-    import numpy as np
-
-    _Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,47 +75,39 @@ def paired(ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], p
     """
     pairs = [(percentile(a, percent), percentile(b, percent)) for a, b in zip(ours, theirs, strict=False) if a and b]
     ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
-    if not ratios:
-        return Interval(rounds=0)
-    import numpy as np
-
-    logs = np.log(ratios)
-    return _interval(float(np.median(logs)), _medians(logs, np.random.default_rng(_SEED)), len(logs), LEVEL)
+    logs = [math.log(ratio) if ratio else -math.inf for ratio in ratios]
+    return _interval(logs, [0.0] * len(logs), LEVEL)
 
 
 def unpaired(
     ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], percent: float = 50, level: float = LEVEL
 ) -> Interval:
     """The same for two runs at different times: the ratio of the medians of their rounds' percentiles."""
-    import numpy as np
-
     a, b = (
-        np.log([value for one in rounds if one and (value := percentile(one, percent)) > 0])
+        [math.log(value) for one in rounds if one and (value := percentile(one, percent)) > 0]
         for rounds in (ours, theirs)
     )
-    if not len(a) or not len(b):
+    return _interval(a, b, level)
+
+
+def _interval(ours: Sequence[float], theirs: Sequence[float], level: float) -> Interval:
+    """The difference of the medians of logarithms, from many samples of as many rounds, drawn with replacement."""
+    rounds = min(len(ours), len(theirs))
+    if not rounds:
         return Interval(level=level, rounds=0)
-    random = np.random.default_rng(_SEED)
-    resampled = _medians(a, random) - _medians(b, random)
-    return _interval(float(np.median(a) - np.median(b)), resampled, min(len(a), len(b)), level)
+    import numpy as np  # importing it earlier than it is needed would change the memory of measured processes
 
-
-def _medians(logs: _Floats, random: np.random.Generator) -> _Floats:
-    """Of many samples of as many rounds, drawn with replacement."""
-    import numpy as np
-
-    medians: _Floats = np.median(logs[random.integers(0, len(logs), (_RESAMPLES, len(logs)))], axis=1)
-    return medians
-
-
-def _interval(ratio: float, resampled: _Floats, rounds: int, level: float) -> Interval:
-    import numpy as np
-
+    ratio = float(np.median(ours) - np.median(theirs))
     if rounds < 2:
         return Interval(math.exp(ratio), 0.0, math.inf, level, rounds)
+    random = np.random.default_rng(_SEED)
+    a, b = (
+        np.median(logs[random.integers(0, len(logs), (_RESAMPLES, len(logs)))], axis=1)
+        for logs in map(np.asarray, (ours, theirs))
+    )
     tail = (1 - level) / 2
     wider = student(level, rounds) / NormalDist().inv_cdf(1 - tail)
-    low, high = (ratio + wider * (end - ratio) for end in np.quantile(resampled, [tail, 1 - tail]))
+    low, high = (ratio + wider * (end - ratio) for end in np.quantile(a - b, [tail, 1 - tail]))
     return Interval(math.exp(ratio), math.exp(low), math.exp(high), level, rounds)
 
 

@@ -48,9 +48,8 @@ def run(
     cannot be written.
     """
     console = console or Console()
-    _require_matplotlib()  # before an hour of measuring, not after it
     check_folder(folder)
-    _check_not_foreign(folder)
+    _check(folder)  # before an hour of measuring, not after it
     expected = sum(one.expected_s(quick) for one in comparisons)
     about = f"{expected / 60:.0f} min" if expected > 120 else f"{expected} s"
     console.print(f"{len(comparisons)} comparisons: about {about}", highlight=False)
@@ -81,11 +80,9 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
 
     Raises PebbleError.
     """
-    _require_matplotlib()
-    _check_not_foreign(folder)
+    _check(folder)
     known = _known(folder)
-    every = (_section(one, folder, known, redraw) for one in catalogue.reported())
-    sections = [section for section in every if section is not None]
+    sections = [found for one in catalogue.reported() if (found := _section(one, folder, known, redraw)) is not None]
     if not sections:
         raise PebbleError(f"{folder} has no results of pebble bench: run pebble bench report {folder}")
     path = folder / NAME
@@ -94,13 +91,10 @@ def write(folder: Path, *, redraw: bool = True) -> Path:
     return path
 
 
-def _require_matplotlib() -> None:
+def _check(folder: Path) -> None:
+    """Raises PebbleError without matplotlib, or if README.md is not one of our reports and would be overwritten."""
     if find_spec("matplotlib") is None:
         raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
-
-
-def _check_not_foreign(folder: Path) -> None:
-    """Raises PebbleError if README.md is not one of our reports, which would be overwritten."""
     path = folder / NAME
     with named(path):
         ours = not path.exists() or path.read_text(errors="replace").startswith(HEADING)
@@ -110,7 +104,7 @@ def _check_not_foreign(folder: Path) -> None:
 
 def _section(comparison: Comparison, folder: Path, known: Run, redraw: bool) -> Section | None:
     """None for a comparison without results and output."""
-    from pebble.bench.plots import draw, pictures
+    from pebble.bench.pictures import draw, pictures
 
     output, measured = folder / f"{comparison.name}.txt", folder / f"{comparison.name}.json"
     words = output.read_text(errors="replace") if output.exists() else ""
@@ -133,19 +127,15 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task("", total=sum(expected))
-
-        def tick(number: int, since_s: float) -> None:
-            name, expected_s = comparisons[number].name, expected[number]
-            text = f"{number + 1} of {len(comparisons)}: {name}, {since_s:.0f} s of about {expected_s}"
-            progress.update(bar, description=text, completed=sum(expected[:number]) + min(since_s, expected_s))
-
         for number, one in enumerate(comparisons):
+            about = f"{number + 1} of {len(comparisons)}: {one.name}, about {expected[number]} s"
+            progress.update(bar, description=about, completed=sum(expected[:number]))
             _delete_results(one, folder)
             known.ended[one.name] = Outcome(code=INTERRUPTED, took_s=0.0)  # until it ends
             known.interrupted = f"in {one.name}, after {number} of {len(comparisons)}"
             _save(known, folder)
             began = time.monotonic()
-            code = _run(one, folder, quick, partial(tick, number))
+            code = _run(one, folder, quick, partial(progress.advance, bar))
             left = (folder / f"{one.name}.json").exists()
             ended = Outcome(code=code, took_s=round(time.monotonic() - began, 1), results=left)
             known.ended[one.name], known.interrupted = ended, ""
@@ -154,16 +144,15 @@ def _measure(comparisons: Sequence[Comparison], folder: Path, quick: bool, known
             console.print(", ".join(filter(None, (took, ended.problem))), highlight=False, soft_wrap=True)
 
 
-def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[float], None]) -> int:
+def _run(comparison: Comparison, folder: Path, quick: bool, advance: Callable[[float], None]) -> int:
     """Runs a comparison's command line and returns its exit code. The process ends with this one."""
     words = python("pebble.cli", *comparison.arguments(quick), "--output", folder)
-    longest = _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
+    until = time.monotonic() + _TIMEOUT_FACTOR * comparison.expected_s(quick) + _TIMEOUT_EXTRA_S
     program = Program(comparison.name, [*_PLAIN, *words], folder / f"{comparison.name}.txt")
-    began = time.monotonic()
     try:
-        while program.code is None and (since_s := time.monotonic() - began) < longest:
-            tick(since_s)
+        while program.code is None and time.monotonic() < until:
             time.sleep(_POLL_S)
+            advance(_POLL_S)
         return HUNG if program.code is None else program.code
     finally:
         end_all([program], _END_S)
@@ -171,13 +160,11 @@ def _run(comparison: Comparison, folder: Path, quick: bool, tick: Callable[[floa
 
 def _delete_results(comparison: Comparison, folder: Path) -> None:
     """Deletes the results of an earlier run, so that a failure is not hidden by them."""
-    from pebble.bench.plots import pictures
+    from pebble.bench.pictures import pictures
 
-    measured = folder / f"{comparison.name}.json"
-    try:
+    measured, old = folder / f"{comparison.name}.json", list[str]()
+    with suppress(PebbleError):  # of another format: its pictures, if any, will be overwritten
         old = [f"{picture.name}.png" for picture in pictures(load(measured))] if measured.exists() else []
-    except PebbleError:  # of another format: its pictures, if any, will be overwritten
-        old = []
     for name in (*old, measured.name, f"{comparison.name}.txt"):
         (folder / name).unlink(missing_ok=True)
 

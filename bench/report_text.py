@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -22,7 +22,6 @@ _LONG = 45  # lines of output: more are collapsed
 _BOLD = {MISSED: f"**{MISSED}**"}
 _PIPE = "\\|"
 _TAIL = 12  # lines of a failed command's output
-
 
 HUNG, INTERRUPTED = -1, -2
 _WHY = {HUNG: "hung and was ended", INTERRUPTED: "was interrupted"}
@@ -49,10 +48,6 @@ class Run(msgspec.Struct, kw_only=True):
     ended: dict[str, Outcome] = {}
     left_out: list[str] = []  # not permitted for this user
     interrupted: str = ""  # in which comparison, after how many
-
-    @property
-    def took_s(self) -> float:
-        return sum(one.took_s for one in self.ended.values())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,12 +80,14 @@ def text(sections: Sequence[Section], run: Run | None = None) -> str:
     """The whole report as Markdown."""
     run, measured = run or Run(), [section.results for section in sections if section.results is not None]
     quick = any(results.quick for results in measured)
-    parts = [*_head(sections, measured, quick, run), *_summary(sections, measured, run)]
-    parts += [*_aims(sections), *_machine(measured)]
-    for section in sections:
-        parts += _section(section, quick)
-    parts += ["## What these numbers do not show", "\n".join(f"* {line}" for line in limits(measured))]
+    parts = [*_head(sections, measured, quick, run), *_summary(sections, measured, run), *_aims(sections)]
+    parts += [*_machine(measured), *(part for section in sections for part in _section(section, quick))]
+    parts += ["## What these numbers do not show", _listed(limits(measured))]
     return "\n\n".join(parts) + "\n"
+
+
+def _listed(lines: Iterable[object]) -> str:
+    return "\n".join(f"* {line}" for line in lines)
 
 
 def _head(sections: Sequence[Section], measured: Sequence[Results], quick: bool, run: Run) -> Iterator[str]:
@@ -126,23 +123,23 @@ def _summary(sections: Sequence[Section], measured: Sequence[Results], run: Run)
     lines = []
     for section in sections:
         about, results = section.comparison, section.results
-        link = f"* [{about.title}]({section.link})"
+        link, why = f"[{about.title}]({section.link})", section.problem
         found = [] if results is None else [f"  * {line}" for line in results.assessment[: about.summary_lines]]
         if results is None:
-            lines.append(f"{link}: **failed**, {section.problem or 'nothing was measured'}")
-        elif section.problem:
-            lines += [f"{link}: **incomplete**, it {section.problem}", *found]
-        elif found:
-            lines += [link, *found]
-    lines += [f"* {catalogue.find(name).title}: left out, needs root" for name in run.left_out]
+            link += f": **failed**, {why or 'nothing was measured'}"
+        elif why:
+            link += f": **incomplete**, it {why}"
+        if results is None or why or found:
+            lines.append("\n".join((link, *found)))
+    lines += [f"{catalogue.find(name).title}: left out, needs root" for name in run.left_out]
     tests = [f"{one.bench.removesuffix(_NULL)} {_null(one)}" for one in measured if one.bench.endswith(_NULL)]
     if tests:
         lines.append(
-            f"* Null tests, each variant against itself and against itself slowed by a fifth: {', '.join(tests)}"
+            f"Null tests, each variant against itself and against itself slowed by a fifth: {', '.join(tests)}"
         )
     if lines:
         yield "## In short"
-        yield "\n".join(lines)
+        yield _listed(lines)
 
 
 def _null(results: Results) -> str:
@@ -189,7 +186,7 @@ def _section(section: Section, quick: bool) -> Iterator[str]:
     if section.problem:
         yield f"**It {section.problem}: something could not be measured.** See its output."
     if lines := [*results.assessment, *results.aims]:
-        yield "\n".join(f"* {line}" for line in lines)
+        yield _listed(lines)
     for file, caption in section.pictures:
         yield f"![{caption}]({file})"
     yield from _output(section, results)
@@ -213,10 +210,9 @@ def _fenced(lines: Sequence[str]) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [
-        f"| {' | '.join(cell.replace('|', _PIPE) for cell in line)} |".replace("|  |", "| |") for line in (heads, *rows)
-    ]
-    return "\n".join([lines[0], "|" + "---|" * len(heads), *lines[1:]])
+    escaped = (" | ".join(cell.replace("|", _PIPE) for cell in line) for line in (heads, *rows))
+    first, *lines = (f"| {line} |".replace("|  |", "| |") for line in escaped)
+    return "\n".join((first, "|" + "---|" * len(heads), *lines))
 
 
 # -- limits

@@ -7,6 +7,7 @@ import lzma
 import math
 import os
 import platform
+import re
 import subprocess
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -50,12 +51,17 @@ class Cell(msgspec.Struct, kw_only=True):
     percentiles: dict[str, float] = {}  # and their percentiles
 
     @property
+    def case(self) -> Hashable:
+        """What the cells that are compared have in common: conditions and measure."""
+        return frozenset(self.params.items()), self.measure
+
+    @property
     def samples(self) -> list[float]:
         return [sample for one in self.rounds for sample in one]
 
     @property
     def lost(self) -> int | None:
-        """Messages that were sent and never arrived; None if they were not counted."""
+        """Messages that were sent and never arrived; None if not counted."""
         sent = self.figures.get("sent")
         return int(sent) - sum(self.sizes) if isinstance(sent, int) else None
 
@@ -63,6 +69,11 @@ class Cell(msgspec.Struct, kw_only=True):
     def sizes(self) -> list[int]:
         """How many samples each round had, before the cell was thinned."""
         return self.counts or [len(one) for one in self.rounds]
+
+    def single(self, name: str) -> float:
+        """A single value; NaN without one."""
+        found = self.figures.get(name)
+        return float(found) if isinstance(found, (int, float)) else math.nan
 
     def percentile(self, percent: float) -> float:
         """A percentile of all samples; NaN without samples."""
@@ -140,39 +151,28 @@ def _thinned(samples: Sequence[float], most: int) -> list[float]:
 
 
 def pack(folder: Path) -> None:
-    """Moves the samples of all results in a folder into one small file, thinned. Raises PebbleError."""
+    """Moves the samples of all results in a folder into one small file, thinned. Raises PebbleError.
+
+    It holds the differences of neighbours, which compress well.
+    """
     packed: dict[str, list[list[list[float]]]] = {}
     for path in sorted(folder.glob("*.json")):
-        try:
+        with suppress(PebbleError):  # of another version, or not of a comparison
             results = load(path)
-        except PebbleError:  # of another version, or not of a comparison
-            continue
-        results.cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
-        packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in results.cells]
-        for cell in results.cells:
-            cell.rounds = []
-        results.save(path)
+            results.cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
+            packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in results.cells]
+            results.cells = [msgspec.structs.replace(cell, rounds=[]) for cell in results.cells]
+            results.save(path)
     (folder / SAMPLES).write_bytes(lzma.compress(msgspec.json.encode(packed), preset=9))
 
 
 def _steps(samples: Sequence[float]) -> list[float]:
-    """Differences of neighbours, which compress well."""
     whole = [round(sample * 10**_DIGITS) for sample in samples]
-    return [*whole[:1], *(one - before for before, one in itertools.pairwise(whole))]
-
-
-def _unpack(results: Results, path: Path) -> None:
-    """Reads the thinned samples of results. Raises PebbleError."""
-    try:
-        packed = msgspec.json.decode(lzma.decompress(path.read_bytes()), type=dict[str, list[list[list[int]]]])
-        for cell, rounds in zip(results.cells, packed[results.bench], strict=True):
-            cell.rounds = [[value / 10**_DIGITS for value in itertools.accumulate(one)] for one in rounds]
-    except (OSError, lzma.LZMAError, msgspec.DecodeError, KeyError, ValueError) as error:
-        raise PebbleError(f"{path} does not hold the samples of {results.bench}: {error}") from None
+    return [one - before for before, one in itertools.pairwise([0, *whole])]
 
 
 def load(path: Path) -> Results:
-    """Raises PebbleError if the file holds no results."""
+    """Reads results, with the samples that a report has moved. Raises PebbleError if the file holds none."""
     try:
         with named(path):
             results = msgspec.json.decode(path.read_bytes(), type=Results)
@@ -185,6 +185,15 @@ def load(path: Path) -> Results:
     return results
 
 
+def _unpack(results: Results, path: Path) -> None:
+    try:
+        packed = msgspec.json.decode(lzma.decompress(path.read_bytes()), type=dict[str, list[list[list[int]]]])
+        for cell, rounds in zip(results.cells, packed[results.bench], strict=True):
+            cell.rounds = [[value / 10**_DIGITS for value in itertools.accumulate(one)] for one in rounds]
+    except (OSError, lzma.LZMAError, msgspec.DecodeError, KeyError, ValueError) as error:
+        raise PebbleError(f"{path} does not hold the samples of {results.bench}: {error}") from None
+
+
 def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results:
     """Results of a run that begins now, on this machine."""
     began = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
@@ -193,48 +202,37 @@ def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results
 
 def machine() -> dict[str, Value]:
     """The machine and the versions the results depend on; no names of hosts or users."""
+    cpuinfo, system = "", platform.system()
+    with suppress(OSError):
+        cpuinfo = Path("/proc/cpuinfo").read_text()
+    with suppress(OSError):
+        system = platform.freedesktop_os_release().get("PRETTY_NAME", "")
+    model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", cpuinfo, re.MULTILINE)
     return {
-        "cpu": _cpu(),
+        "cpu": model[1] if model else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),
-        "system": _system(),
+        "system": system,
         "python": platform.python_version(),
         "mosquitto": _mosquitto(),
         **{name: _version(name) for name in _PACKAGES},
     }
 
 
-def _cpu() -> str:
-    lines: list[str] = []
-    with suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model")))
-    return next(named, platform.machine())
-
-
-def _system() -> str:
-    try:
-        return platform.freedesktop_os_release().get("PRETTY_NAME", "")
-    except OSError:
-        return platform.system()
-
-
 def _mosquitto() -> str | None:
     from pebble.rig.broker import mosquitto_path  # not for the processes that only measure
 
-    try:
+    with suppress(OSError, subprocess.SubprocessError):
         command = [mosquitto_path() or "", "-h"]
         answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5).stdout
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return answer.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
+        return answer.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
+    return None
 
 
 def _version(package: str) -> str | None:
-    try:
+    with suppress(PackageNotFoundError):
         return version(package)
-    except PackageNotFoundError:
-        return None
+    return None
 
 
 def grouped(ones: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
@@ -255,6 +253,4 @@ def percentile(figures: Sequence[float], percent: float) -> float:
 
 def rounded(figure: float | int | None, digits: int) -> float | int | None:
     """Rounds for JSON, which has no NaN: None means not measured."""
-    if figure is None or not math.isfinite(figure):
-        return None
-    return figure if isinstance(figure, int) else round(figure, digits)
+    return None if figure is None or not math.isfinite(figure) else round(figure, digits)

@@ -26,27 +26,15 @@ def plain_table(title: str, columns: Sequence[str], *, left: int = 1) -> Table:
 
 def latency_table(title: str, cells: Sequence[Cell], baseline: str) -> Table:
     """Rows in the order of the cells. Last column: ratio of the median to ``baseline``'s under the same conditions."""
-    columns = [percentile_column(50, f"p50 {cells[0].unit if cells else 'us'}"), *map(percentile_column, (95, 99, 100))]
-    columns += [COUNT, LOST]
-    heads = [*(column.head for column in columns), f"p50 / {baseline}"]
-    table = plain_table(title, ["conditions", "variant", *heads], left=2)
-    before = None
-    for cell in cells:
-        conditions = f"{cell.measure}, {cell.conditions()}"
-        base = base_of(cell, cells, baseline)
-        ratio = "" if base is None else str(paired(cell.rounds, base.rounds))
-        if before not in (None, conditions):
-            table.add_section()
-        values = [column.value(cell) for column in columns]
-        table.add_row("" if conditions == before else conditions, cell.variant, *values, ratio)
-        before = conditions
-    return table
+    first = percentile_column(50, f"p50 {cells[0].unit if cells else 'us'}")
+    columns = (first, *map(percentile_column, (95, 99, 100)), COUNT, LOST)
+    return next(Grid(title=title, rows=("conditions", "variant"), columns=columns, baseline=baseline)(cells))
 
 
 def base_of(cell: Cell, cells: Sequence[Cell], baseline: str) -> Cell | None:
     """The baseline's cell under the same conditions; None for a cell of the baseline."""
-    same = (one for one in cells if one.params == cell.params and one.measure == cell.measure)
-    return None if cell.variant == baseline else next((one for one in same if one.variant == baseline), None)
+    same = (one for one in cells if one.variant == baseline and one.case == cell.case)
+    return None if cell.variant == baseline else next(same, None)
 
 
 def figure(value: float) -> str:
@@ -71,9 +59,9 @@ def spread(cell: Cell) -> str:
 
 
 def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
-    """Compares the robots in one measure; ``quantity`` as in "takes 0.9× the time".
+    """Compares one or two robots in one measure, the baseline first; ``quantity`` as in "takes 0.9× the time".
 
-    ``cells`` are one or two, the baseline first.
+    Without an interval it states whether all rounds of one robot lie below those of the other.
     """
     unit = f" {cells[0].unit}" if cells[0].unit else ""
     values = ", ".join(f"{cell.variant} {spread(cell)}{unit}" for cell in cells)
@@ -83,13 +71,16 @@ def sentence(what: str, cells: Sequence[Cell], *, quantity: str) -> str:
     if enough(cells):
         words = paired(ours.rounds, theirs.rounds).words(ours.variant, theirs.variant, quantity)
         return f"{what}: {words}; {values}"
-    return f"{what}: {values}{_without_interval(ours, theirs, quantity)}"
+    a, b = medians(ours), medians(theirs)
+    if min(len(a), len(b)) < _LEAST_APART:
+        return f"{what}: {values}"
+    less = ours.variant if max(a) < min(b) else theirs.variant if max(b) < min(a) else None
+    return f"{what}: {values}: " + (f"{less} takes less {quantity} in every round" if less else "no clear difference")
 
 
 def against(cells: Sequence[Cell]) -> str:
     """The second robot's value divided by the first's, with an interval if there are enough rounds."""
-    interval = paired(cells[1].rounds, cells[0].rounds)
-    return str(interval) if enough(cells) else figure(interval.ratio)
+    return str(paired(cells[1].rounds, cells[0].rounds))
 
 
 def enough(cells: Sequence[Cell]) -> bool:
@@ -101,23 +92,10 @@ def caveat(cells: Sequence[Cell]) -> list[str]:
     """A note below sentences without intervals."""
     if enough(cells):
         return []
-    few = min(len(medians(cell)) for cell in cells)
+    few, needs = min(len(medians(cell)) for cell in cells), f"a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
     if few < 2:
-        return [f"One round is not enough to compare; a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}."]
-    return [
-        f"{few} rounds, and a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}:"
-        " these are medians, with minimum and maximum."
-    ]
-
-
-def _without_interval(ours: Cell, theirs: Cell, quantity: str) -> str:
-    """States whether all rounds of one robot lie below those of the other."""
-    a, b = medians(ours), medians(theirs)
-    if min(len(a), len(b)) < _LEAST_APART:
-        return ""
-    if max(a) < min(b):
-        return f": {ours.variant} takes less {quantity} in every round"
-    return f": {theirs.variant} takes less {quantity} in every round" if max(b) < min(a) else ": no clear difference"
+        return [f"One round is not enough to compare; {needs}."]
+    return [f"{few} rounds, and {needs}: these are medians, with minimum and maximum."]
 
 
 # -- tables and sentences as data
@@ -139,11 +117,7 @@ def percentile_column(percent: float, head: str = "") -> Column:
 def single_column(head: str, name: str, how: str = "g") -> Column:
     """A single value of the cell, formatted as ``how``; empty without one."""
 
-    def value(cell: Cell) -> str:
-        found = cell.figures.get(name)
-        return format(found, how) if isinstance(found, (int, float)) else ""
-
-    return Column(head, value)
+    return Column(head, lambda cell: "" if math.isnan(value := cell.single(name)) else format(value, how))
 
 
 COUNT = Column("n", lambda cell: str(len(cell.samples)))
@@ -158,11 +132,12 @@ def median_column(head: str, measure: str | None = None, how: Callable[[float], 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """A table: a row for each value of the ``rows`` (parameters, ``measure``, ``unit`` or ``variant``).
+    """A table: a row for each value of the ``rows`` (parameters, ``conditions``, ``measure``, ``unit`` or ``variant``).
 
-    The columns are repeated side by side for each variant, unless it is one of the rows; with ``ratio`` the second
-    variant's value as a ratio to the first's comes last. A row of the name ``last`` comes last, in bold. There is one
-    table for all values of ``each`` of these parameters, which the title may name.
+    The columns are repeated side by side for each variant, unless it is one of the rows. The last one is with ``ratio``
+    that of the second variant to the first, with ``baseline`` that of the row's variant to this one. A row of the name
+    ``last`` comes last, in bold. There is one table for all values of ``each`` of these parameters, which the title may
+    name.
     """
 
     title: str
@@ -171,6 +146,7 @@ class Grid:
     heads: Sequence[str] | None = None  # of the rows
     of: Callable[[Cell], bool] = lambda _cell: True
     ratio: bool = False
+    baseline: str = ""
     last: str = ""
     caption: str = ""
     each: Sequence[str] = ()
@@ -186,23 +162,27 @@ class Grid:
         groups = grouped(cells, lambda cell: _fields(cell, self.rows))
         named = variants if len(variants) > 1 or self.ratio else [None]
         heads = [" ".join(filter(None, (one, column.head))) for one in named for column in self.columns]
-        heads += [f"{variants[1]} / {variants[0]}"] if self.ratio and len(variants) > 1 else []
+        if ratio := self.ratio and len(variants) > 1:
+            heads.append(f"{variants[1]} / {variants[0]}")
+        elif self.baseline:
+            heads.append(f"p50 / {self.baseline}")
         table = plain_table(title, [*(self.heads or self.rows), *heads], left=len(self.rows))
-        firsts, before = [row[0] for row in groups], None
-        for row in sorted(groups, key=lambda names: self._order(names, list(groups))):
-            if before not in (None, row[0]) and max(map(firsts.count, (before, row[0]))) > 1:
+        before = 1
+        for first, rows in grouped(groups, lambda row: row[0]).items():
+            if max(before, before := len(rows)) > 1:
                 table.add_section()
-            shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
-            shown += [against(groups[row])] if self.ratio and len(variants) > 1 else []
-            names = ["" if row[0] == before and len(row) > 1 else row[0], *row[1:]]
-            table.add_row(*names, *shown, style="bold" if self.last in row and self.last else None)
-            before = row[0]
+            for row in sorted(rows, key=self._is_last):
+                shown = [self._value(groups[row], one, column) for one in variants for column in self.columns]
+                base = base_of(groups[row][0], cells, self.baseline)
+                shown += [against(groups[row])] if ratio else [against((base, groups[row][0]))] if base else []
+                style = "bold" if self._is_last(row) else None
+                table.add_row(first, *row[1:], *shown, style=style)
+                first = ""
         table.caption, table.caption_justify = self.caption or None, "left"
         return table
 
-    def _order(self, row: tuple[str, ...], rows: list[tuple[str, ...]]) -> tuple[int, bool, int]:
-        """Rows of the same first name stay together, and the last one comes last."""
-        return next(at for at, one in enumerate(rows) if one[0] == row[0]), self.last in row, rows.index(row)
+    def _is_last(self, row: Sequence[str]) -> bool:
+        return bool(self.last) and self.last in row
 
     def _value(self, group: Sequence[Cell], variant: str | None, column: Column) -> str:
         found = [one for one in group if variant in (None, one.variant) and column.measure in (None, one.measure)]
@@ -210,7 +190,8 @@ class Grid:
 
 
 def _fields(cell: Cell, names: Sequence[str]) -> tuple[str, ...]:
-    own = {"measure": cell.measure, "unit": cell.unit, "variant": cell.variant}
+    conditions = f"{cell.measure}, {cell.conditions()}"
+    own = {"conditions": conditions, "measure": cell.measure, "unit": cell.unit, "variant": cell.variant}
     return tuple(str(own[name] if name in own else cell.params.get(name, "")) for name in names)
 
 
@@ -228,7 +209,7 @@ class Claims:
     judged: Callable[[Cell], bool] = lambda _cell: True  # the cells whose number of rounds is noted if it is too small
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[str]:
-        for group in grouped(filter(self.of, cells), lambda cell: (*cell.params.items(), cell.measure)).values():
+        for group in grouped(filter(self.of, cells), lambda cell: cell.case).values():
             quantity = self.quantity.get(group[0].measure, "time")
             group.sort(key=lambda cell: self.order.index(cell.variant) if self.order else 0)
             what = self.what.format(measure=group[0].measure, quantity=quantity, **group[0].params)

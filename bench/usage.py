@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from statistics import median_low
 
@@ -23,26 +23,20 @@ def cpu_s(pids: Iterable[int]) -> float:
 
     In nanoseconds: /proc counts in ticks of 10 ms, too coarse for slices of less than a second.
     """
-    return sum(map(_cpu_s, pids))
-
-
-def _cpu_s(pid: int) -> float:
-    try:
-        return time.clock_gettime(~pid << 3 | 2)  # the number that clock_getcpuclockid(3) makes of a pid
-    except OSError:
-        return 0.0
+    seconds = 0.0
+    for pid in pids:
+        with suppress(OSError):
+            seconds += time.clock_gettime(~pid << 3 | 2)  # the number that clock_getcpuclockid(3) makes of a pid
+    return seconds
 
 
 def wake_ups(pids: Iterable[int]) -> int:
     """How often threads of these processes have been woken up so far; 0 for processes that have ended."""
-    return sum(_switches(task) for pid in pids for task in _PROC.glob(f"{pid}/task/*"))
-
-
-def _switches(task: Path) -> int:
-    try:
-        return _sum(task / "status", "voluntary_ctxt_switches:")
-    except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-        return 0
+    count = 0
+    for status in (found for pid in pids for found in _PROC.glob(f"{pid}/task/*/status")):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            count += _sum(status, "voluntary_ctxt_switches:")
+    return count
 
 
 def _sum(file: Path, *fields: str) -> int:
@@ -81,13 +75,11 @@ def _memory_mb(pid: int, *fields: str) -> float:
 
 
 def wake_up_us() -> tuple[float, float]:
-    """The time to wake up a waiting process on the same core and on another one, us; equal if there is only one core.
+    """The time to wake up a waiting process on the same core and on another one, us; alike if there is only one core.
 
     It is half of the median round trip of a byte through a socket to ``cat``: a round trip is two wake-ups and little
     else. Raises PebbleError without ``cat``.
     """
-    if sys.platform != "linux":  # cores cannot be chosen
-        return _wake_up_us(), _wake_up_us()
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, cores[:1])  # only this thread, and processes that it starts meanwhile
     try:
@@ -96,7 +88,7 @@ def wake_up_us() -> tuple[float, float]:
         os.sched_setaffinity(0, cores)
 
 
-def _wake_up_us(core: int | None = None) -> float:
+def _wake_up_us(core: int) -> float:
     near, far = socket.socketpair()
     with near, far:
         try:
@@ -104,8 +96,7 @@ def _wake_up_us(core: int | None = None) -> float:
         except OSError as error:
             raise PebbleError(f"cat: {error.strerror}") from None
         with cat:
-            if core is not None:
-                os.sched_setaffinity(cat.pid, {core})
+            os.sched_setaffinity(cat.pid, {core})
             ways = []
             for _ in range(_PINGS):
                 time.sleep(_PERIOD_S)

@@ -117,22 +117,27 @@ class Comparisons(TyperGroup):
 
 def command_of(about: Comparison) -> Callable[..., int]:
     """The function of a command, with the options of its comparison."""
+    options = {option.name.replace("-", "_"): option for option in about.options}
 
     def run(*, quick: bool = False, output: Path = FOLDER, **given: Any) -> int:
         from pebble.bench.engine import run as run_
 
-        wanted = {option.key: _parsed(option, given[_python(option)]) for option in about.options}
+        wanted = {options[name].key: _parsed(options[name], value) for name, value in given.items()}
         mode = next((mode for name, mode in about.modes.items() if wanted.get(name)), about)
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
-    parameters = [_parameter(_python(option), _annotation(about, option)) for option in about.options]
-    parameters += [_parameter("quick", Quick, False)] if about.has_quick else []
+    declared: dict[str, tuple[Any, Any]] = {name: (_annotation(about, one), None) for name, one in options.items()}
+    if about.has_quick:
+        declared["quick"] = Quick, False
+    declared["output"] = Output, about.folder
     run.__doc__ = about.help
-    return with_parameters(run, [*parameters, _parameter("output", Output, about.folder)])
-
-
-def _parameter(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+    return with_parameters(
+        run,
+        [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+            for name, (annotation, default) in declared.items()
+        ],
+    )
 
 
 def with_parameters(run: Callable[..., int], parameters: Sequence[inspect.Parameter]) -> Callable[..., int]:
@@ -145,9 +150,8 @@ def with_parameters(run: Callable[..., int], parameters: Sequence[inspect.Parame
 def _annotation(about: Comparison, option: Option) -> Any:
     """The option for typer: None if it is not given."""
     kind: Any = list[option.kind] if option.repeated else str if option.many else option.kind  # type: ignore[name-defined]
-    low, high = (None, None) if option.kind in (str, bool) or option.many else (option.least, option.most)
-    help_ = f"{option.help}{_default(about, option)}"
-    name = f"--{option.name}"
+    low, high = (None, None) if option.many else (option.least, option.most)
+    name, help_ = f"--{option.name}", f"{option.help}{_default(about, option)}"
     return Annotated[
         kind | None, typer.Option(name, help=help_, metavar=option.metavar, show_default=False, min=low, max=high)
     ]
@@ -159,13 +163,11 @@ def _default(about: Comparison, option: Option) -> str:
         return " [default: all]"
     if full is None or option.kind is bool:
         return ""
-    shown = [_shown(one) for one in (full, *([] if quick in (None, full) else [quick]))]
+    shown = [
+        ", ".join(map(as_word, value if option.many else [value]))
+        for value in ([full] if quick in (None, full) else [full, quick])
+    ]
     return f" [default: {'; quick '.join(shown) if option.many else ', quick '.join(shown)}]"
-
-
-def _shown(value: Any) -> str:
-    values = [value] if isinstance(value, (str, int, float)) else value
-    return ", ".join(as_word(one) for one in values)
 
 
 def _parsed(option: Option, value: Any) -> Any:
@@ -177,10 +179,6 @@ def _parsed(option: Option, value: Any) -> Any:
         return [option.kind(one) for one in split_names(value)]
     except ValueError:
         raise PebbleError(f"--{option.name}: {value} is not a list of numbers") from None
-
-
-def _python(option: Option) -> str:
-    return option.name.replace("-", "_")
 
 
 def register(app: typer.Typer) -> None:

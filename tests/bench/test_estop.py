@@ -27,7 +27,7 @@ from pebble.bench.estop import (
     rest,
     sample,
 )
-from pebble.bench.plots import pictures
+from pebble.bench.pictures import pictures
 from pebble.bench.results import Cell, Results, load
 from pebble.errors import PebbleError
 from pebble.rig.worker import Worker, end_workers

@@ -14,7 +14,8 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from pebble.bench.impair.pictures import marks
-from pebble.bench.plots import draw, pictures, place, save, styles
+from pebble.bench.pictures import draw, pictures
+from pebble.bench.plots import place, save, styles
 from pebble.bench.results import Cell, Results
 from pebble.errors import PebbleError
 from tests.bench import synthetic

@@ -13,7 +13,7 @@ from pebble.bench import traffic as comparison
 from pebble.bench.catalogue import chosen
 from pebble.bench.engine import run
 from pebble.bench.paper import TABLE_4_1
-from pebble.bench.plots import pictures
+from pebble.bench.pictures import pictures
 from pebble.bench.results import load
 from pebble.bench.traffic import TRAFFIC, cells_of, robots_of, sentences, tables
 from pebble.errors import PebbleError

@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # whole robots
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plots have tests of their own, and take as long as a robot."""
-    monkeypatch.setattr("pebble.bench.plots.draw", lambda *_: [])
+    monkeypatch.setattr("pebble.bench.pictures.draw", lambda *_: [])
 
 
 def test_startup_of_both_kinds(tmp_path: Path) -> None:
