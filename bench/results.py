@@ -157,12 +157,14 @@ def pack(folder: Path) -> None:
     """
     packed: dict[str, list[list[list[float]]]] = {}
     for path in sorted(folder.glob("*.json")):
-        with suppress(PebbleError):  # of another version, or not of a comparison
+        try:
             results = load(path)
-            results.cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
-            packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in results.cells]
-            results.cells = [msgspec.structs.replace(cell, rounds=[]) for cell in results.cells]
-            results.save(path)
+        except PebbleError:  # of another version, or not of a comparison
+            continue
+        results.cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
+        packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in results.cells]
+        results.cells = [msgspec.structs.replace(cell, rounds=[]) for cell in results.cells]
+        results.save(path)
     (folder / SAMPLES).write_bytes(lzma.compress(msgspec.json.encode(packed), preset=9))
 
 
