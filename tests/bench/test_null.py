@@ -12,7 +12,7 @@ from pebble.bench import engine, null
 from pebble.bench.charts import LEAST
 from pebble.bench.comparison import Case
 from pebble.bench.frames import FRAMES_NULL
-from pebble.bench.frames_loop import RATE_HZ
+from pebble.bench.frames_worker import RATE_HZ
 from pebble.bench.results import Cell, Judged, load
 from pebble.errors import PebbleError
 
