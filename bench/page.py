@@ -39,8 +39,7 @@ class Goal(NamedTuple):
     at_least: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(NamedTuple):
     """One line of the table, by the key of its samples; ``prototype`` is what the design measured."""
 
     key: str

@@ -50,13 +50,13 @@ _REST_S = 8.0  # after the last viewer: the server lets go after 5, the camera r
 _WIDE = "wide"  # a robot whose pictures are larger than the network carries
 _FPS, _SIZE = 15, (640, 360)  # of its pictures
 _OFFERED_BYTES = 35_000  # of each: 4.2 megabits a second
-_HIDE = """hidden => {
-  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
+_BLUR = "() => { const at = bench.now(); dispatchEvent(new Event('blur')); return at; }"
+_HIDE = """() => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => true });
   const at = bench.now();
   document.dispatchEvent(new Event("visibilitychange"));
   return at;
 }"""
-_BLUR = "() => { const at = bench.now(); dispatchEvent(new Event('blur')); return at; }"
 
 
 def keys(rig: Rig, scale: float) -> Samples:
@@ -85,31 +85,24 @@ def interruptions(rig: Rig, scale: float) -> Samples:
         session = page.context.new_cdp_session(page)
         undo.callback(session.detach)
         session.send("Debugger.enable")
-        at = time.monotonic()
-        session.send("Debugger.pause")
-        return at
-
-    def closed(page: Page) -> float:
-        at = time.monotonic()
-        page.close()
-        return at
+        return _timed(session.send, "Debugger.pause")
 
     def stalled(_page: Page) -> float:
         """The browser's process for the network stands still."""
         pid = _network_process()
         undo.callback(os.kill, pid, signal.SIGCONT)
-        return _signal(pid, signal.SIGSTOP)
+        return _timed(os.kill, pid, signal.SIGSTOP)
 
     def server(number: signal.Signals) -> float:
         undo.callback(rig.stage.restart_server)
         undo.callback(rig.stage.server.thaw)
-        return _signal(rig.stage.server.pid, number)
+        return _timed(os.kill, rig.stage.server.pid, number)
 
     actions: dict[str, Callable[[Page], float]] = {
         "blur to stop": lambda page: monotonic(page.evaluate(_BLUR)),
-        "hidden to stop": lambda page: monotonic(page.evaluate(_HIDE, True)),
+        "hidden to stop": lambda page: monotonic(page.evaluate(_HIDE)),
         "frozen to stop": frozen,
-        "closed to stop": closed,
+        "closed to stop": lambda page: _timed(page.close),
         "stalled to stop": stalled,
         "server frozen to stop": lambda _: server(signal.SIGSTOP),
         "server killed to stop": lambda _: server(signal.SIGKILL),
@@ -129,9 +122,10 @@ def interruptions(rig: Rig, scale: float) -> Samples:
     return found
 
 
-def _signal(pid: int, number: signal.Signals) -> float:
+def _timed(act: Callable[..., object], *arguments: object) -> float:
+    """Do it; when it began."""
     at = time.monotonic()
-    os.kill(pid, number)
+    act(*arguments)
     return at
 
 
@@ -198,16 +192,16 @@ def pictures(rig: Rig, scale: float) -> Samples:
         rig.until(page, f"bench.drawn.at(-1)?.[0] === '{encoding}'", f"no {encoding}")
         rig.pause(page, 1.5)
         drawn = [one for one in _drawn(rig, page, 20 * scale) if one[0] == encoding]
-        found[f"scene, {encoding} to drawn"] = [at - captured for _, _, captured, at, _ in drawn]
+        found[f"scene, {encoding} to drawn"] = [at - captured for _, _, captured, at in drawn]
         found[f"scene, {encoding} lost"] = [lost_percent([one[1] for one in drawn])]
     return found
 
 
-def _drawn(rig: Rig, page: Page, seconds: float) -> list[tuple[str, int, float, float, bool]]:
-    """The pictures drawn in this time, as the page notes them: encoding, number, captured and drawn (ms), rescue."""
+def _drawn(rig: Rig, page: Page, seconds: float) -> list[tuple[str, int, float, float]]:
+    """The pictures drawn in this time, as the page notes them: encoding, number, captured and drawn (ms)."""
     page.evaluate("bench.drawn.length = 0")
     rig.pause(page, seconds)
-    drawn: list[tuple[str, int, float, float, bool]] = page.evaluate("bench.drawn")
+    drawn: list[tuple[str, int, float, float]] = page.evaluate("bench.drawn")
     return drawn
 
 
@@ -238,10 +232,10 @@ def files(rig: Rig, _scale: float) -> Samples:
     picture = page.evaluate("bench.picture")
     fetched = [(urldefrag(url).url, at) for url, at in entries if url.startswith("http")]  # one file of many icons
     urls = {page.url: 0.0} | dict(reversed(fetched))
-    own = {url: at for url, at in urls.items() if urlsplit(url).netloc == urlsplit(rig.stage.url).netloc}
+    own = [url for url in urls if url.startswith(rig.stage.url)]
+    before = [url for url in own if urls[url] < picture]
     bodies = {url: urllib.request.urlopen(url, timeout=5).read() for url in own}  # noqa: S310 - of our own server
     packed = {url: len(gzip.compress(body)) / 1000 for url, body in bodies.items()}
-    before = [url for url, at in own.items() if at < picture]
     return {
         "page, kB": [sum(len(bodies[url]) for url in before) / 1000],
         "page, kB gz": [sum(packed[url] for url in before)],
@@ -358,7 +352,7 @@ def thin(rig: Rig, scale: float) -> Samples:
         took_s = time.monotonic() - began
         offered = sum(size for at, ref, size in rig.frames if ref == rig.ref(_WIDE) and at >= began)
     return {
-        "2 Mbit/s: picture age": [at - captured for _, _, captured, at, _ in drawn if captured],
+        "2 Mbit/s: picture age": [at - captured for _, _, captured, at in drawn if captured],
         "2 Mbit/s: offered": [8 * offered / 1e6 / took_s],
         "2 Mbit/s: drawn a second": [len(drawn) / took_s],
     }

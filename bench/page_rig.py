@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 Received = list[tuple[float, str, Any]]  # time, base topic, and what was received
+Test = str | Callable[[], object]  # an expression of the page, or a function
 
 _AT_REST_S = 0.2  # motors that are off for so long have stopped
 _WAIT_S, _MOVED_S = 20.0, 3.0
@@ -76,7 +77,7 @@ bench.film = () => {
   const draw = pebble.video.draw;
   pebble.video.draw = function (bitmap, info) {
     draw.call(this, bitmap, info);
-    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now(), info.rescue]);
+    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]);
   };
 };
 bench.confirmed = (refs) => {
@@ -142,11 +143,8 @@ class Rig:
         """Wait until the robot of that page can be driven."""
         self.until(page, lambda: page.evaluate(_READY) == "", lambda: str(page.evaluate(_READY)))
 
-    def until(
-        self, page: Page | None, condition: str | Callable[[], object], what: str | Callable[[], str],
-        wait_s: float = _WAIT_S,
-    ) -> None:
-        """Wait for the condition, or an expression of the page. Raises PebbleError with ``what`` is wrong."""
+    def until(self, page: Page | None, condition: Test, what: Test, wait_s: float = _WAIT_S) -> None:
+        """Wait for the condition. Raises PebbleError with ``what`` is wrong, in words."""
         end = time.monotonic() + wait_s
         while not (condition() if callable(condition) else page and page.evaluate(condition)):
             if time.monotonic() > end:
