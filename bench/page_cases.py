@@ -279,26 +279,26 @@ async def _view(url: str, ref: str, count: int, seconds: float) -> tuple[float, 
     """Viewers without a browser: when they began to count and stopped, and the pictures of each between."""
     from websockets.asyncio.client import connect  # optional
 
-    host, arrived = urlsplit(url).netloc, [[] for _ in range(count)]  # type: tuple[str, list[list[float]]]
+    host, frames, counting = urlsplit(url).netloc, [0] * count, False
     address = f"ws://{host}/ws/media?{urlencode({'ref': ref, 'can': _CAN})}"
 
-    async def watch(times: list[float]) -> None:
-        """Each acknowledges every picture at once, as a fast page does."""
+    async def watch(number: int) -> None:
+        """Acknowledges every picture at once, as a fast page does."""
         async with connect(address, origin=f"http://{host}", compression=None, max_size=None) as socket:  # type: ignore[arg-type]
             async for message in socket:
-                times.append(time.monotonic())
+                frames[number] += counting
                 await socket.send(message[:4] + struct.pack(">B", 0))  # type: ignore[operator]
 
-    tasks = [asyncio.create_task(watch(times)) for times in arrived]
+    tasks = [asyncio.create_task(watch(number)) for number in range(count)]
     await asyncio.sleep(_FLOW_S)
-    began = time.monotonic()
+    began, counting = time.monotonic(), True
     await asyncio.sleep(seconds)
-    ended = time.monotonic()
-    await asyncio.sleep(0.2)  # what is under way
+    ended, counting = time.monotonic(), False
+    await asyncio.sleep(0.2)  # what the robot published is under way to its subscriber
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
-    return began, ended, [sum(began <= at < ended for at in times) for times in arrived]
+    return began, ended, frames
 
 
 def crowd(rig: Rig, scale: float) -> Samples:
