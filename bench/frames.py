@@ -123,12 +123,13 @@ def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seco
     cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
     writer, *readers = (worker.answer(_ANSWER_S) for worker in workers)
     bare = case.variant == "memcpy"  # has no writer; it times copies, so there is no number of sent ones
+    copying = [sum(reader["latencies_us"]) / 1e4 / seconds for reader in readers]
     return case.cell(
         "frame",
         "us",
         (latency for reader in readers for latency in reader["latencies_us"]),
         cpu_writer=0.0 if bare else cpu[0],
-        cpu_reader=statistics.fmean([reader["cpu"] for reader in readers] if bare else cpu[1 : len(workers)]),
+        cpu_reader=statistics.fmean(copying if bare else cpu[1 : len(workers)]),
         cpu_broker=None if broker is None else cpu[-1],
         memory_writer_mb=0.0 if bare else pss_mb(workers[0].pid),
         memory_reader_mb=0.0 if bare else statistics.fmean(pss_mb(worker.pid) for worker in workers[1:]),

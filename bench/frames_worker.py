@@ -92,10 +92,6 @@ class Window:
         self._answered = True
         return True
 
-    def percent(self, ns: int) -> float:
-        """Of the window's duration."""
-        return 100 * ns / (self._end - self._begin)
-
 
 def write(writer: Writer, size: int, *, slower_us: float) -> None:
     """Writes a frame of ``size`` bytes 30 times a second until standard input closes; answers how many of the window.
@@ -140,8 +136,8 @@ def _spin(us: float) -> None:
 def read(reader: Reader, *, bare_copy: int = 0) -> None:
     """Reads until standard input closes; answers with every latency of the window in µs.
 
-    With ``bare_copy``, measures instead the time and the CPU (%) of a copy of that many bytes between two frames, when
-    the caches hold other data.
+    With ``bare_copy``, measures instead the time of a copy of that many bytes between two frames, when the caches hold
+    other data.
     """
     source = np.random.default_rng(2).integers(0, 256, bare_copy, dtype=np.uint8)
     target = np.zeros(bare_copy, np.uint8)
@@ -164,8 +160,7 @@ def read(reader: Reader, *, bare_copy: int = 0) -> None:
             if frames == _WARM_UP:
                 worker_end.answer({"ready": True})
         if window.is_over():
-            copies = {"cpu": window.percent(sum(took_ns))} if bare_copy else {}
-            worker_end.answer({"latencies_us": [took / 1000 for took in took_ns], "torn": torn, **copies})
+            worker_end.answer({"latencies_us": [took / 1000 for took in took_ns], "torn": torn})
     reader.close()
 
 
