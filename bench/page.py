@@ -174,8 +174,6 @@ def _idle(wait_s: float) -> float:
 
 def worst(row: Row, samples: Sequence[float]) -> float:
     """The figure by which tries are compared: smaller is better."""
-    if not samples:
-        return math.inf
     if row.goal.at_least is not None:
         return -min(samples)
     return percentile(samples, 50 if row.goal.p95 is None else 95)
