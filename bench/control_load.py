@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pebble.bench import frames_worker
-from pebble.bench.frames_loop import RATE_HZ, Reader, Writer
+from pebble.bench.frames_worker import RATE_HZ, Reader, Writer
 from pebble.rig.worker_end import answer, serve_on_thread
 
 SIZE = 640 * 480 * 3

@@ -18,7 +18,7 @@ from pebble.bench.usage import wake_up_us
 from pebble.errors import PebbleError
 
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
-RATE_HZ = 30.0  # of the pictures, as in bench/frames_loop.py
+RATE_HZ = 30.0  # of the pictures, as in bench/frames_worker.py
 _LONG_US = 995.0
 _MUCH_LATE, _MUCH_LOST = 0.05, 0.005
 _FEWER = 0.9 * RATE_HZ  # pictures: the load is lighter than intended

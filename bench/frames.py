@@ -6,21 +6,19 @@ import functools
 import statistics
 import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from pebble.bench import null
-from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, of_known, rounds, seconds, variants
+from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import ecdf, null_ratios, tails
 from pebble.bench.ratios import LEAST_ROUNDS, paired
 from pebble.bench.results import Cell, Value
 from pebble.bench.tables import COUNT, LOST, Column, Grid, figure, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.rig.broker import Broker, BrokerKind, best_kind
+from pebble.rig.broker import Broker, mosquitto_path
 from pebble.rig.processes import Processes, python
 from pebble.rig.worker import Worker
 
@@ -39,7 +37,8 @@ INSTALL_GSTREAMER = (
 )
 _INSTALL_MOSQUITTO = "apt-get install -y --no-install-recommends mosquitto"
 _SYSTEM_PYTHON = "/usr/bin/python3"  # the only one that Debian's gi and Gst can be imported into
-_GSTREAMER = str(Path(__file__).with_name("frames_loop.py"))
+_WORKER = "pebble.bench.frames_worker"
+_PLAIN_WORKER = str(Path(__file__).with_name("frames_worker.py"))
 _PROBE_S = 20.0
 OURS = "zenoh-shm"
 SIZES, READERS = ("640x480", "1920x1080"), (1, 3)
@@ -48,28 +47,18 @@ _STARTUP_S = 0.1  # from the last process ready to the first counted frame
 _ANSWER_S = 10.0
 
 
-class Size(NamedTuple):
-    """A picture in BGR, three bytes per pixel."""
-
-    width: int
-    height: int
-
-    def __str__(self) -> str:
-        return f"{self.width}x{self.height}"
-
-
-def parse_size(text: str) -> Size:
-    """``640x480`` or ``640×480``. Raises PebbleError."""
+def parse_size(text: str) -> str:
+    """``640x480``, also of ``640×480``. Raises PebbleError."""
     width, _, height = text.replace("×", "x").partition("x")
     if not (width.isdecimal() and height.isdecimal()) or not 8 <= int(width) * int(height) <= 10**8:
         raise PebbleError(f"not a size: {text} (example: 640x480)")
     if int(width) % 4:
         raise PebbleError(f"{text}: the width must be a multiple of 4, or GStreamer pads the rows")
-    return Size(int(width), int(height))
+    return f"{int(width)}x{int(height)}"
 
 
 def conditions(run: Run) -> list[dict[str, Value]]:
-    return [{"size": str(parse_size(size)), "readers": count} for size in run["size"] for count in run["readers"]]
+    return [{"size": parse_size(size), "readers": count} for size in run["size"] for count in run["readers"]]
 
 
 def prepare(run: Run) -> None:
@@ -79,22 +68,15 @@ def prepare(run: Run) -> None:
 
 def missing(variant: str) -> str | None:
     """Why this variant cannot run on this machine, with the command that installs it; None if it can."""
-    if variant == "mqtt":
-        return _mosquitto()
+    if variant == "mqtt" and mosquitto_path() is None:
+        return f"mosquitto is not installed: {_INSTALL_MOSQUITTO}"
     return _gstreamer() if variant == "gstreamer-shm" else None
-
-
-def _mosquitto() -> str | None:
-    with suppress(PebbleError):
-        if best_kind() is BrokerKind.MOSQUITTO:
-            return None
-    return f"mosquitto is not installed: {_INSTALL_MOSQUITTO}"
 
 
 @functools.cache
 def _gstreamer() -> str | None:
     try:
-        probe = subprocess.run([_SYSTEM_PYTHON, _GSTREAMER], capture_output=True, timeout=_PROBE_S, check=False)
+        probe = subprocess.run([_SYSTEM_PYTHON, _PLAIN_WORKER], capture_output=True, timeout=_PROBE_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{error}; GStreamer is read by {_SYSTEM_PYTHON}: {INSTALL_GSTREAMER}"
     return None if probe.returncode == 0 else f"GStreamer is not installed: {INSTALL_GSTREAMER}"
@@ -125,10 +107,9 @@ def measure(case: Case) -> Iterator[Cell]:
 
 def _command(case: Case, role: str, where: Path | int) -> list[str]:
     """Of the writer or a reader; ``where`` is a folder for sockets, or the broker's port."""
-    size, slower_us = case.condition["size"], case.planted_us if case.slowed else 0.0
-    if case.variant == "gstreamer-shm":
-        return [_SYSTEM_PYTHON, *map(str, (_GSTREAMER, role, f"{where}/gst.sock", size, slower_us))]
-    return python("pebble.bench.frames_worker", case.variant, role, where, size, slower_us)
+    command = python(_WORKER) if case.variant != "gstreamer-shm" else [_SYSTEM_PYTHON, _PLAIN_WORKER]
+    slower_us = case.planted_us if case.slowed else 0.0
+    return [*command, *map(str, (case.variant, role, where, case.condition["size"], slower_us))]
 
 
 def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seconds: float) -> Cell:
@@ -142,12 +123,13 @@ def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seco
     cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
     writer, *readers = (worker.answer(_ANSWER_S) for worker in workers)
     bare = case.variant == "memcpy"  # has no writer; it times copies, so there is no number of sent ones
+    copying = [sum(reader["latencies_us"]) / 1e4 / seconds for reader in readers]
     return case.cell(
         "frame",
         "us",
         (latency for reader in readers for latency in reader["latencies_us"]),
         cpu_writer=0.0 if bare else cpu[0],
-        cpu_reader=statistics.fmean([reader["cpu"] for reader in readers] if bare else cpu[1 : len(workers)]),
+        cpu_reader=statistics.fmean(copying if bare else cpu[1 : len(workers)]),
         cpu_broker=None if broker is None else cpu[-1],
         memory_writer_mb=0.0 if bare else pss_mb(workers[0].pid),
         memory_reader_mb=0.0 if bare else statistics.fmean(pss_mb(worker.pid) for worker in workers[1:]),
@@ -155,16 +137,6 @@ def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None, seco
         fallbacks=writer["fallbacks"],  # frames that did not go through shared memory, since the start
         **({} if bare else {"sent": writer["sent"] * len(readers)}),  # each frame to each reader
     )
-
-
-_JOINED: Mapping[str, Combine] = {
-    "torn": sum,
-    "fallbacks": sum,
-    **dict.fromkeys(
-        ("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb"),
-        of_known(statistics.median, 2),
-    ),
-}
 
 
 # -- the report
@@ -269,7 +241,13 @@ FRAMES = Comparison(
     measure=measure,
     alone=True,
     measures=("frame",),
-    figures=_JOINED,
+    figures={
+        **dict.fromkeys(("torn", "fallbacks"), sum),
+        **dict.fromkeys(
+            ("cpu_writer", "cpu_reader", "cpu_broker", "memory_writer_mb", "memory_reader_mb"),
+            of_known(statistics.median, 2),
+        ),
+    },
     tables=(
         Grid(
             title="{size} BGR at 30 Hz, readers: {readers}", each=("size", "readers"), rows=("variant",),

@@ -1,36 +1,178 @@
-"""One end of a frame transfer, as a process.
+"""One end of a transfer of time-stamped frames, 30 a second, as a process that measures during a given window.
 
 ``python -m pebble.bench.frames_worker VARIANT ROLE WHERE SIZE SLOWER_US``: ``WHERE`` is a folder for sockets, or a
-broker's port; ``SIZE`` is ``640x480``; a writer delays each frame by ``SLOWER_US``.
+broker's port; ``SIZE`` is ``640x480``; a writer delays each frame by ``SLOWER_US``. One end of GStreamer's is this
+file in the system's Python, where gi and Gst are installed; without arguments it fails if it could not be. So a plain
+file imports only the standard library, numpy, and the other end of a worker.
+
+A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
+time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns) and answers
+after that window.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections import deque
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from pebble.bench.frames_loop import Reader, Writer, frame_bytes, read, write
-from pebble.errors import TransportError
-from pebble.transports.frames import Frame, FrameInfo, FrameReader, FrameWriter, Slot, shared_memory
+if __package__:
+    from pebble.errors import TransportError
+    from pebble.rig import worker_end
+    from pebble.transports.frames import Frame, FrameInfo, FrameReader, FrameWriter, Slot, shared_memory
+else:  # the system's Python runs plain files
+    sys.path.append(str(Path(__file__).parents[1] / "rig"))
+    import worker_end  # type: ignore[import-not-found, no-redef]
 
-STREAM = "bench"
-_TOPIC = "pebble/bench/frames"
+RATE_HZ = 30.0
+_WARM_UP = 8  # frames: the first ones create pools and fill caches
+_READ_S = 0.2
+_LATE_NS = 150_000_000  # how long to wait for the last frames after the window
+_GAP_S = 0.010  # between a frame and the bare copy after it
+_FRAMES_IN_SEGMENT = 8
+_START_NS = 5_000_000_000
+_STREAM, _TOPIC = "bench", "pebble/bench/frames"
 _CONNECT_S = 10.0
 _WITHOUT_COPIES = ("zenoh-shm", "memcpy")
-_INFO = FrameInfo(format="bgr24")
+
+Gst: Any = None  # loaded by main(): other Pythons have no gi
+
+
+class Writer(Protocol):
+    """One way of sending frames; ``fallbacks`` did not go through shared memory."""
+
+    @property
+    def fallbacks(self) -> int: ...
+
+    def begin(self) -> np.ndarray | None:
+        """The buffer for the next frame's pixels (uint8, 1-D); None if no frame can be sent now."""
+
+    def send(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Reader(Protocol):
+    """One way of receiving frames."""
+
+    def read(self, timeout: float) -> np.ndarray | None:
+        """The next frame, or None after ``timeout`` seconds."""
+
+    def done(self) -> None:
+        """Releases the array; nothing to do if it is a copy."""
+        return
+
+    def close(self) -> None: ...
+
+
+class Window:
+    """The time in which is measured, as standard input names it; CLOCK_MONOTONIC, ns."""
+
+    def __init__(self) -> None:
+        self._begin = self._end = math.inf
+        self._answered = False
+        self.ended = worker_end.serve_on_thread(self._take)  # standard input
+
+    def _take(self, line: str) -> None:
+        self._begin, self._end = map(int, line.split())
+
+    def __contains__(self, ns: int) -> bool:
+        return self._begin <= ns < self._end
+
+    def is_over(self) -> bool:
+        """True once: when the last frames of the window have had time to arrive."""
+        if self._answered or time.monotonic_ns() < self._end + _LATE_NS:
+            return False
+        self._answered = True
+        return True
+
+
+def write(writer: Writer, size: int, *, slower_us: float) -> None:
+    """Writes a frame of ``size`` bytes 30 times a second until standard input closes; answers how many of the window.
+
+    Each frame is delayed by ``slower_us`` of busy work between its time stamp and its sending.
+    """
+    picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
+    window, number, sent, due = Window(), 0, 0, time.monotonic()
+    worker_end.answer({"ready": True})
+    while not window.ended.is_set():
+        due += 1 / RATE_HZ
+        window.ended.wait(max(0.0, due - time.monotonic()))
+        frame = writer.begin()
+        if frame is not None:
+            number += 1
+            stamp = _fill(frame, picture, number)
+            _spin(slower_us)
+            writer.send()
+            sent += stamp in window
+        if window.is_over():
+            worker_end.answer({"sent": sent, "fallbacks": writer.fallbacks})
+    writer.close()
+
+
+def _fill(frame: np.ndarray, picture: np.ndarray, number: int) -> int:
+    """Fills the frame as a camera does: pixels, then the time, which is returned."""
+    np.copyto(frame, picture)
+    ends = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
+    frame[8:16] = frame[-8:] = ends
+    stamp = time.monotonic_ns()
+    frame[:8] = np.frombuffer(stamp.to_bytes(8, "little"), np.uint8)
+    return stamp
+
+
+def _spin(us: float) -> None:
+    """Same as pebble.bench.null.spin, which the system's Python cannot import."""
+    end = time.perf_counter_ns() + int(1000 * us)
+    while time.perf_counter_ns() < end:
+        pass
+
+
+def read(reader: Reader, *, bare_copy: int = 0) -> None:
+    """Reads until standard input closes; answers with every latency of the window in µs.
+
+    With ``bare_copy``, measures instead the time of a copy of that many bytes between two frames, when the caches hold
+    other data.
+    """
+    source = np.random.default_rng(2).integers(0, 256, bare_copy, dtype=np.uint8)
+    target = np.zeros(bare_copy, np.uint8)
+    window, took_ns, torn, frames = Window(), [], 0, 0
+    while not window.ended.is_set():
+        frame = reader.read(_READ_S)
+        if frame is not None:
+            now, frames = time.monotonic_ns(), frames + 1
+            stamp, number = (int.from_bytes(frame[at : at + 8].tobytes(), "little") for at in (0, 8))
+            torn += number != int.from_bytes(frame[-8:].tobytes(), "little")
+            reader.done()
+            del frame
+            if stamp in window:
+                if bare_copy:
+                    window.ended.wait(_GAP_S)
+                    stamp = time.monotonic_ns()
+                    np.copyto(target, source)
+                    now = time.monotonic_ns()
+                took_ns.append(now - stamp)
+            if frames == _WARM_UP:
+                worker_end.answer({"ready": True})
+        if window.is_over():
+            worker_end.answer({"latencies_us": [took / 1000 for took in took_ns], "torn": torn})
+    reader.close()
+
+
+# -- Pebble's frame transport
 
 
 class ZenohWriter:
-    """Pebble's frame transport; ``in_segment``: frames are created in the shared segment, else copied there."""
+    """``in_segment``: frames are created in the shared segment, else copied there."""
 
     def __init__(self, folder: Path, size: int, *, in_segment: bool, shared: bool) -> None:
-        self._size, self._in_segment = size, in_segment
-        self._writer = FrameWriter(folder, STREAM, capacity=size).open()
+        self._size, self._in_segment, self._info = size, in_segment, FrameInfo(format="bgr24")
+        self._writer = FrameWriter(folder, _STREAM, capacity=size).open()
         _refuse(self._writer.problem if shared else "")
         self._frame = np.zeros(size, np.uint8)
         self._slot: Slot | None = None
@@ -43,9 +185,9 @@ class ZenohWriter:
 
     def send(self) -> None:
         if self._slot is not None:
-            self._slot.send(_INFO)
+            self._slot.send(self._info)
         else:
-            self._writer.write(self._frame, _INFO)
+            self._writer.write(self._frame, self._info)
 
     @property
     def fallbacks(self) -> int:
@@ -57,11 +199,11 @@ class ZenohWriter:
 
 
 class ZenohReader(Reader):
-    """Pebble's frame transport, as views into the segment or as copies."""
+    """Frames are views into the segment, or copies."""
 
     def __init__(self, folder: Path, *, views: bool, shared: bool) -> None:
         self._shared = shared
-        self._reader = FrameReader(folder, STREAM, views=views).open()
+        self._reader = FrameReader(folder, _STREAM, views=views).open()
         self._frame: Frame | None = None
 
     def read(self, timeout: float) -> np.ndarray | None:
@@ -82,13 +224,17 @@ def _refuse(problem: str) -> None:
         raise TransportError(problem)
 
 
+# -- MQTT, QoS 0
+
+
 class MqttWriter:
-    """QoS 0 through a broker. The next frame is not begun before the last one is sent."""
+    """The next frame is not begun before the last one is sent."""
+
+    fallbacks = 0
 
     def __init__(self, port: int, size: int) -> None:
         self._client = _mqtt(port, None)
         self._client.loop_start()
-        self.fallbacks = 0
         self._frame = bytearray(size)
         self._leaving: Any = None
 
@@ -139,29 +285,121 @@ def _mqtt(port: int, on_message: Any) -> Any:
     return client
 
 
-def main(arguments: list[str]) -> int:
-    variant, role, where, size_, slower_us = arguments
-    size = frame_bytes(size_)
-    if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
-        shared_memory.lockable = lambda size: False  # noqa: ARG005
-    if role == "writer":
-        write(writer(variant, where, size), size, slower_us=float(slower_us))
-    else:
-        read(reader(variant, where), bare_copy=size if variant == "memcpy" else 0)
-    return 0
+# -- GStreamer's shmsink and shmsrc, in the system's Python
 
 
-def writer(variant: str, where: str, size: int) -> Writer:
+class GstWriter:
+    """appsrc into shmsink. As in the original Pebble, pictures are created in the shared segment: no copy is made."""
+
+    fallbacks = 0
+
+    def __init__(self, socket: str, caps: str, size: int) -> None:
+        self._size = size
+        self._pipeline = Gst.parse_launch(
+            f"appsrc name=source is-live=true format=time do-timestamp=true max-buffers=2 leaky-type=downstream"
+            f" caps={caps} ! shmsink name=sink"
+            f" socket-path={socket} shm-size={_FRAMES_IN_SEGMENT * size} wait-for-connection=false sync=false"
+        )
+        self._source, sink = (self._pipeline.get_by_name(name) for name in ("source", "sink"))
+        self._pipeline.set_state(Gst.State.PLAYING)
+        # The allocator that shmsink offers upstream exists once the pipeline has started.
+        query = Gst.Query.new_allocation(Gst.Caps.from_string(caps), True)
+        if not sink.get_static_pad("sink").query(query) or not query.get_n_allocation_params():
+            raise RuntimeError("shmsink offers no allocator")
+        self._allocator = query.parse_nth_allocation_param(0)[0]
+        self._buffer: Any = None
+        self._mapped: Any = None
+
+    def begin(self) -> np.ndarray | None:
+        self._buffer = Gst.Buffer.new_allocate(self._allocator, self._size, None)
+        if self._buffer is None:
+            return None
+        self._mapped = self._buffer.map(Gst.MapFlags.WRITE)
+        return np.frombuffer(self._mapped.__enter__().data, np.uint8)
+
+    def send(self) -> None:
+        self._mapped.__exit__(None, None, None)
+        self._source.push_buffer(self._buffer)
+        self._buffer = self._mapped = None
+
+    def close(self) -> None:
+        """shmsink removes its socket and its segment."""
+        self._pipeline.set_state(Gst.State.NULL)
+
+
+class GstReader(Reader):
+    """shmsrc into appsink, which holds only the newest buffer; the reader maps it and copies it once."""
+
+    def __init__(self, socket: str, caps: str) -> None:
+        self._pipeline = Gst.parse_launch(
+            f"shmsrc socket-path={socket} is-live=true do-timestamp=true ! {caps}"
+            " ! appsink name=sink sync=false max-buffers=1 drop=true"
+        )
+        self._sink = self._pipeline.get_by_name("sink")
+        self._pipeline.set_state(Gst.State.PLAYING)
+        if self._pipeline.get_state(_START_NS)[0] == Gst.StateChangeReturn.FAILURE:
+            raise RuntimeError(f"shmsrc cannot read {socket}")
+
+    def read(self, timeout: float) -> np.ndarray | None:
+        sample = self._sink.try_pull_sample(int(timeout * 1e9))
+        if sample is None:
+            return None
+        with sample.get_buffer().map(Gst.MapFlags.READ) as mapped:
+            return np.frombuffer(mapped.data, np.uint8).copy()
+
+    def close(self) -> None:
+        self._pipeline.set_state(Gst.State.NULL)
+
+
+def _load_gstreamer() -> None:
+    global Gst
+    import gi  # type: ignore[import-not-found]
+
+    gi.require_version("Gst", "1.0")
+    gi.require_version("GstApp", "1.0")
+    Gst = import_module("gi.repository.Gst")
+    import_module("gi.repository.GstApp")  # gives appsrc and appsink their methods
+    Gst.init(None)
+    for name in ("shmsink", "shmsrc", "appsrc", "appsink"):
+        if not Gst.ElementFactory.find(name):
+            raise RuntimeError(f"GStreamer has no {name}")
+
+
+# -- the process
+
+
+def writer(variant: str, where: str, size: int, caps: str = "") -> Writer:
+    """``size`` in bytes; ``caps``: the format of frames, for GStreamer."""
+    if variant == "gstreamer-shm":
+        return GstWriter(f"{where}/gst.sock", caps, size)
     if variant == "mqtt":
         return MqttWriter(int(where), size)
     return ZenohWriter(Path(where), size, in_segment=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
 
 
-def reader(variant: str, where: str) -> Reader:
+def reader(variant: str, where: str, caps: str = "") -> Reader:
+    if variant == "gstreamer-shm":
+        return GstReader(f"{where}/gst.sock", caps)
     if variant == "mqtt":
         return MqttReader(int(where))
     return ZenohReader(Path(where), views=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
 
 
+def main(arguments: list[str]) -> None:
+    if not __package__:
+        _load_gstreamer()
+    if not arguments:  # only asked whether it could
+        return
+    variant, role, where, size, slower_us = arguments
+    width, height = map(int, size.split("x"))
+    count, caps = 3 * width * height, f"video/x-raw,format=BGR,width={width},height={height},framerate=30/1"
+    if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
+        shared_memory.lockable = lambda size: False  # noqa: ARG005
+    if role == "writer":
+        write(writer(variant, where, count, caps), count, slower_us=float(slower_us))
+    else:
+        read(reader(variant, where, caps), bare_copy=count if variant == "memcpy" else 0)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(sys.argv[1:])

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,16 +39,12 @@ class Goal(NamedTuple):
     at_least: float | None = None
 
 
-NO_GOAL = Goal()
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(NamedTuple):
     """One line of the table, by the key of its samples; ``prototype`` is what the design measured."""
 
     key: str
     unit: str
-    goal: Goal = NO_GOAL
+    goal: Goal = Goal()
     prototype: str = "–"
 
 
@@ -149,17 +144,19 @@ def measure(case: Case) -> Iterator[Cell]:
     """One try. One that fails is noted, and its rows are empty."""
     run, name = case.run, str(case.condition["case"])
     about = next(one for one in CASES if one.name == name)
+
+    def note(text: str, style: str = "") -> None:
+        run.notes.append(f"{name}, try {case.number + 1}: {text}")
+        run.console.print(run.notes[-1], style=style, highlight=False, markup=False)
+
     load = _idle(run["wait"])
-    busy = "" if load < IDLE_LOAD else ", busy: read the figures as upper bounds"
-    run.notes.append(f"{name}, try {case.number + 1}: load {load:.2f}{busy}")
-    run.console.print(run.notes[-1], highlight=False)
+    note(f"load {load:.2f}{'' if load < IDLE_LOAD else ', busy: read the figures as upper bounds'}")
     samples: cases.Samples = {}
     try:
         with about.setting() as made:
             samples = about.measure(made, run["scale"])
     except PebbleError as error:
-        run.notes.append(f"{name}, try {case.number + 1}: {error}")
-        run.console.print(run.notes[-1], style="red", highlight=False, markup=False)
+        note(str(error), "red")
     for row in about.rows:
         yield case.cell(row.key, row.unit, samples.get(row.key, []))
 
@@ -167,9 +164,9 @@ def measure(case: Case) -> Iterator[Cell]:
 def _idle(wait_s: float) -> float:
     """The load of the machine, once it is low or the time is over."""
     end = time.monotonic() + wait_s
-    while os.getloadavg()[0] >= IDLE_LOAD and time.monotonic() < end:
+    while (load := os.getloadavg()[0]) >= IDLE_LOAD and time.monotonic() < end:
         time.sleep(_LOAD_STEP_S)
-    return os.getloadavg()[0]
+    return load
 
 
 # -- what is shown
@@ -177,8 +174,6 @@ def _idle(wait_s: float) -> float:
 
 def worst(row: Row, samples: Sequence[float]) -> float:
     """The figure by which tries are compared: smaller is better."""
-    if not samples:
-        return math.inf
     if row.goal.at_least is not None:
         return -min(samples)
     return percentile(samples, 50 if row.goal.p95 is None else 95)
@@ -191,20 +186,20 @@ def ranked(row: Row, tries: Sequence[Sequence[float]]) -> list[Sequence[float]]:
 
 def met(goal: Goal, samples: Sequence[float]) -> bool | None:
     """Whether samples satisfy a goal; None: there is none, or nothing was measured."""
-    if goal == NO_GOAL or not samples:
+    if goal == Goal() or not samples:
         return None
-    bounds = [(goal.p50, percentile(samples, 50)), (goal.p95, percentile(samples, 95))]
-    return (goal.at_least is None or min(samples) >= goal.at_least) and all(
-        bound is None or value <= bound for bound, value in bounds
-    )
+    p50, p95 = (math.inf if bound is None else bound for bound in (goal.p50, goal.p95))
+    least = -math.inf if goal.at_least is None else goal.at_least
+    return min(samples) >= least and percentile(samples, 50) <= p50 and percentile(samples, 95) <= p95
 
 
 def words(goal: Goal) -> str:
     """A goal for the table."""
     if goal.at_least is not None:
         return f"≥ {goal.at_least:g} each"
-    bounds = ["–" if bound is None else f"{bound:g}" for bound in (goal.p50, goal.p95)]
-    return "–" if bounds == ["–", "–"] else f"≤ {' / '.join(bounds)}"
+    if goal == Goal():
+        return "–"
+    return "≤ " + " / ".join("–" if bound is None else f"{bound:g}" for bound in (goal.p50, goal.p95))
 
 
 def shown(goal: Goal, samples: Sequence[float], unit: str = "") -> str:
@@ -217,35 +212,40 @@ def shown(goal: Goal, samples: Sequence[float], unit: str = "") -> str:
     return f"{figure(percentile(samples, 50))} / {figure(percentile(samples, 95))}{low} {unit}".strip()
 
 
-def _rows(cells: Sequence[Cell]) -> Iterator[tuple[str, Row, Sequence[float], Sequence[Sequence[float]]]]:
-    """The case and the row of each cell, its best try and the others."""
+def _rows(cells: Sequence[Cell]) -> Iterator[tuple[Cell, Row, Sequence[float], Sequence[Sequence[float]]]]:
+    """Each cell with its row, its best try and the others."""
     for cell in cells:
         row = ROWS[cell.measure]
         best, *others = ranked(row, cell.rounds) or [()]
-        yield str(cell.params["case"]), row, best, others
+        yield cell, row, best, others
 
 
 def tables(cells: Sequence[Cell]) -> Iterator[Table]:
     """A line for each row: the best try, its goal, the prototype's figure, and the other tries."""
     heads = ["", "unit", "measured", "n", "goal", "", "prototype", "others"]
     table = plain_table("p50 / p95 of the best try", heads, left=2)
-    for _, rows in groupby(_rows(cells), key=lambda one: one[0]):
-        for _, row, best, others in rows:
-            state = {None: "", True: "met", False: "MISSED"}[met(row.goal, best)]
-            rest = "; ".join(shown(row.goal, one) for one in others)
-            count, measured = str(len(best)), shown(row.goal, best)
-            table.add_row(row.key, row.unit, measured, count, words(row.goal), state, row.prototype, rest)
-        table.add_section()
+    last = None
+    for cell, row, best, others in _rows(cells):
+        if cell.params != last:
+            table.add_section()
+        state = {None: "", True: "met", False: "MISSED"}[met(row.goal, best)]
+        rest = "; ".join(shown(row.goal, one) for one in others)
+        figures = (shown(row.goal, best), str(len(best)), words(row.goal), state, row.prototype, rest)
+        table.add_row(row.key, row.unit, *figures)
+        last = cell.params
     yield table
 
 
 def goals(cells: Sequence[Cell]) -> Iterator[Judged]:
     """The goals as aims, each judged by the best try."""
     for _, row, best, _ in _rows(cells):
-        if row.goal != NO_GOAL:
-            what, is_met = f"{row.key}, p50 / p95 {words(row.goal)} {row.unit}".strip(), met(row.goal, best)
-            how = outcome(bool(is_met), judged=is_met is not None)
-            yield Judged(what=what, outcome=how, measured=shown(row.goal, best, row.unit))
+        if row.goal != Goal():
+            is_met = met(row.goal, best)
+            yield Judged(
+                what=f"{row.key}, p50 / p95 {words(row.goal)} {row.unit}".strip(),
+                outcome=outcome(bool(is_met), judged=is_met is not None),
+                measured=shown(row.goal, best, row.unit),
+            )
 
 
 def _is_complete(cells: Sequence[Cell]) -> bool:

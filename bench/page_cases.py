@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 import gzip
+import json
 import os
 import signal
+import struct
 import threading
 import time
 import urllib.request
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urldefrag, urlsplit
+from urllib.parse import urldefrag, urlencode, urlsplit
 
 import numpy as np
 
 from pebble.bench.drivers import Driver
+from pebble.bench.drivers import driving as others_drive
 from pebble.bench.page_rig import Rig, monotonic
 from pebble.bench.usage import cpu_s
 from pebble.contract import CAMERA, CAPABILITIES, MQTT_VIDEO, ONLINE, VIDEO_CONTROL, codec
@@ -38,19 +43,20 @@ Samples = dict[str, list[float]]
 KEY, ROBOT = "KeyW", "goob"
 VIEWERS, ROBOTS_SHOWN = 30, 100
 _HELD_S = 0.4
-_COUNT_S = 40.0  # for processes of viewers to answer, beyond their time
+_CAN = "h264,pbvz,pbvd,json,jpeg"
+_FLOW_S = 4.0  # until the camera is running and every viewer has a key frame
 _LATER_S = 5.0  # the page has fetched its other screens by then
 _REST_S = 8.0  # after the last viewer: the server lets go after 5, the camera rests then
 _WIDE = "wide"  # a robot whose pictures are larger than the network carries
 _FPS, _SIZE = 15, (640, 360)  # of its pictures
 _OFFERED_BYTES = 35_000  # of each: 4.2 megabits a second
-_HIDE = """hidden => {
-  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
+_BLUR = "() => { const at = bench.now(); dispatchEvent(new Event('blur')); return at; }"
+_HIDE = """() => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => true });
   const at = bench.now();
   document.dispatchEvent(new Event("visibilitychange"));
   return at;
 }"""
-_BLUR = "() => { const at = bench.now(); dispatchEvent(new Event('blur')); return at; }"
 
 
 def keys(rig: Rig, scale: float) -> Samples:
@@ -79,31 +85,24 @@ def interruptions(rig: Rig, scale: float) -> Samples:
         session = page.context.new_cdp_session(page)
         undo.callback(session.detach)
         session.send("Debugger.enable")
-        at = time.monotonic()
-        session.send("Debugger.pause")
-        return at
-
-    def closed(page: Page) -> float:
-        at = time.monotonic()
-        page.close()
-        return at
+        return _timed(session.send, "Debugger.pause")
 
     def stalled(_page: Page) -> float:
         """The browser's process for the network stands still."""
         pid = _network_process()
         undo.callback(os.kill, pid, signal.SIGCONT)
-        return _signal(pid, signal.SIGSTOP)
+        return _timed(os.kill, pid, signal.SIGSTOP)
 
     def server(number: signal.Signals) -> float:
         undo.callback(rig.stage.restart_server)
         undo.callback(rig.stage.server.thaw)
-        return _signal(rig.stage.server.pid, number)
+        return _timed(os.kill, rig.stage.server.pid, number)
 
     actions: dict[str, Callable[[Page], float]] = {
         "blur to stop": lambda page: monotonic(page.evaluate(_BLUR)),
-        "hidden to stop": lambda page: monotonic(page.evaluate(_HIDE, True)),
+        "hidden to stop": lambda page: monotonic(page.evaluate(_HIDE)),
         "frozen to stop": frozen,
-        "closed to stop": closed,
+        "closed to stop": lambda page: _timed(page.close),
         "stalled to stop": stalled,
         "server frozen to stop": lambda _: server(signal.SIGSTOP),
         "server killed to stop": lambda _: server(signal.SIGKILL),
@@ -123,9 +122,10 @@ def interruptions(rig: Rig, scale: float) -> Samples:
     return found
 
 
-def _signal(pid: int, number: signal.Signals) -> float:
+def _timed(act: Callable[..., object], *arguments: object) -> float:
+    """Do it; when it began."""
     at = time.monotonic()
-    os.kill(pid, number)
+    act(*arguments)
     return at
 
 
@@ -142,13 +142,13 @@ def _network_process() -> int:
 def stops(rig: Rig, scale: float) -> Samples:
     """STOP is clicked while other operators drive."""
     found: Samples = defaultdict(list)
-    with _driven_by_others(rig) as driver:
+    with others_drive(rig.stage.broker_port) as driver:
         for what, names, button in (("STOP", (ROBOT,), "stop-one"), ("STOP ALL", ROBOTS, "stop-all")):
-            page = rig.page(ROBOT) if what == "STOP" else rig.fleet()
+            page = rig.page(ROBOT if what == "STOP" else "")
             page.locator(f"[data-test={button}]").wait_for()
             for _ in range(max(1, round(10 * scale))):
                 pressed, stopped = _stop(rig, page, driver, names, button)
-                rig.until(page, lambda: page.evaluate("bench.mark"), "the stop was not confirmed")  # noqa: B023
+                rig.until(page, "bench.mark", "the stop was not confirmed")
                 found[f"{what} to motors"] += stopped
                 found[f"{what} to confirmed"].append(1000 * (monotonic(page.evaluate("bench.mark")) - pressed))
                 _reset(rig, page, names)
@@ -156,20 +156,12 @@ def stops(rig: Rig, scale: float) -> Samples:
     return found
 
 
-@contextmanager
-def _driven_by_others(rig: Rig) -> Iterator[Driver]:
-    """Another operator, who drives whichever robots are chosen."""
-    with closing(Driver(rig.stage.broker_port)) as driver:
-        threading.Thread(target=driver.run, name="another operator", daemon=True).start()
-        yield driver
-
-
 def _stop(
     rig: Rig, page: Page, driver: Driver, names: Sequence[str], button: str = "stop-one"
 ) -> tuple[float, list[float]]:
     """Click it while another operator drives: when, and ms until the motors of each robot stopped."""
-    refs = list(map(rig.ref, names))
-    driver.choose(tuple(refs))
+    refs = tuple(map(rig.ref, names))
+    driver.choose(refs)
     rig.until(page, lambda: all(map(rig.stage.wheels_turning, names)), "the robots do not move")
     rig.pause(page, _HELD_S)
     page.evaluate("refs => bench.confirmed(refs)", refs)
@@ -182,13 +174,11 @@ def _stop(
 
 def _reset(rig: Rig, page: Page, names: Sequence[str]) -> None:
     """End the stops of these robots, once the page shows them."""
-    refs, value = list(map(rig.ref, names)), "pebble.store.get(ref, 'web/estop')?.value"
-    latched = f"refs => refs.every((ref) => {value}.latched)"
-    rig.until(page, lambda: page.evaluate(latched, refs), "not shown")
+    refs, value = json.dumps(list(map(rig.ref, names))), "pebble.store.get(ref, 'web/estop')?.value"
+    rig.until(page, f"{refs}.every((ref) => {value}.latched)", "not shown")
     rig.pause(page, 0.6)  # robots refuse a reset of those who still drive
-    page.evaluate(f"refs => refs.forEach((ref) => pebble.commands.reset(ref, {value}.owners))", refs)
-    free = f"refs => refs.every((ref) => !{value}.latched)"
-    rig.until(page, lambda: page.evaluate(free, refs), "the stops were not reset")
+    page.evaluate(f"{refs}.forEach((ref) => pebble.commands.reset(ref, {value}.owners))")
+    rig.until(page, f"{refs}.every((ref) => !{value}.latched)", "the stops were not reset")
     rig.pause(page, 0.7)
 
 
@@ -199,19 +189,19 @@ def pictures(rig: Rig, scale: float) -> Samples:
     found: Samples = {}
     for encoding in ALL_VIDEO:
         page.evaluate("([ref, one]) => pebble.commands.setEncoding(ref, one)", [rig.ref(ROBOT), encoding])
-        rig.until(page, lambda: page.evaluate("bench.drawn.at(-1)?.[0]") == encoding, f"no {encoding}")  # noqa: B023
+        rig.until(page, f"bench.drawn.at(-1)?.[0] === '{encoding}'", f"no {encoding}")
         rig.pause(page, 1.5)
         drawn = [one for one in _drawn(rig, page, 20 * scale) if one[0] == encoding]
-        found[f"scene, {encoding} to drawn"] = [at - captured for _, _, captured, at, _ in drawn]
+        found[f"scene, {encoding} to drawn"] = [at - captured for _, _, captured, at in drawn]
         found[f"scene, {encoding} lost"] = [lost_percent([one[1] for one in drawn])]
     return found
 
 
-def _drawn(rig: Rig, page: Page, seconds: float) -> list[tuple[str, int, float, float, bool]]:
-    """The pictures drawn in this time, as the page notes them: encoding, number, captured and drawn (ms), rescue."""
+def _drawn(rig: Rig, page: Page, seconds: float) -> list[tuple[str, int, float, float]]:
+    """The pictures drawn in this time, as the page notes them: encoding, number, captured and drawn (ms)."""
     page.evaluate("bench.drawn.length = 0")
     rig.pause(page, seconds)
-    drawn: list[tuple[str, int, float, float, bool]] = page.evaluate("bench.drawn")
+    drawn: list[tuple[str, int, float, float]] = page.evaluate("bench.drawn")
     return drawn
 
 
@@ -226,8 +216,8 @@ def loading(rig: Rig, scale: float) -> Samples:
     """A visitor opens the fleet's page, then a robot's, whose camera rests."""
     found: Samples = defaultdict(list)
     for _ in range(max(1, round(4 * scale))):
-        for key, page, stamp in (("first robot", rig.fleet(), "robot"), ("first picture", rig.page(ROBOT), "picture")):
-            rig.until(page, lambda: page.evaluate(f"bench.{stamp}"), f"no {stamp}")  # noqa: B023
+        for key, page, stamp in (("first robot", rig.page(), "robot"), ("first picture", rig.page(ROBOT), "picture")):
+            rig.until(page, f"bench.{stamp}", f"no {stamp}")
             found[key].append(page.evaluate(f"bench.{stamp}"))
             page.context.close()
         time.sleep(_REST_S)
@@ -242,10 +232,10 @@ def files(rig: Rig, _scale: float) -> Samples:
     picture = page.evaluate("bench.picture")
     fetched = [(urldefrag(url).url, at) for url, at in entries if url.startswith("http")]  # one file of many icons
     urls = {page.url: 0.0} | dict(reversed(fetched))
-    own = {url: at for url, at in urls.items() if urlsplit(url).netloc == urlsplit(rig.stage.url).netloc}
+    own = [url for url in urls if url.startswith(rig.stage.url)]
+    before = [url for url in own if urls[url] < picture]
     bodies = {url: urllib.request.urlopen(url, timeout=5).read() for url in own}  # noqa: S310 - of our own server
     packed = {url: len(gzip.compress(body)) / 1000 for url, body in bodies.items()}
-    before = [url for url, at in own.items() if at < picture]
     return {
         "page, kB": [sum(len(bodies[url]) for url in before) / 1000],
         "page, kB gz": [sum(packed[url] for url in before)],
@@ -276,23 +266,48 @@ def viewers(rig: Rig, scale: float) -> Samples:
 
 def _watched(rig: Rig, count: int, seconds: float) -> tuple[float, list[float]]:
     """Bytes a second of the robot, and per cent of its frames that each viewer received."""
-    viewers = rig.stage.worker("viewers", "pebble.bench.page_viewers", rig.stage.url, rig.ref(ROBOT), count, seconds)
-    answer = viewers.answer(seconds + _COUNT_S)
-    rig.stage.end(viewers)
-    began, ended = answer["began"], answer["ended"]
+    with ThreadPoolExecutor(1) as pool:  # this thread has Playwright's event loop
+        watching = pool.submit(asyncio.run, _view(rig.stage.url, rig.ref(ROBOT), count, seconds))
+        began, ended, frames = watching.result()
     published = [size for at, ref, size in rig.frames if ref == rig.ref(ROBOT) and began <= at < ended]
     if not published:
         raise PebbleError("the robot published no pictures")
-    return sum(published) / (ended - began), [100 * frames / len(published) for frames in answer["frames"]]
+    return sum(published) / (ended - began), [100 * one / len(published) for one in frames]
+
+
+async def _view(url: str, ref: str, count: int, seconds: float) -> tuple[float, float, list[int]]:
+    """Viewers without a browser: when they began to count and stopped, and the pictures of each between."""
+    from websockets.asyncio.client import connect  # optional
+
+    host, frames, counting = urlsplit(url).netloc, [0] * count, False
+    address = f"ws://{host}/ws/media?{urlencode({'ref': ref, 'can': _CAN})}"
+
+    async def watch(number: int) -> None:
+        """Acknowledges every picture at once, as a fast page does."""
+        async with connect(address, origin=f"http://{host}", compression=None, max_size=None) as socket:  # type: ignore[arg-type]
+            async for message in socket:
+                frames[number] += counting
+                await socket.send(message[:4] + struct.pack(">B", 0))  # type: ignore[operator]
+
+    tasks = [asyncio.create_task(watch(number)) for number in range(count)]
+    await asyncio.sleep(_FLOW_S)
+    began, counting = time.monotonic(), True
+    await asyncio.sleep(seconds)
+    ended, counting = time.monotonic(), False
+    await asyncio.sleep(0.2)  # what the robot published is under way to its subscriber
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    return began, ended, frames
 
 
 def crowd(rig: Rig, scale: float) -> Samples:
     """A hundred robots on the fleet's screen."""
     broker = f"mqtt://127.0.0.1:{rig.stage.broker_port}"
     rig.stage.robot("the fleet", "pebble.cli", "sim", "fleet", "-n", ROBOTS_SHOWN, "--broker", broker)
-    page = rig.fleet()
+    page = rig.page()
     count = "document.querySelectorAll('[data-test^=\"card-\"]').length"
-    rig.until(page, lambda: page.evaluate(count) > ROBOTS_SHOWN, lambda: f"{page.evaluate(count)} robots", 60.0)
+    rig.until(page, f"{count} > {ROBOTS_SHOWN}", lambda: f"{page.evaluate(count)} robots", 60.0)
     rig.pause(page, 5.0)
     page.evaluate("new MutationObserver(() => bench.updates++).observe(document.body, "
                   "{ subtree: true, childList: true, characterData: true, attributes: true })")  # fmt: skip
@@ -337,7 +352,7 @@ def thin(rig: Rig, scale: float) -> Samples:
         took_s = time.monotonic() - began
         offered = sum(size for at, ref, size in rig.frames if ref == rig.ref(_WIDE) and at >= began)
     return {
-        "2 Mbit/s: picture age": [at - captured for _, _, captured, at, _ in drawn if captured],
+        "2 Mbit/s: picture age": [at - captured for _, _, captured, at in drawn if captured],
         "2 Mbit/s: offered": [8 * offered / 1e6 / took_s],
         "2 Mbit/s: drawn a second": [len(drawn) / took_s],
     }
@@ -350,20 +365,18 @@ def _wide_robot(port: int) -> Iterator[None]:
     topics = {"topic": CAMERA, "command_topic": VIDEO_CONTROL, "flag_topic": MQTT_VIDEO}
     video = {name: channel.topic(base) for name, channel in topics.items()}
     value = {"video": {"available": True, "controls": True, "encodings": ["pbvd"], **video}}
-    with closing(create("mqtt", _WIDE, MqttSettings(host="127.0.0.1", port=port))) as transport:
-        transport.open()
-        payload = codec.encode(CAPABILITIES, Capabilities(t=int(1000 * time.time()), value=value))
-        transport.publish(CAPABILITIES.topic(base), payload, retain=True, qos=QoS.DELIVERED)
-        thread = threading.Thread(target=_film, args=(transport, base, ending), name=_WIDE, daemon=True)
-        thread.start()
+    payload = codec.encode(CAPABILITIES, Capabilities(t=_now_ms(), value=value))
+    with create("mqtt", _WIDE, MqttSettings(host="127.0.0.1", port=port)) as robot, ThreadPoolExecutor(1) as pool:
+        robot.publish(CAPABILITIES.topic(base), payload, retain=True, qos=QoS.DELIVERED)
+        filming = pool.submit(_film, robot, base, ending)
         try:
             yield
         finally:
             ending.set()
-            thread.join()
+        filming.result()  # raises what ended it early
 
 
-def _film(transport: Transport, base: str, ending: threading.Event) -> None:
+def _film(robot: Transport, base: str, ending: threading.Event) -> None:
     scene, picture = Scene(*_SIZE), np.empty((_SIZE[1], _SIZE[0], 3), np.uint8)
     noise = np.random.default_rng(1).integers(0, 60, (8, *picture.shape), np.uint8)
     encoder = make_encoder("pbvd", fps=_FPS, quality=50)
@@ -371,12 +384,16 @@ def _film(transport: Transport, base: str, ending: threading.Event) -> None:
     while not ending.wait(max(0.0, due - time.monotonic())):
         due += 1 / _FPS
         scene.render(number, picture)
-        payload = encoder.encode(picture // 2 + noise[number % 8], int(1000 * time.time()))
+        payload = encoder.encode(picture // 2 + noise[number % 8], _now_ms())
         encoder.quality = min(95.0, max(5.0, encoder.quality * (_OFFERED_BYTES / len(payload)) ** 0.3))
-        transport.publish(CAMERA.topic(base), payload)
+        robot.publish(CAMERA.topic(base), payload)
         if number % _FPS == 0:
-            transport.publish(ONLINE.topic(base), codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()))))
+            robot.publish(ONLINE.topic(base), codec.encode(ONLINE, Heartbeat(t=_now_ms())))
         number += 1
+
+
+def _now_ms() -> int:
+    return int(1000 * time.time())
 
 
 def far(rig: Rig, scale: float) -> Samples:
@@ -398,7 +415,7 @@ def far(rig: Rig, scale: float) -> Samples:
     arrived = {round(axes.get("y", 0.0), 3): at for at, base, axes in rig.drives if base == rig.ref(ROBOT)}
     late = [1000 * (arrived[round(y, 3)] - monotonic(at)) for y, at in sent if round(y, 3) in arrived]
     stopped: list[float] = []
-    with _driven_by_others(rig) as driver:
+    with others_drive(rig.stage.broker_port) as driver:
         for _ in range(max(1, round(8 * scale))):
             stopped += _stop(rig, page, driver, [ROBOT])[1]
             _reset(rig, page, [ROBOT])

@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 Received = list[tuple[float, str, Any]]  # time, base topic, and what was received
+Test = str | Callable[[], object]  # an expression of the page, or a function
 
 _AT_REST_S = 0.2  # motors that are off for so long have stopped
 _WAIT_S, _MOVED_S = 20.0, 3.0
@@ -76,7 +77,7 @@ bench.film = () => {
   const draw = pebble.video.draw;
   pebble.video.draw = function (bitmap, info) {
     draw.call(this, bitmap, info);
-    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now(), info.rescue]);
+    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]);
   };
 };
 bench.confirmed = (refs) => {
@@ -112,24 +113,24 @@ _READY = """() => {
 
 
 class Rig:
-    """One stage and one browser. ``drives`` and ``frames`` are what the broker has delivered so far."""
+    """One stage and one browser. ``drives`` (commands) and ``frames`` (bytes) are what the broker delivered so far."""
 
     def __init__(self, stage: Stage, browser: Browser, drives: Received, frames: Received) -> None:
-        self.stage, self.ref = stage, stage.ref
-        self.drives = drives  # commands
-        self.frames = frames  # bytes
+        self.stage, self.ref, self.drives, self.frames = stage, stage.ref, drives, frames
         self._browser = browser
 
-    def fleet(self) -> Page:
-        return self._goto(self.stage.url)
-
-    def page(self, name: str) -> Page:
-        return self._goto(self.stage.robot_url(name))
+    def page(self, name: str = "") -> Page:
+        """A robot's page; without a name the fleet's."""
+        context = self._browser.new_context(viewport={"width": 1280, "height": 800})
+        context.add_init_script(_HOOKS)
+        page = context.new_page()
+        page.goto(self.stage.robot_url(name) if name else self.stage.url, wait_until="domcontentloaded")
+        return page
 
     def watched(self, name: str, wait_s: float = _WAIT_S) -> Page:
         """Its page, once it shows pictures."""
         page = self.page(name)
-        self.until(page, lambda: page.evaluate("bench.picture"), "no picture", wait_s)
+        self.until(page, "bench.picture", "no picture", wait_s)
         return page
 
     def drivable(self, name: str) -> Page:
@@ -142,12 +143,10 @@ class Rig:
         """Wait until the robot of that page can be driven."""
         self.until(page, lambda: page.evaluate(_READY) == "", lambda: str(page.evaluate(_READY)))
 
-    def until(
-        self, page: Page | None, condition: Callable[[], object], what: Callable[[], str] | str, wait_s: float = _WAIT_S
-    ) -> None:
-        """Wait for the condition. Raises PebbleError with ``what`` is wrong."""
+    def until(self, page: Page | None, condition: Test, what: Test, wait_s: float = _WAIT_S) -> None:
+        """Wait for the condition. Raises PebbleError with ``what`` is wrong, in words."""
         end = time.monotonic() + wait_s
-        while not condition():
+        while not (condition() if callable(condition) else page and page.evaluate(condition)):
             if time.monotonic() > end:
                 raise PebbleError(f"waited {wait_s:.0f} s: {what() if callable(what) else what}")
             self.pause(page, _STEP_S)
@@ -207,13 +206,6 @@ class Rig:
         self.until(page, found, "no command reached the broker", 5.0)
         return found()[0]
 
-    def _goto(self, url: str) -> Page:
-        context = self._browser.new_context(viewport={"width": 1280, "height": 800})
-        context.add_init_script(_HOOKS)
-        page = context.new_page()
-        page.goto(url, wait_until="domcontentloaded")
-        return page
-
 
 def monotonic(page_ms: float) -> float:
     """A stamp of another process on this machine: epoch milliseconds, as time.monotonic()."""
@@ -226,11 +218,12 @@ def monotonic(page_ms: float) -> float:
 @contextmanager
 def rig(*names: str, program: str | None = None, flags: tuple[str, ...] = (), **settings: Any) -> Iterator[Rig]:
     """Start everything; ``settings`` are of the stage and of the page's server. Raises PebbleError."""
-    with ExitStack() as stack:
-        stage = stack.enter_context(Stage(*(names or ROBOTS), **settings))
-        browser = stack.enter_context(chromium(*flags, program=program))
-        drives = stack.enter_context(_subscribed(stage, DRIVE, "%p", json.loads))
-        frames = stack.enter_context(_subscribed(stage, CAMERA, "%l", int))
+    with (
+        Stage(*(names or ROBOTS), **settings) as stage,
+        chromium(*flags, program=program) as browser,
+        _subscribed(stage, DRIVE, "%p", json.loads) as drives,
+        _subscribed(stage, CAMERA, "%l", int) as frames,
+    ):
         yield Rig(stage, browser, drives, frames)
 
 
@@ -265,25 +258,20 @@ def missing() -> str | None:
     """What to do before a page can be opened; None: nothing."""
     if shutil.which("chromium") is None:
         return "no Chromium: apt install chromium"
-    if find_spec("playwright") is None:
-        return "no Playwright: pip install 'pebble-robot[dev]'"
-    return None
+    return None if find_spec("playwright") else "no Playwright: pip install 'pebble-robot[dev]'"
 
 
 @contextmanager
 def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
     """Run one with further ``flags``; ``program`` starts it in another way. Raises PebbleError with what to install."""
-    problem = missing()
-    if problem is not None:
+    if problem := missing():
         raise PebbleError(problem)
     from playwright.sync_api import sync_playwright  # optional
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program or shutil.which("chromium"), args=[*FLAGS, *flags])
-        try:
+        path = program or shutil.which("chromium")
+        with closing(playwright.chromium.launch(executable_path=path, args=[*FLAGS, *flags])) as browser:
             yield browser
-        finally:
-            browser.close()
 
 
 # -- the browser behind an impaired network
@@ -295,32 +283,29 @@ def linked(condition: Condition, *names: str, flags: tuple[str, ...] = ()) -> It
 
     Needs root. Raises PebbleError.
     """
-    problem = why_no_namespaces()
-    if problem is not None:
+    if problem := why_no_namespaces():
         raise PebbleError(f"no network namespaces: {problem}")
-    with ExitStack() as stack:
-        network = stack.enter_context(NamespaceNetwork())
-        program = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "chromium"
+    secure = f"--unsafely-treat-insecure-origin-as-secure=http://{SERVER}:{_PORT}"  # as https would be
+    with NamespaceNetwork() as network, tempfile.TemporaryDirectory() as folder:
+        program = Path(folder) / "chromium"
         program.write_text(f'#!/bin/sh\nexec {shlex.join(network.on_remote(["chromium"]))} "$@"\n')
         program.chmod(0o700)
-        stack.enter_context(_inside(network.on_robot(())[1].removeprefix("--net=")))
-        secure = f"--unsafely-treat-insecure-origin-as-secure=http://{SERVER}:{_PORT}"  # as https would be
-        made = stack.enter_context(rig(*names, program=str(program), flags=(secure, *flags), host=SERVER, port=_PORT))
-        network.apply(condition)
-        yield made
+        with (
+            _inside(network.on_robot(())[1].removeprefix("--net=")),
+            rig(*names, program=str(program), flags=(secure, *flags), host=SERVER, port=_PORT) as made,
+        ):
+            network.apply(condition)
+            yield made
 
 
 @contextmanager
 def _inside(namespace: str) -> Iterator[None]:
     """This thread, and all that it starts, use that network."""
     libc = ctypes.CDLL(None, use_errno=True)
-    own = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-    other = os.open(namespace, os.O_RDONLY)
-    try:
-        if libc.setns(other, _CLONE_NEWNET):
+    with Path("/proc/thread-self/ns/net").open() as own, Path(namespace).open() as other:
+        if libc.setns(other.fileno(), _CLONE_NEWNET):
             raise PebbleError(f"the network namespace cannot be entered: {os.strerror(ctypes.get_errno())}")
-        yield
-    finally:
-        libc.setns(own, _CLONE_NEWNET)
-        os.close(own)
-        os.close(other)
+        try:
+            yield
+        finally:
+            libc.setns(own.fileno(), _CLONE_NEWNET)

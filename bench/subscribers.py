@@ -13,7 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Set
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +23,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 import pebble.transports.mqtt.transport  # noqa: F401  (otherwise the first subscriber would include the import)
 from pebble.config import load
-from pebble.contract import (
-    AUDIO,
-    AUDIO_CONTROL,
-    CAMERA,
-    MQTT_AUDIO,
-    MQTT_VIDEO,
-    ONLINE,
-    STATUS,
-    VIDEO_CONTROL,
-)
+from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, ONLINE, STATUS, VIDEO_CONTROL
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.errors import PayloadError, PebbleError
 from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
@@ -76,8 +67,8 @@ class RobotSubscriber(StockClient):
             (self.retained.add if message.payload else self.retained.discard)(message.topic)
         if topic in (CAMERA.suffix, AUDIO.suffix):
             self.arrived[encoding_of(bytes(message.payload))] += 1
-        elif topic == ONLINE.suffix and self.first_heartbeat_ns is None and _is_online(message.payload):
-            self.first_heartbeat_ns = now
+        elif topic == ONLINE.suffix and self.first_heartbeat_ns is None:
+            self.first_heartbeat_ns = now if json.loads(message.payload).get("online", True) else None
         elif topic == STATUS.suffix and self.ready_ns is None and _all_ready(message.payload):
             self.ready_ns = now
 
@@ -94,18 +85,11 @@ def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
 
 def encoding_of(raw: bytes) -> str:
     """The encoding of a picture or a sound packet; ``json`` if it has no binary header."""
-    try:
+    with suppress(PayloadError):
         return "h264" if Picture.unpack(raw).kind == PictureKind.H264 else "pbvd"
-    except PayloadError:
-        pass
-    try:
+    with suppress(PayloadError):
         return "opus" if Sound.unpack(raw).codec == Codec.OPUS else "pcm"
-    except PayloadError:
-        return "json"
-
-
-def _is_online(heartbeat: bytes | bytearray) -> bool:
-    return bool(json.loads(heartbeat).get("online", True))
+    return "json"
 
 
 def _all_ready(status: bytes | bytearray) -> bool:
@@ -132,8 +116,7 @@ def stock_operator_ms(port: int, base: str, retained: Set[str]) -> float:
         client.loop(_POLL_S)
     ended_ns = time.monotonic_ns()
     client.disconnect()
-    _check("a late operator", missing)
-    return (ended_ns - began_ns) / 1e6
+    return _checked_ms("a late operator", missing, began_ns, ended_ns)
 
 
 def operator_ms(port: int, base: str, retained: Set[str]) -> float:
@@ -142,10 +125,7 @@ def operator_ms(port: int, base: str, retained: Set[str]) -> float:
 
 
 def retained_ms(transport: Transport, base: str, retained: Set[str]) -> float:
-    """Time from opening ``transport``, as a service does, until the last of ``retained`` has arrived; closes it.
-
-    Raises PebbleError if a topic does not arrive.
-    """
+    """The same from opening ``transport``, as a service does; closes it."""
     missing, complete, ended_ns = set(retained), threading.Event(), 0
 
     def on_message(message: Message) -> None:
@@ -160,7 +140,12 @@ def retained_ms(transport: Transport, base: str, retained: Set[str]) -> float:
         transport.open(timeout=0.0)
         transport.subscribe(f"{base}/#", on_message, direct=True)
         complete.wait(_LIMIT_S)
-    _check(transport.client_id, missing)
+    return _checked_ms(transport.client_id, missing, began_ns, ended_ns)
+
+
+def _checked_ms(who: str, missing: Set[str], began_ns: int, ended_ns: int) -> float:
+    if missing:
+        raise PebbleError(f"{who} did not receive {', '.join(sorted(missing))} within {_LIMIT_S:.0f} s")
     return (ended_ns - began_ns) / 1e6
 
 
@@ -179,11 +164,6 @@ def retained_topics(transport: Transport, base: str) -> set[str]:
         while received.wait(_QUIET_S):
             received.clear()
     return found
-
-
-def _check(who: str, missing: Set[str]) -> None:
-    if missing:
-        raise PebbleError(f"{who} did not receive {', '.join(sorted(missing))} within {_LIMIT_S:.0f} s")
 
 
 def main(path: str) -> None:

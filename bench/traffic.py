@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -35,7 +36,6 @@ from pebble.rig.testbed import ROBOTS, Testbed
 from pebble.transports import MqttSettings, create
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from pebble.bench.plots import Picture
@@ -53,6 +53,16 @@ _PAPER_LATENCIES: Final = {
     "benjr": "about 100 to 1100 ms, a range as of stamps of whole seconds",
     "minilamp": "about 100 to 1100 ms, over Starlink, a range as of stamps of whole seconds",
 }
+_OUTAGES, _LATENCY, _BANDWIDTH = "outages of heartbeats", "latency of heartbeats", "bandwidth"
+#: Of the paper: number, robot and content.
+_FIGURES: Final = (
+    ("4.1", "goob", _OUTAGES),
+    ("4.2", "goob", _LATENCY),
+    ("4.3", "minilamp", _BANDWIDTH),
+    ("4.4", "minilamp", _OUTAGES),
+    ("4.5", "benjr", _LATENCY),
+    ("4.6", "minilamp", _LATENCY),
+)
 
 Robots = dict[str, RobotTraffic]  # by name
 
@@ -96,15 +106,10 @@ def record(folder: Path, idle_s: float, session_s: float) -> None:
 
 def _use(operator: Operator, port: int, seconds: float) -> None:
     """Drive all robots while pictures and sound arrive of those that have them. Raises PebbleError."""
-    with ExitStack() as stack:
-        viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
-        stack.enter_context(closing(viewer))
-        viewer.open()
-        receivers = [
-            stack.enter_context(closing(MediaReceiver(viewer, robot.base)))
-            for robot in operator.discovery.all_robots()
-            if robot.offers("video")
-        ]
+    viewer = create("mqtt", "pebble-bench-viewer", MqttSettings(host="127.0.0.1", port=port))
+    with viewer, ExitStack() as stack:
+        robots = [robot.base for robot in operator.discovery.all_robots() if robot.offers("video")]
+        receivers = [stack.enter_context(closing(MediaReceiver(viewer, base))) for base in robots]
         for receiver in receivers:
             receiver.wait_for_capabilities(_READY_S)
             receiver.viewer.request("video", "json")
@@ -134,22 +139,22 @@ def _polls(receivers: Sequence[MediaReceiver], seconds: float) -> Iterator[None]
 
 def cells_of(traffic: Traffic) -> list[Cell]:
     """The lengths of each robot's outages with all of its analysis, and the bandwidths of each kind of message."""
-    return [cell for robot in traffic.robots for cell in _cells_of(robot)]
-
-
-def _cells_of(robot: RobotTraffic) -> Iterator[Cell]:
-    name, lengths = robot.robot.rpartition("/")[2], [one.length_ms for one in robot.outages]
-    analysis = msgspec.json.encode(robot).decode()
-    yield Cell(variant=name, measure="outage", unit="ms", rounds=[lengths], figures={_ANALYSIS: analysis})
-    for one in robot.bandwidth:
-        yield Cell(
-            variant=name,
-            params={"messages": one.family, "time": one.time},
-            measure="bandwidth",
-            unit="kbit/s",
-            rounds=[[one.median_kbps]],
-            figures={"p95": round(one.p95_kbps, 3), "seconds": one.seconds, "count": one.messages, "bytes": one.bytes},
-        )
+    cells = []
+    for robot in traffic.robots:
+        name, lengths = robot.robot.rpartition("/")[2], [one.length_ms for one in robot.outages]
+        analysis = msgspec.json.encode(robot).decode()
+        cells.append(Cell(variant=name, measure="outage", unit="ms", rounds=[lengths], figures={_ANALYSIS: analysis}))
+        cells += [
+            Cell(
+                variant=name, params={"messages": one.family, "time": one.time}, measure="bandwidth", unit="kbit/s",
+                rounds=[[one.median_kbps]],
+                figures={
+                    "p95": round(one.p95_kbps, 3), "seconds": one.seconds, "count": one.messages, "bytes": one.bytes,
+                },
+            )
+            for one in robot.bandwidth
+        ]  # fmt: skip
+    return cells
 
 
 def robots_of(cells: Sequence[Cell]) -> Robots:
@@ -170,7 +175,7 @@ def tables(cells: Sequence[Cell]) -> Iterator[Table]:
         here = [robots[name].of(family) if name in robots else None for family in (VIDEO, AUDIO)]
         shown = [("–", "–") if one is None else (f"{one.median_kbps:.2f}", f"{one.p95_kbps:.2f}") for one in here]
         table.add_row(name, "paper", *(f"{value:.2f}" for value in paper))
-        table.add_row("", "here", *(value for pair in shown for value in pair))
+        table.add_row("", "here", *chain(*shown))
     yield table
     heads = ["robot", "heartbeats", "every ms", "outages", "below 300 ms", "shared", "latency p1", "p50", "p95 ms"]
     table = plain_table("Heartbeats", heads)
@@ -235,31 +240,20 @@ def figures(results: Results) -> list[Picture]:
     from pebble.bench.plots import Picture, panels
     from pebble.recordings.traffic.figures import draw_bandwidth, draw_latency, draw_outages
 
-    def latency(axes: Axes, robot: RobotTraffic) -> None:
-        if robot.latency is not None:
-            draw_latency(axes, robot.latency)
-
-    def bandwidth(axes: Axes, robot: RobotTraffic) -> None:
-        if shown := [one for one in robot.bandwidth if one.time in (SESSION, IDLE)]:
-            draw_bandwidth(axes, shown)
-
     robots = robots_of(results.cells)
-    drawn = (
-        ("4.1", "goob", "outages of heartbeats", draw_outages),
-        ("4.2", "goob", "latency of heartbeats", latency),
-        ("4.3", "minilamp", "bandwidth", bandwidth),
-        ("4.4", "minilamp", "outages of heartbeats", draw_outages),
-        ("4.5", "benjr", "latency of heartbeats", latency),
-        ("4.6", "minilamp", "latency of heartbeats", latency),
-    )
-    shown = [one for one in drawn if one[1] in robots]
+    shown = [one for one in _FIGURES if one[1] in robots]
 
     def make() -> Figure:
-        figure, places = panels(
-            len(shown), 2, (5.6, 3.0), "Traffic of simulated robots: the paper's Figures 4.1 to 4.6"
-        )
-        for axes, (number, name, what, draw) in zip(places, shown, strict=True):
-            draw(axes, robots[name])
+        heading = "Traffic of simulated robots: the paper's Figures 4.1 to 4.6"
+        figure, places = panels(len(shown), 2, (5.6, 3.0), heading)
+        for axes, (number, name, what) in zip(places, shown, strict=True):
+            robot = robots[name]
+            if what == _BANDWIDTH:
+                draw_bandwidth(axes, [one for one in robot.bandwidth if one.time in (SESSION, IDLE)])
+            elif what == _OUTAGES:
+                draw_outages(axes, robot)
+            elif robot.latency is not None:
+                draw_latency(axes, robot.latency)
             title = f"Figure {number}: {name}, {what}"
             axes.set_title(title, loc="left", pad=22.0, weight="bold")  # points for the legend between panel and title
         return figure

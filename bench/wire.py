@@ -9,15 +9,15 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Final
+from functools import lru_cache
+from typing import Final, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from pebble.bench.aims import Aim, single
-from pebble.bench.clips import FPS, HEIGHT, SCENES, WIDTH, Clip
-from pebble.bench.comparison import Budget, Case, Comparison, Round, Run, seconds
+from pebble.bench.comparison import Budget, Case, Comparison, Run, seconds
 from pebble.bench.pictures import bars
 from pebble.bench.results import Cell, Value
 from pebble.bench.tables import Grid, percentile_column, single_column
@@ -76,12 +76,12 @@ def _encoder(variant: str, quality: float) -> VideoEncoder:
     return make_encoder(variant.partition(",")[0], fps=FPS, keyframe_interval=interval, quality=quality)
 
 
-def code(film: Sequence[Pixels], variant: str, quality: float) -> Coded:
+def code(pictures: Sequence[Pixels], variant: str, quality: float) -> Coded:
     """Encodes and decodes the clip. Raises PebbleError if a picture cannot be decoded."""
     encoder, decoder = _encoder(variant, quality), VideoDecoder()
     sent, likeness, errors = 0, [], []
     encoding = decoding = 0.0
-    for number, picture in enumerate(film):
+    for number, picture in enumerate(pictures):
         began = time.perf_counter()
         payload = encoder.encode(picture, _STARTED_MS + number * 1000 // FPS)
         encoded = time.perf_counter()
@@ -94,7 +94,7 @@ def code(film: Sequence[Pixels], variant: str, quality: float) -> Coded:
         if number % _EVERY == 0:
             likeness.append(ssim(picture, shown.picture))
             errors.append(squared_error(picture, shown.picture))
-    n = len(film)
+    n = len(pictures)
     return {
         "wire": sent * FPS / n / 1000,
         "quality": quality,
@@ -106,13 +106,13 @@ def code(film: Sequence[Pixels], variant: str, quality: float) -> Coded:
     }
 
 
-def match(film: Sequence[Pixels], variant: str, wanted: float) -> Coded:
+def match(pictures: Sequence[Pixels], variant: str, wanted: float) -> Coded:
     """The one whose SSIM is nearest to ``wanted``, found by bisection; stops within a fifth of the tolerance."""
     low, high = 1.0, 100.0
     quality = float(QUALITY)
     tried: list[Coded] = []
     while len(tried) < _TRIES:
-        one = code(film, variant, quality)
+        one = code(pictures, variant, quality)
         tried.append(one)
         if abs(one["ssim"] - wanted) <= TOLERANCE / 5:
             break
@@ -121,19 +121,80 @@ def match(film: Sequence[Pixels], variant: str, wanted: float) -> Coded:
     return min(tried, key=lambda one: abs(one["ssim"] - wanted))
 
 
-def measure_video(round_: Round) -> Iterator[Cell]:
-    films: dict[str, list[Pixels]] = {}
-    references: dict[str, Coded] = {}
-    count = max(_EVERY, round(round_.run["seconds"] * FPS))
-    for case in round_.cases():
-        scene = str(case.condition["scene"])
-        if case.variant == _REFERENCE:
-            clip = Clip(scene)
-            films[scene] = [clip.frame(number) for number in range(count)]
-            coded = references[scene] = code(films[scene], case.variant, QUALITY)
-        else:
-            coded = match(films[scene], case.variant, references[scene]["ssim"])
-        yield _cell(case, "kB/s", coded, references[scene])
+def measure_video(case: Case) -> Iterator[Cell]:
+    scene, count = str(case.condition["scene"]), max(_EVERY, round(case.run["seconds"] * FPS))
+    pictures, reference = _filmed(scene, count)
+    coded = reference if case.variant == _REFERENCE else match(pictures, case.variant, reference["ssim"])
+    yield _cell(case, "kB/s", coded, reference)
+
+
+@lru_cache(1)
+def _filmed(scene: str, count: int) -> tuple[list[Pixels], Coded]:
+    """A clip, and what the reference makes of it."""
+    pictures = film(scene, count)
+    return pictures, code(pictures, _REFERENCE, QUALITY)
+
+
+# -- clips: natural textures, a panning or resting camera, sensor noise
+
+WIDTH, HEIGHT, FPS = 640, 480, 15
+SCENES: Final = ("panning", "quiet")
+_SEED: Final = 8
+_WORLD_WIDTH: Final = 2400
+_PAN: Final = 7.3  # pixels per frame: a robot that turns at about 10 degrees per second
+_SWAY: Final = 3.0  # pixels up and down while it drives
+_LEAN: Final = 1.5  # degrees to either side
+_MARGIN: Final = 48  # pixels of the world around the window
+_NOISE: Final = 2.0  # standard deviation of a small sensor's noise in daylight, in levels of 255
+
+
+def film(scene: str, count: int) -> list[Pixels]:
+    """BGR, always the same: a figure crosses the picture and moves against the background."""
+    random, pictures = np.random.default_rng(_SEED), []
+    world = _world(random)
+    noise = random.normal(0, _NOISE, (HEIGHT + 64, WIDTH + 64, 3)).astype(np.float32)
+    for number in range(count):
+        view = _view(world, scene, number)
+        x, y = round(40 + number * 3.7) % WIDTH, 300
+        cv2.ellipse(view, (x, y), (22, 60), 0, 0, 360, (52, 60, 140), -1, cv2.LINE_AA)
+        cv2.circle(view, (x, y - 74), 17, (120, 150, 190), -1, cv2.LINE_AA)
+        down, right = (number * 29) % 64, (number * 47) % 64  # another part of the noise in each frame
+        grain = noise[down : down + HEIGHT, right : right + WIDTH]
+        pictures.append(np.clip(view + grain + 0.5, 0, 255).astype(np.uint8))
+    return pictures
+
+
+def _view(world: Pixels, scene: str, number: int) -> Pixels:
+    """A window onto the world. While panning it also rotates and zooms, so that no block is merely shifted."""
+    along, sway, lean, scale = 300.0, 0.0, 0.0, 1.0
+    if scene == "panning":
+        along, sway = number * _PAN, _SWAY * math.sin(number / 4)
+        lean, scale = _LEAN * math.sin(number / 9), 1 + 0.05 * math.sin(number / 21)
+    span = _WORLD_WIDTH - WIDTH - 2 * _MARGIN
+    left = _MARGIN + span - abs(along % (2 * span) - span)  # forth and back
+    middle_x, middle_y = left + WIDTH / 2, HEIGHT / 2 + _MARGIN + sway
+    turn = cv2.getRotationMatrix2D((middle_x, middle_y), lean, scale)
+    turn[:, 2] += np.array((WIDTH / 2 - middle_x, HEIGHT / 2 - middle_y))
+    return cast(Pixels, cv2.warpAffine(world, turn, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC))
+
+
+def _world(random: np.random.Generator) -> Pixels:
+    """Octaves of noise of decreasing strength, like the 1/f spectrum of landscapes, and some edges."""
+    height, width = HEIGHT + 2 * _MARGIN, _WORLD_WIDTH
+    world = np.zeros((height, width, 3), np.float32)
+    for octave in range(8):
+        cells = (2 + (height >> (8 - octave)), 2 + (width >> (8 - octave)))
+        light = random.normal(0, 1, (*cells, 1)) + 0.15 * random.normal(0, 1, (*cells, 3))
+        clouds = cv2.resize(light.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        world += 48 * 0.66**octave * clouds
+    world += np.linspace(165, 85, height, dtype=np.float32)[:, None, None]  # the sky is brighter than the ground
+    view = np.clip(world, 0, 255).astype(np.uint8)
+    for _ in range(40):  # houses, posts, doors
+        x, y = int(random.integers(0, width)), int(random.integers(60, height - 60))
+        w, h = int(random.integers(8, 120)), int(random.integers(20, 180))
+        patch, colour = view[y : y + h, x : x + w], random.integers(30, 220, 3)
+        patch[:] = (patch * 0.3 + colour * 0.7).astype(np.uint8)
+    return view
 
 
 # -- the quality of a decoded picture: PSNR over all colours, and SSIM (Wang et al. 2004) as the mean of the channels
@@ -188,7 +249,7 @@ VIDEO = Comparison(
     quick=Budget(8, seconds=1.0),
     variants=_VIDEO,
     conditions=lambda _run: [{"scene": scene, "size": f"{WIDTH}x{HEIGHT}", "fps": FPS} for scene in SCENES],
-    measure_round=measure_video,
+    measure=measure_video,
     tables=(
         Grid(
             title=f"Video on the wire at equal SSIM, {WIDTH}x{HEIGHT}, {FPS} fps", rows=("scene", "variant"),
@@ -253,26 +314,23 @@ def speak(speech: npt.NDArray[np.int16], name: str, bitrate: int = 24_000, bundl
         "wire": sum(wire_bytes(len(packet)) for packet in packets) / lasts_s * 8 / 1000,
         "packets_per_s": len(packets) / lasts_s,
         "payload_kbits": sum(map(len, packets)) * 8 / 1000 / lasts_s,
-        "likeness": likeness(sound, speech[:, 0].astype(np.float64), RATE, by_envelope=name != "pcm"),
+        "likeness": likeness(sound, speech[:, 0].astype(np.float64), by_envelope=name != "pcm"),
         "encode_cpu": (encoded - began) / lasts_s,  # share of one core
         "decode_cpu": (decoded - encoded) / lasts_s,
     }
 
 
-def likeness(received: Wave, speech: Wave, rate: int, *, by_envelope: bool) -> float:
+def likeness(received: Wave, speech: Wave, *, by_envelope: bool) -> float:
     """Correlation (-1 to 1) at the delay that gives the highest one."""
-    count = min(len(received), len(speech)) - round(_DELAY_S * rate)
-    delays = range(0, round(_DELAY_S * rate), max(1, rate // 2000) if by_envelope else 1)
-
-    def compared(wave: Wave) -> Wave:
-        return _envelope(wave, rate) if by_envelope else wave
-
+    most = round(_DELAY_S * RATE)
+    count, compared = min(len(received), len(speech)) - most, _envelope if by_envelope else np.asarray
     original = compared(speech[:count])
+    delays = range(0, most, RATE // 2000 if by_envelope else 1)
     return max(float(np.corrcoef(compared(received[delay : delay + count]), original)[0, 1]) for delay in delays)
 
 
-def _envelope(wave: Wave, rate: int) -> Wave:
-    step = round(rate * _STEP_S)
+def _envelope(wave: Wave) -> Wave:
+    step = round(RATE * _STEP_S)
     loudness: Wave = np.sqrt((wave[: len(wave) // step * step].reshape(-1, step) ** 2).mean(axis=1))
     return loudness
 

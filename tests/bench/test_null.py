@@ -11,7 +11,7 @@ from rich.console import Console
 from pebble.bench import engine, null
 from pebble.bench.comparison import Case
 from pebble.bench.frames import FRAMES_NULL
-from pebble.bench.frames_loop import RATE_HZ
+from pebble.bench.frames_worker import RATE_HZ
 from pebble.bench.pictures import LEAST
 from pebble.bench.results import Cell, Judged, load
 from pebble.errors import PebbleError
