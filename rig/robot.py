@@ -10,7 +10,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ from pebble.rig.programs import Program, Wrap, children, unchanged
 from pebble.simulation.trace import Entry, read_trace
 
 if TYPE_CHECKING:
-    from pebble.rig.room import Outcome
+    from pebble.rig.testbed import Outcome
     from pebble.simulation.mcu import Snapshot
 
 KINDS = ("mqtt", "zenoh")
@@ -74,34 +74,26 @@ class SimulatedRobot:
         self._entries.extend(msgspec.json.decode(line, type=Entry) for line in complete.splitlines())
         return list(self._entries)
 
-    def relays(self) -> list[Entry]:
-        """The changes of its outlets' relays, oldest first; most robots have none."""
-        return []
-
     def outcome(self, at: float) -> Outcome:
         """What came of a script that ended at ``at``; only a robot with scripts knows."""
         raise NotImplementedError
 
-    def _add(self, name: str, command: Sequence[str], kind: int, log: str, *, reports: bool = False) -> Program:
-        self.programs.append(Program(name, command, self.folder / log, reports=reports))
+    def _add(
+        self, name: str, command: Sequence[str], kind: int, log: str, each: Callable[[bytes], object] | None = None
+    ) -> Program:
+        self.programs.append(Program(name, command, self.folder / log, each=each))
         return self.running.add(self.programs[-1], kind)
 
     def _start_mcu(self, module: str, *options: object, reports: bool = True) -> Program:
         """The MCU of its motors; with ``reports`` what it measures is collected."""
         command = python(module, *options, *(["--report"] if reports else []))
-        self.mcu = self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", reports=reports)
-        if reports:
-            threading.Thread(target=self._watch, args=(self.mcu,), name=f"reports of {self.name}", daemon=True).start()
+        self.mcu = self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", self._collect if reports else None)
         return self.mcu
 
-    def _watch(self, mcu: Program) -> None:
-        for line in mcu.reports:
-            self.mcu_reports.append(self._read(line))
-
-    def _read(self, line: bytes) -> Snapshot:
+    def _collect(self, line: bytes) -> None:
         from pebble.simulation.mcu import Snapshot
 
-        return msgspec.json.decode(line, type=Snapshot)
+        self.mcu_reports.append(msgspec.json.decode(line, type=Snapshot))
 
 
 class Robot(SimulatedRobot):
@@ -125,7 +117,8 @@ class Robot(SimulatedRobot):
         wrap: Wrap = unchanged,
     ) -> None:
         super().__init__(running, name, folder or running.folder)
-        self.kind, self.remote, self.base = kind, remote, Identity("pebble", "robots", name).base
+        self.kind, self.remote, self.remote_port = kind, remote, remote[1]
+        self.base = Identity("pebble", "robots", name).base
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
@@ -165,10 +158,6 @@ class Robot(SimulatedRobot):
     # -- its processes
 
     @property
-    def remote_port(self) -> int:
-        return self.remote[1]
-
-    @property
     def broker_ports(self) -> list[int]:
         """The remote broker's port, then that of the local broker, if there is one."""
         return [self.remote_port, *([] if self.local_broker is None else [self.local_broker.port])]
@@ -186,8 +175,8 @@ class Robot(SimulatedRobot):
         names = {name[:_COMM_BYTES]: name for name in self._programs_of()}
         found = {LAUNCHER: self.launcher.pid}
         for pid in children(self.launcher.pid):
-            comm = _comm(pid)
-            if comm:
+            with suppress(OSError):  # it has just ended
+                comm = Path(f"/proc/{pid}/comm").read_text().strip()
                 found[names.get(comm, comm)] = pid
         if self.local_broker is not None:
             found[BROKER] = self.local_broker.pid
@@ -229,11 +218,10 @@ class Robot(SimulatedRobot):
 
     def _connected(self, config: dict[str, Any]) -> dict[str, Any]:
         """A config with the addresses and paths of this robot."""
-        host, port = self.remote
         changes: dict[str, Any] = {
             "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
             "services": {
-                "mqtt_bridge": {"remote_mqtt": {"host": host, "port": port}},
+                "mqtt_bridge": {"remote_mqtt": {"host": self.remote[0], "port": self.remote_port}},
                 "serial_mcu_bridge": {"serial": {"port": str(self.port)}},
             },
         }
@@ -274,11 +262,3 @@ def one_robot(kind: str, make: Callable[..., Robot] = Robot, **options: Any) -> 
         broker.wait()
         robot.prepare()
         yield robot
-
-
-def _comm(pid: int) -> str:
-    """A process's name in the kernel; empty if it has just ended."""
-    try:
-        return Path(f"/proc/{pid}/comm").read_text().strip()
-    except OSError:
-        return ""

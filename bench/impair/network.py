@@ -26,7 +26,7 @@ from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.forwarder import ETHERNET, TIMED, WIRE
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
-from pebble.rig.worker import Worker, end_workers
+from pebble.rig.programs import Worker, end_workers
 
 KINDS = ("auto", "namespaces", "proxy")
 LOOPBACK = "127.0.0.1"
