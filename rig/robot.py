@@ -122,8 +122,14 @@ class Robot(SimulatedRobot):
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
-        self._services, self.reports, self._wrap = services or {}, reports, wrap
+        self.reports, self._wrap = reports, wrap
         self._started: list[Program] = []
+        self._services = dict(services or {})
+        motors: dict[str, Any] = {"enabled": True, "serial": {"baud": 460_800}}
+        if reports is not None:
+            motors["telemetry"] = {"publish_touch_sensors": reports}
+        own = {"mqtt_bridge": {"enabled": True}, "serial_mcu_bridge": motors}
+        self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}, "services": own}
 
     def prepare(self, ending: threading.Event | None = None) -> None:
         """Starts what the robot needs and writes its config, or waits no longer once ``ending`` is set.
@@ -206,19 +212,10 @@ class Robot(SimulatedRobot):
         options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
         return self._start_mcu("pebble.simulation.mcu", *options, reports=False)
 
-    def _contents(self) -> dict[str, Any]:
-        """Of its config file."""
-        motors: dict[str, Any] = {"enabled": True, "serial": {"baud": 460_800}}
-        if self.reports is not None:
-            motors["telemetry"] = {"publish_touch_sensors": self.reports}
-        services = {"mqtt_bridge": {"enabled": True}, "serial_mcu_bridge": motors}
-        more = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
-        own = {"robot": {"id": self.name}, "transport": {"kind": self.kind}, "services": deep_merge(services, more)}
-        return self._connected(own)
-
-    def _connected(self, config: dict[str, Any]) -> dict[str, Any]:
-        """A config with the addresses and paths of this robot."""
-        changes: dict[str, Any] = {
+    def _contents(self) -> Config:
+        """Of its config file: its own, with the addresses and paths of this robot."""
+        services = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
+        connections: dict[str, Any] = {
             "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
             "services": {
                 "mqtt_bridge": {"remote_mqtt": {"host": self.remote[0], "port": self.remote_port}},
@@ -226,9 +223,9 @@ class Robot(SimulatedRobot):
             },
         }
         if self.local_port is not None:
-            changes["local_mqtt"] = {"host": "localhost", "port": self.local_port}
-        connected: dict[str, Any] = deep_merge(config, changes)
-        return connected
+            connections["local_mqtt"] = {"host": "localhost", "port": self.local_port}
+        contents: Config = deep_merge(deep_merge(self._own, {"services": services}), connections)
+        return contents
 
 
 def board(kind: str, port: Path, trace: Path) -> tuple[object, ...]:

@@ -1,4 +1,4 @@
-"""Brokers, the simulated robots that come with Pebble, their room and the operator page, in the order of their start."""
+"""Brokers, the simulated robots that come with Pebble, their room, and the operator page; Stage has no driver."""
 
 from __future__ import annotations
 
@@ -72,13 +72,27 @@ class LinuxRobot(Robot):
 
     def __init__(self, running: Processes, name: str, local_port: int, remote_port: int, *devices: str) -> None:
         """``devices``: self-describing MCUs that it has besides, by their kind."""
-        self._own = json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
-        kind, folder = self._own["transport"]["kind"], running.folder / name
-        super().__init__(running, kind, (_HOST, remote_port), name=name, folder=folder)
+        own = json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
+        folder = running.folder / name
+        super().__init__(running, own["transport"]["kind"], (_HOST, remote_port), name=name, folder=folder)
         self.has_imu = IMU in devices
         self.local_port = local_port
-        self._devices = {kind: folder / kind for kind in devices}  # their serial ports
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
+        self._devices = {kind: folder / kind for kind in devices}  # their serial ports
+        self._own = own | {"services": own["services"] | {"av_daemon": {}}}
+        raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
+        instances = {
+            _LINES[kind]: {"protocol": "pebble_serial_v1", "serial": {"port": str(port)}}
+            for kind, port in self._devices.items()
+        }
+        self._services = {
+            "mqtt_bridge": {
+                "service_restart_control": {"command": _RESTART},
+                "media": {"audio_receiver": {"command": [*_loudspeaker(self.voice), *raw]}},
+            },
+            "serial_mcu_bridge": {"instances": instances},
+            "av_daemon": MEDIA["av_daemon"],
+        }
 
     def bring_up(self, ending: threading.Event) -> None:
         """Start the MCUs first, so that their ports exist, then the robot."""
@@ -94,22 +108,6 @@ class LinuxRobot(Robot):
 
     def _start_motors(self) -> Program:
         return self._start_mcu("pebble.simulation.mcu", *board(self.name, self.port, self._trace))
-
-    def _contents(self) -> dict[str, Any]:
-        """Its own config file, with only addresses, paths and devices changed."""
-        raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
-        instances = {
-            _LINES[kind]: {"protocol": "pebble_serial_v1", "serial": {"port": str(port)}}
-            for kind, port in self._devices.items()
-        }
-        bridge = {
-            "service_restart_control": {"command": _RESTART},
-            "media": {"audio_receiver": {"command": [*_loudspeaker(self.voice), *raw]}},
-        }
-        services = {"mqtt_bridge": bridge, "serial_mcu_bridge": {"instances": instances}}
-        config = self._connected(deep_merge(self._own, {"services": services}))
-        config["services"]["av_daemon"] = {"enabled": True, **MEDIA["av_daemon"]}
-        return config
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +134,13 @@ class RoomRobot(LinuxRobot):
         self.port, self._trace = port_path(self.folder, name), trace_path(self.folder, name)
         room = json.loads((files("pebble.simulation.world") / "room.json").read_text())
         self._room.write_text(json.dumps(room | {"robots": _START}, indent=1))
-        self._clip = _write_clips(self.folder / "sounds")
+        sounds = self.folder / "sounds"
+        self._clip = _write_clips(sounds)
+        playback = {"directory": str(sounds), "player_command": _loudspeaker(self._record)}
+        self._services |= {
+            "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self._room}#{name}"}}),
+            "soundboard_handler": {"playback": playback},
+        }
 
     def outcome(self, at: float) -> Outcome:
         """Where the tag was then, and what the loudspeaker has played of the clip."""
@@ -147,15 +151,6 @@ class RoomRobot(LinuxRobot):
         bearing = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)
         played = [len(one.frames()) for one in playbacks(self._record) if self._clip.startswith(one.frames())]
         return Outcome(math.hypot(dx, dy), bearing, CLIP_S * max(played, default=0) / len(self._clip), CLIP_S)
-
-    def _contents(self) -> dict[str, Any]:
-        playback = {"directory": str(self.folder / "sounds"), "player_command": _loudspeaker(self._record)}
-        services = {
-            "av_daemon": {"video": {"device": f"{self._room}#{self.name}"}},
-            "soundboard_handler": {"playback": playback},
-        }
-        config: dict[str, Any] = deep_merge(super()._contents(), {"services": services})
-        return config
 
     def _start_motors(self) -> Program:
         return self._start_mcu("pebble.simulation.world", self._room, "--folder", self.folder, "--trace")
