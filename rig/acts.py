@@ -136,9 +136,13 @@ def emergency_stop(
         sender.end()
         repeat(forward, wait, _IN_VAIN_S)
         take()
-        estops = {robot.name: sender.robots[robot.base].estop for robot in robots}
-        by_others = [name for name, estop in estops.items() if estop.stopped_by and estop.stopped_by.by != by]
-        resets = {name: Reset(estop, by) for name, estop in estops.items() if name not in by_others}
+        stops = {robot.name: sender.robots[robot.base] for robot in robots}
+        holders = {name: stop.estop.stopped_by for name, stop in stops.items()}
+        resets = {
+            name: Reset(stops[name].estop, by)
+            for name, holder in holders.items()
+            if holder is None or holder.by == by
+        }
         reset_at = time.monotonic()
         for reset in resets.values():
             publish(reset.messages())
@@ -149,14 +153,7 @@ def emergency_stop(
         wait(_STOPPED_REST_S)
         take()
     return [
-        CompletedStop(
-            robot=name,
-            pressed=pressed,
-            confirmed_s=sender.robots[reset.robot.base].confirmed_s,
-            reset=reset_at,
-            is_free=bool(reset.shown) and reset.free,
-            ended=ended,
-        )
+        CompletedStop(name, pressed, stops[name].confirmed_s, reset_at, bool(reset.shown) and reset.free, ended)
         for name, reset in resets.items()
     ]
 

@@ -60,7 +60,6 @@ class SimulatedRobot:
         self.folder.mkdir(exist_ok=True)
         self.mcu_reports: deque[Snapshot] = deque(maxlen=_REPORTS)
         self.programs: list[Program] = []  # all that were started for it
-        self.mcu: Program | None = None  # of its motors
         self._trace, self._trace_read = folder / "trace.jsonl", 0
         self._entries: deque[Entry] = deque(maxlen=_ENTRIES)
 
@@ -87,8 +86,7 @@ class SimulatedRobot:
     def _start_mcu(self, module: str, *options: object, reports: bool = True) -> Program:
         """The MCU of its motors; with ``reports`` what it measures is collected."""
         command = python(module, *options, *(["--report"] if reports else []))
-        self.mcu = self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", self._collect if reports else None)
-        return self.mcu
+        return self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", self._collect if reports else None)
 
     def _collect(self, line: bytes) -> None:
         from pebble.simulation.mcu import Snapshot
@@ -153,15 +151,15 @@ class Robot(SimulatedRobot):
         """What the MCU received, did and (with ``reports``) sent after ``since_ns`` (CLOCK_MONOTONIC)."""
         return [entry for entry in read_trace(self._trace) if entry.ns >= since_ns]
 
+    # -- its processes, once it is launched
+
     def log(self) -> str:
         """The end of the robot's log."""
-        return "" if self.launcher is None else self.launcher.tail()
+        return self.launcher.tail()
 
     @property
-    def launcher(self) -> Program | None:
-        return self._started[0] if self._started else None
-
-    # -- its processes
+    def launcher(self) -> Program:
+        return self._started[0]
 
     @property
     def broker_ports(self) -> list[int]:
@@ -172,12 +170,10 @@ class Robot(SimulatedRobot):
         """The launcher, its children (including a hub), and the local broker, if there is one."""
         local = [] if self.local_broker is None else [self.local_broker.pid]
         own = [pid for program in self._started for pid in (program.pid, *children(program.pid))]
-        return [*own, *local] if own else []
+        return [*own, *local]
 
     def processes(self) -> dict[str, int]:
         """The same by name."""
-        if self.launcher is None:
-            return {}
         names = {name[:_COMM_BYTES]: name for name in self._programs_of()}
         found = {LAUNCHER: self.launcher.pid}
         for pid in children(self.launcher.pid):
@@ -194,8 +190,6 @@ class Robot(SimulatedRobot):
 
     def expect(self, condition: Callable[[], bool], what: str, timeout: float) -> None:
         """Waits for the condition. Raises PebbleError with the robot's log after ``timeout`` seconds, or if it ends."""
-        if self.launcher is None:
-            raise PebbleError("the robot was not launched")
         try:
             self.launcher.wait_until(condition, timeout)
         except PebbleError as error:

@@ -325,8 +325,7 @@ class Stage(Testbed):
 
     def wheels_turning(self, name: str, since_ns: int | None = None) -> bool:
         """Whether its motors run now; with ``since_ns`` whether they have run at any time since then."""
-        if since_ns is None:
-            return [speeds for _, speeds in self.motors(name)][-1:] not in ([], [_AT_REST])
+        since_ns = time.monotonic_ns() if since_ns is None else since_ns
         return self.last_motion_ns(name) > since_ns
 
     def last_motion_ns(self, name: str) -> int:
