@@ -139,9 +139,7 @@ def emergency_stop(
         stops = {robot.name: sender.robots[robot.base] for robot in robots}
         holders = {name: stop.estop.stopped_by for name, stop in stops.items()}
         resets = {
-            name: Reset(stops[name].estop, by)
-            for name, holder in holders.items()
-            if holder is None or holder.by == by
+            name: Reset(stops[name].estop, by) for name, holder in holders.items() if holder is None or holder.by == by
         }
         reset_at = time.monotonic()
         for reset in resets.values():
