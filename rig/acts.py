@@ -137,10 +137,8 @@ def emergency_stop(
         repeat(forward, wait, _IN_VAIN_S)
         take()
         stops = {robot.name: sender.robots[robot.base] for robot in robots}
-        holders = {name: stop.estop.stopped_by for name, stop in stops.items()}
-        resets = {
-            name: Reset(stops[name].estop, by) for name, holder in holders.items() if holder is None or holder.by == by
-        }
+        others = [name for name, stop in stops.items() if (held := stop.estop.stopped_by) and held.by != by]
+        resets = {name: Reset(stop.estop, by) for name, stop in stops.items() if name not in others}
         reset_at = time.monotonic()
         for reset in resets.values():
             publish(reset.messages())

@@ -115,8 +115,8 @@ class Robot(SimulatedRobot):
         wrap: Wrap = unchanged,
     ) -> None:
         super().__init__(running, name, folder or running.folder)
-        self.kind, self.remote, self.remote_port = kind, remote, remote[1]
-        self.base = Identity("pebble", "robots", name).base
+        self.kind, self.base = kind, Identity("pebble", "robots", name).base
+        self._remote_host, self.remote_port = remote
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
@@ -212,7 +212,7 @@ class Robot(SimulatedRobot):
         connections: dict[str, Any] = {
             "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
             "services": {
-                "mqtt_bridge": {"remote_mqtt": {"host": self.remote[0], "port": self.remote_port}},
+                "mqtt_bridge": {"remote_mqtt": {"host": self._remote_host, "port": self.remote_port}},
                 "serial_mcu_bridge": {"serial": {"port": str(self.port)}},
             },
         }
