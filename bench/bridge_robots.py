@@ -22,8 +22,8 @@ from pebble.bench.usage import cpu_s
 from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.rig.processes import Processes, python
+from pebble.rig.programs import Worker
 from pebble.rig.robot import BASE, Robot, one_robot, synthetic_media
-from pebble.rig.worker import Worker
 
 STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
 FORWARDER, SERIAL = "bridge", "serial bridge"

@@ -15,8 +15,7 @@ from pebble.bench.usage import cpu_s, wake_ups
 from pebble.errors import PebbleError
 from pebble.rig.broker import Broker
 from pebble.rig.processes import BROKERS, Processes, python
-from pebble.rig.programs import Program
-from pebble.rig.worker import Worker
+from pebble.rig.programs import Program, Worker
 from pebble.transports.settings import MqttSettings, ZenohSettings
 
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")

@@ -20,7 +20,7 @@ from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
 from pebble.rig.broker import Broker, mosquitto_path
 from pebble.rig.processes import Processes, python
-from pebble.rig.worker import Worker
+from pebble.rig.programs import Worker
 
 _ABOUT = {
     "zenoh-shm": "created in the shared segment, read as a view: no copy",

@@ -13,7 +13,6 @@ import os
 import shlex
 import shutil
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -29,8 +28,7 @@ from pebble.contract.channels import Channel
 from pebble.errors import PebbleError
 from pebble.rig.processes import OPERATORS
 from pebble.rig.programs import Program
-from pebble.rig.stage import Stage
-from pebble.rig.testbed import ROBOTS
+from pebble.rig.testbed import ROBOTS, Stage
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -235,19 +233,16 @@ def _subscribed(stage: Stage, channel: Channel, what: str, read: Callable[[bytes
         raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
     options = ["-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", channel.filter("+/+/+"), "-F", f"%U %t {what}"]
     log = stage.folder / "subscriber.log"
-    subscriber = stage.add(Program("mosquitto_sub", [program, *options], log, reports=True), OPERATORS)
     received: Received = []
 
-    def receive() -> None:
-        for line in subscriber.reports:
-            at, topic, rest = line.split(b" ", 2)
-            base = topic.decode().removesuffix(f"/{channel.suffix}")
-            received.append((monotonic(1000 * float(at)), base, read(rest)))
+    def receive(line: bytes) -> None:
+        at, topic, rest = line.split(b" ", 2)
+        base = topic.decode().removesuffix(f"/{channel.suffix}")
+        received.append((monotonic(1000 * float(at)), base, read(rest)))
 
-    reader = threading.Thread(target=receive, name="subscriber", daemon=True)
-    reader.start()
+    subscriber = stage.add(Program("mosquitto_sub", [program, *options], log, each=receive), OPERATORS)
     yield received
-    if subscriber.ended or not reader.is_alive():
+    if subscriber.ended or not subscriber.is_read:
         raise PebbleError("mosquitto_sub has ended: what it should have received is missing")
 
 

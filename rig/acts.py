@@ -5,16 +5,17 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 
-from pebble.client.discovery import DiscoveredRobot
+from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot
 from pebble.client.estop import StopSender, new_name
-from pebble.client.estop_states import Reset, RobotEstop
+from pebble.client.estop_states import Reset
 from pebble.contract import APRILTAG_DATA, AUTONOMY_COMMAND, SOUNDBOARD_COMMAND, Channel, codec
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
 from pebble.errors import PayloadError
 from pebble.motion.arbiter import HOLD_MS
-from pebble.rig.room import CLIP, TAG_ID, TAG_SIZE_M
 from pebble.services.serial_mcu_bridge.text.goob_base import mix
 from pebble.transports import Message, QoS, Transport
 
@@ -23,6 +24,9 @@ _POLL_S = 0.02
 
 Wait = Callable[[float], None]
 """Waits for so many seconds. Raises EndedEarlyError."""
+
+Send = Callable[[Drive], None]
+"""Sends a drive command to one robot, or to all that take part."""
 
 Wheels = tuple[float, float]  # left and right, -1..1
 
@@ -104,77 +108,50 @@ class CompletedStop:
         return self.pressed - _BEFORE_S
 
 
-class EmergencyStop:
-    """One stop of all robots, on the operator's thread. ``receive`` runs on the transport's.
+def emergency_stop(
+    transport: Transport, robots: Sequence[DiscoveredRobot], drive: Send, wait: Wait, by: str
+) -> list[CompletedStop]:
+    """Drive all robots, stop them, drive in vain, reset, drive again; a stop by a person is the person's to reset."""
+    received: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    forward = partial(drive, _FORWARD)
 
-    ``drive(axes)`` sends a drive command to all robots.
-    """
+    def publish(messages: Sequence[Message]) -> None:
+        for message in messages:
+            transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
-    def __init__(self, transport: Transport, drive: Callable[[Drive], None], wait: Wait, by: str) -> None:
-        self._transport, self._drive, self._wait, self._by = transport, drive, wait, by
-        self._received: queue.SimpleQueue[Message] = queue.SimpleQueue()
-        self._robots: dict[str, RobotEstop] = {}
+    def take() -> None:
+        while not received.empty():
+            sender.receive(received.get(), time.monotonic())
 
-    def receive(self, message: Message) -> None:
-        self._received.put(message)
-
-    def perform(self, robots: Sequence[DiscoveredRobot]) -> list[CompletedStop]:
-        """Drive, stop, drive in vain, reset, drive again."""
-        self._robots = {robot.base: RobotEstop(robot.base) for robot in robots}
-        self._keep_driving(_BEFORE_S)
+    with closing(transport.subscribe(ALL_OUTGOING, received.put)):  # brings retained capabilities again
+        repeat(forward, wait, _BEFORE_S)
         pressed = time.monotonic()
-        sender = StopSender(new_name(), by=self._by, why="part of the demo", now=pressed, robots=list(self._robots))
+        bases = [robot.base for robot in robots]
+        sender = StopSender(new_name(), by=by, why="part of the demo", now=pressed, robots=bases)
         while not sender.confirmed and time.monotonic() < pressed + _CONFIRMED_S:
-            self._publish(sender.tick(time.monotonic()))
-            self._drive(_FORWARD)
-            self._wait(COMMAND_PERIOD_S)
-            self._take(sender)
+            publish(sender.tick(time.monotonic()))
+            forward()
+            wait(COMMAND_PERIOD_S)
+            take()
         sender.end()
-        self._keep_driving(_IN_VAIN_S)
-        self._take(sender)
-        mine = {base: robot for base, robot in self._robots.items() if not self._stopped_by_another(robot)}
-        resets = {base: Reset(robot, self._by) for base, robot in mine.items()}
+        repeat(forward, wait, _IN_VAIN_S)
+        take()
+        stops = {robot.name: sender.robots[robot.base] for robot in robots}
+        others = [name for name, stop in stops.items() if (held := stop.estop.stopped_by) and held.by != by]
+        resets = {name: Reset(stop.estop, by) for name, stop in stops.items() if name not in others}
         reset_at = time.monotonic()
         for reset in resets.values():
-            self._publish(reset.messages())
-        self._wait(_RESET_S)
-        self._keep_driving(_AFTER_S)
-        self._drive(Drive())
+            publish(reset.messages())
+        wait(_RESET_S)
+        repeat(forward, wait, _AFTER_S)
+        drive(Drive())
         ended = time.monotonic()
-        self._wait(_STOPPED_REST_S)
-        self._take(sender)
-        return [
-            CompletedStop(
-                robot.name,
-                pressed,
-                sender.robots[robot.base].confirmed_s,
-                reset_at,
-                bool(resets[robot.base].shown) and resets[robot.base].free,
-                ended,
-            )
-            for robot in robots
-            if robot.base in resets
-        ]
-
-    def _stopped_by_another(self, robot: RobotEstop) -> bool:
-        """A person's stop is the person's to reset."""
-        stop = robot.stopped_by
-        return stop is not None and stop.by != self._by
-
-    def _keep_driving(self, seconds: float) -> None:
-        repeat(lambda: self._drive(_FORWARD), self._wait, seconds)
-
-    def _take(self, sender: StopSender) -> None:
-        """Pass on what was received."""
-        while not self._received.empty():
-            message = self._received.get()
-            sender.receive(message, time.monotonic())
-            for robot in self._robots.values():
-                robot.receive(message)
-
-    def _publish(self, messages: Sequence[Message]) -> None:
-        for message in messages:
-            self._transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
+        wait(_STOPPED_REST_S)
+        take()
+    return [
+        CompletedStop(name, pressed, stops[name].confirmed_s, reset_at, bool(reset.shown) and reset.free, ended)
+        for name, reset in resets.items()
+    ]
 
 
 # -- a script on a robot, which is driven for a moment in between
@@ -182,6 +159,8 @@ class EmergencyStop:
 
 BY_ITSELF = "by itself"
 FOLLOW = "apriltag-follow"
+TAG_ID, TAG_SIZE_M = 21, 0.25  # of the tag that Goob follows, as in the world file
+CLIP = "horn.wav"
 DISTANCE_M, TOLERANCE_M = 0.9, 0.05
 HOLD_S = HOLD_MS / 1000  # scripts are refused this long after a person's last command
 _APPROACH_S, _OVERRIDE_S, _STEADY_S, _FOLLOWED_REST_S = 1.0, 1.0, 0.8, 0.5
@@ -210,22 +189,15 @@ class CompletedFollow:
 
 
 class TakeOver:
-    """One script on one robot, on the operator's thread.
-
-    ``drive(axes)`` sends a drive command to the robot; ``note(what, text)`` shows what the operator does.
-    """
+    """One script on one robot, on the operator's thread; ``note(what, text)`` shows what the operator does."""
 
     def __init__(
-        self,
-        transport: Transport,
-        robot: DiscoveredRobot,
-        drive: Callable[[Drive], None],
-        wait: Wait,
-        note: Callable[[str, str], None],
+        self, transport: Transport, robot: DiscoveredRobot, drive: Send, wait: Wait, note: Callable[[str, str], None]
     ) -> None:
         self._transport, self._robot = transport, robot
         self._drive, self._wait, self._note = drive, wait, note
         self._seen: TagData | None = None
+        self._away_at = 0.0  # when the tag was last not at the wanted distance
 
     def perform(self) -> CompletedFollow:
         """The script is ended in any case; what goes wrong is for the assessment."""
@@ -239,54 +211,44 @@ class TakeOver:
         return completed
 
     def _follow(self) -> CompletedFollow:
-        name, started = self._robot.name, self._start()
+        name = self._robot.name
+        self._note("PLAYS", f"{CLIP} on {name}")
+        self._note("STARTS", f"{FOLLOW}, {name} drives to tag {TAG_ID} by itself")
+        config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
+        started = time.monotonic()
+        self._publish(AUTONOMY_COMMAND, AutonomyCommand(action="start", file=FOLLOW, config=config))
+        self._publish(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
         self._until(lambda: self._seen is not None and not self._overruled, _START_S)
         self._wait(_APPROACH_S)
         self._note("TAKES OVER", f"drives {name}, {FOLLOW} is overruled")
         took_over = time.monotonic()
-        repeat(lambda: self._drive(_BACK), self._wait, _OVERRIDE_S)
+        repeat(partial(self._drive, _BACK), self._wait, _OVERRIDE_S)
         self._drive(Drive())
         released = time.monotonic()
         self._note("LETS GO", f"{name} waits {HOLD_S:.0f} s for another command")
         self._until(lambda: not self._overruled, HOLD_S + _STATUS_S)
         self._note("GIVES BACK", f"{FOLLOW} drives {name} again")
-        self._until(self._arrival(), _ARRIVAL_S)
-        self._note("ENDS", f"{FOLLOW}, {name} {self._place()}")
+        self._away_at = time.monotonic()
+        self._until(self._arrived, _ARRIVAL_S)
+        distance = "does not see tag {}" if self._distance_m is None else "sees tag {} at {:.2f} m"
+        self._note("ENDS", f"{FOLLOW}, {name} {distance.format(TAG_ID, self._distance_m)}")
         return CompletedFollow(name, started, took_over, mix(_BACK.x, _BACK.z), released, time.monotonic(), CLIP)
 
-    def _start(self) -> float:
-        """Start the script and a clip; returns when."""
-        self._note("PLAYS", f"{CLIP} on {self._robot.name}")
-        self._note("STARTS", f"{FOLLOW}, {self._robot.name} drives to tag {TAG_ID} by itself")
-        config = {"tag_id": TAG_ID, "tag_size_m": TAG_SIZE_M, "target_distance_m": DISTANCE_M}
-        started = time.monotonic()
-        self._publish(AUTONOMY_COMMAND, AutonomyCommand(action="start", file=FOLLOW, config=config))
-        self._publish(SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file=CLIP))
-        return started
+    @property
+    def _distance_m(self) -> float | None:
+        return None if self._seen is None else self._seen.distance_m
 
-    def _arrival(self) -> Callable[[], bool]:
-        """A condition: the tag has been at the wanted distance for a while."""
-        since = time.monotonic()
-
-        def arrived() -> bool:
-            nonlocal since
-            distance = None if self._seen is None else self._seen.distance_m
-            if distance is None or abs(distance - DISTANCE_M) > TOLERANCE_M:
-                since = time.monotonic()
-            return time.monotonic() - since >= _STEADY_S
-
-        return arrived
+    def _arrived(self) -> bool:
+        """The tag has been at the wanted distance for a while."""
+        if self._distance_m is None or abs(self._distance_m - DISTANCE_M) > TOLERANCE_M:
+            self._away_at = time.monotonic()
+        return time.monotonic() - self._away_at >= _STEADY_S
 
     @property
     def _overruled(self) -> bool:
         """Whether the robot reports that a person goes before its script, as after the steps before."""
         status = self._robot.autonomy
         return status is None or not status.running or status.overridden is True
-
-    def _place(self) -> str:
-        if self._seen is None or self._seen.distance_m is None:
-            return f"does not see tag {TAG_ID}"
-        return f"sees tag {TAG_ID} at {self._seen.distance_m:.2f} m"
 
     def _until(self, condition: Callable[[], bool], timeout: float) -> None:
         """Wait for ``condition`` at most that long."""
@@ -301,7 +263,5 @@ class TakeOver:
     # -- the transport's thread
 
     def _receive(self, message: Message) -> None:
-        try:
+        with suppress(PayloadError):  # the assessment notices if there is no other
             self._seen = codec.decode(APRILTAG_DATA, message.payload)
-        except PayloadError:  # the assessment notices if there is no other
-            return

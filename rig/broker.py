@@ -46,8 +46,9 @@ class Broker(Program):
     ) -> None:
         """``extra``: more lines for mosquitto's configuration; amqtt has none. ``port`` 0 is a free one."""
         self.port = port or free_port()
-        mosquitto = kind is BrokerKind.MOSQUITTO
-        command = mosquitto_command(self.port, folder / name, extra, host) if mosquitto else _amqtt(self.port)
+        command = [sys.executable, "-m", "pebble.rig.broker", str(self.port)]
+        if kind is BrokerKind.MOSQUITTO:
+            command = mosquitto_command(self.port, folder / name, extra, host)
         super().__init__(name, wrap(command), folder / f"{name}.log")
 
     def wait(self, ending: threading.Event | None = None) -> None:
@@ -91,10 +92,6 @@ def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: st
     return [path, "-c", str(config)]
 
 
-def _amqtt(port: int) -> list[str]:
-    return [sys.executable, "-m", "pebble.rig.broker", str(port)]
-
-
 def free_port() -> int:
     """An unused TCP port, also where there is no loopback device; in a new network namespace every port is unused."""
     with socket.socket() as probe:
@@ -121,12 +118,9 @@ async def serve_amqtt(port: int) -> None:
     """Run amqtt on loopback until the task is cancelled."""
     from amqtt.broker import Broker as AmqttBroker  # optional
 
-    broker = AmqttBroker(
-        {
-            "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
-            "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
-        }
-    )
+    listeners = {"default": {"type": "tcp", "bind": f"{_HOST}:{port}"}}
+    plugins = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+    broker = AmqttBroker({"listeners": listeners, "plugins": plugins})
     broker._subscriptions = _Subscriptions()
     await broker.start()
     await asyncio.Event().wait()

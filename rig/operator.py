@@ -9,9 +9,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import closing, suppress
-from dataclasses import dataclass
+from contextlib import suppress
 from functools import partial
+from typing import NamedTuple
 
 from pebble.client.discovery import ALL_OUTGOING, DiscoveredRobot, Discovery
 from pebble.contract import DRIVE, DRIVING, LIGHTS_FLASH, LIGHTS_SOLID, codec
@@ -26,11 +26,10 @@ from pebble.rig.acts import (
     CompletedFollow,
     CompletedStep,
     CompletedStop,
-    EmergencyStop,
     EndedEarlyError,
     Step,
     TakeOver,
-    Wait,
+    emergency_stop,
     repeat,
 )
 from pebble.transports import Message, MqttSettings, QoS, create
@@ -166,7 +165,10 @@ class Operator:
 
     def _perform(self, step: Step, robots: list[DiscoveredRobot]) -> None:
         began = time.monotonic()
-        self._switch_lights(step, robots)
+        flash = isinstance(step.lights, LightsFlash)
+        lights = codec.encode(LIGHTS_FLASH if flash else LIGHTS_SOLID, step.lights)
+        for robot in robots:
+            self._publish(robot.lights_topic(flash=flash), lights)
         released = repeat(lambda: self._send(step.drive, robots), self._wait, step.drive_s)
         if step.sends_stop:
             self._send(STOP, robots)
@@ -180,9 +182,7 @@ class Operator:
 
     def _stop_all(self, robots: list[DiscoveredRobot]) -> None:
         robots = self._begin(EMERGENCY_STOP, robots)
-        emergency = EmergencyStop(self._transport, lambda drive: self._send(drive, robots), self._wait, by=NAME)
-        with closing(self._transport.subscribe(ALL_OUTGOING, emergency.receive)):  # brings retained capabilities again
-            completed = emergency.perform(robots)
+        completed = emergency_stop(self._transport, robots, partial(self._send, robots=robots), self._wait, NAME)
         mine = {robot.name for robot in robots if self._mine(robot)}
         self.completed.extend(one for one in completed if one.robot in mine)
 
@@ -191,15 +191,11 @@ class Operator:
         for robot in self._begin("scripts", [robot for robot in robots if robot.offers("autonomy")]):
             drive, wait = partial(self._send, robots=[robot]), partial(self._wait_with, robot)
             with suppress(EndedEarlyError):
-                if BY_ITSELF in self.again:
-                    self._back_off(drive, wait)
+                if BY_ITSELF in self.again:  # away from the tag before which it arrived, for a way to drive
+                    repeat(partial(drive, _BACK_OFF), wait, _BACK_OFF_S)
+                    drive(STOP)
                 self.completed.append(TakeOver(self._transport, robot, drive, wait, self._note).perform())
             self._wait(0.0)
-
-    def _back_off(self, drive: Callable[[Drive], None], wait: Wait) -> None:
-        """Away from the tag before which it arrived, so that there is a way to drive."""
-        repeat(lambda: drive(_BACK_OFF), wait, _BACK_OFF_S)
-        drive(STOP)
 
     def _wait_with(self, robot: DiscoveredRobot, seconds: float) -> None:
         self._wait(seconds)
@@ -216,12 +212,6 @@ class Operator:
             self.commands[robot.base] = drive, time.monotonic()
             self._publish(robot.drive_topic, payload)
 
-    def _switch_lights(self, step: Step, robots: list[DiscoveredRobot]) -> None:
-        flash = isinstance(step.lights, LightsFlash)
-        payload = codec.encode(LIGHTS_FLASH if flash else LIGHTS_SOLID, step.lights)
-        for robot in robots:
-            self._publish(robot.lights_topic(flash=flash), payload)
-
     def _publish(self, topic: str | None, payload: bytes) -> None:
         if topic is not None:
             self._transport.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
@@ -230,12 +220,10 @@ class Operator:
 # -- people at the page
 
 
-@dataclass(frozen=True, slots=True)
-class _Visit:
+class _Visit(NamedTuple):
     server: str
-    driver: Driver
+    driver: Driver | None  # None: it is over
     announced: float  # monotonic
-    over: bool = False
 
 
 class Visitors:
@@ -252,20 +240,17 @@ class Visitors:
         if address is None or not address.identity.is_server or message.retain:
             return
         try:
-            payload = codec.decode(DRIVING, message.payload)
+            driven = codec.decode(DRIVING, message.payload).robots
         except PayloadError:  # from something that is no server of ours
             return
         server = address.identity.id
-        for base, visit in list(self._visits.items()):
-            if visit.server == server and not visit.over and base not in payload.robots:
-                self._visits[base] = _Visit(server, visit.driver, now, over=True)
-        for base, driver in payload.robots.items():
-            self._visits[base] = _Visit(server, driver, now)
+        running = [base for base, visit in self._visits.items() if visit.server == server and visit.driver is not None]
+        self._visits |= {base: _Visit(server, driven.get(base), now) for base in {*running, *driven}}
 
     def driver(self, base: str, now: float) -> str:
         """Who has that robot now, for display; empty: nobody."""
         visit = self._visits.get(base)
-        if visit is None or visit.over or now - visit.announced > EXPIRES_S:
+        if visit is None or visit.driver is None or now - visit.announced > EXPIRES_S:
             return ""
         return f"{visit.driver.by} on {visit.driver.device}" if visit.driver.device else visit.driver.by
 

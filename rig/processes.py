@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 from pebble.rig.broker import Broker, BrokerKind
-from pebble.rig.programs import Program, Wrap, end_all, unchanged
-from pebble.rig.worker import Worker
+from pebble.rig.programs import Program, Worker, Wrap, end_all, unchanged
 
 #: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
 OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
@@ -35,7 +34,7 @@ class Processes:
         self.folder = Path(tempfile.mkdtemp(prefix=prefix, dir=into))
         self.closing = ExitStack()
         self.workers: list[Worker] = []
-        self._programs: tuple[list[Program], ...] = ([], [], [], [])
+        self._kinds: dict[Program, int] = {}
 
     def __enter__(self) -> Self:
         try:
@@ -50,25 +49,22 @@ class Processes:
 
     def __exit__(self, *_: object) -> None:
         self.closing.close()
-        for programs, within_s in zip(self._programs, self.ends_s, strict=True):
-            end_all(programs, within_s)
+        for kind, within_s in enumerate(self.ends_s):
+            end_all([program for program, one in self._kinds.items() if one == kind], within_s)
         if not self.keep:
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def add(self, program: P, kind: int) -> P:
-        self._programs[kind].append(program)
+        self._kinds[program] = kind
         return program
 
     def end(self, program: Program) -> None:
         """End one of them before the others."""
-        for programs, within_s in zip(self._programs, self.ends_s, strict=True):
-            if program in programs:
-                programs.remove(program)
-                end_all([program], within_s)
+        end_all([program], self.ends_s[self._kinds.pop(program)])
 
     def unexpected_exits(self) -> list[str]:
-        """The processes that should still run and do not."""
-        programs = [program for kind in reversed(self._programs) for program in kind]
+        """The processes that should still run and do not, brokers first."""
+        programs = sorted(self._kinds, key=lambda program: -self._kinds[program])
         return [f"{program.name} ended unexpectedly: see {program.log}" for program in programs if program.ended]
 
     def worker(self, name: str, module: str, *arguments: object, wrap: Wrap = unchanged) -> Worker:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
+import queue
 import signal
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 from pebble.errors import PebbleError
 from pebble.runtime.parent import tied_to_parent
@@ -18,8 +21,8 @@ Wrap = Callable[[Sequence[str]], Sequence[str]]
 """Extends a command, so that it runs in another network."""
 
 _STEP_S = 0.01
+_END_S = 4.0  # for workers
 _TAIL = 2000  # characters of a log that are shown
-_PROC = Path("/proc")
 
 
 def unchanged(command: Sequence[str]) -> Sequence[str]:
@@ -38,27 +41,30 @@ class Program:
         command: Sequence[str],
         log: Path,
         *,
-        stdin: int = subprocess.DEVNULL,
-        reports: bool = False,
-        tied: bool = True,
+        each: Callable[[bytes], object] | None = None,
+        has_input: bool = False,
     ) -> None:
-        """``tied``: the kernel ends it when the thread that starts it ends."""
+        """``each`` gets the lines of its standard output on a thread of its own; without it they are in the log.
+
+        ``has_input``: it ends with its standard input, not with the thread that starts it.
+        """
         self.name, self.log = name, log
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
-                tied_to_parent(command, signal.SIGTERM) if tied else command,
-                stdin=stdin,
-                stdout=subprocess.PIPE if reports else errors,
+                command if has_input else tied_to_parent(command, signal.SIGTERM),
+                stdin=subprocess.PIPE if has_input else subprocess.DEVNULL,
+                stdout=errors if each is None else subprocess.PIPE,
                 stderr=errors,
                 start_new_session=True,
             )
+        self._reader = threading.Thread(target=self._read, args=(each,), name=f"output of {name}", daemon=True)
+        if each is not None:
+            self._reader.start()
 
     @property
-    def reports(self) -> IO[bytes]:
-        """What the program writes to its standard output, if it was started with ``reports``."""
-        if self._process.stdout is None:
-            raise PebbleError(f"{self.name} was not started to report")
-        return self._process.stdout
+    def is_read(self) -> bool:
+        """Whether ``each`` still gets lines: the program has not closed its output, and no line was an error."""
+        return self._reader.is_alive()
 
     @property
     def pid(self) -> int:
@@ -94,7 +100,7 @@ class Program:
         end, ending = time.monotonic() + timeout, ending or threading.Event()
         while not condition() and not ending.wait(_STEP_S):
             if self.ended:
-                raise PebbleError(f"{self.name} ended at once with code {self._process.returncode}: see {self.log}")
+                raise PebbleError(f"{self.name} ended at once with code {self.code}: see {self.log}")
             if time.monotonic() > end:
                 raise PebbleError(f"{self.name} was not ready after {timeout:.0f} s: see {self.log}")
 
@@ -110,6 +116,54 @@ class Program:
             os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait()
 
+    def _read(self, each: Callable[[bytes], object]) -> None:
+        for line in self._process.stdout or ():
+            each(line)
+
+
+class Worker(Program):
+    """A program that reads lines, answers in JSON lines, and ends with its input: its other end is worker_end.
+
+    So it also ends when this process ends in any way.
+    """
+
+    def __init__(self, name: str, command: Sequence[str], log: Path) -> None:
+        self._answers: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        super().__init__(name, command, log, each=lambda line: self._answers.put(json.loads(line)), has_input=True)
+
+    def answer(self, timeout: float) -> dict[str, Any]:
+        """The next answer. Raises PebbleError if the process ends, or does not answer within ``timeout`` seconds."""
+        try:
+            answer = self._answers.get(timeout=timeout)
+        except queue.Empty:
+            raise self._problem(f"did not answer within {timeout:.0f} s") from None
+        if answer is None:
+            raise self._problem(f"ended with code {self._process.wait()}")
+        return answer
+
+    def send(self, line: str) -> None:
+        """Writes a line to standard input. Ignored if the process has ended: :meth:`answer` reports that."""
+        if self._process.stdin is not None:
+            with suppress(BrokenPipeError):
+                self._process.stdin.write(line.encode() + b"\n")
+                self._process.stdin.flush()
+
+    def ask(self, line: str, timeout: float) -> dict[str, Any]:
+        self.send(line)
+        return self.answer(timeout)
+
+    def ask_to_end(self) -> None:
+        if self._process.stdin is not None:
+            with suppress(BrokenPipeError):  # it ended by itself
+                self._process.stdin.close()
+
+    def _read(self, each: Callable[[bytes], object]) -> None:
+        super()._read(each)
+        self._answers.put(None)
+
+    def _problem(self, what: str) -> PebbleError:
+        return PebbleError(":\n".join(filter(None, (f"{self.name} {what}", self.tail()))))
+
 
 def end_all(programs: Iterable[Program], within_s: float) -> None:
     """Send SIGTERM to all of them, and kill those that still run after ``within_s``."""
@@ -121,16 +175,19 @@ def end_all(programs: Iterable[Program], within_s: float) -> None:
         program.end(deadline)
 
 
+def end_workers(workers: Iterable[Worker]) -> None:
+    """Ends all workers at the same time; kills those that do not end within seconds."""
+    end_all(workers, _END_S)
+
+
 def children(pid: int) -> list[int]:
     """The direct children of a process; none if it has ended.
 
     Reads the parent of every process: not every kernel has ``/proc/<pid>/task/<tid>/children``.
     """
-    return sorted(int(one.name) for one in _PROC.iterdir() if one.name.isdecimal() and _parent(one) == pid)
-
-
-def _parent(process: Path) -> int | None:
-    try:
-        return int((process / "stat").read_text().rpartition(")")[2].split()[1])
-    except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-        return None
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            if int((process / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(process.name))
+    return sorted(found)

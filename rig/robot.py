@@ -10,7 +10,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ from pebble.rig.programs import Program, Wrap, children, unchanged
 from pebble.simulation.trace import Entry, read_trace
 
 if TYPE_CHECKING:
-    from pebble.rig.room import Outcome
+    from pebble.rig.testbed import Outcome
     from pebble.simulation.mcu import Snapshot
 
 KINDS = ("mqtt", "zenoh")
@@ -60,7 +60,6 @@ class SimulatedRobot:
         self.folder.mkdir(exist_ok=True)
         self.mcu_reports: deque[Snapshot] = deque(maxlen=_REPORTS)
         self.programs: list[Program] = []  # all that were started for it
-        self.mcu: Program | None = None  # of its motors
         self._trace, self._trace_read = folder / "trace.jsonl", 0
         self._entries: deque[Entry] = deque(maxlen=_ENTRIES)
 
@@ -74,34 +73,25 @@ class SimulatedRobot:
         self._entries.extend(msgspec.json.decode(line, type=Entry) for line in complete.splitlines())
         return list(self._entries)
 
-    def relays(self) -> list[Entry]:
-        """The changes of its outlets' relays, oldest first; most robots have none."""
-        return []
-
     def outcome(self, at: float) -> Outcome:
         """What came of a script that ended at ``at``; only a robot with scripts knows."""
         raise NotImplementedError
 
-    def _add(self, name: str, command: Sequence[str], kind: int, log: str, *, reports: bool = False) -> Program:
-        self.programs.append(Program(name, command, self.folder / log, reports=reports))
+    def _add(
+        self, name: str, command: Sequence[str], kind: int, log: str, each: Callable[[bytes], object] | None = None
+    ) -> Program:
+        self.programs.append(Program(name, command, self.folder / log, each=each))
         return self.running.add(self.programs[-1], kind)
 
     def _start_mcu(self, module: str, *options: object, reports: bool = True) -> Program:
         """The MCU of its motors; with ``reports`` what it measures is collected."""
         command = python(module, *options, *(["--report"] if reports else []))
-        self.mcu = self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", reports=reports)
-        if reports:
-            threading.Thread(target=self._watch, args=(self.mcu,), name=f"reports of {self.name}", daemon=True).start()
-        return self.mcu
+        return self._add(f"{self.name}'s MCU", command, MCUS, "mcu.log", self._collect if reports else None)
 
-    def _watch(self, mcu: Program) -> None:
-        for line in mcu.reports:
-            self.mcu_reports.append(self._read(line))
-
-    def _read(self, line: bytes) -> Snapshot:
+    def _collect(self, line: bytes) -> None:
         from pebble.simulation.mcu import Snapshot
 
-        return msgspec.json.decode(line, type=Snapshot)
+        self.mcu_reports.append(msgspec.json.decode(line, type=Snapshot))
 
 
 class Robot(SimulatedRobot):
@@ -125,12 +115,19 @@ class Robot(SimulatedRobot):
         wrap: Wrap = unchanged,
     ) -> None:
         super().__init__(running, name, folder or running.folder)
-        self.kind, self.remote, self.base = kind, remote, Identity("pebble", "robots", name).base
+        self.kind, self.base = kind, Identity("pebble", "robots", name).base
+        self._remote_host, self.remote_port = remote
         self.run_dir, self.config, self.port = (self.folder / file for file in ("run", f"{name}.json", "mcu"))
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
-        self._services, self.reports, self._wrap = services or {}, reports, wrap
+        self.reports, self._wrap = reports, wrap
         self._started: list[Program] = []
+        self._services = dict(services or {})
+        motors: dict[str, Any] = {"enabled": True, "serial": {"baud": 460_800}}
+        if reports is not None:
+            motors["telemetry"] = {"publish_touch_sensors": reports}
+        own = {"mqtt_bridge": {"enabled": True}, "serial_mcu_bridge": motors}
+        self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}, "services": own}
 
     def prepare(self, ending: threading.Event | None = None) -> None:
         """Starts what the robot needs and writes its config, or waits no longer once ``ending`` is set.
@@ -154,19 +151,15 @@ class Robot(SimulatedRobot):
         """What the MCU received, did and (with ``reports``) sent after ``since_ns`` (CLOCK_MONOTONIC)."""
         return [entry for entry in read_trace(self._trace) if entry.ns >= since_ns]
 
+    # -- its processes, once it is launched
+
     def log(self) -> str:
         """The end of the robot's log."""
-        return "" if self.launcher is None else self.launcher.tail()
+        return self.launcher.tail()
 
     @property
-    def launcher(self) -> Program | None:
-        return self._started[0] if self._started else None
-
-    # -- its processes
-
-    @property
-    def remote_port(self) -> int:
-        return self.remote[1]
+    def launcher(self) -> Program:
+        return self._started[0]
 
     @property
     def broker_ports(self) -> list[int]:
@@ -177,17 +170,15 @@ class Robot(SimulatedRobot):
         """The launcher, its children (including a hub), and the local broker, if there is one."""
         local = [] if self.local_broker is None else [self.local_broker.pid]
         own = [pid for program in self._started for pid in (program.pid, *children(program.pid))]
-        return [*own, *local] if own else []
+        return [*own, *local]
 
     def processes(self) -> dict[str, int]:
         """The same by name."""
-        if self.launcher is None:
-            return {}
         names = {name[:_COMM_BYTES]: name for name in self._programs_of()}
         found = {LAUNCHER: self.launcher.pid}
         for pid in children(self.launcher.pid):
-            comm = _comm(pid)
-            if comm:
+            with suppress(OSError):  # it has just ended
+                comm = Path(f"/proc/{pid}/comm").read_text().strip()
                 found[names.get(comm, comm)] = pid
         if self.local_broker is not None:
             found[BROKER] = self.local_broker.pid
@@ -199,8 +190,6 @@ class Robot(SimulatedRobot):
 
     def expect(self, condition: Callable[[], bool], what: str, timeout: float) -> None:
         """Waits for the condition. Raises PebbleError with the robot's log after ``timeout`` seconds, or if it ends."""
-        if self.launcher is None:
-            raise PebbleError("the robot was not launched")
         try:
             self.launcher.wait_until(condition, timeout)
         except PebbleError as error:
@@ -217,30 +206,20 @@ class Robot(SimulatedRobot):
         options = [*board("goob", self.port, self._trace), *(["--trace-said"] if self.reports else [])]
         return self._start_mcu("pebble.simulation.mcu", *options, reports=False)
 
-    def _contents(self) -> dict[str, Any]:
-        """Of its config file."""
-        motors: dict[str, Any] = {"enabled": True, "serial": {"baud": 460_800}}
-        if self.reports is not None:
-            motors["telemetry"] = {"publish_touch_sensors": self.reports}
-        services = {"mqtt_bridge": {"enabled": True}, "serial_mcu_bridge": motors}
-        more = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
-        own = {"robot": {"id": self.name}, "transport": {"kind": self.kind}, "services": deep_merge(services, more)}
-        return self._connected(own)
-
-    def _connected(self, config: dict[str, Any]) -> dict[str, Any]:
-        """A config with the addresses and paths of this robot."""
-        host, port = self.remote
-        changes: dict[str, Any] = {
+    def _contents(self) -> Config:
+        """Of its config file: its own, with the addresses and paths of this robot."""
+        services = {name: {"enabled": True, **fields} for name, fields in self._services.items()}
+        connections: dict[str, Any] = {
             "transport": {"run_dir": str(self.run_dir), "state_dir": str(self.folder / "state")},
             "services": {
-                "mqtt_bridge": {"remote_mqtt": {"host": host, "port": port}},
+                "mqtt_bridge": {"remote_mqtt": {"host": self._remote_host, "port": self.remote_port}},
                 "serial_mcu_bridge": {"serial": {"port": str(self.port)}},
             },
         }
         if self.local_port is not None:
-            changes["local_mqtt"] = {"host": "localhost", "port": self.local_port}
-        connected: dict[str, Any] = deep_merge(config, changes)
-        return connected
+            connections["local_mqtt"] = {"host": "localhost", "port": self.local_port}
+        contents: Config = deep_merge(deep_merge(self._own, {"services": services}), connections)
+        return contents
 
 
 def board(kind: str, port: Path, trace: Path) -> tuple[object, ...]:
@@ -274,11 +253,3 @@ def one_robot(kind: str, make: Callable[..., Robot] = Robot, **options: Any) -> 
         broker.wait()
         robot.prepare()
         yield robot
-
-
-def _comm(pid: int) -> str:
-    """A process's name in the kernel; empty if it has just ended."""
-    try:
-        return Path(f"/proc/{pid}/comm").read_text().strip()
-    except OSError:
-        return ""

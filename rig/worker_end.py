@@ -1,4 +1,4 @@
-"""The other end of a worker (pebble.rig.worker): lines from standard input, answers in JSON lines.
+"""The other end of a worker (pebble.rig.programs): lines from standard input, answers in JSON lines.
 
 It needs only the standard library: the system's Python, which has GStreamer, imports it as a plain file.
 """
@@ -11,6 +11,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+Handle = Callable[[str], bytes | dict[str, Any] | None]
+
 
 def answer(what: bytes | dict[str, Any]) -> None:
     """Write one answer; bytes are JSON already."""
@@ -18,7 +20,7 @@ def answer(what: bytes | dict[str, Any]) -> None:
     sys.stdout.buffer.flush()
 
 
-def serve(handle: Callable[[str], bytes | dict[str, Any] | None]) -> None:
+def serve(handle: Handle) -> None:
     """Pass each line to ``handle`` and write what it answers, if anything, until standard input closes."""
     for line in sys.stdin:
         reply = handle(line.strip())
@@ -26,17 +28,14 @@ def serve(handle: Callable[[str], bytes | dict[str, Any] | None]) -> None:
             answer(reply)
 
 
-def serve_on_thread(
-    handle: Callable[[str], bytes | dict[str, Any] | None], end: Callable[[], object] | None = None
-) -> threading.Event:
+def serve_on_thread(handle: Handle, end: Callable[[], object] = lambda: None) -> threading.Event:
     """The same on a thread of its own; the event is set, and ``end`` is called, when standard input has closed."""
     ended = threading.Event()
 
     def run() -> None:
         serve(handle)
         ended.set()
-        if end is not None:
-            end()
+        end()
 
     threading.Thread(target=run, name="lines", daemon=True).start()
     return ended

@@ -25,7 +25,7 @@ from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.forwarder import ETHERNET, TIMED, WIRE
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
-from pebble.rig.worker import Worker, end_workers
+from pebble.rig.programs import Worker, end_workers
 
 KINDS = ("auto", "namespaces", "proxy")
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"

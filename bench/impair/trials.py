@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-import wave
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,11 +24,11 @@ from pebble.bench.results import LONGEST_S, Cell, grouped
 from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
 from pebble.media.pcm import to_bytes
+from pebble.media.sound_file import write_wav
 from pebble.media.speech import Speech
 from pebble.rig.processes import Processes
-from pebble.rig.programs import Program
+from pebble.rig.programs import Program, Worker
 from pebble.rig.robot import BASE, Config, Robot, synthetic_media
-from pebble.rig.worker import Worker
 from pebble.simulation.loudspeaker import Playback, playbacks
 from pebble.simulation.trace import Entry
 
@@ -147,9 +146,7 @@ def _write_clip(folder: Path) -> Path:
     """The folder, with the clip that is played at the end of each trial."""
     folder.mkdir()
     samples = Speech(_AUDIO_RATE).samples(0, round(CLIP_S * _AUDIO_RATE))
-    with wave.open(str(folder / CLIP), "wb") as file:
-        file.setparams((1, 2, _AUDIO_RATE, len(samples), "NONE", "not compressed"))
-        file.writeframes(to_bytes(samples))
+    write_wav(folder / CLIP, to_bytes(samples), _AUDIO_RATE)
     return folder
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pebble.rig.acts import BY_ITSELF, DISTANCE_M, FOLLOW, HOLD_S, TOLERANCE_M, CompletedFollow, Wheels
-from pebble.rig.room import Outcome
+from pebble.rig.testbed import Outcome
 from pebble.simulation.trace import Entry
 
 BEARING_RAD = 0.09

@@ -7,13 +7,13 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import wave
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 from pebble.config import Config
 from pebble.doctor import Finding, Level
+from pebble.media.sound_file import write_wav
 from pebble.services.soundboard_handler.playback import Players
 
 SILENCE_S = 0.2
@@ -34,7 +34,8 @@ def loudspeaker(config: Config, silence_s: float = SILENCE_S) -> Iterator[Findin
         yield Finding(Level.WARN, _WHAT, f"{name} is not installed: nothing can be played", _installation(name))
     if commands and not missing:
         with tempfile.TemporaryDirectory(prefix="pebble-doctor-") as folder:
-            wav = _write_silence(Path(folder) / "silence.wav", silence_s)
+            wav = Path(folder) / "silence.wav"
+            write_wav(wav, _silence(silence_s), _RATE)
             yield _played(players, wav if services.soundboard_handler.enabled else None, silence_s)
 
 
@@ -48,7 +49,7 @@ def _played(players: Players, wav: Path | None, silence_s: float) -> Finding:
     running: list[subprocess.Popen[bytes]] = []
     try:
         for _ in range(2):
-            running.append(_start(players, words, b"" if wav is not None else bytes(2 * round(silence_s * _RATE))))
+            running.append(_start(players, words, b"" if wav is not None else _silence(silence_s)))
         problems = [problem for process in running if (problem := _problem(process, silence_s))]
     except OSError as error:
         return Finding(Level.WARN, _WHAT, f"{words[0]} cannot be started: {error}", "correct the player's command")
@@ -91,10 +92,5 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _write_silence(path: Path, seconds: float) -> Path:
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(_RATE)
-        file.writeframes(bytes(2 * round(seconds * _RATE)))
-    return path
+def _silence(seconds: float) -> bytes:
+    return bytes(2 * round(seconds * _RATE))

@@ -87,6 +87,15 @@ class SoundFile:
         return PebbleError(f"{self._name} cannot be decoded: {getattr(error, 'strerror', None) or error}")
 
 
+def write_wav(path: Path, samples: bytes, rate: int) -> None:
+    """One channel of s16le as a wav file."""
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(rate)
+        file.writeframes(samples)
+
+
 def _samples(raw: bytes, channels: int, width: int) -> Samples:
     """The most significant 16 bits of samples of ``width`` bytes; those of one byte are unsigned."""
     size = channels * width

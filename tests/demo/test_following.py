@@ -8,7 +8,7 @@ import pytest
 
 from pebble.demo.following import FollowResult, assess
 from pebble.rig.acts import DISTANCE_M, CompletedFollow
-from pebble.rig.room import Outcome
+from pebble.rig.testbed import Outcome
 from pebble.simulation.trace import Entry
 
 STARTED, TOOK_OVER, RELEASED, ENDED = 100.0, 104.0, 105.0, 112.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pebble.errors import PebbleError
-from pebble.media.sound_file import SoundFile
+from pebble.media.sound_file import SoundFile, write_wav
 from tests.media.sound_files import encode
 
 SOUND = np.stack([np.arange(-20_000, 20_000, 4), np.arange(20_000, -20_000, -4)], axis=1).astype(np.int16)
@@ -28,6 +28,11 @@ def samples(path: Path, volume: float = 1.0, rate: int = 8000) -> np.ndarray:
     with SoundFile(path) as file:
         assert file.rate == rate
         return np.frombuffer(b"".join(file.chunks(volume)), "<i2").reshape(-1, file.channels)
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    write_wav(tmp_path / "x.wav", SOUND[:, :1].astype("<i2").tobytes(), 8000)
+    assert np.array_equal(samples(tmp_path / "x.wav"), SOUND[:, :1])
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 4])

@@ -22,8 +22,7 @@ from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.recordings.library import files, merged
-from pebble.rig.stage import Stage
-from pebble.rig.testbed import ROBOTS
+from pebble.rig.testbed import ROBOTS, Stage
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.support import quarters, until
 

@@ -21,8 +21,7 @@ from pathlib import Path
 
 from pebble.bench.results import percentile
 from pebble.contract import ONLINE
-from pebble.rig.stage import Stage
-from pebble.rig.testbed import ROBOTS
+from pebble.rig.testbed import ROBOTS, Stage
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.recordings.endurance import Operator
 from tests.support import until

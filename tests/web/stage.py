@@ -5,6 +5,29 @@
 
 from __future__ import annotations
 
-from pebble.rig.stage import Stage
+from pebble.rig import testbed
+from pebble.rig.testbed import OUTLETS
+from pebble.simulation.trace import Entry, read_trace
 
-__all__ = ["Stage"]
+
+class Stage(testbed.Stage):
+    """What only tests do with one, and what they look at."""
+
+    def restart_broker(self) -> None:
+        """Start the operators' broker again at the same port, without its retained messages. Raises PebbleError."""
+        self.end(self.remote_broker)
+        self.remote_broker = self.broker("remote-broker", port=self.broker_port)
+        self.remote_broker.wait()
+
+    def turned_s(self, name: str, since_ns: int) -> float:
+        """How long its motors have run since then, in seconds."""
+        return sum(max(0, end - max(since_ns, begin)) for begin, end in self.motions(name)) / 1e9
+
+    def relays(self, name: str) -> list[str]:
+        """Every change of its outlets' relays, oldest first: "o1 on"."""
+        trace = self.robots[name].folder / f"{OUTLETS}.jsonl"
+        return [entry.line for entry in read_trace(trace) if entry.event == "relay"]
+
+    def lines(self, name: str) -> list[Entry]:
+        """What its MCU received, oldest first."""
+        return [entry for entry in self.robots[name].entries() if entry.event == "line"]

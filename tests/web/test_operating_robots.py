@@ -80,7 +80,6 @@ def test_what_a_service_logs_is_on_the_page_and_can_be_filtered(at_goob: Console
 def child(robots: Stage, name: str) -> int:
     """The pid of a service of goob; 0 if it does not run."""
     launcher = robots.robots["goob"].launcher
-    assert launcher is not None
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             head, _, rest = stat.read_text().rpartition(")")
@@ -154,8 +153,7 @@ def test_troubles_of_another_robot_are_listed(at_goob: Console, robots: Stage, w
     wire.publish("minilamp/incoming/estop", {"stop": "00112233445566cc", "by": "eve", "why": "test"})
     spoken = at_goob.page.locator("[data-test=announcement]")
     assert at_goob.tab.until(lambda: spoken.inner_text() == "minilamp was stopped by eve", 5), spoken.inner_text()
-    mcu = robots.robots["minilamp"].mcu
-    assert mcu is not None
+    mcu = robots.robots["minilamp"].programs[0]
     os.kill(mcu.pid, signal.SIGKILL)
     assert at_goob.tab.until(lambda: spoken.inner_text() == "minilamp is offline", 10), spoken.inner_text()
     at_goob.test("bell").click()
