@@ -11,9 +11,9 @@ from typing import Any
 from pebble.bench import control_far as far
 from pebble.bench import null
 from pebble.bench.comparison import Budget, Case, Combine, Comparison, Option, Run, of_known, rounds, seconds, variants
-from pebble.bench.control_ends import SMALLEST, SliceSpec, rate_name, size_name
+from pebble.bench.control_ends import ONE_WAY, ROUND_TRIP, SMALLEST, SliceSpec, rate_name, size_name
 from pebble.bench.control_participants import LOADS, MEDIA, NONE, P2P, VARIANTS, Participants
-from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, legend, tables, wake_up_cost
+from pebble.bench.control_report import assessment, legend, tables, wake_up_cost
 from pebble.bench.engine import roles_of
 from pebble.bench.pictures import ecdf, null_ratios, ratios
 from pebble.bench.results import Cell, Value, percentile, rounded
@@ -46,20 +46,14 @@ def prepare(run: Run) -> None:
 
 def measure(case: Case) -> Iterator[Cell]:
     """One slice. The null test uses only the one-way times, since its slowdown is a fifth of them."""
-    participants: Participants = case.env
-    found = participants.run(case.role, SliceSpec.of(case), str(case.condition["load"]))
-    answer = found.answer
+    answer, used = case.env.run(case.role, SliceSpec.of(case), str(case.condition["load"]))
+    hops = {"call_us": answer.call, "fabric_us": answer.transport_times, "inbox_us": answer.inbox}
     figures: dict[str, Any] = {
         "sent": answer.sent,
         "late": answer.late,
-        "cpu_percent": found.cpu,
-        "broker_cpu_percent": found.backbone_cpu,
-        "call_us": rounded(percentile(answer.call, 50), 1),
-        "fabric_us": rounded(percentile(answer.transport_times, 50), 1),
-        "inbox_us": rounded(percentile(answer.inbox, 50), 1),
-        "wake_ups": found.wake_ups,
-        "broker_wake_ups": found.backbone_wake_ups,
-        "pictures_hz": found.pictures_hz,
+        **{name: rounded(percentile(times, 50), 1) for name, times in hops.items()},
+        "pictures_hz": None,
+        **used,
     }
     yield case.cell(ONE_WAY, "us", answer.one_way, **figures)
     if not case.run.comparison.is_null:

@@ -30,26 +30,25 @@ class Switch:
 
     def __init__(self) -> None:
         self.pictures = 0
-        self.on = False
-        self.ended = False
-        self._changed = threading.Condition()
-        serve_on_thread(self._handle, lambda: self._set(on=False, ended=True))
+        self._on = threading.Event()
+        self.wait = self._on.wait  # until it is on, or standard input closes
+        self._ended = serve_on_thread(self._handle, self._on.set)
         answer({"pictures": 0})  # it is ready
 
-    def wait(self, timeout: float | None = None) -> None:
-        """Waits until it is on, or standard input closes."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.on or self.ended, timeout)
+    @property
+    def ended(self) -> bool:
+        return self._ended.is_set()
+
+    @property
+    def on(self) -> bool:
+        return self._on.is_set() and not self.ended
 
     def _handle(self, line: str) -> dict[str, Any]:
-        if line in ("0", "1"):
-            self._set(on=line == "1")
+        if line == "1":
+            self._on.set()
+        elif line == "0":
+            self._on.clear()
         return {"pictures": self.pictures}
-
-    def _set(self, *, on: bool, ended: bool = False) -> None:
-        with self._changed:
-            self.on, self.ended = on, ended
-            self._changed.notify_all()
 
 
 def main(role: str, kind: str = "", where: str = "") -> None:

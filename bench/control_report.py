@@ -9,22 +9,19 @@ from msgspec.structs import replace
 from rich.table import Table
 
 from pebble.bench.aims import MISSED, NOT_JUDGED, outcome, rounds_with_lost, single
+from pebble.bench.control_ends import ONE_WAY
 from pebble.bench.control_participants import BASELINE, HOG, HUB, MEDIA, MQTT, NONE, P2P, VARIANTS
 from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
-from pebble.bench.results import Cell, Judged
-from pebble.bench.tables import Column, Grid, base_of, figure, plain_table
+from pebble.bench.results import Cell, Judged, grouped
+from pebble.bench.tables import Column, Grid, base_of, figure
 from pebble.bench.usage import wake_up_us
 from pebble.errors import PebbleError
 
-ONE_WAY, ROUND_TRIP = "one-way", "round trip"
-RATE_HZ = 30.0  # of the pictures, as in bench/frames_loop.py
 _LONG_US = 995.0
 _MUCH_LATE, _MUCH_LOST = 0.05, 0.005
-_FEWER = 0.9 * RATE_HZ  # pictures: the load is lighter than intended
+_PICTURES_HZ, _FEWER_HZ = 30.0, 27.0  # as in bench/frames_loop.py; with fewer the load is lighter than intended
 AIM_P50, AIM_MEDIA_P99 = 0.70, 0.35
-_PICTURES_HZ = single("pictures_hz")
-_BETTER = " (the better MQTT variant)"
 _JUDGED = {"size": "40 B", "rate": "200 Hz"}
 
 _Key = tuple[str | None, str]  # variant and load
@@ -36,35 +33,27 @@ def legend(cells: Sequence[Cell]) -> list[str]:
     return [f"{name}: {VARIANTS[name].about}" for name in names]
 
 
-def tables(cells: Sequence[Cell]) -> list[Table]:
+def tables(cells: Sequence[Cell]) -> Iterator[Table]:
     """One table per measure with a column for each variant; then the ratios to the baseline, if it was measured."""
-    measures = list(dict.fromkeys(cell.measure for cell in cells))
-    found = [
-        _side_by_side(
-            f"{measure}, {cells[0].unit}: p50/p99 (k: thousands)",
-            [cell for cell in cells if cell.measure == measure],
-            lambda cell: f"{_short(cell.percentile(50))}/{_short(cell.percentile(99))}",
-        )
-        for measure in measures
-    ]
-    others = [cell for cell in cells if cell.measure == ONE_WAY and cell.variant != BASELINE]
-    if others and len(others) < len(cells) / len(measures):
-        title = f"{ONE_WAY}, p50 as a ratio to that of {BASELINE}, and its 99 % interval"
-        found.append(_side_by_side(title, others, lambda cell: _ratio(cell, base_of(cell, cells, BASELINE))))
-    return [*found, *(_HOPS(cells) if any(map(_HOPS.of, cells)) else ())]
+    yield from _side_by_side(
+        "{measure}, us: p50/p99 (k: thousands)",
+        cells,
+        lambda cell: f"{_short(cell.percentile(50))}/{_short(cell.percentile(99))}",
+    )
+    others = [cell for cell in cells if cell.measure == ONE_WAY and base_of(cell, cells, BASELINE) is not None]
+    title = f"{{measure}}, p50 as a ratio to that of {BASELINE}, and its 99 % interval"
+    yield from _side_by_side(title, others, lambda cell: _ratio(cell, base_of(cell, cells, BASELINE)))
+    if any(map(_HOPS.of, cells)):
+        yield from _HOPS(cells)
 
 
-def _side_by_side(title: str, cells: Sequence[Cell], shown: Callable[[Cell], str]) -> Table:
+def _side_by_side(title: str, cells: Sequence[Cell], shown: Callable[[Cell], str]) -> Iterator[Table]:
     """A row for each condition, a column for each variant."""
     names = list(dict.fromkeys(cell.variant for cell in cells))
-    heads = [name.replace("-", "-\n").replace(" ", "\n", 1) for name in names]
-    table = plain_table(title, ["size", "Hz", "load", *heads])
-    table.padding = 0  # six variants in 80 columns
-    for params in dict.fromkeys(tuple(cell.params.items()) for cell in cells):
-        row = {cell.variant: shown(cell) for cell in cells if tuple(cell.params.items()) == params}
-        conditions = (str(value).removesuffix(" Hz") for _, value in params)
-        table.add_row(*conditions, *(row.get(name, "") for name in names))
-    return table
+    column = Column(names[0] if len(names) == 1 else "", shown)
+    for table in Grid(title=title, rows=("size", "rate", "load"), columns=(column,), each=("measure",))(cells):
+        table.padding = 0  # six variants in 80 columns
+        yield table
 
 
 def _short(us: float) -> str:
@@ -76,16 +65,14 @@ def _short(us: float) -> str:
 
 def _ratio(cell: Cell, base: Cell | None) -> str:
     """Formats a ratio on two lines, so that five fit side by side."""
-    if base is None:
-        return ""
-    interval = paired(cell.rounds, base.rounds)
+    interval = Interval() if base is None else paired(cell.rounds, base.rounds)
     if interval.few:
         return str(interval)
     return f"{figure(interval.ratio)}\n{figure(interval.low)}–{figure(interval.high)}"
 
 
 def _is_judged(cell: Cell) -> bool:
-    return cell.measure == ONE_WAY and all(cell.params.get(name) == value for name, value in _JUDGED.items())
+    return cell.measure == ONE_WAY and _JUDGED.items() <= cell.params.items()
 
 
 def _hop(head: str, name: str) -> Column:
@@ -142,9 +129,10 @@ def assessment(cells: Sequence[Cell]) -> list[str | Judged]:
         one, other = names or (str(ours[0]), str(theirs[0]))
         return [f"{before}{'' if percent == 50 else f'p{percent:g}: '}{interval.words(one, other)}"]
 
+    better = "{} (the better MQTT variant)".format
     lines = [
-        *compare(50, (P2P, NONE), (best, NONE), names=(P2P, f"{best}{_BETTER}")),
-        *compare(99, (P2P, MEDIA), (best_loaded, MEDIA), f"with {MEDIA}, ", (P2P, f"{best_loaded}{_BETTER}")),
+        *compare(50, (P2P, NONE), (best, NONE), names=(P2P, better(best))),
+        *compare(99, (P2P, MEDIA), (best_loaded, MEDIA), f"with {MEDIA}, ", (P2P, better(best_loaded))),
         *_pictures(by_key),
         *compare(50, (HUB, NONE), (P2P, NONE)),
     ]
@@ -180,28 +168,27 @@ def _ratio_of(by_key: _ByKey, ours: _Key, theirs: _Key, percent: float) -> Inter
 
 def _pictures(by_key: _ByKey) -> Iterator[str]:
     """The rate of pictures meanwhile: a variant that carries fewer has a lighter load."""
-    rates = {str(name): _PICTURES_HZ(cell) for (name, load), cell in by_key.items() if load == MEDIA}
-    known = {name: rate for name, rate in rates.items() if not math.isnan(rate)}
-    if known:
+    rates = {str(name): single("pictures_hz")(cell) for (name, load), cell in by_key.items() if load == MEDIA}
+    if known := {name: rate for name, rate in rates.items() if not math.isnan(rate)}:
         shown = ", ".join(f"{name} {figure(rate)}" for name, rate in known.items())
-        yield f"With media, pictures received per second, of {RATE_HZ:g}: {shown}"
-    if fewer := [name for name, rate in known.items() if rate < _FEWER]:
-        yield f"With media, {', '.join(fewer)}: fewer than {_FEWER:g} pictures per second, so the load was lighter."
+        yield f"With media, pictures received per second, of {_PICTURES_HZ:g}: {shown}"
+    if fewer := [name for name, rate in known.items() if rate < _FEWER_HZ]:
+        yield f"With media, {', '.join(fewer)}: fewer than {_FEWER_HZ:g} pictures per second, so the load was lighter."
 
 
 def _warnings(cells: Sequence[Cell]) -> Iterator[str]:
     """Reasons to distrust the results: too few rounds, late or lost messages."""
     if min((len(cell.rounds) for cell in cells), default=0) < LEAST_ROUNDS:
         yield f"A 99 % interval needs {LEAST_ROUNDS} rounds."
-    for rate in dict.fromkeys(str(cell.params["rate"]) for cell in cells):
-        ours = [cell for cell in cells if cell.measure == ONE_WAY and cell.params["rate"] == rate]
+    one_way = [cell for cell in cells if cell.measure == ONE_WAY]
+    for rate, ours in grouped(one_way, lambda cell: cell.params["rate"]).items():
         late, sent = _total(ours, "late"), _total(ours, "sent")
         if late > _MUCH_LATE * sent:
             yield f"At {rate} {late / sent:.0%} of the messages were sent late: this machine cannot keep that rate."
-        shares = {}
-        for name in dict.fromkeys(cell.variant for cell in ours):
-            own = [cell for cell in ours if cell.variant == name]
-            shares[name] = sum(cell.lost or 0 for cell in own) / max(1, _total(own, "sent"))
+        shares = {
+            name: sum(cell.lost or 0 for cell in own) / max(1, _total(own, "sent"))
+            for name, own in grouped(ours, lambda cell: cell.variant).items()
+        }
         if lost := ", ".join(f"{share:.1%} of {name}" for name, share in shares.items() if share > _MUCH_LOST):
             yield f"At {rate} messages were lost: {lost}. Percentiles exclude them, aims count them as infinitely late."
 
