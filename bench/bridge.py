@@ -16,23 +16,23 @@ from typing import Any
 from pebble.bench import null
 from pebble.bench.aims import Aim, RatioAim, with_lost
 from pebble.bench.bridge_operator import RATE_HZ, Arrived, DriveSegment
-from pebble.bench.bridge_profile import may_capture, profile_assessment, profile_tables, trace_commands
+from pebble.bench.bridge_profile import PacketCapture, profile_assessment, profile_tables, trace_commands
 from pebble.bench.bridge_report import (
     COMMANDS,
     CPU,
     DOWN,
     LOADED,
+    SUFFIXES,
     UNLOADED,
     UP,
     WAYS,
     assessment,
     legend,
     matches,
-    suffix,
     tables,
     with_excess,
 )
-from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN, DrivenRobot, OneHop, media_load
+from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN, Driven, DrivenRobot, OneHop
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.ratios import LEAST_ROUNDS
@@ -71,37 +71,32 @@ def prepare_profile(run: Run) -> None:
     """Raises PebbleError without permission to capture packets."""
     prepare(run)
     run.options["passes"] = 1
-    may_capture()
+    with PacketCapture(()):
+        pass
 
 
 def measure(round_: Round) -> Iterator[Cell]:
     """Fresh robots that forward reports, also with media; and fresh ones that do not. In turn, the other way round."""
     run = round_.run
     for load in (COMMANDS, UNLOADED) if round_.number % 2 else (UNLOADED, COMMANDS):
+        reports, media = load == UNLOADED, load == UNLOADED and run["with-media"]
         with ExitStack() as stack:
             run.show("starting the robots")
-            driven: dict[str, DrivenRobot | OneHop] = {
-                kind: stack.enter_context(
-                    DrivenRobot(kind, media=load == UNLOADED and _has_media(run, kind), reports=load == UNLOADED)
-                )
+            driven: dict[str, Driven] = {
+                kind: stack.enter_context(DrivenRobot(kind, media=media and kind in KINDS, reports=reports))
                 for kind in run["variants"]
             }
-            if load == UNLOADED:
+            if reports:
                 driven[HOP] = stack.enter_context(OneHop())
             for one in driven.values():
                 one.wait()
             time.sleep(_STARTUP_S)
             yield from _in_turns(round_, load, driven)
-            if load == UNLOADED and run["with-media"]:
+            if media:
                 yield from _with_media(round_, driven)
 
 
-def _has_media(run: Run, kind: str) -> bool:
-    """The stand-in has none."""
-    return bool(run["with-media"]) and kind in KINDS
-
-
-def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot | OneHop]) -> Iterator[Cell]:
+def _in_turns(round_: Round, load: str, driven: Mapping[str, Driven]) -> Iterator[Cell]:
     """Drives each of them for the seconds of a round, in as many turns as there are passes."""
     turn_s = round_.run["seconds"] / round_.run["passes"]
     cases = (case for case in round_.cases([{"load": load}]) if case.variant in driven)
@@ -113,12 +108,12 @@ def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot | OneHo
             yield from cells_of(case, segment, arrived)
 
 
-def _with_media(round_: Round, driven: Mapping[str, DrivenRobot | OneHop]) -> Iterator[Cell]:
-    """One robot after the other, while its own camera and microphone are in use."""
+def _with_media(round_: Round, driven: Mapping[str, Driven]) -> Iterator[Cell]:
+    """One robot after the other, while its own camera and microphone are in use; the stand-in has none."""
     for case in round_.cases([{"load": LOADED}], 1):
         robot = driven[case.variant]
-        if isinstance(robot, DrivenRobot) and _has_media(case.run, case.variant):
-            with media_load(robot) as counts:
+        if isinstance(robot, DrivenRobot) and case.variant in KINDS:
+            with robot.media_load() as counts:
                 time.sleep(_MEDIA_STARTUP_S)
                 before = counts()
                 segment = robot.drive(case.run["seconds"])
@@ -160,7 +155,7 @@ def pilot(case: Case) -> Iterator[Cell]:
     """The usual latency. Raises PebbleError if no command arrives."""
     (found,) = case.env.match_arrivals([case.env.drive(_PILOT_S, NULL_RATE_HZ)])
     if not found.down:
-        raise PebbleError(f"{case.variant}: no command arrived\n{case.env.robot.log()}")
+        raise case.env.problem("no command arrived")
     yield case.cell(DOWN, "ms", found.down)
 
 
@@ -170,18 +165,15 @@ def in_roles(round_: Round) -> Iterator[Cell]:
     The operator works before every command; only in the slowed role it reads the clock before that work.
     """
     robot, run = round_.env, round_.run
-    turns = [
-        (case, robot.drive(
-            run["seconds"] / run["passes"], NULL_RATE_HZ, work_us=case.planted_us, slowed=case.slowed
-        ))
-        for case in round_.cases()
-    ]  # fmt: skip
-    found = robot.match_arrivals([segment for _, segment in turns])
+    cases, segments, turn_s = [], [], run["seconds"] / run["passes"]
+    for case in round_.cases():
+        cases.append(case)
+        segments.append(robot.drive(turn_s, NULL_RATE_HZ, work_us=case.planted_us, slowed=case.slowed))
     run.notes[:] = [
-        f"Planted: {turns[0][0].planted_us:.0f} us, a fifth of the usual latency. All {run.rounds} rounds are turns of"
+        f"Planted: {cases[0].planted_us:.0f} us, a fifth of the usual latency. All {run.rounds} rounds are turns of"
         " one running robot, not fresh robots, and only commands to the wheels are assessed."
     ]
-    for (case, _), arrived in zip(turns, found, strict=True):
+    for case, arrived in zip(cases, robot.match_arrivals(segments), strict=True):
         yield case.cell(DOWN, "ms", arrived.down, sent=arrived.sent)
 
 
@@ -192,7 +184,7 @@ def _aims() -> Iterator[Aim | RatioAim]:
     for measure_, load in AIMED:
         for percent, at_most in AIMS_MS.items():
             yield Aim(
-                what=f"{{variant}}, {WAYS[measure_]}{suffix(load)}, p{percent} at most {{bound:g}} ms",
+                what=f"{{variant}}, {WAYS[measure_]}{SUFFIXES[load]}, p{percent} at most {{bound:g}} ms",
                 of=matches(measure_, KINDS, load=load), value=with_lost(percent), at_most=at_most,
                 least=LEAST_SAMPLES[percent], least_rounds=LEAST_ROUNDS,
                 shown=with_excess(at_most), never="not within 1 s",
@@ -200,7 +192,7 @@ def _aims() -> Iterator[Aim | RatioAim]:
     for percent, bounds in AIMS_COMMANDS.items():
         for kind, at_most in bounds.items():
             yield RatioAim(
-                what=f"{{variant}}, {WAYS[DOWN]}{suffix(COMMANDS)}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
+                what=f"{{variant}}, {WAYS[DOWN]}{SUFFIXES[COMMANDS]}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
                 of=matches(DOWN, [kind], load=COMMANDS), to=STAND_IN, percent=percent, at_most=at_most,
                 least=LEAST_IN_ROUND[percent],
             )  # fmt: skip

@@ -32,7 +32,6 @@ from pebble.contract import (
     TOUCH_SENSORS,
     VIDEO_CONTROL,
 )
-from pebble.errors import PebbleError
 from pebble.rig.stock_client import StockClient, steadily
 from pebble.rig.worker_end import answer, serve, serve_on_thread
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
@@ -41,11 +40,11 @@ from pebble.simulation.trace import Entry
 RATE_HZ = 20.0  # of an operator's commands
 
 Wheels = tuple[float, float]
+Reports = Sequence[tuple[int, int | None]]
+"""When each report was sent, and when it was received; None: it was not."""
 
 _DIGITS = 3  # of a wheel's speed on the serial line
 _STEPS = 800  # wheel values 0.100 … 0.899
-_UP_S = 30.0
-_POLL_S = 0.02
 _REPORTS_LIMIT = 400_000  # reports; a robot sends 50 a second
 _READ_S = 0.2
 _EVERY = 16  # bytes: one in so many of a picture's is read
@@ -61,24 +60,12 @@ class Operator(StockClient):
 
     def __init__(self, port: int, base: str) -> None:
         self._base, self._number = base, 0
-        self._services: dict[str, Any] = {}
-        self._heartbeats = 0
         self._received: deque[tuple[int, bytes | bytearray]] = deque(maxlen=_REPORTS_LIMIT)
-        super().__init__(self._on_message, [(channel.topic(base), 1) for channel in (STATUS, ONLINE, TOUCH_SENSORS)])
+        channels = (STATUS, ONLINE, TOUCH_SENSORS)
+        super().__init__(lambda _: self.acknowledge(), [(channel.topic(base), 1) for channel in channels])
         self.paho.on_publish = lambda *_: self.acknowledge()
         self.paho.message_callback_add(TOUCH_SENSORS.topic(base), self._on_report)
         self.open(port)
-
-    def wait_until_ready(self) -> None:
-        """Waits until every service is ready and heartbeats arrive. Raises PebbleError after a timeout."""
-        end = time.monotonic() + _UP_S
-        while time.monotonic() < end:
-            states = {name: service.get("state") for name, service in self._services.items()}
-            waiting = [name for name, state in states.items() if state not in ("ready", "stopped")]
-            if states and not waiting and self._heartbeats > 1:
-                return
-            time.sleep(_POLL_S)
-        raise PebbleError(f"the robot is not ready after {_UP_S:.0f} s: {states}")
 
     def media(self, wanted: bool) -> None:
         """Allows and requests video and audio, or stops both."""
@@ -105,13 +92,6 @@ class Operator(StockClient):
     def received(self, since_ns: int) -> list[tuple[int, Touch]]:
         """The MCU's reports after ``since_ns``, each with its time of arrival."""
         return [(ns, Touch(**json.loads(payload)["value"])) for ns, payload in self._received.copy() if ns >= since_ns]
-
-    def _on_message(self, message: MQTTMessage) -> None:
-        self.acknowledge()
-        if message.topic == STATUS.topic(self._base):
-            self._services = json.loads(message.payload).get("value", {}).get("services", {})
-        elif not message.retain:
-            self._heartbeats += 1
 
     def _on_report(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
         self._received.append((time.monotonic_ns(), message.payload))
@@ -173,9 +153,7 @@ def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> 
     return [(ns, first.get(touch)) for touch, ns in wanted.items()]
 
 
-def all_arrived(
-    segment: DriveSegment, commands: Mapping[Wheels, int], reports: Sequence[tuple[int, int | None]]
-) -> bool:
+def all_arrived(segment: DriveSegment, commands: Mapping[Wheels, int], reports: Reports) -> bool:
     """Whether the last command and report arrived. What is still missing then was overtaken or lost: order is kept."""
     own = [received for published, received in reports if segment.began <= published <= segment.ended]
     return list(segment.sent)[-1] in commands and (not own or own[-1] is not None)
@@ -184,7 +162,7 @@ def all_arrived(
 def arrived_of(
     segment: DriveSegment,
     commands: Mapping[Wheels, int],
-    reports: Sequence[tuple[int, int | None]],
+    reports: Reports,
     received: Sequence[tuple[int, Touch]] = (),
 ) -> Arrived:
     """Selects the commands and reports that belong to the segment; ``received`` has reports of equal values, too."""

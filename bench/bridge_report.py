@@ -9,7 +9,7 @@ from rich.table import Table
 from pebble.bench.bridge_robots import FLOWS, HOP, STAND_IN
 from pebble.bench.null import variant_of
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell, Value
+from pebble.bench.results import Cell, grouped
 from pebble.bench.tables import (
     Grid,
     base_of,
@@ -28,7 +28,7 @@ DOWN, UP, CPU = "down", "up", "CPU per message"
 _LEAST_IN_ROUND = 100  # samples to compare p99 by rounds: with fewer it is the maximum
 _LOSS_SHOWN = 0.005
 WAYS = {DOWN: "command to the wheels", UP: "report to the operator"}
-_SUFFIXES = {COMMANDS: ", commands only", LOADED: ", media flowing"}
+SUFFIXES = {UNLOADED: "", COMMANDS: ", commands only", LOADED: ", media flowing"}
 _MEANWHILE = Grid(
     title="Meanwhile", rows=("variant", "load"), heads=("robot", "load"),
     columns=(
@@ -58,24 +58,20 @@ def tables(cells: Sequence[Cell]) -> Iterator[Table]:
 def _cpu_table(cells: Sequence[Cell]) -> Table:
     title = "CPU for each forwarded message: median (minimum to maximum) of the rounds"
     table = plain_table(title, ["load", "process", "robot", "us", "turns", f"/ {STAND_IN}"], left=3)
-    places: dict[tuple[Value, ...], list[Cell]] = {}
-    for cell in cells:
-        places.setdefault(tuple(cell.params.values()), []).append(cell)
-    for place, some in places.items():
+    for place, some in grouped(cells, lambda cell: tuple(map(str, cell.params.values()))).items():
         table.add_section()
-        for number, cell in enumerate(some):
+        for cell, shown in zip(some, [place, *len(some) * [("", "")]], strict=False):
             base = base_of(cell, cells, STAND_IN)
-            ratio = "" if base is None or base is cell else str(paired(cell.rounds, base.rounds))
-            shown = ("", "") if number else map(str, place)
+            ratio = "" if base is None else str(paired(cell.rounds, base.rounds))
             table.add_row(*shown, cell.variant, spread(cell), str(len(cell.samples)), ratio)
     return table
 
 
 def assessment(cells: Sequence[Cell]) -> Iterator[str]:
     """One sentence for each comparison."""
-    for load in (UNLOADED, COMMANDS, LOADED):
+    for load, suffix in SUFFIXES.items():
         for way, words in WAYS.items():
-            what, robots = f"Median, {words}{suffix(load)}", _found(cells, way, load)
+            what, robots = f"Median, {words}{suffix}", _found(cells, way, load)
             if robots:
                 yield sentence(what, robots, quantity="time")
             for plain in _found(cells, way, load, [STAND_IN]):
@@ -85,8 +81,7 @@ def assessment(cells: Sequence[Cell]) -> Iterator[str]:
             for free in _found(cells, way, UNLOADED, [loaded.variant]):
                 yield f"{free.variant}, {words}, p99: {_media_effect(loaded, free)}"
     for cell in cells:
-        base = base_of(cell, cells, STAND_IN)
-        if cell.measure == CPU and base is not None and base is not cell:
+        if cell.measure == CPU and (base := base_of(cell, cells, STAND_IN)) is not None:
             load = "commands and reports" if cell.params["load"] == UNLOADED else "commands only"
             yield sentence(f"{CPU}, {cell.params['process']}, {load}", [base, cell], quantity="CPU time")
     yield from _floor(cells)
@@ -128,12 +123,8 @@ def _lost(cells: Sequence[Cell]) -> Iterator[str]:
     for cell in (cell for cell in cells if cell.measure in WAYS):
         lost, sent = cell.lost or 0, len(cell.samples) + (cell.lost or 0)
         if lost > _LOSS_SHOWN * sent:
-            what = f"{cell.variant}, {WAYS[cell.measure]}{suffix(cell.params['load'])}"
+            what = f"{cell.variant}, {WAYS[cell.measure]}{SUFFIXES[str(cell.params['load'])]}"
             yield f"{what}: {100 * lost / sent:.1f} % of {sent} were overtaken, or did not arrive within 1 s."
-
-
-def suffix(load: Value) -> str:
-    return _SUFFIXES.get(str(load), "")
 
 
 def with_excess(aim: float) -> Callable[[float], str]:

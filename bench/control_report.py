@@ -53,6 +53,8 @@ def _side_by_side(title: str, cells: Sequence[Cell], shown: Callable[[Cell], str
     column = Column(names[0] if len(names) == 1 else "", shown)
     for table in Grid(title=title, rows=("size", "rate", "load"), columns=(column,), each=("measure",))(cells):
         table.padding = 0  # six variants in 80 columns
+        for head in table.columns:
+            head.header = str(head.header).replace("-", "-\n").replace(" ", "\n", 1)
         yield table
 
 
