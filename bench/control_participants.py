@@ -1,11 +1,20 @@
-"""The variants of the control comparison and their processes: brokers and hubs, two ends for each role, and loads."""
+"""The variants of the control comparison and their processes: brokers and hubs, two ends for each role, and loads.
+
+A load is a process that standard input switches on and off: ``python -m pebble.bench.control_participants
+hog|writer|reader [mqtt|zenoh-shm WHERE]``, a busy loop, or one end of a stream of raw 640x480 pictures at 30 Hz, as in
+``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing; each is answered with the number of
+pictures so far.
+"""
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -17,14 +26,25 @@ from pebble.rig.broker import Broker
 from pebble.rig.processes import BROKERS, Processes, python
 from pebble.rig.programs import Program
 from pebble.rig.worker import Worker
+from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.transports.settings import MqttSettings, ZenohSettings
 
+if TYPE_CHECKING:
+    from pebble.bench.frames_loop import Reader, Writer
+
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
+_ENDS, _LOADS = "pebble.bench.control_ends", "pebble.bench.control_participants"
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
 _FLOWING = 3  # pictures received until the stream counts as flowing
 _FLOW_S = 10.0
 _POLL_S = 0.02
+PICTURES_HZ = 30.0  # as in bench/frames_loop.py
+_PICTURE = 640 * 480 * 3  # bytes
+_READ_S = 0.2
+_ALIVE_S = 0.01  # of reading while off: the client's network loop must run to stay connected
+_EVERY = 64  # bytes: one in each cache line is read
+_REST_S = 1.0  # between two runs of the network loop while off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,12 +102,12 @@ class Participant:
             settings = ZenohSettings(run_dir=self._run_dir, client=self._variant.client)
             stream = ("zenoh-shm", str(self._run_dir))
         where = (self._variant.kind, _json(settings))
-        self._ends = [self._worker(end, "control_ends", *where) for end in ("echo", "sender")]
+        self._ends = [self._worker(end, _ENDS, *where) for end in ("echo", "sender")]
         if media:
-            self.media = [self._worker(end, "control_load", *stream) for end in ("reader", "writer")]
+            self.media = [self._worker(end, _LOADS, *stream) for end in ("reader", "writer")]
 
     def _worker(self, end: str, module: str, *arguments: str) -> Worker:
-        return self._processes.worker(f"{self._role}: {end}", f"pebble.bench.{module}", end, *arguments)
+        return self._processes.worker(f"{self._role}: {end}", module, end, *arguments)
 
     def run(self, spec: SliceSpec) -> tuple[Answer, Usage]:
         """Runs one slice; returns the sender's answer, and what the two ends and the backbone used meanwhile."""
@@ -150,10 +170,90 @@ class Participants(Processes):
         for participant in self._participants.values():
             participant.start(media=MEDIA in self._loads)
         if HOG in self._loads:
-            self._hogs = [self.worker("hog", "pebble.bench.control_load", "hog")]
+            self._hogs = [self.worker("hog", _LOADS, "hog")]
         for worker in self.workers:
             worker.answer(_READY_S)
 
 
 def _json(what: MqttSettings | ZenohSettings | SliceSpec) -> str:
     return msgspec.json.encode(what, enc_hook=str).decode()
+
+
+# -- a load as a process
+
+
+class Switch:
+    """Switches the load as standard input requests, and answers with the number of pictures."""
+
+    def __init__(self) -> None:
+        self.pictures = 0
+        self._on = threading.Event()
+        self.wait = self._on.wait  # until it is on, or standard input closes
+        self._ended = serve_on_thread(self._handle, self._on.set)
+        answer({"pictures": 0})  # it is ready
+
+    @property
+    def ended(self) -> bool:
+        return self._ended.is_set()
+
+    @property
+    def on(self) -> bool:
+        return self._on.is_set() and not self.ended
+
+    def _handle(self, line: str) -> dict[str, Any]:
+        if line == "1":
+            self._on.set()
+        elif line == "0":
+            self._on.clear()
+        return {"pictures": self.pictures}
+
+
+def hog(switch: Switch) -> None:
+    while not switch.ended:
+        switch.wait()
+        while switch.on:
+            pass
+
+
+def write(writer: Writer, switch: Switch) -> None:
+    import numpy as np  # only the processes of a stream need it
+
+    picture = np.random.default_rng(1).integers(0, 256, _PICTURE, dtype=np.uint8)
+    while not switch.ended:
+        switch.wait()
+        due = time.monotonic()
+        while switch.on:
+            frame = writer.begin()
+            if frame is not None:
+                np.copyto(frame, picture)
+                writer.send()
+                switch.pictures += 1
+            del frame
+            due += 1 / PICTURES_HZ
+            time.sleep(max(0.0, due - time.monotonic()))
+    writer.close()
+
+
+def read(reader: Reader, switch: Switch) -> None:
+    while not switch.ended:
+        switch.wait(_REST_S)
+        frame = reader.read(_READ_S if switch.on else _ALIVE_S)
+        if frame is not None:
+            switch.pictures += bool(frame[::_EVERY].any())
+            del frame
+            reader.done()
+    reader.close()
+
+
+def main(role: str, kind: str = "", where: str = "") -> None:
+    if role == "hog":
+        return hog(Switch())
+    from pebble.bench import frames_worker
+
+    if role == "writer":
+        return write(frames_worker.writer(kind, where, _PICTURE), Switch())
+    return read(frames_worker.reader(kind, where), Switch())
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -11,9 +11,9 @@ from typing import Any, ClassVar, Self
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, control_load, engine, null
+from pebble.bench import control, control_participants, engine, null
 from pebble.bench.comparison import Case, Comparison
-from pebble.bench.control import CONTROL, CONTROL_NULL
+from pebble.bench.control import CONTROL, CONTROL_NULL, assessment, tables
 from pebble.bench.control_ends import (
     ONE_WAY,
     REPLIES,
@@ -33,7 +33,6 @@ from pebble.bench.control_ends import (
     stamped,
 )
 from pebble.bench.control_participants import VARIANTS, Usage
-from pebble.bench.control_report import assessment, tables
 from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
@@ -393,7 +392,7 @@ def test_a_reader_that_is_off_still_runs_its_network_loop(tmp_path: Path, monkey
         reader = MqttReader(broker.port)
         loop = reader._client.loop
         monkeypatch.setattr(reader._client, "loop", lambda timeout: (looped.append(timeout), loop(timeout)))
-        control_load._read(reader, Idle())  # type: ignore[arg-type]
+        control_participants.read(reader, Idle())  # type: ignore[arg-type]
     finally:
         end_all([broker], 5.0)
     assert len(looped) >= 3
