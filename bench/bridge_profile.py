@@ -17,8 +17,7 @@ from itertools import pairwise
 
 from rich.table import Table
 
-from pebble.bench.bridge_operator import Wheels, arrivals, wheels_of
-from pebble.bench.bridge_robots import DrivenRobot
+from pebble.bench.bridge_operator import DrivenRobot, Wheels, arrivals, wheels_of
 from pebble.bench.comparison import Case
 from pebble.bench.results import Cell, grouped, percentile
 from pebble.bench.tables import figure, plain_table

@@ -14,8 +14,23 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import bridge, bridge_profile, engine
-from pebble.bench.bridge import BRIDGE, BRIDGE_NULL, BRIDGE_PROFILE, cells_of
+from pebble.bench.bridge import (
+    BRIDGE,
+    BRIDGE_NULL,
+    BRIDGE_PROFILE,
+    COMMANDS,
+    CPU,
+    DOWN,
+    LOADED,
+    UNLOADED,
+    UP,
+    cells_of,
+)
 from pebble.bench.bridge_operator import (
+    FORWARDER,
+    HOP,
+    SERIAL,
+    STAND_IN,
     Arrived,
     DriveSegment,
     all_arrived,
@@ -26,8 +41,6 @@ from pebble.bench.bridge_operator import (
     wheels_of,
 )
 from pebble.bench.bridge_profile import _stamp, commands
-from pebble.bench.bridge_report import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
-from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.results import Cell, Judged, Value, load
 from pebble.errors import PebbleError
