@@ -48,9 +48,14 @@ STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robo
 FORWARDER, SERIAL = "bridge", "serial bridge"
 FLOWS = ("frames", "video", "audio")
 _SERVICES = {FORWARDER: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
-_PROGRAMS = "pebble.bench.bridge_operator"
+_MODULE = "pebble.bench.bridge_operator"
 _MEDIA: Final = synthetic_media((1920, 1080, 30), (640, 360, 15))
 _HOP_BASE = "pebble/robots/one-hop"
+_DIGITS = 3  # of a wheel's speed on the serial line
+_STEPS = 800  # wheel values 0.100 … 0.899
+_REPORTS_LIMIT = 400_000  # reports; a robot sends 50 a second
+_READ_S = 0.2
+_EVERY = 16  # bytes: one in so many of a picture's is read
 _UP_S, _FLOW_S, _STOP_S = 30.0, 20.0, 10.0
 _ANSWER_S = 5.0
 _ARRIVE_S = 1.0  # commands and reports that take longer count as lost
@@ -61,13 +66,6 @@ Reports = Sequence[tuple[int, int | None]]
 """When each report was sent, and when it was received; None: it was not."""
 Arrivals = tuple[Mapping[Wheels, int], Reports, Sequence[tuple[int, Touch]]]
 """When each command arrived; the reports; and all reports that were received."""
-
-
-_DIGITS = 3  # of a wheel's speed on the serial line
-_STEPS = 800  # wheel values 0.100 … 0.899
-_REPORTS_LIMIT = 400_000  # reports; a robot sends 50 a second
-_READ_S = 0.2
-_EVERY = 16  # bytes: one in so many of a picture's is read
 
 
 class Operator(StockClient):
@@ -292,8 +290,8 @@ class DrivenRobot(Driven):
         """
         robot, before = self.rover, len(self.rover.pids())
         workers = [
-            self.worker("frame reader", _PROGRAMS, "frames", robot.run_dir),
-            self.worker("media operator", _PROGRAMS, "media", robot.remote_port, robot.base),
+            self.worker("frame reader", _MODULE, "frames", robot.run_dir),
+            self.worker("media operator", _MODULE, "media", robot.remote_port, robot.base),
         ]
 
         def counts() -> dict[str, int]:
@@ -340,7 +338,7 @@ class OneHop(Driven):
         """Raises PebbleError if something does not start."""
         broker = self.broker("hop")
         broker.wait()
-        self._subscriber = self.worker("the subscriber", _PROGRAMS, "hop", broker.port, DRIVE.topic(_HOP_BASE))
+        self._subscriber = self.worker("the subscriber", _MODULE, "hop", broker.port, DRIVE.topic(_HOP_BASE))
         self.operator = Operator(broker.port, _HOP_BASE)
         self.closing.callback(self.operator.close)
         self._received: dict[Wheels, int] = {}

@@ -100,14 +100,14 @@ def request(number: int, t1: int, size: int) -> bytes:
 
 
 def stamped(payload: bytes, t2: int, t3: int) -> bytes:
-    """The same message with the echo's stamps, of the same length. Raises struct.error for a foreign message."""
+    """The same message with the echo's stamps, of the same length: at least :data:`SMALLEST`."""
     message = bytearray(payload)
     _ECHOED.pack_into(message, _ECHOED_AT, t2, t3)
     return bytes(message)
 
 
 def parse(payload: bytes) -> tuple[int, ...]:
-    """Number, t1, t2, t3. Raises struct.error for a foreign message."""
+    """Number, t1, t2, t3, of at least :data:`SMALLEST` bytes."""
     return _FORM.unpack_from(payload)
 
 
@@ -173,7 +173,10 @@ def stock(port: int) -> Connection:
     client.wait()
 
     def subscribe(filter_: str, handler: Handler) -> None:
-        client.paho.on_message = lambda _client, _data, one: handler(one.topic, one.payload, time.monotonic_ns())
+        def on_message(_client: Any, _data: Any, message: Any) -> None:
+            handler(message.topic, message.payload, time.monotonic_ns())
+
+        client.paho.on_message = on_message
         client.subscribe(filter_, QOS)
 
     return Connection(subscribe, partial(client.paho.publish, qos=QOS), client.close)
@@ -189,12 +192,10 @@ class Echo:
 
     def _on_message(self, topic: str, payload: bytes, _transport_ns: int) -> None:
         received = self._clock()
-        try:
+        if len(payload) >= SMALLEST:  # else a foreign message on a shared broker
             reply = stamped(payload, received, self._clock())
-        except struct.error:  # a foreign message on a shared broker
-            return
-        self._connection.publish(REPLIES + topic.removeprefix(REQUESTS), reply)
-        self.count += 1
+            self._connection.publish(REPLIES + topic.removeprefix(REQUESTS), reply)
+            self.count += 1
 
 
 class Sender:
@@ -263,10 +264,9 @@ class Sender:
 
     def _on_message(self, _topic: str, payload: bytes, transport_ns: int) -> None:
         received = self._clock()
-        try:
-            number, t1, t2, t3 = parse(payload)
-        except struct.error:
+        if len(payload) < SMALLEST:
             return
+        number, t1, t2, t3 = parse(payload)
         index = number - self._first
         if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
             self._received[index] = Exchange(t1, t2, t3, received, transport_ns)
