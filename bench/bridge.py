@@ -8,38 +8,60 @@ local transport and the serial bridge. Real processes, stock mosquitto, loopback
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from statistics import fmean
 from typing import Any
 
+from rich.table import Table
+
 from pebble.bench import null
 from pebble.bench.aims import Aim, RatioAim, with_lost
-from pebble.bench.bridge_operator import RATE_HZ, Arrived, DriveSegment
-from pebble.bench.bridge_profile import may_capture, profile_assessment, profile_tables, trace_commands
-from pebble.bench.bridge_report import (
-    COMMANDS,
-    CPU,
-    DOWN,
-    LOADED,
-    UNLOADED,
-    UP,
-    WAYS,
-    assessment,
-    legend,
-    matches,
-    suffix,
-    tables,
-    with_excess,
+from pebble.bench.bridge_operator import (
+    FLOWS,
+    FORWARDER,
+    HOP,
+    RATE_HZ,
+    SERIAL,
+    STAND_IN,
+    Arrived,
+    Driven,
+    DrivenRobot,
+    DriveSegment,
+    OneHop,
 )
-from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN, DrivenRobot, OneHop, media_load
+from pebble.bench.bridge_profile import PacketCapture, profile_assessment, profile_tables, trace_commands
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
-from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell, Value
+from pebble.bench.ratios import LEAST_ROUNDS, paired
+from pebble.bench.results import Cell, Value, grouped
+from pebble.bench.tables import (
+    Grid,
+    base_of,
+    caveat,
+    figure,
+    latency_table,
+    plain_table,
+    sentence,
+    single_column,
+    spread,
+)
 from pebble.errors import PebbleError
 from pebble.rig.robot import KINDS
 
+UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
+DOWN, UP, CPU = "down", "up", "CPU per message"
+_LOSS_SHOWN = 0.005
+WAYS = {DOWN: "command to the wheels", UP: "report to the operator"}
+SUFFIXES = {UNLOADED: "", COMMANDS: ", commands only", LOADED: ", media flowing"}
+_MEANWHILE = Grid(
+    title="Meanwhile", rows=("variant", "load"), heads=("robot", "load"),
+    columns=(
+        single_column("CPU %", "cpu_percent", ".1f"),
+        *(single_column(f"{name}/s", f"{name}_per_s", ".1f") for name in FLOWS),
+    ),
+    of=lambda cell: cell.measure == DOWN and "cpu_percent" in cell.figures,
+)  # fmt: skip
 NULL_RATE_HZ = 100.0  # more than an operator's 20 a second, to shorten the test
 AIMS_MS, AIMED = {50: 0.7, 99: 2.0}, ((DOWN, UNLOADED), (UP, UNLOADED), (DOWN, COMMANDS))
 #: At most this ratio to the stand-in. Commands, by percentile: nothing else is forwarded.
@@ -47,7 +69,7 @@ AIMS_COMMANDS = {50: {"mqtt": 1.0, "zenoh": 1.05}, 99: {"mqtt": 0.5, "zenoh": 0.
 #: CPU for each message, by process: commands and reports are forwarded.
 AIMS_CPU = {FORWARDER: {"mqtt": 1.0, "zenoh": 1.1}, SERIAL: {"mqtt": 1.1, "zenoh": 1.4}}
 LEAST_SAMPLES = {50: 1, 99: 300}  # to assess an aim: with fewer, hardly any lie beyond that percentile
-LEAST_IN_ROUND = {50: 1, 99: 100}  # to assess a ratio over rounds
+LEAST_IN_ROUND = {50: 1, 99: 100}  # to compare by rounds: with fewer, p99 is the maximum
 _TURN_S, _NULL_TURN_S = 1.0, 0.05  # of driving one robot before the next one
 _STARTUP_S = 1.0  # for start-up work to finish
 _MEDIA_STARTUP_S = 1.0
@@ -72,37 +94,32 @@ def prepare_profile(run: Run) -> None:
     """Raises PebbleError without permission to capture packets."""
     prepare(run)
     run.options["passes"] = 1
-    may_capture()
+    with PacketCapture(()):
+        pass
 
 
 def measure(round_: Round) -> Iterator[Cell]:
     """Fresh robots that forward reports, also with media; and fresh ones that do not. In turn, the other way round."""
     run = round_.run
     for load in (COMMANDS, UNLOADED) if round_.number % 2 else (UNLOADED, COMMANDS):
+        reports, media = load == UNLOADED, load == UNLOADED and run["with-media"]
         with ExitStack() as stack:
             run.show("starting the robots")
-            driven: dict[str, DrivenRobot | OneHop] = {
-                kind: stack.enter_context(
-                    DrivenRobot(kind, media=load == UNLOADED and _has_media(run, kind), reports=load == UNLOADED)
-                )
+            driven: dict[str, Driven] = {
+                kind: stack.enter_context(DrivenRobot(kind, media=media and kind in KINDS, reports=reports))
                 for kind in run["variants"]
             }
-            if load == UNLOADED:
+            if reports:
                 driven[HOP] = stack.enter_context(OneHop())
             for one in driven.values():
                 one.wait()
             time.sleep(_STARTUP_S)
             yield from _in_turns(round_, load, driven)
-            if load == UNLOADED and run["with-media"]:
+            if media:
                 yield from _with_media(round_, driven)
 
 
-def _has_media(run: Run, kind: str) -> bool:
-    """The stand-in has none."""
-    return bool(run["with-media"]) and kind in KINDS
-
-
-def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot | OneHop]) -> Iterator[Cell]:
+def _in_turns(round_: Round, load: str, driven: Mapping[str, Driven]) -> Iterator[Cell]:
     """Drives each of them for the seconds of a round, in as many turns as there are passes."""
     turn_s = round_.run["seconds"] / round_.run["passes"]
     cases = (case for case in round_.cases([{"load": load}]) if case.variant in driven)
@@ -114,12 +131,12 @@ def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot | OneHo
             yield from cells_of(case, segment, arrived)
 
 
-def _with_media(round_: Round, driven: Mapping[str, DrivenRobot | OneHop]) -> Iterator[Cell]:
-    """One robot after the other, while its own camera and microphone are in use."""
+def _with_media(round_: Round, driven: Mapping[str, Driven]) -> Iterator[Cell]:
+    """One robot after the other, while its own camera and microphone are in use; the stand-in has none."""
     for case in round_.cases([{"load": LOADED}], 1):
         robot = driven[case.variant]
-        if isinstance(robot, DrivenRobot) and _has_media(case.run, case.variant):
-            with media_load(robot) as counts:
+        if isinstance(robot, DrivenRobot) and case.variant in KINDS:
+            with robot.media_load() as counts:
                 time.sleep(_MEDIA_STARTUP_S)
                 before = counts()
                 segment = robot.drive(min(case.run["seconds"], _LOADED_S))
@@ -161,7 +178,7 @@ def pilot(case: Case) -> Iterator[Cell]:
     """The usual latency. Raises PebbleError if no command arrives."""
     (found,) = case.env.match_arrivals([case.env.drive(_PILOT_S, NULL_RATE_HZ)])
     if not found.down:
-        raise PebbleError(f"{case.variant}: no command arrived\n{case.env.robot.log()}")
+        raise case.env.problem("no command arrived")
     yield case.cell(DOWN, "ms", found.down)
 
 
@@ -171,47 +188,140 @@ def in_roles(round_: Round) -> Iterator[Cell]:
     The operator works before every command; only in the slowed role it reads the clock before that work.
     """
     robot, run = round_.env, round_.run
-    turns = [
-        (case, robot.drive(
-            run["seconds"] / run["passes"], NULL_RATE_HZ, work_us=case.planted_us, slowed=case.slowed
-        ))
-        for case in round_.cases()
-    ]  # fmt: skip
-    found = robot.match_arrivals([segment for _, segment in turns])
+    cases, segments, turn_s = [], [], run["seconds"] / run["passes"]
+    for case in round_.cases():
+        cases.append(case)
+        segments.append(robot.drive(turn_s, NULL_RATE_HZ, work_us=case.planted_us, slowed=case.slowed))
     run.notes[:] = [
-        f"Planted: {turns[0][0].planted_us:.0f} us, a fifth of the usual latency. All {run.rounds} rounds are turns of"
+        f"Planted: {cases[0].planted_us:.0f} us, a fifth of the usual latency. All {run.rounds} rounds are turns of"
         " one running robot, not fresh robots, and only commands to the wheels are assessed."
     ]
-    for (case, _), arrived in zip(turns, found, strict=True):
+    for case, arrived in zip(cases, robot.match_arrivals(segments), strict=True):
         yield case.cell(DOWN, "ms", arrived.down, sent=arrived.sent)
 
 
-# -- the aims
+# -- the report
+
+
+def legend(cells: Sequence[Cell]) -> Iterator[str]:
+    if cells:
+        yield f"{UNLOADED}: 20 commands and 50 reports a second; {COMMANDS}: the robots forward no reports"
+
+
+def tables(cells: Sequence[Cell]) -> Iterator[Table]:
+    """The latencies, CPU for each message, then CPU and media rates of the same time."""
+    if some := [cell for cell in cells if cell.measure in WAYS]:
+        baseline = STAND_IN if any(cell.variant == STAND_IN for cell in some) else null.variant_of(some[0].variant)
+        yield latency_table("Commands down, reports up; and the load on the robot", some, baseline)
+    if some := [cell for cell in cells if cell.measure == CPU]:
+        yield _cpu_table(some)
+    if any(map(_MEANWHILE.of, cells)):
+        yield from _MEANWHILE(cells)
+
+
+def _cpu_table(cells: Sequence[Cell]) -> Table:
+    title = "CPU for each forwarded message: median (minimum to maximum) of the rounds"
+    table = plain_table(title, ["load", "process", "robot", "us", "turns", f"/ {STAND_IN}"], left=3)
+    for place, some in grouped(cells, lambda cell: tuple(map(str, cell.params.values()))).items():
+        table.add_section()
+        for cell, shown in zip(some, [place, *len(some) * [("", "")]], strict=False):
+            base = base_of(cell, cells, STAND_IN)
+            ratio = "" if base is None else str(paired(cell.rounds, base.rounds))
+            table.add_row(*shown, cell.variant, spread(cell), str(len(cell.samples)), ratio)
+    return table
+
+
+def assessment(cells: Sequence[Cell]) -> Iterator[str]:
+    """One sentence for each comparison."""
+    for load, suffix in SUFFIXES.items():
+        for way, words in WAYS.items():
+            what, robots = f"Median, {words}{suffix}", _found(cells, way, load)
+            if robots:
+                yield sentence(what, robots, quantity="time")
+            for plain in _found(cells, way, load, [STAND_IN]):
+                yield from (sentence(what, [plain, one], quantity="time") for one in robots if plain.samples)
+    for way, words in WAYS.items():
+        for loaded in _found(cells, way, LOADED):
+            for free in _found(cells, way, UNLOADED, [loaded.variant]):
+                yield f"{free.variant}, {words}, p99: {_media_effect(loaded, free)}"
+    for cell in cells:
+        if cell.measure == CPU and (base := base_of(cell, cells, STAND_IN)) is not None:
+            load = "commands and reports" if cell.params["load"] == UNLOADED else "commands only"
+            yield sentence(f"{CPU}, {cell.params['process']}, {load}", [base, cell], quantity="CPU time")
+    yield from _floor(cells)
+    yield from _lost(cells)
+    yield from caveat([cell for way in WAYS for cell in _found(cells, way, UNLOADED)])
+
+
+def matches(measure: str, variants: Sequence[str], **params: str) -> Callable[[Cell], bool]:
+    """Whether a cell has this measure, one of these variants and these parameters."""
+    return lambda cell: cell.measure == measure and cell.variant in variants and params.items() <= cell.params.items()
+
+
+def _found(cells: Sequence[Cell], measure: str, load: str, variants: Sequence[str] = KINDS) -> list[Cell]:
+    """In the order of the variants."""
+    return [cell for name in variants for cell in filter(matches(measure, [name], load=load), cells)]
+
+
+def _media_effect(loaded: Cell, free: Cell) -> str:
+    """Compares p99 with and without media."""
+    times = f"{figure(free.percentile(99))} ms, with media {figure(loaded.percentile(99))} ms"
+    rounds = [*loaded.rounds, *free.rounds]
+    if min(len(loaded.rounds), len(free.rounds)) < LEAST_ROUNDS or min(map(len, rounds)) < LEAST_IN_ROUND[99]:
+        return times
+    ratio = paired(loaded.rounds, free.rounds, 99)
+    return f"{times}; {ratio.words('the robot with media', 'the one without')}"
+
+
+def _floor(cells: Sequence[Cell]) -> Iterator[str]:
+    """The time a robot adds to one hop through a broker."""
+    robots = _found(cells, DOWN, UNLOADED)
+    for hop in (cell for cell in cells if cell.variant == HOP and cell.samples and robots):
+        floor = hop.percentile(50)
+        more = ", ".join(f"{cell.variant} {figure(cell.percentile(50) - floor)} ms more" for cell in robots)
+        yield f"One hop, operator to a stock client through a broker of their own, takes {figure(floor)} ms; {more}."
+
+
+def _lost(cells: Sequence[Cell]) -> Iterator[str]:
+    """Reports losses above a threshold."""
+    for cell in (cell for cell in cells if cell.measure in WAYS):
+        lost, sent = cell.lost or 0, len(cell.samples) + (cell.lost or 0)
+        if lost > _LOSS_SHOWN * sent:
+            what = f"{cell.variant}, {WAYS[cell.measure]}{SUFFIXES[str(cell.params['load'])]}"
+            yield f"{what}: {100 * lost / sent:.1f} % of {sent} were overtaken, or did not arrive within 1 s."
+
+
+def _with_excess(aim: float) -> Callable[[float], str]:
+    """Formats a latency, with what it takes longer than an aim."""
+    return lambda ms: f"{figure(ms)} ms" + (f", by {ms - aim:.2f} ms" if ms > aim else "")
 
 
 def _aims() -> Iterator[Aim | RatioAim]:
     for measure_, load in AIMED:
         for percent, at_most in AIMS_MS.items():
             yield Aim(
-                what=f"{{variant}}, {WAYS[measure_]}{suffix(load)}, p{percent} at most {{bound:g}} ms",
+                what=f"{{variant}}, {WAYS[measure_]}{SUFFIXES[load]}, p{percent} at most {{bound:g}} ms",
                 of=matches(measure_, KINDS, load=load), value=with_lost(percent), at_most=at_most,
                 least=LEAST_SAMPLES[percent], least_rounds=LEAST_ROUNDS,
-                shown=with_excess(at_most), never="not within 1 s",
+                shown=_with_excess(at_most), never="not within 1 s",
             )  # fmt: skip
     for percent, bounds in AIMS_COMMANDS.items():
-        for kind, at_most in bounds.items():
-            yield RatioAim(
-                what=f"{{variant}}, {WAYS[DOWN]}{suffix(COMMANDS)}, p{percent} at most {{bound:.2f}} of {STAND_IN}'s",
-                of=matches(DOWN, [kind], load=COMMANDS), to=STAND_IN, percent=percent, at_most=at_most,
-                least=LEAST_IN_ROUND[percent],
-            )  # fmt: skip
+        what, least = f"{WAYS[DOWN]}{SUFFIXES[COMMANDS]}, p{percent}", LEAST_IN_ROUND[percent]
+        yield from _ratio_aims(what, bounds, DOWN, percent=percent, least=least, load=COMMANDS)
     for process, bounds in AIMS_CPU.items():
-        for kind, at_most in bounds.items():
-            what = f"{CPU} of the {process}, commands and reports"
-            yield RatioAim(
-                what=f"{{variant}}, {what}, at most {{bound:.2f}} of {STAND_IN}'s",
-                of=matches(CPU, [kind], load=UNLOADED, process=process), to=STAND_IN, at_most=at_most,
-            )  # fmt: skip
+        yield from _ratio_aims(
+            f"{CPU} of the {process}, commands and reports,", bounds, CPU, load=UNLOADED, process=process
+        )
+
+
+def _ratio_aims(
+    what: str, bounds: Mapping[str, float], measure: str, percent: int = 50, least: int = 1, **params: str
+) -> Iterator[RatioAim]:
+    for kind, at_most in bounds.items():
+        yield RatioAim(
+            what=f"{{variant}}, {what} at most {{bound:.2f}} of {STAND_IN}'s",
+            of=matches(measure, [kind], **params), to=STAND_IN, percent=percent, at_most=at_most, least=least,
+        )  # fmt: skip
 
 
 def _options(known: Sequence[str]) -> tuple[Option, ...]:

@@ -1,4 +1,4 @@
-"""An operator who drives at a steady rate over MQTT, and which of the commands and of the MCU's reports arrived.
+"""An operator who drives at a steady rate over MQTT, what is driven, and which commands and reports of its MCU arrived.
 
 As processes beside the robot: ``python -m pebble.bench.bridge_operator WHAT …``. ``frames RUN_DIR`` reads a robot's
 frames and ``media PORT BASE`` receives its video and sound; both answer every line with the counts so far. ``hop PORT
@@ -12,14 +12,17 @@ import json
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from paho.mqtt.client import Client, MQTTMessage
 
 from pebble.bench.null import spin
+from pebble.bench.subscribers import RobotSubscriber
+from pebble.bench.usage import cpu_s
 from pebble.contract import (
     AUDIO,
     AUDIO_CONTROL,
@@ -33,22 +36,36 @@ from pebble.contract import (
     VIDEO_CONTROL,
 )
 from pebble.errors import PebbleError
+from pebble.rig.processes import Processes, python
+from pebble.rig.robot import BASE, Robot, synthetic_media
 from pebble.rig.stock_client import StockClient, steadily
 from pebble.rig.worker_end import answer, serve, serve_on_thread
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 from pebble.simulation.trace import Entry
 
 RATE_HZ = 20.0  # of an operator's commands
-
-Wheels = tuple[float, float]
-
+STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
+FORWARDER, SERIAL = "bridge", "serial bridge"
+FLOWS = ("frames", "video", "audio")
+_SERVICES = {FORWARDER: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
+_MODULE = "pebble.bench.bridge_operator"
+_MEDIA: Final = synthetic_media((1920, 1080, 30), (640, 360, 15))
+_HOP_BASE = "pebble/robots/one-hop"
 _DIGITS = 3  # of a wheel's speed on the serial line
 _STEPS = 800  # wheel values 0.100 … 0.899
-_UP_S = 30.0
-_POLL_S = 0.02
 _REPORTS_LIMIT = 400_000  # reports; a robot sends 50 a second
 _READ_S = 0.2
 _EVERY = 16  # bytes: one in so many of a picture's is read
+_UP_S, _FLOW_S, _STOP_S = 30.0, 20.0, 10.0
+_ANSWER_S = 5.0
+_ARRIVE_S = 1.0  # commands and reports that take longer count as lost
+_POLL_S = 0.05
+
+Wheels = tuple[float, float]
+Reports = Sequence[tuple[int, int | None]]
+"""When each report was sent, and when it was received; None: it was not."""
+Arrivals = tuple[Mapping[Wheels, int], Reports, Sequence[tuple[int, Touch]]]
+"""When each command arrived; the reports; and all reports that were received."""
 
 
 class Operator(StockClient):
@@ -61,24 +78,12 @@ class Operator(StockClient):
 
     def __init__(self, port: int, base: str) -> None:
         self._base, self._number = base, 0
-        self._services: dict[str, Any] = {}
-        self._heartbeats = 0
         self._received: deque[tuple[int, bytes | bytearray]] = deque(maxlen=_REPORTS_LIMIT)
-        super().__init__(self._on_message, [(channel.topic(base), 1) for channel in (STATUS, ONLINE, TOUCH_SENSORS)])
+        channels = (STATUS, ONLINE, TOUCH_SENSORS)
+        super().__init__(lambda _: self.acknowledge(), [(channel.topic(base), 1) for channel in channels])
         self.paho.on_publish = lambda *_: self.acknowledge()
         self.paho.message_callback_add(TOUCH_SENSORS.topic(base), self._on_report)
         self.open(port)
-
-    def wait_until_ready(self) -> None:
-        """Waits until every service is ready and heartbeats arrive. Raises PebbleError after a timeout."""
-        end = time.monotonic() + _UP_S
-        while time.monotonic() < end:
-            states = {name: service.get("state") for name, service in self._services.items()}
-            waiting = [name for name, state in states.items() if state not in ("ready", "stopped")]
-            if states and not waiting and self._heartbeats > 1:
-                return
-            time.sleep(_POLL_S)
-        raise PebbleError(f"the robot is not ready after {_UP_S:.0f} s: {states}")
 
     def media(self, wanted: bool) -> None:
         """Allows and requests video and audio, or stops both."""
@@ -105,13 +110,6 @@ class Operator(StockClient):
     def received(self, since_ns: int) -> list[tuple[int, Touch]]:
         """The MCU's reports after ``since_ns``, each with its time of arrival."""
         return [(ns, Touch(**json.loads(payload)["value"])) for ns, payload in self._received.copy() if ns >= since_ns]
-
-    def _on_message(self, message: MQTTMessage) -> None:
-        self.acknowledge()
-        if message.topic == STATUS.topic(self._base):
-            self._services = json.loads(message.payload).get("value", {}).get("services", {})
-        elif not message.retain:
-            self._heartbeats += 1
 
     def _on_report(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
         self._received.append((time.monotonic_ns(), message.payload))
@@ -173,9 +171,7 @@ def matched(entries: Sequence[Entry], received: Sequence[tuple[int, Touch]]) -> 
     return [(ns, first.get(touch)) for touch, ns in wanted.items()]
 
 
-def all_arrived(
-    segment: DriveSegment, commands: Mapping[Wheels, int], reports: Sequence[tuple[int, int | None]]
-) -> bool:
+def all_arrived(segment: DriveSegment, commands: Mapping[Wheels, int], reports: Reports) -> bool:
     """Whether the last command and report arrived. What is still missing then was overtaken or lost: order is kept."""
     own = [received for published, received in reports if segment.began <= published <= segment.ended]
     return list(segment.sent)[-1] in commands and (not own or own[-1] is not None)
@@ -184,7 +180,7 @@ def all_arrived(
 def arrived_of(
     segment: DriveSegment,
     commands: Mapping[Wheels, int],
-    reports: Sequence[tuple[int, int | None]],
+    reports: Reports,
     received: Sequence[tuple[int, Touch]] = (),
 ) -> Arrived:
     """Selects the commands and reports that belong to the segment; ``received`` has reports of equal values, too."""
@@ -197,6 +193,164 @@ def arrived_of(
         reports=len(own),
         forwarded=len(arrived) + sum(segment.began <= ns <= segment.ended for ns, _ in received),
     )
+
+
+# -- what is driven
+
+
+class Driven(Processes):
+    """What is driven, and its operator: starts both in ``with``; both are ready when :meth:`wait` returns."""
+
+    operator: Operator
+
+    def wait(self) -> None:
+        """Raises PebbleError if it does not become ready."""
+
+    def drive(
+        self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False
+    ) -> DriveSegment:
+        """See :meth:`Operator.drive`."""
+        began = time.monotonic_ns()
+        sent = self.operator.drive(seconds, rate_hz, work_us=work_us, slowed=slowed)
+        return DriveSegment(began, time.monotonic_ns(), sent)
+
+    def match_arrivals(self, segments: Sequence[DriveSegment]) -> list[Arrived]:
+        """Waits for the last commands and reports, or until they count as lost; returns one result for each segment."""
+        since, end = min(segment.began for segment in segments), time.monotonic() + _ARRIVE_S
+        while True:
+            late = time.monotonic() > end
+            commands, reports, received = self._arrivals(since)
+            if late or all_arrived(segments[-1], commands, reports):
+                return [arrived_of(segment, commands, reports, received) for segment in segments]
+            time.sleep(_POLL_S)
+
+    def _arrivals(self, since: int) -> Arrivals:
+        raise NotImplementedError
+
+
+class DrivenRobot(Driven):
+    """A whole robot. With ``reports`` it forwards those of its MCU."""
+
+    def __init__(self, kind: str, *, media: bool = False, reports: bool = True) -> None:
+        super().__init__()
+        self.kind, self._media, self._reports = kind, media, reports
+        self._parts: Mapping[str, int] = {}
+
+    def start(self) -> None:
+        """Raises PebbleError if something does not start."""
+        make, services = StandIn if self.kind == STAND_IN else Robot, _MEDIA if self._media else {}
+        broker = self.broker("remote")
+        self.subject = make(self, self.kind, ("127.0.0.1", broker.port), services=services, reports=self._reports)
+        broker.wait()
+        self.subject.prepare()
+        self.subject.launch()
+        self.operator = Operator(broker.port, BASE)
+        self.closing.callback(self.operator.close)
+
+    def wait(self) -> None:
+        with closing(RobotSubscriber(self.subject.remote_port, BASE)) as subscriber:
+            self.subject.expect(
+                lambda: subscriber.ready_ns is not None and subscriber.first_heartbeat_ns is not None,
+                f"{self.kind}: the robot is not ready", _UP_S,
+            )  # fmt: skip
+        running = self.subject.processes()
+        if missing := [name for name in _SERVICES.values() if name not in running]:
+            raise self.problem(f"{' and '.join(missing)} is not running")
+        self._parts = {part: running[name] for part, name in _SERVICES.items()}
+
+    def drive(
+        self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False
+    ) -> DriveSegment:
+        """See :meth:`Operator.drive`. Raises PebbleError if one of the two bridges has ended."""
+        pids = self.subject.pids()
+        used, before = cpu_s(pids), self._parts_cpu_s()
+        segment = super().drive(seconds, rate_hz, work_us=work_us, slowed=slowed)
+        parts = {part: after - before[part] for part, after in self._parts_cpu_s().items()}
+        if ended := [part for part, used_s in parts.items() if used_s <= 0]:
+            raise self.problem(f"the {' and the '.join(ended)} ended while it was driven")
+        return replace(segment, cpu_s=cpu_s(pids) - used, parts_cpu_s=parts)
+
+    def _parts_cpu_s(self) -> dict[str, float]:
+        return {part: cpu_s([pid]) for part, pid in self._parts.items()}
+
+    def _arrivals(self, since: int) -> Arrivals:
+        entries, received = self.subject.lines(since), self.operator.received(since)
+        return arrivals(entries), matched(entries, received), received
+
+    def problem(self, what: str) -> PebbleError:
+        """An error with the robot's log."""
+        return PebbleError(f"{self.kind}: {what}\n{self.subject.log()}")
+
+    @contextmanager
+    def media_load(self) -> Iterator[Callable[[], dict[str, int]]]:
+        """Puts its camera and microphone in use: a program on the robot reads frames, an operator gets both.
+
+        All media flow as the ``with`` block begins, and stop with it. It is given what counts the received frames and
+        packets so far, by flow. Raises PebbleError naming what does not flow.
+        """
+        robot, before = self.subject, len(self.subject.pids())
+        workers = [
+            self.worker("frame reader", _MODULE, "frames", robot.run_dir),
+            self.worker("media operator", _MODULE, "media", robot.remote_port, robot.base),
+        ]
+
+        def counts() -> dict[str, int]:
+            for worker in workers:
+                worker.send("")
+            found = {name: count for worker in workers for name, count in worker.answer(_ANSWER_S).items()}
+            return {name: found.get(name, 0) for name in FLOWS}
+
+        try:
+            self.operator.media(True)
+            end = time.monotonic() + _FLOW_S
+            while missing := [name for name, count in counts().items() if not count]:
+                if time.monotonic() > end:
+                    raise self.problem(f"no {', '.join(missing)} after {_FLOW_S:.0f} s")
+                time.sleep(_POLL_S)
+            yield counts
+        finally:
+            self.operator.media(False)
+            for worker in workers:
+                self.end(worker)
+            end = time.monotonic() + _STOP_S
+            while len(robot.pids()) > before and time.monotonic() < end:
+                time.sleep(_POLL_S)
+
+
+class StandIn(Robot):
+    """What a user would have without us."""
+
+    def launch(self) -> None:
+        local = 0 if self.local_broker is None else self.local_broker.port
+        rest = (local, self.remote_port, self.base, self.port, *(["--reports"] if self.reports else []))
+        for part in ("bridge", "serial"):
+            self.start(f"the stand-in's {part}", python("pebble.bench.stand_in", part, *rest))
+
+    def processes(self) -> dict[str, int]:
+        """Its two programs, by the names of the services that they stand for."""
+        return {name: one.pid for name, one in zip(_SERVICES.values(), self._started, strict=False)}
+
+
+class OneHop(Driven):
+    """The lower bound: the same commands to a stock client, one hop through a stock broker without other traffic."""
+
+    def start(self) -> None:
+        """Raises PebbleError if something does not start."""
+        broker = self.broker("hop")
+        broker.wait()
+        self._subscriber = self.worker("the subscriber", _MODULE, "hop", broker.port, DRIVE.topic(_HOP_BASE))
+        self.operator = Operator(broker.port, _HOP_BASE)
+        self.closing.callback(self.operator.close)
+        self._received: dict[Wheels, int] = {}
+
+    def wait(self) -> None:
+        """Raises PebbleError if its client does not subscribe."""
+        self._subscriber.answer(_UP_S)
+
+    def _arrivals(self, _since: int) -> Arrivals:
+        new = self._subscriber.ask("", _ANSWER_S)["received"]
+        self._received |= {(left, right): ns for left, right, ns in new}
+        return self._received, [], []
 
 
 # -- programs beside the robot

@@ -14,14 +14,12 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
-from typing import Self
 
 from rich.table import Table
 
-from pebble.bench.bridge_operator import Wheels, arrivals, wheels_of
-from pebble.bench.bridge_robots import DrivenRobot
+from pebble.bench.bridge_operator import DrivenRobot, Wheels, arrivals, wheels_of
 from pebble.bench.comparison import Case
-from pebble.bench.results import Cell, percentile
+from pebble.bench.results import Cell, grouped, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
 
@@ -53,22 +51,16 @@ PassageTimes = dict[tuple[int, int], dict[Wheels, int]]
 """By a port and whether it was the source or the destination: when (CLOCK_MONOTONIC, ns) each command first passed."""
 
 
-def may_capture() -> None:
-    """Raises PebbleError without permission to capture."""
-    with PacketCapture(()):
-        pass
-
-
 def trace_commands(case: Case) -> Iterator[Cell]:
     """Drives a fresh robot and follows each command. Raises PebbleError."""
-    with DrivenRobot(case.variant) as driven_robot, PacketCapture(driven_robot.robot.broker_ports) as wire:
-        driven_robot.wait()
+    with DrivenRobot(case.variant) as driven, PacketCapture(driven.subject.broker_ports) as wire:
+        driven.wait()
         time.sleep(_STARTUP_S)
         wire.passed()
-        segment = driven_robot.drive(case.run["seconds"])
-        driven_robot.match_arrivals([segment])  # waits for the last ones
-        pty, passed = arrivals(driven_robot.robot.lines(segment.began)), wire.passed()
-        ends = [(port, end) for port in driven_robot.robot.broker_ports for end in (_DESTINATION, _SOURCE)]
+        segment = driven.drive(case.run["seconds"])
+        driven.match_arrivals([segment])  # waits for the last ones
+        pty, passed = arrivals(driven.subject.lines(segment.began)), wire.passed()
+        ends = [(port, end) for port in driven.subject.broker_ports for end in (_DESTINATION, _SOURCE)]
         times = hops(segment.sent, [*(passed.get(end, {}) for end in ends), pty])
     for number, name in enumerate((*HOPS[case.variant], ALL)):
         yield case.cell("hop", "ms", [(*one, sum(one))[number] for one in times], {"hop": name})
@@ -97,20 +89,16 @@ def slowest(times: Times) -> Times:
 
 
 def _times_by_kind(cells: Sequence[Cell]) -> dict[str, Times]:
-    hops: dict[str, list[list[float]]] = {}
-    for cell in cells:
-        if cell.params["hop"] != ALL:
-            hops.setdefault(cell.variant, []).append(cell.samples)
-    return {kind: list(zip(*each, strict=True)) for kind, each in hops.items()}
+    hops = grouped((cell for cell in cells if cell.params["hop"] != ALL), lambda cell: cell.variant)
+    return {kind: list(zip(*(cell.samples for cell in own), strict=True)) for kind, own in hops.items()}
 
 
 def profile_tables(cells: Sequence[Cell]) -> Iterator[Table]:
     for kind, times in _times_by_kind(cells).items():
         table = plain_table(f"{kind}: {len(times)} commands, mean of each hop, ms", ["hop", "typical", "slowest 1 %"])
-        if times:
-            rows = [(*_means(few), sum(_means(few))) for few in (typical(times), slowest(times))]
-            for number, name in enumerate((*HOPS[kind], ALL)):
-                table.add_row(name, *(figure(row[number]) for row in rows))
+        rows = [[*_means(few), sum(_means(few))] for few in (typical(times), slowest(times))]
+        for name, *row in zip((*HOPS[kind], ALL), *rows, strict=True) if times else ():
+            table.add_row(name, *map(figure, row))
         yield table
 
 
@@ -139,37 +127,25 @@ def _means(times: Times) -> list[float]:
 # -- packets on loopback
 
 
-class PacketCapture:
-    """Captures from ``with`` on; packets are read only in :meth:`passed`, which keeps the measurement undisturbed."""
+class PacketCapture(socket.socket):
+    """Captures from its construction on; packets are read only in :meth:`passed`: the measurement is not disturbed."""
 
     def __init__(self, ports: Sequence[int]) -> None:
-        self._ports = ports
-
-    def __enter__(self) -> Self:
         """Raises PebbleError without permission to capture."""
-        try:
-            self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW)  # no protocol: it receives nothing yet
-        except PermissionError:
-            raise PebbleError("--profile captures packets on loopback, which requires root: run it with sudo") from None
-        try:
-            self._listen()
-        except OSError as error:
-            self._socket.close()
-            raise PebbleError(f"--profile cannot capture on loopback: {error.strerror}; run it with sudo") from None
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._socket.close()
-
-    def _listen(self) -> None:
-        program = port_filter(self._ports)  # otherwise other programs' traffic fills the buffer
+        program = port_filter(ports)  # otherwise other programs' traffic fills the buffer
         code = ctypes.create_string_buffer(program, len(program))
         short = struct.pack("HL", len(program) // _INSTRUCTION.size, ctypes.addressof(code))
-        self._socket.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, short)
-        self._socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER)
-        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        self._socket.setblocking(False)
-        self._socket.bind(("lo", _ETH_P_IP))
+        try:
+            super().__init__(socket.AF_PACKET, socket.SOCK_RAW)  # no protocol: it receives nothing yet
+            self.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, short)
+            self.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER)
+            self.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            self.setblocking(False)
+            self.bind(("lo", _ETH_P_IP))
+        except PermissionError:
+            raise PebbleError("--profile captures packets on loopback, which requires root: run it with sudo") from None
+        except OSError as error:
+            raise PebbleError(f"--profile cannot capture on loopback: {error.strerror}; run it with sudo") from None
 
     def passed(self) -> PassageTimes:
         """All commands since the last call."""
@@ -177,7 +153,7 @@ class PacketCapture:
         found: PassageTimes = {}
         with suppress(BlockingIOError):
             while True:
-                frame, stamps, _, _ = self._socket.recvmsg(_LARGEST, 64)
+                frame, stamps, _, _ = self.recvmsg(_LARGEST, 64)
                 ns = _stamp(stamps) - offset
                 for (source, destination), wheels in commands(frame):
                     found.setdefault((source, _SOURCE), {}).setdefault(wheels, ns)

@@ -14,9 +14,11 @@ import struct
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -31,6 +33,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, Transport, Zeno
 if TYPE_CHECKING:
     from pebble.bench.comparison import Case
 
+ONE_WAY, ROUND_TRIP = "one-way", "round trip"  # measures
 REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"  # followed by the sender's name
 QOS = QoS(DRIVE.default_qos)
 _LEAD_S = 0.1  # messages at the start of a slice do not count: caches are cold after a pause
@@ -97,28 +100,26 @@ def request(number: int, t1: int, size: int) -> bytes:
 
 
 def stamped(payload: bytes, t2: int, t3: int) -> bytes:
-    """The same message with the echo's stamps, of the same length. Raises struct.error for a foreign message."""
+    """The same message with the echo's stamps, of the same length: at least :data:`SMALLEST`."""
     message = bytearray(payload)
     _ECHOED.pack_into(message, _ECHOED_AT, t2, t3)
     return bytes(message)
 
 
 def parse(payload: bytes) -> tuple[int, ...]:
-    """Number, t1, t2, t3. Raises struct.error for a foreign message."""
+    """Number, t1, t2, t3, of at least :data:`SMALLEST` bytes."""
     return _FORM.unpack_from(payload)
 
 
 # -- connections, and the two ends
 
 
-class Connection(Protocol):
-    """The connection of one end."""
+class Connection(NamedTuple):
+    """What one end does with its connection."""
 
-    def subscribe(self, filter_: str, handler: Handler) -> None: ...
-
-    def publish(self, topic: str, payload: bytes) -> None: ...
-
-    def close(self) -> None: ...
+    subscribe: Callable[[str, Handler], object]  # to a filter
+    publish: Callable[[str, bytes], object]  # to a topic
+    close: Callable[[], object]
 
 
 class Desk:
@@ -146,52 +147,39 @@ class Desk:
                 job()
 
 
-class TransportConnection:
-    """Any of Pebble's transports, used through the same calls as in pebble.service.Service."""
+def opened(transport: Transport, desk: Desk) -> Connection:
+    """Any of Pebble's transports, used through the same calls as in pebble.service.Service. Raises PebbleError."""
+    transport.open(_CONNECT_S)
+    if transport.state is not State.CONNECTED:
+        problem = transport.problem
+        transport.close()
+        raise PebbleError(f"no connection: {problem or 'no answer'}")
 
-    def __init__(self, transport: Transport, desk: Desk) -> None:
-        self._transport, self._desk = transport, desk
-        transport.open(_CONNECT_S)
-        if transport.state is not State.CONNECTED:
-            problem = transport.problem
-            transport.close()
-            raise PebbleError(f"no connection: {problem or 'no answer'}")
-
-    def subscribe(self, filter_: str, handler: Handler) -> None:
+    def subscribe(filter_: str, handler: Handler) -> None:
         def on_message(message: Message) -> None:
             received_ns = time.monotonic_ns()
-            self._desk.bring(lambda: handler(message.topic, message.payload, received_ns))
+            desk.bring(lambda: handler(message.topic, message.payload, received_ns))
 
-        self._transport.subscribe(filter_, on_message, qos=QOS, direct=True)
+        transport.subscribe(filter_, on_message, qos=QOS, direct=True)
 
-    def publish(self, topic: str, payload: bytes) -> None:
-        self._transport.publish(topic, payload, qos=QOS)
-
-    def close(self) -> None:
-        self._transport.close()
+    return Connection(subscribe, partial(transport.publish, qos=QOS), transport.close)
 
 
-class PahoConnection:
+def stock(port: int) -> Connection:
     """Stock paho with its own network thread and no socket options, as in the original program."""
+    from pebble.rig.stock_client import StockClient  # only these ends import paho
 
-    def __init__(self, port: int) -> None:
-        from pebble.rig.stock_client import StockClient  # only these ends import paho
+    client = StockClient(at_once=False).open(port)
+    client.wait()
 
-        self._client = StockClient(at_once=False).open(port)
-        self._client.wait()
-
-    def subscribe(self, filter_: str, handler: Handler) -> None:
+    def subscribe(filter_: str, handler: Handler) -> None:
         def on_message(_client: Any, _data: Any, message: Any) -> None:
             handler(message.topic, message.payload, time.monotonic_ns())
 
-        self._client.paho.on_message = on_message
-        self._client.subscribe(filter_, QOS)
+        client.paho.on_message = on_message
+        client.subscribe(filter_, QOS)
 
-    def publish(self, topic: str, payload: bytes) -> None:
-        self._client.paho.publish(topic, payload, qos=QOS)
-
-    def close(self) -> None:
-        self._client.close()
+    return Connection(subscribe, partial(client.paho.publish, qos=QOS), client.close)
 
 
 class Echo:
@@ -204,12 +192,10 @@ class Echo:
 
     def _on_message(self, topic: str, payload: bytes, _transport_ns: int) -> None:
         received = self._clock()
-        try:
+        if len(payload) >= SMALLEST:  # else a foreign message on a shared broker
             reply = stamped(payload, received, self._clock())
-        except struct.error:  # a foreign message on a shared broker
-            return
-        self._connection.publish(REPLIES + topic.removeprefix(REQUESTS), reply)
-        self.count += 1
+            self._connection.publish(REPLIES + topic.removeprefix(REQUESTS), reply)
+            self.count += 1
 
 
 class Sender:
@@ -278,10 +264,9 @@ class Sender:
 
     def _on_message(self, _topic: str, payload: bytes, transport_ns: int) -> None:
         received = self._clock()
-        try:
-            number, t1, t2, t3 = parse(payload)
-        except struct.error:
+        if len(payload) < SMALLEST:
             return
+        number, t1, t2, t3 = parse(payload)
         index = number - self._first
         if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
             self._received[index] = Exchange(t1, t2, t3, received, transport_ns)
@@ -310,7 +295,6 @@ def _echo(connection: Connection, desk: Desk) -> None:
     answer({"ready": True})
     while not ended.is_set():
         desk.turn()
-    connection.close()
 
 
 def _send(connection: Connection, desk: Desk) -> None:
@@ -326,32 +310,27 @@ def _send(connection: Connection, desk: Desk) -> None:
         raise PebbleError("the echo does not answer")
     answer({"ready": True})
     while line := lines.get():
-        answer(msgspec.json.encode(_run(sender, line)))
-    connection.close()
-
-
-def _run(sender: Sender, line: str) -> Answer:
-    sent, late, exchanges = sender.run(msgspec.json.decode(line, type=SliceSpec))
-    return Answer(
-        trips=sender.trips,
-        sent=sent,
-        late=late,
-        one_way=[(exchange.t2 - exchange.t1) / 1000 for exchange in exchanges],
-        round_trip=[(exchange.t4 - exchange.t1) / 1000 for exchange in exchanges],
-        call=[ns / 1000 for ns in sender.calls_ns],
-        transport_times=[(exchange.transport_ns - exchange.t3) / 1000 for exchange in exchanges],
-        inbox=[(exchange.t4 - exchange.transport_ns) / 1000 for exchange in exchanges],
-    )
+        sent, late, exchanges = sender.run(msgspec.json.decode(line, type=SliceSpec))
+        done = Answer(
+            trips=sender.trips,
+            sent=sent,
+            late=late,
+            one_way=[(one.t2 - one.t1) / 1000 for one in exchanges],
+            round_trip=[(one.t4 - one.t1) / 1000 for one in exchanges],
+            call=[ns / 1000 for ns in sender.calls_ns],
+            transport_times=[(one.transport_ns - one.t3) / 1000 for one in exchanges],
+            inbox=[(one.t4 - one.transport_ns) / 1000 for one in exchanges],
+        )
+        answer(msgspec.json.encode(done))
 
 
 def main(role: str, kind: str, settings: str) -> None:
     desk, form = Desk(), ZenohSettings if kind == "zenoh" else MqttSettings
     where: Any = msgspec.json.decode(settings, type=form, dec_hook=lambda _kind, text: Path(text))
     try:
-        connection = (
-            PahoConnection(where.port) if kind == "paho" else TransportConnection(create(kind, role, where), desk)
-        )
-        (_echo if role == "echo" else _send)(connection, desk)
+        paho = kind == "paho"
+        with closing(stock(where.port) if paho else opened(create(kind, role, where), desk)) as connection:
+            (_echo if role == "echo" else _send)(connection, desk)
     except PebbleError as error:
         sys.exit(str(error))
 

@@ -24,17 +24,18 @@ from rich.console import Console
 from pebble.bench.aims import single
 from pebble.bench.comparison import Case, Combine, Run, of_known
 from pebble.bench.control_ends import (
+    ROUND_TRIP,
     Clock,
+    Connection,
     Desk,
     Echo,
     Exchange,
     Sender,
     SliceSpec,
-    TransportConnection,
+    opened,
     rate_name,
     size_name,
 )
-from pebble.bench.control_report import ROUND_TRIP
 from pebble.bench.results import Cell, Value
 from pebble.bench.tables import Column, Grid, figure
 from pebble.errors import PebbleError
@@ -66,12 +67,8 @@ def settings_of(url: str, password_file: Path | None, ca_cert: Path | None) -> M
 
 def wall_clock() -> Clock:
     """Wall-clock time, ns, that is neither set nor slewed from now on: NTP may slew CLOCK_MONOTONIC by 500 ppm."""
-    since = time.time_ns() - _quartz_ns()
-    return lambda: _quartz_ns() + since
-
-
-def _quartz_ns() -> int:
-    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+    since = time.time_ns() - time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+    return lambda: time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW) + since
 
 
 def serve(settings: MqttSettings, clock: Clock | None = None) -> int:
@@ -83,14 +80,12 @@ def serve(settings: MqttSettings, clock: Clock | None = None) -> int:
         with console.status("") as status:
             while True:
                 status.update(f"echo {through}, {echo.count} messages so far; Ctrl-C ends it")
-                end = time.monotonic() + _POLL_S
-                while (left := end - time.monotonic()) > 0:
-                    desk.turn(left)
+                desk.turn(_POLL_S)
 
 
-def _connection(settings: MqttSettings, what: str, desk: Desk) -> TransportConnection:
+def _connection(settings: MqttSettings, what: str, desk: Desk) -> Connection:
     """Opens a connection with a client id of its own: several runs may share one broker."""
-    return TransportConnection(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings), desk)
+    return opened(create("mqtt", f"bench-{what}-{secrets.token_hex(4)}", settings), desk)
 
 
 # -- the offset of the clocks
@@ -169,12 +164,11 @@ def measure(case: Case) -> Iterator[Cell]:
 
     Round trips are without the processing time of the echo, so that the two one-way times add up to them.
     """
-    sender: Sender = case.env
-    sent, late, exchanges = sender.run(SliceSpec.of(case))
+    sent, late, exchanges = case.env.run(SliceSpec.of(case))
     trips = [(one.t4 - one.t1 - (one.t3 - one.t2)) / 1e6 for one in exchanges]
     yield case.cell(ROUND_TRIP, "ms", trips, sent=sent, late=late)
-    ways: list[tuple[int, int]] = []
     clocks: dict[str, Any] = {"clock_offset_ms": None, "clock_error_ms": None}
+    ways: list[tuple[int, int]] = []
     try:
         offset = estimate(exchanges)
     except PebbleError:  # too few, or a clock was set: the round trips are still valid
@@ -199,17 +193,14 @@ def derived(cells: list[Cell]) -> list[Cell]:
 
     One-way times that it exceeds are unknown.
     """
-    return [cell if cell.measure == ROUND_TRIP else _with_error(cell) for cell in cells]
-
-
-def _with_error(cell: Cell) -> Cell:
-    error = _ERROR_MS(cell)
-    known = cell.percentile(50) > error  # False if either is NaN
-    return replace(
-        cell,
-        params={**cell.params, "clocks": f"± {figure(error)} ms"},
-        rounds=cell.rounds if known else [[] for _ in cell.rounds],
-    )
+    return [
+        cell if cell.measure == ROUND_TRIP else replace(
+            cell,
+            params={**cell.params, "clocks": f"± {figure(_ERROR_MS(cell))} ms"},
+            rounds=[one if cell.percentile(50) > _ERROR_MS(cell) else [] for one in cell.rounds],  # NaN: unknown
+        )
+        for cell in cells
+    ]  # fmt: skip
 
 
 def _both(cell: Cell) -> str:

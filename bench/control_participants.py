@@ -1,11 +1,20 @@
-"""The variants of the control comparison and their processes: brokers and hubs, two ends for each role, and loads."""
+"""The variants of the control comparison and their processes: brokers and hubs, two ends for each role, and loads.
+
+A load is a process that standard input switches on and off: ``python -m pebble.bench.control_participants
+hog|writer|reader [mqtt|zenoh-shm WHERE]``, a busy loop, or one end of a stream of raw 640x480 pictures at 30 Hz, as in
+``pebble bench frames``. Line ``1`` switches it on, ``0`` off, ``?`` does nothing; each is answered with the number of
+pictures so far.
+"""
 
 from __future__ import annotations
 
+import sys
+import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -16,14 +25,25 @@ from pebble.errors import PebbleError
 from pebble.rig.broker import Broker
 from pebble.rig.processes import BROKERS, Processes, python
 from pebble.rig.programs import Program, Worker
+from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.transports.settings import MqttSettings, ZenohSettings
 
+if TYPE_CHECKING:
+    from pebble.bench.frames_worker import Reader, Writer
+
 NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
+_ENDS, _LOADS = "pebble.bench.control_ends", "pebble.bench.control_participants"
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
 _FLOWING = 3  # pictures received until the stream counts as flowing
 _FLOW_S = 10.0
 _POLL_S = 0.02
+PICTURES_HZ = 30.0  # as in bench/frames_worker.py
+_PICTURE = 640 * 480 * 3  # bytes
+_READ_S = 0.2
+_ALIVE_S = 0.01  # of reading while off: the client's network loop must run to stay connected
+_EVERY = 64  # bytes: one in each cache line is read
+_REST_S = 1.0  # between two runs of the network loop while off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,66 +70,69 @@ BASELINE = "mqtt"
 P2P, HUB = "zenoh-p2p", "zenoh-hub"
 MQTT = tuple(name for name, variant in VARIANTS.items() if variant.kind != "zenoh")
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Slice:
-    """Results of one slice of one role; CPU in % of one core, wake-ups per round trip."""
-
-    answer: Answer
-    cpu: float
-    backbone_cpu: float
-    wake_ups: float
-    backbone_wake_ups: float
-    pictures_hz: float | None = None
+Usage = dict[str, float | None]
+"""By name, as in the results: CPU in % of one core, wake-ups per round trip, pictures per second."""
 
 
 class Participant:
     """The processes of one role: the broker of an MQTT variant or the hub of a Zenoh one, two ends, and a stream."""
 
     def __init__(self, role: str, folder: Path, processes: Processes) -> None:
-        self.role, self._processes = role, processes
+        self._role, self._processes = role, processes
         self._variant, self._run_dir = VARIANTS[variant_of(role)], folder / "z"
-        self._broker: Broker | None = None
+        self._backbone: Program
         if self._variant.kind == "zenoh":
             command = python("pebble.runtime.hub", _json(ZenohSettings(run_dir=self._run_dir)))
             self._backbone = processes.add(Program("hub", command, folder / "hub.log"), BROKERS)
         else:
-            self._backbone = self._broker = processes.broker(extra=self._variant.broker, folder=folder)
-        self.ends: list[Worker] = []  # echo, sender
+            self._backbone = processes.broker(extra=self._variant.broker, folder=folder)
+        self._ends: list[Worker] = []  # echo, sender
         self.media: list[Worker] = []  # reader, writer
 
     def start(self, *, media: bool) -> None:
         """Starts the other processes as soon as the broker or hub is ready."""
         settings: MqttSettings | ZenohSettings
-        if self._broker is None:
+        if isinstance(self._backbone, Broker):
+            self._backbone.wait()
+            settings = MqttSettings(host="127.0.0.1", port=self._backbone.port, protocol=self._variant.protocol)
+            stream = ("mqtt", str(self._backbone.port))
+        else:
             self._backbone.wait_until((self._run_dir / "hub.sock").exists, _READY_S)
             settings = ZenohSettings(run_dir=self._run_dir, client=self._variant.client)
             stream = ("zenoh-shm", str(self._run_dir))
-        else:
-            self._broker.wait()
-            settings = MqttSettings(host="127.0.0.1", port=self._broker.port, protocol=self._variant.protocol)
-            stream = ("mqtt", str(self._broker.port))
         where = (self._variant.kind, _json(settings))
-        self.ends = [self._worker(end, "control_ends", *where) for end in ("echo", "sender")]
+        self._ends = [self._worker(end, _ENDS, *where) for end in ("echo", "sender")]
         if media:
-            self.media = [self._worker(end, "control_load", *stream) for end in ("reader", "writer")]
-
-    def run(self, spec: SliceSpec) -> Slice:
-        """Runs one slice; returns the sender's answer and the resource usage of the ends and the backbone."""
-        every = ([worker.pid for worker in self.ends], [self._backbone.pid])
-        began, before = time.monotonic(), [(cpu_s(pids), wake_ups(pids)) for pids in every]
-        answer = msgspec.convert(self.ends[1].ask(_json(spec), spec.seconds + _ANSWER_S), Answer)
-        took = time.monotonic() - began
-        (cpu, woken), (backbone_cpu, backbone_woken) = (
-            (100 * (cpu_s(pids) - cpu_before) / took, (wake_ups(pids) - woken_before) / answer.trips)
-            for pids, (cpu_before, woken_before) in zip(every, before, strict=True)
-        )
-        return Slice(
-            answer=answer, cpu=cpu, backbone_cpu=backbone_cpu, wake_ups=woken, backbone_wake_ups=backbone_woken
-        )
+            self.media = [self._worker(end, _LOADS, *stream) for end in ("reader", "writer")]
 
     def _worker(self, end: str, module: str, *arguments: str) -> Worker:
-        return self._processes.worker(f"{self.role}: {end}", f"pebble.bench.{module}", end, *arguments)
+        return self._processes.worker(f"{self._role}: {end}", module, end, *arguments)
+
+    def run(self, spec: SliceSpec) -> tuple[Answer, Usage]:
+        """Runs one slice; returns the sender's answer, and what the two ends and the backbone used meanwhile."""
+        used: Usage = {}
+        every = {"": [worker.pid for worker in self._ends], "broker_": [self._backbone.pid]}
+        began, before = time.monotonic(), {name: (cpu_s(pids), wake_ups(pids)) for name, pids in every.items()}
+        answer = msgspec.convert(self._ends[1].ask(_json(spec), spec.seconds + _ANSWER_S), Answer)
+        took = time.monotonic() - began
+        for name, pids in every.items():
+            cpu_before, woken_before = before[name]
+            used[f"{name}cpu_percent"] = 100 * (cpu_s(pids) - cpu_before) / took
+            used[f"{name}wake_ups"] = (wake_ups(pids) - woken_before) / answer.trips
+        return answer, used
+
+    def flowing(self) -> int:
+        """Waits until some pictures have arrived; returns their number so far. Raises PebbleError after a timeout."""
+        enough, end = self.pictures() + _FLOWING, time.monotonic() + _FLOW_S
+        while (count := self.pictures()) < enough:
+            if time.monotonic() > end:
+                raise PebbleError(f"{self._role}: no pictures flow after {_FLOW_S:.0f} s")
+            time.sleep(_POLL_S)
+        return count
+
+    def pictures(self) -> int:
+        """How many pictures the reader has received so far."""
+        return int(self.media[0].ask("?", _FLOW_S)["pictures"])
 
 
 class Participants(Processes):
@@ -121,22 +144,22 @@ class Participants(Processes):
         self._participants: dict[str, Participant] = {}
         self._hogs: list[Worker] = []
 
-    def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
+    def run(self, role: str, spec: SliceSpec, load: str) -> tuple[Answer, Usage]:
         """Runs one slice. Raises PebbleError if a process ended, or pictures do not flow."""
         participant = self._participants[role]
         busy = {NONE: [], MEDIA: participant.media, HOG: self._hogs}[load]
         try:
             for worker in busy:
-                _switch_load(worker, "1")
+                worker.ask("1", _FLOW_S)
             if load != MEDIA:
                 return participant.run(spec)
-            before, began = _flowing(participant), time.monotonic()
-            slice_ = participant.run(spec)
-            pictures, took = _switch_load(participant.media[0], "?") - before, time.monotonic() - began
-            return replace(slice_, pictures_hz=pictures / took)
+            before, began = participant.flowing(), time.monotonic()
+            answer, used = participant.run(spec)
+            pictures, took = participant.pictures() - before, time.monotonic() - began
+            return answer, {**used, "pictures_hz": pictures / took}
         finally:
             for worker in reversed(busy):  # first the writer, then the reader
-                _switch_load(worker, "0")
+                worker.ask("0", _FLOW_S)
 
     def start(self) -> None:
         for number, role in enumerate(self._roles):
@@ -146,26 +169,90 @@ class Participants(Processes):
         for participant in self._participants.values():
             participant.start(media=MEDIA in self._loads)
         if HOG in self._loads:
-            self._hogs = [self.worker("hog", "pebble.bench.control_load", "hog")]
+            self._hogs = [self.worker("hog", _LOADS, "hog")]
         for worker in self.workers:
             worker.answer(_READY_S)
 
 
-def _switch_load(worker: Worker, line: str) -> int:
-    """Sends a command to a load process; returns its count of pictures so far."""
-    return int(worker.ask(line, _FLOW_S)["pictures"])
-
-
-def _flowing(participant: Participant) -> int:
-    """Waits until some pictures have arrived; returns their number so far. Raises PebbleError after a timeout."""
-    reader = participant.media[0]
-    enough, end = _switch_load(reader, "?") + _FLOWING, time.monotonic() + _FLOW_S
-    while (count := _switch_load(reader, "?")) < enough:
-        if time.monotonic() > end:
-            raise PebbleError(f"{participant.role}: no pictures flow after {_FLOW_S:.0f} s")
-        time.sleep(_POLL_S)
-    return count
-
-
 def _json(what: MqttSettings | ZenohSettings | SliceSpec) -> str:
     return msgspec.json.encode(what, enc_hook=str).decode()
+
+
+# -- a load as a process
+
+
+class Switch:
+    """Switches the load as standard input requests, and answers with the number of pictures."""
+
+    def __init__(self) -> None:
+        self.pictures = 0
+        self._on = threading.Event()
+        self.wait = self._on.wait  # until it is on, or standard input closes
+        self._ended = serve_on_thread(self._handle, self._on.set)
+        answer({"pictures": 0})  # it is ready
+
+    @property
+    def ended(self) -> bool:
+        return self._ended.is_set()
+
+    @property
+    def on(self) -> bool:
+        return self._on.is_set() and not self.ended
+
+    def _handle(self, line: str) -> dict[str, Any]:
+        if line == "1":
+            self._on.set()
+        elif line == "0":
+            self._on.clear()
+        return {"pictures": self.pictures}
+
+
+def hog(switch: Switch) -> None:
+    while not switch.ended:
+        switch.wait()
+        while switch.on:
+            pass
+
+
+def write(writer: Writer, switch: Switch) -> None:
+    import numpy as np  # only the processes of a stream need it
+
+    picture = np.random.default_rng(1).integers(0, 256, _PICTURE, dtype=np.uint8)
+    while not switch.ended:
+        switch.wait()
+        due = time.monotonic()
+        while switch.on:
+            frame = writer.begin()
+            if frame is not None:
+                np.copyto(frame, picture)
+                writer.send()
+                switch.pictures += 1
+            del frame
+            due += 1 / PICTURES_HZ
+            time.sleep(max(0.0, due - time.monotonic()))
+    writer.close()
+
+
+def read(reader: Reader, switch: Switch) -> None:
+    while not switch.ended:
+        switch.wait(_REST_S)
+        frame = reader.read(_READ_S if switch.on else _ALIVE_S)
+        if frame is not None:
+            switch.pictures += bool(frame[::_EVERY].any())
+            del frame
+            reader.done()
+    reader.close()
+
+
+def main(role: str, kind: str = "", where: str = "") -> None:
+    if role == "hog":
+        return hog(Switch())
+    from pebble.bench import frames_worker
+
+    if role == "writer":
+        return write(frames_worker.writer(kind, where, _PICTURE), Switch())
+    return read(frames_worker.reader(kind, where), Switch())
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -50,38 +51,33 @@ class Reading:
 
 
 def measure(case: Case) -> Iterator[Cell]:
-    """All phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
     for reading in read(case.variant, case.run["seconds"]):
         yield from cells_of(case, reading)
 
 
 def read(kind: str, seconds: float) -> Iterator[Reading]:
+    """All phases of a fresh robot. Raises PebbleError with its log if a phase does not start."""
     with ready_robot(kind) as (robot, subscriber):
         yield _read(robot, subscriber, IDLE, seconds)
         with driving(robot.remote_port, BASE):
             yield _read(robot, subscriber, DRIVING, seconds)
-        for name in STREAMS:
+        for name, forms in STREAMS.items():
             if name == _WITHOUT_AV or _has_av():
-                _start_streams(robot, subscriber, name)
+                subscriber.ask_for(*forms)
+                due = {form: subscriber.arrived[form] + _FIRST for form in forms}
+                robot.expect(partial(_flows, robot, subscriber, due), f"{name} does not flow", _FLOW_S)
                 yield _read(robot, subscriber, name, seconds)
 
 
-def _start_streams(robot: Robot, subscriber: RobotSubscriber, name: str) -> None:
-    subscriber.ask_for(*STREAMS[name])
-    due = {form: subscriber.arrived[form] + _FIRST for form in STREAMS[name]}
-    robot.expect(
-        lambda: all(subscriber.arrived[form] >= count for form, count in due.items()) and robot.complete(),
-        f"{name} does not flow",
-        _FLOW_S,
-    )
+def _flows(robot: Robot, subscriber: RobotSubscriber, due: Mapping[str, int]) -> bool:
+    return all(subscriber.arrived[form] >= count for form, count in due.items()) and robot.complete()
 
 
 def _read(robot: Robot, subscriber: RobotSubscriber, phase: str, seconds: float) -> Reading:
     """Measures the robot's processes for some seconds; memory is read afterwards."""
     time.sleep(_STARTUP_S)
-    processes = robot.processes()
+    processes, form = robot.processes(), STREAMS.get(phase, ("no pictures",))[0]
     before = {name: cpu_s([pid]) for name, pid in processes.items()}
-    form, *_ = STREAMS.get(phase, ("no pictures",))
     pictures, began = subscriber.arrived[form], time.monotonic()
     time.sleep(seconds)
     took = time.monotonic() - began

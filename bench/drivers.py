@@ -74,62 +74,52 @@ def driving(port: int, *bases: str) -> Iterator[Driver]:
         yield driver
 
 
-class FleetOperator(StockClient):
-    """Drives all robots of a fleet in :data:`STEPS`, and subscribes to all heartbeats."""
+def drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -> None:
+    """Drives a whole fleet in :data:`STEPS`, and subscribes to all heartbeats. Times are CLOCK_MONOTONIC, ns."""
+    bases = [Identity("pebble", "robots", name).base for name in ids]
+    heartbeats = {ONLINE.topic(base): array("q") for base in bases}
 
-    def __init__(self, port: int, ids: Sequence[str]) -> None:
-        bases = [Identity("pebble", "robots", name).base for name in ids]
-        self._drives = [DRIVE.topic(base) for base in bases]
-        self._index = {ONLINE.topic(base): number for number, base in enumerate(bases)}
-        self.heartbeats = [array("q") for _ in ids]  # CLOCK_MONOTONIC, ns
-        self.late = 0  # commands that were not sent in time
-        super().__init__(self._on_message, [(topic, 0) for topic in self._index], in_flight=MANY)
-        self.open(port)
-
-    def wait_until_online(self) -> int:
-        """Waits until all robots are online, or for a timeout; returns how many are."""
-        end = time.monotonic() + _ONLINE_S
-        while not all(self.heartbeats) and time.monotonic() < end:
-            time.sleep(_POLL_S)
-        return sum(map(bool, self.heartbeats))
-
-    def drive(self, seconds: float, rate_hz: float) -> list[list[int]]:
-        """Drives; returns when (CLOCK_MONOTONIC, ns) each robot's commands were published; n is STEPS[n % 8]."""
-        sent: list[list[int]] = [[] for _ in self._drives]
-        gap = 1 / rate_hz / len(self._drives)
-        bodies = [json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}) for left, right in STEPS]
-        began = time.monotonic()
-        for number in range(round(seconds * rate_hz) * len(self._drives)):
-            step, robot = divmod(number, len(self._drives))
-            left = began + number * gap - time.monotonic()
-            if left > 0:
-                time.sleep(left)
-            elif left < -1 / rate_hz:
-                self.late += 1
-            sent[robot].append(time.monotonic_ns())
-            self.paho.publish(self._drives[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
-        return sent
-
-    def _on_message(self, message: MQTTMessage) -> None:
+    def receive(message: MQTTMessage) -> None:
         if not message.retain and b"true" in message.payload:
-            self.heartbeats[self._index[message.topic]].append(time.monotonic_ns())
+            heartbeats[message.topic].append(time.monotonic_ns())
+
+    client = StockClient(receive, [(topic, 0) for topic in heartbeats], in_flight=MANY).open(port)
+    end = time.monotonic() + _ONLINE_S
+    while not all(heartbeats.values()) and time.monotonic() < end:
+        time.sleep(_POLL_S)
+    answer({"online": sum(map(bool, heartbeats.values()))})
+    began = time.monotonic_ns()
+    sent, late = _send_steps(client, [DRIVE.topic(base) for base in bases], seconds, rate_hz)
+    ended = time.monotonic_ns()
+    received = [[ns for ns in robot if began <= ns <= ended] for robot in heartbeats.values()]
+    answer({"began": began, "ended": ended, "late": late, "sent": sent, "heartbeats": received})
+    client.close()
 
 
-def _drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -> None:
-    serve_on_thread(lambda _line: None, lambda: os._exit(0))
-    with closing(FleetOperator(port, ids)) as operator:
-        answer({"online": operator.wait_until_online()})
-        began = time.monotonic_ns()
-        sent = operator.drive(seconds, rate_hz)
-        ended = time.monotonic_ns()
-        heartbeats = [[ns for ns in robot if began <= ns <= ended] for robot in operator.heartbeats]
-        answer({"began": began, "ended": ended, "late": operator.late, "sent": sent, "heartbeats": heartbeats})
+def _send_steps(
+    client: StockClient, topics: Sequence[str], seconds: float, rate_hz: float
+) -> tuple[list[list[int]], int]:
+    """When each robot's commands were published, n is STEPS[n % 8]; and how many were not sent in time."""
+    sent: list[list[int]] = [[] for _ in topics]
+    late, gap = 0, 1 / rate_hz / len(topics)
+    bodies = [json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}) for left, right in STEPS]
+    began = time.monotonic()
+    for number in range(round(seconds * rate_hz) * len(topics)):
+        step, robot = divmod(number, len(topics))
+        left = began + number * gap - time.monotonic()
+        if left > 0:
+            time.sleep(left)
+        late += left < -1 / rate_hz
+        sent[robot].append(time.monotonic_ns())
+        client.paho.publish(topics[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
+    return sent, late
 
 
 def main(port: str, *fleet: str) -> None:
     if fleet:
         seconds, rate_hz, *ids = fleet
-        _drive_fleet(int(port), float(seconds), float(rate_hz), ids)
+        serve_on_thread(lambda _line: None, lambda: os._exit(0))
+        drive_fleet(int(port), float(seconds), float(rate_hz), ids)
     else:
         with driving(int(port)) as driver:
             serve(lambda line: driver.choose(tuple(line.split())))

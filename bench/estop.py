@@ -1,38 +1,51 @@
 """Measures the emergency stop: until the wheels are at rest, until every motor owner has confirmed it, and a hold.
 
 Two Linux robots, one on each local transport, and a fleet of boards with Wi-Fi share one remote broker. Each is driven
-all the time by a process of its own; stops and resets come from this one. Real processes, stock mosquitto, loopback.
+all the time by a process of its own; this one stops and resets them with the code that ``pebble estop`` is made of.
+Real processes, stock mosquitto, loopback.
 """
 
 from __future__ import annotations
 
 import os
 import random
+import subprocess
+import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+from pebble.bench import drivers
 from pebble.bench.aims import Aim, outcome, with_lost
 from pebble.bench.comparison import Budget, Comparison, Option, Round, Run, rounds
-from pebble.bench.drivers import RATE_HZ
-from pebble.bench.estop_operator import StopOperator
 from pebble.bench.fleet import read_moves
 from pebble.bench.pictures import ecdf
 from pebble.bench.results import Cell, Judged, Value
 from pebble.bench.tables import COUNT, Claims, Grid, figure, percentile_column
+from pebble.client.connection import Listener, Target, connected
+from pebble.client.discovery import ALL_OUTGOING
+from pebble.client.estop import StopSender, new_name
+from pebble.client.estop_states import Reset, RobotEstop
+from pebble.contract import CAPABILITIES, DRIVE, ESTOP_STATE
+from pebble.contract import ESTOP as ESTOP_COMMAND
 from pebble.errors import PebbleError
 from pebble.rig.processes import Processes
 from pebble.rig.robot import KINDS, Robot
+from pebble.rig.stock_client import StockClient
 from pebble.simulation.fleet import MOST, Moved, members
+from pebble.transports import Message, Transport
 
 REST, CONFIRMED, HOLD, WIRE = MEASURES = ("wheels at rest", "confirmed", "latched under a hold", "first stop sent")
 STOP, COMMAND, ZERO = "emergency stop", "pebble estop", "plain zero"
 ALL, BOARD = "all together", "board"
+_BY = "bench"
 _STARTED_S = 90.0  # boards start one after the other
 _CONFIRMED_S = 10.0
 _MOVING_S = 10.0
+_ANSWER_S, _COMMAND_S = 5.0, 30.0
 _WATCH_S = 0.3  # after a stop, while driving goes on; the fleet writes its trace ten times a second
 _POLL_S = 0.05
+_LONGEST_WAIT_S = 0.25
 _QUIET_S = 0.8  # after a reset: motor owners publish few states a second, so a stop at once is confirmed later
 
 
@@ -61,10 +74,60 @@ def sample(measure: str, robot: str, variant: str, began: int, ended: int | None
     return Cell(variant=variant, params={"robot": robot}, measure=measure, unit="ms", rounds=[ms], figures=more)
 
 
+class Stop:
+    """One emergency stop over a connection that is open, from its construction on.
+
+    Times are CLOCK_MONOTONIC, ns. A robot that has not confirmed it is missing.
+    """
+
+    def __init__(self, transport: Transport, robots: Collection[str] | None, *, hold: bool = False) -> None:
+        """``robots`` None: all, which are found as ``--all`` finds them."""
+        self._transport = transport
+        self.received: dict[str, int] = {}  # when each robot's first message arrived
+        self.latched: dict[str, int] = {}  # when the first state arrived that says so
+        self.confirmed: dict[str, int] = {}
+        self.began = time.monotonic_ns()
+        self._sender = StopSender(new_name(), by=_BY, why="", now=self.began / 1e9, robots=robots, hold=hold)
+        self._publish()
+        channels = (ESTOP_STATE, CAPABILITIES)
+        filters = [ALL_OUTGOING] if robots is None else [one.filter(base) for one in channels for base in robots]
+        self._listener = Listener(transport, filters)
+
+    def wait_until_confirmed(self, robots: Collection[str], timeout: float) -> None:
+        """Send and receive until these robots have confirmed it. Raises PebbleError after ``timeout`` seconds."""
+        end = time.monotonic() + timeout
+        while not self.confirmed.keys() >= {*robots}:
+            if time.monotonic() > end:
+                missing = [f"{base}: {robot.why}" for base, robot in self._sender.robots.items() if robot.why]
+                raise PebbleError(f"a stop was not confirmed within {timeout:.0f} s: {'; '.join(missing)}")
+            due = self._sender.due
+            left = _LONGEST_WAIT_S if due is None else min(_LONGEST_WAIT_S, due - time.monotonic())
+            while (message := self._listener.next(left)) is not None:
+                self._receive(message, time.monotonic_ns())
+                left = 0.0
+            self._publish()
+
+    def _receive(self, message: Message, now: int) -> None:
+        self._sender.receive(message, now / 1e9)
+        base = message.topic.partition("/outgoing/")[0]
+        robot = self._sender.robots.get(base)
+        if robot is not None:
+            self.received.setdefault(base, now)
+            if robot.estop.latched:
+                self.latched.setdefault(base, now)
+            if robot.confirmed_s is not None:
+                self.confirmed.setdefault(base, now)
+
+    def _publish(self) -> None:
+        for message in self._sender.tick(time.monotonic()):
+            self._transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
+
+
 class Robots(Processes):
     """Two Linux robots, one of each kind, and boards; who drives and stops them, and each way of stopping, measured.
 
-    Each measurement ends with the stopped robots reset.
+    Each measurement ends with the stopped robots reset. Every stop has a connection of its own, which is open before it
+    begins.
     """
 
     def __init__(self, boards: int) -> None:
@@ -77,47 +140,57 @@ class Robots(Processes):
         """Starts what the robots need. Raises PebbleError if a process does not start."""
         broker = self.broker("remote")
         broker.wait()
-        self._port, self._operator = broker.port, StopOperator(broker.port)
+        self._port, self._target = broker.port, Target(url=f"mqtt://127.0.0.1:{broker.port}")
         for kind in KINDS:
             name, folder = f"rover-{kind}", self.folder / kind
-            robot = Robot(self, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
-            robot.prepare()
-            self._linux[kind] = robot
+            self._linux[kind] = Robot(self, kind, ("127.0.0.1", broker.port), name=name, folder=folder)
+            self._linux[kind].prepare()
         self._driver = self.worker("driver", "pebble.bench.drivers", broker.port)
 
-    def hold_linux(self) -> Iterator[Cell]:
-        """Launch the Linux robots, one after the other, while a stop of all robots is held."""
-        with self._operator.stop(None, hold=True) as stop:
-            for kind, robot in self._linux.items():
-                robot.launch()
-                stop.wait_until_confirmed([robot.base], _STARTED_S)
-                yield sample(HOLD, kind, STOP, stop.received[robot.base], stop.latched[robot.base])
-        self._reset(self._linux_bases)
+    # -- what is measured
 
-    def hold_boards(self) -> Iterator[Cell]:
-        """Start all boards while a stop of all robots is held."""
-        with self._operator.stop(None, hold=True) as stop:
-            where = ("--broker", f"127.0.0.1:{self._port}", "--trace", self._trace)
-            self.robot("the fleet", "pebble.simulation.fleet_program", "--robots", len(self._boards), *where)
-            stop.wait_until_confirmed(self._bases, _STARTED_S)
-            for base in self._boards.values():
-                yield sample(HOLD, BOARD, STOP, stop.received[base], stop.latched[base])
-        self._reset(self._bases)
+    def hold(self, *, boards: bool = False) -> Iterator[Cell]:
+        """Start the Linux robots one after the other, or all boards, while a stop of all robots is held."""
+        started: list[tuple[str, Callable[[], object], list[str]]]
+        started = [(kind, robot.launch, [robot.base]) for kind, robot in self._linux.items()]
+        if boards:
+            started = [(BOARD, self._start_boards, [*self._boards.values()])]
+        with connected(self._target) as (transport, _):
+            stop = Stop(transport, None, hold=True)
+            for kind, start, bases in started:
+                start()
+                stop.wait_until_confirmed(bases, _STARTED_S)
+                for base in bases:
+                    yield sample(HOLD, kind, STOP, stop.received[base], stop.latched[base])
+        self._reset(self._bases if boards else self._linux_bases)
 
     def stop_one(self, kind: str) -> Iterator[Cell]:
-        """Stop a driven robot by an emergency stop, and by a plain zero."""
+        """Stop a driven robot by an emergency stop, and by a plain zero as a stock client sends it."""
         base = self._linux[kind].base
         yield from self._stop(kind, [base], [base])
         self._drive([base])
-        yield self._rest(kind, ZERO, [base], self._operator.zero(base))
+        client = StockClient(at_once=False).open(self._port)
+        client.wait()
+        began = time.monotonic_ns()
+        client.paho.publish(DRIVE.topic(base), drivers.ZERO, qos=DRIVE.default_qos).wait_for_publish(_ANSWER_S)
+        client.close()
+        yield self._rest(kind, ZERO, [base], began)
         self._release([base])
 
     def stop_by_command(self, kind: str) -> Iterator[Cell]:
         """Stop a driven robot by the shell command; times begin with the start of its process."""
-        base = self._linux[kind].base
+        base, received = self._linux[kind].base, list[int]()
+        words = [sys.executable, "-m", "pebble.cli", "estop", base, "--url", str(self._target.url)]
         self._drive([base])
-        began, received, ended = self._operator.command(base)
-        yield sample(WIRE, kind, COMMAND, began, received)
+        with connected(self._target) as (transport, _):
+            topic = ESTOP_COMMAND.topic(base)
+            transport.subscribe(topic, lambda _message: received.append(time.monotonic_ns()), direct=True)
+            began = time.monotonic_ns()
+            done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=_COMMAND_S)
+            ended = time.monotonic_ns()
+        if done.returncode or not received:
+            raise PebbleError(f"pebble estop ended with code {done.returncode}: {done.stdout}{done.stderr}")
+        yield sample(WIRE, kind, COMMAND, began, received[0])
         yield self._rest(kind, COMMAND, [base], began)
         yield sample(CONFIRMED, kind, COMMAND, began, ended)
         self._reset([base])
@@ -129,11 +202,14 @@ class Robots(Processes):
     def _stop(self, robot: str, bases: Sequence[str], named: Sequence[str] | None) -> Iterator[Cell]:
         """Stop these driven robots by one emergency stop that names them, or all."""
         self._drive(bases)
-        with self._operator.stop(named) as stop:
+        with connected(self._target) as (transport, _):
+            stop = Stop(transport, named)
             stop.wait_until_confirmed(bases, _CONFIRMED_S)
         yield self._rest(robot, STOP, bases, stop.began)
         yield sample(CONFIRMED, robot, STOP, stop.began, max(stop.confirmed[base] for base in bases))
         self._reset(bases)
+
+    # -- how
 
     @property
     def _linux_bases(self) -> list[str]:
@@ -143,11 +219,15 @@ class Robots(Processes):
     def _bases(self) -> list[str]:
         return [*self._linux_bases, *self._boards.values()]
 
+    def _start_boards(self) -> None:
+        where = ("--broker", f"127.0.0.1:{self._port}", "--trace", self._trace)
+        self.robot("the fleet", "pebble.simulation.fleet_program", "--robots", len(self._boards), *where)
+
     def _drive(self, bases: Sequence[str]) -> None:
         """Drive these robots from now on; returns at a random moment after all of them move."""
         self._driver.send(" ".join(bases))
         self._wait_until(bases, moving=True)
-        time.sleep(random.random() / RATE_HZ)  # noqa: S311  (no secret)
+        time.sleep(random.random() / drivers.RATE_HZ)  # noqa: S311  (no secret)
 
     def _release(self, bases: Sequence[str]) -> None:
         """Drive no robot."""
@@ -155,8 +235,17 @@ class Robots(Processes):
         self._wait_until(bases, moving=False)
 
     def _reset(self, bases: Sequence[str]) -> None:
+        """Let these robots, which are stopped, move again. Raises PebbleError if one does not confirm it."""
         self._release(bases)
-        self._operator.reset(bases)
+        robots = [RobotEstop(base) for base in bases]
+        with connected(self._target) as (transport, _):
+            for robot in robots:
+                robot.subscribe(transport)
+            _wait(lambda: all(robot.has_capabilities and robot.latched for robot in robots), "no stop to reset")
+            resets = [Reset(robot, _BY) for robot in robots]
+            for message in (message for reset in resets for message in reset.messages()):
+                transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
+            _wait(lambda: all(reset.free for reset in resets), "a reset was not obeyed")
         time.sleep(_QUIET_S)
 
     def _wait_until(self, bases: Sequence[str], *, moving: bool) -> None:
@@ -187,11 +276,19 @@ class Robots(Processes):
         return moves | {base: changes.get(name, []) for name, base in boards.items()}
 
 
+def _wait(condition: Callable[[], bool], problem: str) -> None:
+    end = time.monotonic() + _ANSWER_S
+    while not condition():
+        if time.monotonic() > end:
+            raise PebbleError(f"{problem} within {_ANSWER_S:.0f} s")
+        time.sleep(_POLL_S)
+
+
 def measure(round_: Round) -> Iterator[Cell]:
     """One round, with processes of its own. Raises PebbleError."""
     run, env = round_.run, round_.env
     run.show("Linux robots start while a stop is held")
-    yield from env.hold_linux()
+    yield from env.hold()
     for number in range(run["stops"]):
         run.show(f"stop {number + 1} of {run['stops']} of one robot")
         for kind in KINDS[:: -1 if number % 2 else 1]:
@@ -201,7 +298,7 @@ def measure(round_: Round) -> Iterator[Cell]:
         yield from env.stop_by_command(kind)
     if run["boards"]:
         run.show(f"{run['boards']} boards start while a stop is held")
-        yield from env.hold_boards()
+        yield from env.hold(boards=True)
     for number in range(run["all_stops"]):
         run.show(f"stop {number + 1} of {run['all_stops']} of all robots")
         yield from env.stop_all()
@@ -259,7 +356,7 @@ ESTOP = Comparison(
     ),
     full=Budget(600, rounds=10, boards=50, stops=12, all_stops=3),
     quick=Budget(90, rounds=2, stops=3, all_stops=2),
-    constants={"rate_hz": RATE_HZ},
+    constants={"rate_hz": drivers.RATE_HZ},
     prepare=prepare,
     environment=lambda run: Robots(run["boards"]),
     measure_round=measure,

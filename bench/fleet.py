@@ -17,7 +17,7 @@ import msgspec
 from pebble.bench.comparison import Budget, Case, Comparison, Option, seconds
 from pebble.bench.drivers import STEPS
 from pebble.bench.pictures import ecdf
-from pebble.bench.results import Cell, percentile, rounded
+from pebble.bench.results import Cell, grouped, percentile, rounded
 from pebble.bench.tables import COUNT, Grid, percentile_column, single_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.rig.processes import Processes
@@ -93,12 +93,9 @@ def _is(moved: Moved, step: tuple[int, int]) -> bool:
 
 
 def read_moves(trace: Path) -> dict[str, list[Moved]]:
-    moves: dict[str, list[Moved]] = {}
     raw = trace.read_bytes()
-    for line in raw[: raw.rfind(b"\n") + 1].splitlines():
-        moved = msgspec.json.decode(line, type=Moved)
-        moves.setdefault(moved.robot, []).append(moved)
-    return moves
+    lines = raw[: raw.rfind(b"\n") + 1].splitlines()
+    return grouped((msgspec.json.decode(line, type=Moved) for line in lines), lambda moved: moved.robot)
 
 
 def _rate(heartbeats: list[int]) -> float | None:

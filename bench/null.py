@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pebble.bench.aims import outcome
 from pebble.bench.ratios import Interval, paired
 from pebble.bench.results import Cell, Judged
+from pebble.bench.tables import base_of
 
 AGAIN, SLOWED = " again", " +20 %"
 SLOWDOWN = 0.2
@@ -23,7 +24,6 @@ def roles(variant: str) -> tuple[str, str, str]:
 
 
 def variant_of(role: str) -> str:
-    """The variant of a role."""
     return role.removesuffix(AGAIN).removesuffix(SLOWED)
 
 
@@ -40,14 +40,8 @@ def spin(us: float) -> None:
 
 def intervals(cells: Sequence[Cell]) -> list[tuple[Cell, Interval]]:
     """Each cell of a repeated or slowed role, with the ratio of its median latency to the plain one's."""
-    plain = [cell for cell in cells if variant_of(cell.variant) == cell.variant]
-    return [
-        (cell, paired(cell.rounds, base.rounds))
-        for base in plain
-        for cell in cells
-        if cell is not base and variant_of(cell.variant) == base.variant
-        if cell.params == base.params and cell.measure == base.measure
-    ]
+    bases = [(cell, base_of(cell, cells, variant_of(cell.variant))) for cell in cells]
+    return [(cell, paired(cell.rounds, base.rounds)) for cell, base in bases if base is not None]
 
 
 def assessment(cells: Sequence[Cell]) -> list[str | Judged]:

@@ -4,8 +4,8 @@ import io
 import json
 import math
 import struct
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -14,8 +14,23 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import bridge, bridge_profile, engine
-from pebble.bench.bridge import BRIDGE, BRIDGE_NULL, BRIDGE_PROFILE, cells_of
+from pebble.bench.bridge import (
+    BRIDGE,
+    BRIDGE_NULL,
+    BRIDGE_PROFILE,
+    COMMANDS,
+    CPU,
+    DOWN,
+    LOADED,
+    UNLOADED,
+    UP,
+    cells_of,
+)
 from pebble.bench.bridge_operator import (
+    FORWARDER,
+    HOP,
+    SERIAL,
+    STAND_IN,
     Arrived,
     DriveSegment,
     all_arrived,
@@ -26,8 +41,6 @@ from pebble.bench.bridge_operator import (
     wheels_of,
 )
 from pebble.bench.bridge_profile import _stamp, commands
-from pebble.bench.bridge_report import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
-from pebble.bench.bridge_robots import FORWARDER, HOP, SERIAL, STAND_IN
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.results import Cell, Judged, Value, load
 from pebble.errors import PebbleError
@@ -176,6 +189,9 @@ class FakeRobot:
     def log(self) -> str:
         return ""
 
+    def media_load(self) -> AbstractContextManager[Callable[[], dict[str, int]]]:
+        return nullcontext(self.counts)
+
     def counts(self) -> dict[str, int]:
         return {"frames": len(self.driven)}
 
@@ -193,7 +209,6 @@ def _fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FakeRobot, "driven", [])
     for name in ("DrivenRobot", "OneHop"):
         monkeypatch.setattr(bridge, name, FakeRobot)
-    monkeypatch.setattr(bridge, "media_load", lambda driven: nullcontext(driven.counts))
     for name in ("_STARTUP_S", "_MEDIA_STARTUP_S"):
         monkeypatch.setattr(bridge, name, 0.0)
     monkeypatch.setattr(engine, "find_spec", lambda _name: None)
@@ -275,7 +290,7 @@ def test_shared_memory_is_swept_however_it_ends(
     swept: list[bool] = []
     for module in (bridge, bridge_profile):
         monkeypatch.setattr(module, "DrivenRobot", fail)
-    monkeypatch.setattr(bridge, "may_capture", lambda: None)
+    monkeypatch.setattr(bridge, "PacketCapture", nullcontext)
     monkeypatch.setattr(engine, "sweep", lambda: swept.append(True))
     with pytest.raises(PebbleError, match="no robot today"):
         engine.run(about.run_of(rounds=1, output=tmp_path, console=Console(file=io.StringIO())))

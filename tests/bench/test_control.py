@@ -15,10 +15,9 @@ from rich.console import Console
 from pebble.bench import control_far, engine
 from pebble.bench.comparison import Case, Comparison
 from pebble.bench.control import CONTROL, CONTROL_FAR
-from pebble.bench.control_ends import Exchange, SliceSpec
+from pebble.bench.control_ends import ONE_WAY, ROUND_TRIP, Exchange, SliceSpec
 from pebble.bench.control_far import BACK, THERE, Offset
 from pebble.bench.control_participants import VARIANTS, Participants
-from pebble.bench.control_report import ONE_WAY, ROUND_TRIP
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig.programs import children

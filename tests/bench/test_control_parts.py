@@ -11,13 +11,16 @@ from typing import Any, ClassVar, Self
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, control_load, engine, null
+from pebble.bench import control, control_participants, engine, null
 from pebble.bench.comparison import Case, Comparison
-from pebble.bench.control import CONTROL, CONTROL_NULL
+from pebble.bench.control import CONTROL, CONTROL_NULL, assessment, tables
 from pebble.bench.control_ends import (
+    ONE_WAY,
     REPLIES,
     REQUESTS,
+    ROUND_TRIP,
     Answer,
+    Connection,
     Desk,
     Echo,
     Handler,
@@ -29,8 +32,7 @@ from pebble.bench.control_ends import (
     size_name,
     stamped,
 )
-from pebble.bench.control_participants import VARIANTS, Slice
-from pebble.bench.control_report import ONE_WAY, ROUND_TRIP, assessment, tables
+from pebble.bench.control_participants import VARIANTS, Usage
 from pebble.bench.frames_worker import MqttReader
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
@@ -55,6 +57,7 @@ class Loop:
         self._handlers: dict[str, Handler] = {}
         self._spoil = spoil
         self.sizes: list[int] = []
+        self.connection = Connection(self.subscribe, self.publish, lambda: None)
 
     def subscribe(self, filter_: str, handler: Handler) -> None:
         self._handlers[filter_] = handler
@@ -64,9 +67,6 @@ class Loop:
         for one in self._spoil(payload) if topic.startswith(f"{REPLIES}/") else [payload]:
             self._handlers[topic](topic, one, 0)
 
-    def close(self) -> None:
-        """Nothing is open."""
-
 
 def lines_of(cells: list[Cell]) -> list[str]:
     return [str(one) for one in assessment(cells)]
@@ -75,8 +75,8 @@ def lines_of(cells: list[Cell]) -> list[str]:
 def run(loop: Loop, spec: SliceSpec) -> tuple[int, int, int]:
     ticks = iter(range(0, 10**9, 1000))
     clock = lambda: next(ticks)  # noqa: E731
-    echo = Echo(loop, "me", clock)
-    sender = Sender(loop, "me", clock, Desk())
+    echo = Echo(loop.connection, "me", clock)
+    sender = Sender(loop.connection, "me", clock, Desk())
     assert sender.warm_up(2, 5.0)
     sent, _, received = sender.run(spec)
     assert all(one.t1 < one.t2 < one.t3 < one.t4 for one in received)
@@ -92,8 +92,8 @@ def test_a_slice_counts_what_it_sends_after_the_first_tenth_of_a_second() -> Non
 @pytest.mark.parametrize(("slowed", "least"), [(False, 0), (True, 2_000_000)])
 def test_the_slowed_one_works_between_its_stamp_and_its_publish_call(slowed: bool, least: int) -> None:
     loop = Loop()
-    Echo(loop, "me", time.monotonic_ns)
-    sender = Sender(loop, "me", time.monotonic_ns, Desk())
+    Echo(loop.connection, "me", time.monotonic_ns)
+    sender = Sender(loop.connection, "me", time.monotonic_ns, Desk())
     _, _, received = sender.run(SliceSpec(size=40, rate=100, seconds=0.05, work_us=2000, slowed=slowed))
     assert min(one.t2 - one.t1 for one in received) >= least
 
@@ -105,7 +105,7 @@ def test_duplicates_count_once_and_foreign_messages_do_not() -> None:
 
 def test_a_foreign_request_is_not_echoed() -> None:
     loop = Loop()
-    echo = Echo(loop, "me", lambda: 0)
+    echo = Echo(loop.connection, "me", lambda: 0)
     loop.publish(f"{REQUESTS}/me", b"hello")
     assert echo.count == 0
 
@@ -188,14 +188,14 @@ class FakeParticipants:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         """Nothing was started."""
 
-    def run(self, role: str, spec: SliceSpec, load: str) -> Slice:
+    def run(self, role: str, spec: SliceSpec, load: str) -> tuple[Answer, Usage]:
         self.calls.append((role, spec, load))
         times = [100.0 + spec.slowed * spec.work_us + number for number in range(10)]
         answer = Answer(
             trips=12, sent=10, late=0, one_way=times, round_trip=[2 * one for one in times],
             call=[50.0] * 10, transport_times=[70.0] * 10, inbox=[30.0] * 10,
         )  # fmt: skip
-        return Slice(answer=answer, cpu=1.0, backbone_cpu=0.5, wake_ups=7.0, backbone_wake_ups=3.5)
+        return answer, {"cpu_percent": 1.0, "broker_cpu_percent": 0.5, "wake_ups": 7.0, "broker_wake_ups": 3.5}
 
 
 @pytest.fixture
@@ -322,7 +322,7 @@ def test_too_few_rounds_are_not_judged_and_have_no_interval() -> None:
     few = [cell(name, "media", p50, count=7) for name, p50 in (("mqtt", 900.0), ("zenoh-p2p", 900.0))]
     assert "at most 0.35: not judged (1.00 of 7 rounds)" in lines_of(few)[-1]
     printed = io.StringIO()
-    Console(file=printed, width=80).print(tables(few)[-1])
+    Console(file=printed, width=80).print([*tables(few)][-1])
     assert "–" not in printed.getvalue()
 
 
@@ -392,7 +392,7 @@ def test_a_reader_that_is_off_still_runs_its_network_loop(tmp_path: Path, monkey
         reader = MqttReader(broker.port)
         loop = reader._client.loop
         monkeypatch.setattr(reader._client, "loop", lambda timeout: (looped.append(timeout), loop(timeout)))
-        control_load._read(reader, Idle())  # type: ignore[arg-type]
+        control_participants.read(reader, Idle())  # type: ignore[arg-type]
     finally:
         end_all([broker], 5.0)
     assert len(looped) >= 3

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from pebble.bench import bridge, bridge_profile
 from pebble.bench.bridge import BRIDGE, BRIDGE_NULL, BRIDGE_PROFILE
-from pebble.bench.bridge_robots import FLOWS, FORWARDER, HOP, SERIAL, STAND_IN
+from pebble.bench.bridge_operator import FLOWS, FORWARDER, HOP, SERIAL, STAND_IN
 from pebble.bench.engine import run
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError

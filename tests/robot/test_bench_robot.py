@@ -12,9 +12,8 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import cost, startup
-from pebble.bench.bridge import BRIDGE
-from pebble.bench.bridge_report import COMMANDS, CPU, DOWN, UNLOADED, UP
-from pebble.bench.bridge_robots import STAND_IN
+from pebble.bench.bridge import BRIDGE, COMMANDS, CPU, DOWN, UNLOADED, UP
+from pebble.bench.bridge_operator import STAND_IN
 from pebble.bench.engine import run
 from pebble.bench.results import load
 from pebble.rig.programs import children
