@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -198,11 +199,12 @@ def arrived_of(
 # -- what is driven
 
 
-class Driven(Processes):
+class Driven(Processes, ABC):
     """What is driven, and its operator: starts both in ``with``; both are ready when :meth:`wait` returns."""
 
     operator: Operator
 
+    @abstractmethod
     def wait(self) -> None:
         """Raises PebbleError if it does not become ready."""
 
@@ -224,8 +226,9 @@ class Driven(Processes):
                 return [arrived_of(segment, commands, reports, received) for segment in segments]
             time.sleep(_POLL_S)
 
+    @abstractmethod
     def _arrivals(self, since: int) -> Arrivals:
-        raise NotImplementedError
+        """What arrived after ``since``."""
 
 
 class DrivenRobot(Driven):
