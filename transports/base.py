@@ -126,12 +126,11 @@ class Subscription:
         with self._lock:
             if self._closed:
                 return
-            retained = repeat if self._transport.as_published else message.retain
-            if retained and message.topic in self._delivered_topics:
+            if not self._delivered_topics.has(message.topic):
+                self._delivered_topics[message.topic] = None
+            elif repeat if self._transport.as_published else message.retain:
                 self._transport.counters.add("stale")
                 return
-            if message.topic not in self._delivered_topics:
-                self._delivered_topics[message.topic] = None
             if self.direct:
                 self._call(message)
                 return

@@ -50,6 +50,8 @@ class BoundedTable(MutableMapping[str, V]):
     def __init__(self, topics: int, size: int, size_of: Callable[[V], int]) -> None:
         self._max_topics, self._max_size, self._size_of = topics, size, size_of
         self._values: dict[str, V] = {}
+        #: The same as ``in``, which takes a call of Python's: for what every message asks.
+        self.has: Callable[[object], bool] = self._values.__contains__
         self._size = 0
         self._lock = threading.Lock()
 

@@ -76,7 +76,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     def default_retain(self) -> bool:
         return self.kind.retain if self.retain is None else self.retain
 
-    @property
+    @cached_property
     def is_pattern(self) -> bool:
         return "{" in self.metric
 

@@ -195,11 +195,14 @@ _DRIVE_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
 }
 
 
-class _UsualDrive(Drive, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is in keys that are not read has to be valid, too."""
-
-
-_drive_decoder = msgspec.json.Decoder(_UsualDrive)
+#: The fields of a drive command and no others: what is in keys that are not read has to be valid, too.
+_drive_decoder: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
+    msgspec.defstruct(
+        "UsualDrive",
+        [(field.name, field.type, field.default) for field in msgspec.structs.fields(Drive)],
+        forbid_unknown_fields=True,
+    )
+)
 
 
 def _usual_drive(raw: bytes) -> Drive | None:
@@ -208,11 +211,13 @@ def _usual_drive(raw: bytes) -> Drive | None:
         return None
     try:
         found = _drive_decoder.decode(raw)
-    except msgspec.DecodeError:
+        drive = Drive(x=found.x, z=found.z, y=found.y, source=found.source, run=found.run, valid_ms=found.valid_ms)
+    except (msgspec.DecodeError, ValueError):
         return None
-    if (found.signed and found.run is UNSET) or not (found.valid_ms is UNSET or 1 <= found.valid_ms < _LONGEST_MS):
-        return None
-    return Drive(x=found.x, z=found.z, y=found.y, source=found.source, run=found.run, valid_ms=found.valid_ms)
+    usual = (drive.source != SCRIPT or drive.run is not UNSET) and (
+        drive.valid_ms is UNSET or 1 <= drive.valid_ms < _LONGEST_MS
+    )
+    return drive if usual else None
 
 
 def _number(channel: Channel, name: str, value: Any) -> float:

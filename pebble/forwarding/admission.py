@@ -36,9 +36,11 @@ class Admission:
         """Why this message may not pass; None if it may."""
         if side is Side.REMOTE and subject.kind.direction == INCOMING and len(message.payload) > MAX_COMMAND_BYTES:
             return Drop.TOO_LARGE
+        if subject.channel is not None and subject.kind is not Kind.ACTION:
+            return None
         if side is Side.REMOTE and self._is_too_often(subject, message):
             return Drop.TOO_OFTEN
-        if subject.channel is not None or subject.kind is not Kind.FLAG:
+        if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
         if not message.payload:  # removed; who removes a million others costs the robot nothing
             if side is Side.REMOTE and message.topic not in self._flags:

@@ -94,11 +94,11 @@ class Cycles:
 
         ``once``: it means something that happens once; ``report``: it is what a robot reports again and again.
         """
-        number = _number_of(payload)
+        number = _number_of(payload) if payload[-1:] in _DIGITS else None
         with self._lock:
             if number is not None:
                 return self._receive_probe(side, topic, number)
-            way, now = self._way(side, topic), self._clock()
+            way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
             if way.closed and (once or count > _SUSPICIOUS):  # more than one copy may come back
                 return Finding.CIRCULATES

@@ -110,11 +110,12 @@ class Forwarder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.gate = Gate.WAITING
-        self.mirroring = False
         self.counters = Counters()
         self._subjects, self._rules, self._transports = subjects, rules, transports
         self._winner, self._on_value, self._clock = winner, on_value, clock
         self._both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
+        #: What :func:`route` has returned. There are not many subjects, so it needs no bound.
+        self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         self._lock = self.retained_lock = threading.RLock()  # while it is held no retained message passes
         self._reconciliation = Reconciliation(winner)
         self._admission = Admission(clock)
@@ -131,7 +132,16 @@ class Forwarder:
         self._restarted: set[Side] = set()
         self._lost_at = {side: float("-inf") for side in Side}  # -inf: before the first connection, too
         self._went_back = dict.fromkeys(Side, False)
-        self._mirror_refused = False
+        self._mirroring = self._mirror_refused = False
+
+    @property
+    def mirroring(self) -> bool:
+        """Whether remote-mirror is on."""
+        return self._mirroring
+
+    @mirroring.setter
+    def mirroring(self, on: bool) -> None:
+        self._mirroring, self._mirror_refused = on, on and self._mirror_refused
 
     def dropped(self) -> dict[str, int]:
         """How many messages did not pass, here or in a transport, because of a bound; by reason, like ``too_many``."""
@@ -237,8 +247,6 @@ class Forwarder:
             transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
 
     def _examine(self, side: Side, subject: Subject, message: Message) -> Finding:
-        if self.gate is not Gate.OPEN:
-            return Finding.PASS
         if subject.is_stop:
             repeated = self._cycles.repeats_stop(side, message.topic, message.payload)
             return Finding.CIRCULATES if repeated else Finding.PASS
@@ -272,50 +280,64 @@ class Forwarder:
         return Routed(subject, outcome)
 
     def _receive(self, side: Side, subject: Subject | None, message: Message) -> Forward | Drop:
+        """Hot: what nearly no message needs is asked for here, and done elsewhere."""
         if subject is None or not subject.is_stop:
             if message.retain:  # they still arrive: a stop may be among them, which does not count: it may be repeated
                 self._note_retained(side)
         elif not self._is_old_stop(side, message):
             message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
-        forward = route(self._rules, side, subject, message, mirroring=self._may_mirror())
-        if isinstance(forward, Drop) or subject is None:
-            return forward if isinstance(forward, Drop) else Drop.FOREIGN
+        if subject is None:
+            return Drop.FOREIGN
+        mirroring = self._mirroring and self._may_mirror()
+        key = side, subject, message.qos, message.retain, message.retain_requested, mirroring
+        forward = self._routes.get(key)
+        if forward is None:
+            forward = self._routes[key] = route(self._rules, side, subject, message, mirroring=mirroring)
+        if isinstance(forward, Drop):
+            return forward
         refused = self._admission.refuse(side, subject, message)
         if refused is Drop.KNOWN:
             return refused
         if refused is not None:
             self._quiet_log.warning(refused.name, "%s is not forwarded: %s", message.topic[:_LOGGED], refused.value)
             return refused
-        if subject.kind in ONE_SHOT and _is_late(subject, message):
+        if subject.kind in ONE_SHOT and (waited := message.waited_s) > _LATE_S and _is_late(subject, message, waited):
             return Drop.LATE
-        if self._is_echo(side, subject, message):
+        is_exact = self._transports[side].exact_echo
+        if (self._cycles.closed_ways or not is_exact) and self._is_echo(side, subject, message):
             return Drop.ECHO
-        match self._examine(side, subject, message):
-            case Finding.PROBE:
-                return Drop.PROBE
-            case Finding.CIRCULATES:
-                return Drop.CIRCULATES
-            case Finding.RELAY:
-                self._publish(side.other, subject, message, Forward(forward.qos, False, forward.urgent))
-                return Drop.PROBE
-            case Finding.SUSPECT:  # the probe goes first: it comes back before the message does
-                self._probe(side, message.topic, message.payload)
-        return self._pass(side, subject, message, forward)
-
-    def _pass(self, side: Side, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+        if self.gate is Gate.OPEN:
+            finding = self._examine(side, subject, message)
+            if finding is not Finding.PASS and (drop := self._act_on(finding, side, subject, message, forward)):
+                return drop
         if forward.retain:
             return self._pass_retained(side, subject, message, forward)
+        is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
         if self.gate is not Gate.OPEN:
-            return self._hold_event(side, subject, message)
-        if _is_event(subject, message):
+            return self._hold_event(side, message) if is_event else Drop.CLOSED
+        if is_event:
             self._note_return(side.other, subject, message)
             self._events[side.other].send(message)
         else:
             self._publish(side.other, subject, message, forward)
         return forward
 
-    def _hold_event(self, side: Side, subject: Subject, message: Message) -> Drop:
-        if self.gate is Gate.SHUT or not _is_event(subject, message):
+    def _act_on(
+        self, finding: Finding, side: Side, subject: Subject, message: Message, forward: Forward
+    ) -> Drop | None:
+        """Why a message that is suspicious, or a probe, does not pass; None if it does."""
+        match finding:
+            case Finding.CIRCULATES:
+                return Drop.CIRCULATES
+            case Finding.SUSPECT:  # the probe goes first: it comes back before the message does
+                self._probe(side, message.topic, message.payload)
+                return None
+            case Finding.RELAY:
+                self._publish(side.other, subject, message, Forward(forward.qos, False, forward.urgent))
+        return Drop.PROBE
+
+    def _hold_event(self, side: Side, message: Message) -> Drop:
+        if self.gate is Gate.SHUT:
             return Drop.CLOSED
         events = self._events[side.other]
         events.hold(message)
@@ -399,7 +421,8 @@ class Forwarder:
 
     def _publish(self, side: Side, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, self._transports[side]
-        self._note_return(side, subject, message)
+        if self._cycles.closed_ways:
+            self._note_return(side, subject, message)
         echoing = not transport.exact_echo and _echo_matters(subject)
         if echoing:
             self._loopback[side].expect(topic, payload)
@@ -431,9 +454,6 @@ class Forwarder:
 
     def _may_mirror(self) -> bool:
         """A broker that sends our own commands back would repeat each one later: also after the stop."""
-        if not self.mirroring:
-            self._mirror_refused = False
-            return False
         if self._echo_is_exact(all):
             return True
         if not self._mirror_refused:
@@ -467,10 +487,9 @@ def _ignore(_message: Message) -> None:
     """A barrier has to subscribe to something."""
 
 
-def _is_late(subject: Subject, message: Message) -> bool:
+def _is_late(subject: Subject, message: Message, waited_s: float) -> bool:
     """Of what happens once."""
-    limit = _PATIENT_S if subject.channel in _PATIENT else _LATE_S
-    if message.waited_s <= limit:
+    if waited_s <= (_PATIENT_S if subject.channel in _PATIENT else _LATE_S):
         return False
     return not (subject.is_stop or _ends_something(subject, message))
 
@@ -489,10 +508,6 @@ def _ends_something(subject: Subject, message: Message) -> bool:
     if word := getattr(command, "action", None):  # it wins over ``enabled``
         return word.strip().lower() in STOP_WORDS
     return getattr(command, "enabled", getattr(command, "on", None)) is False
-
-
-def _is_event(subject: Subject, message: Message) -> bool:
-    return subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
 
 
 def _echo_matters(subject: Subject) -> bool:

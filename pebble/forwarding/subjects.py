@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 from pebble.config import Config
 from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Channel, Kind
@@ -22,9 +22,12 @@ _FAMILIES = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Subject:
-    """One topic below our own identity. ``channel`` is None for metrics that are not in the contract."""
+    """What all topics of a channel, or of a family, mean. ``channel`` is None for metrics that are not in the contract.
+
+    Of each there is one object, so that what is remembered by subject is bounded, and found quickly.
+    """
 
     kind: Kind
     channel: Channel | None = None
@@ -46,33 +49,26 @@ class Subject:
         return self.channel is ESTOP
 
 
-class _Unknown:
-    """Not looked up yet."""
+class Subjects(dict[str, Subject | None]):
+    """Subjects by effective topic, those of every serial instance included.
 
-
-_UNKNOWN = _Unknown()
-
-
-class Subjects:
-    """Looks subjects up by effective topic, those of every serial instance included."""
+    None: the topic is not this robot's, or not valid. What was looked up before is found without a call of Python's.
+    """
 
     def __init__(self, config: Config) -> None:
+        super().__init__()
         self._base = config.base
         names = dict.fromkeys(["", *config.serial_instances()])
         self._addresses = [Addresses(view_of(config, name)) for name in names]
-        self._known: dict[str, Subject | _Unknown | None] = {}
+        self._subject = cache(Subject)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
         named = (addresses[one].topic.encode() for addresses in self._addresses for one in CHANNELS)
         self._named = frozenset(topic.removeprefix(self._incoming) for topic in named)
 
-    def __getitem__(self, topic: str) -> Subject | None:
-        """The subject of ``topic``; None if it is not this robot's, or not a valid topic."""
-        found = self._known.get(topic, _UNKNOWN)  # one step: another thread may clear them
-        if not isinstance(found, _Unknown):
-            return found
-        if len(self._known) >= _REMEMBERED:
-            self._known.clear()
-        subject = self._known[topic] = self._find(topic)
+    def __missing__(self, topic: str) -> Subject | None:
+        if len(self) >= _REMEMBERED:
+            self.clear()
+        subject = self[topic] = self._find(topic)
         return subject
 
     def invented(self, topic: bytes) -> Kind | None:
@@ -109,8 +105,8 @@ class Subjects:
             channel = addresses.channel(topic)
             if channel is not None:
                 address = addresses[channel]
-                return Subject(channel.kind, channel, address.qos, address.retain)
+                return self._subject(channel.kind, channel, address.qos, address.retain)
         suffix = topic.removeprefix(f"{self._base}/")
         if suffix == topic:
             return None
-        return next((Subject(kind) for family, kind in _FAMILIES if suffix.startswith(family)), None)
+        return next((self._subject(kind) for family, kind in _FAMILIES if suffix.startswith(family)), None)

@@ -153,9 +153,7 @@ class Service:
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
         """Handle ``channel`` from now on, as ``@on`` does from the start; until the subscription is closed."""
 
-        def receive(message: Message) -> None:
-            self._receive(channel, method, message, direct=direct)
-
+        receive = partial(self._receive, channel, method, direct=direct)
         topic = self.addresses[channel].topic
         return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
 

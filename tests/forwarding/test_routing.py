@@ -269,7 +269,7 @@ class TestFilters:
         subjects = Subjects(make_config())
         for number in range(10_000):
             assert subjects[f"{BASE}/outgoing/n{number}"] is not None
-        assert len(subjects._known) < 5000
+        assert len(subjects) < 5000
 
 
 class TestMirrorTable:

@@ -233,7 +233,8 @@ class Connection:
         client = self._client
         with self._lock:
             # Before reading: messages queued during a silence must not arrive as if they were fresh (T19).
-            self._check_silence(now)
+            if now - self._answered_at > self._settings.silence_s:
+                self._check_silence(now)
             if readable or self._more:
                 self._read(now)
             if client.waiting or self._backlog.waiting:

@@ -311,7 +311,7 @@ class MqttTransport(Transport):
                     self.counters.add("echoes")
                     continue
                 repeat = self._own_message_filter.is_repeat(message)
-            for subscription in self._matching(message.topic):
+            for subscription in self._matched.get(message.topic) or self._matching(message.topic):
                 subscription.offer(message, repeat=repeat)
 
     def _note_answers(self, refused: Mapping[str, bool]) -> None:

@@ -266,7 +266,8 @@ class ZenohTransport(Transport):
     # -- sending
 
     def _send(self, message: Message, urgent: bool) -> bool:
-        check_process(self._pid)
+        if self._pid != os.getpid():
+            check_process(self._pid)
         session = self._session
         if session is None or (self._settings.client and not self._watch.hubs):
             return False
@@ -354,9 +355,13 @@ class ZenohTransport(Transport):
             self.counters.add("received")
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            if self._is_late(sample, stamp, read_at):
+            # A sender of the same boot shares the clock, so that also the time in the socket counts.
+            since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
+            if (since is None or read_at - since > self._late_s) and self._is_late(sample, stamp, read_at):
                 return
-            message = _live_message(sample, stamp, subscription.qos, read_at)
+            topic, payload = key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
+            qos = min(stamp.qos, subscription.qos)
+            message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
             if subscription.direct and self._putting == threading.get_ident():
                 self._loopback.put(subscription, message)
             else:
@@ -493,13 +498,6 @@ def _direct(function: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
         function(received)
 
     return zenoh.handlers.Callback(run, indirect=False)
-
-
-def _live_message(sample: zenoh.Sample, stamp: wire.LiveStamp, qos: QoS, read_at: float) -> Message:
-    """A sender of the same boot shares the clock, so that also the time in the socket counts."""
-    waiting_since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else read_at
-    topic = key_to_topic(str(sample.key_expr))
-    return Message(topic, sample.payload.to_bytes(), min(stamp.qos, qos), False, stamp.retain_requested, waiting_since)
 
 
 def _retained_message(sample: zenoh.Sample, stamp: wire.Stamp, qos: QoS) -> Message:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from zlib import crc32
 
 import msgspec
@@ -56,7 +56,7 @@ BOOT = crc32(Path("/proc/sys/kernel/random/boot_id").read_bytes())  # shared by 
 since_boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
 
 
-class LiveStamp(NamedTuple):
+class LiveStamp(msgspec.Struct, frozen=True):
     """The attachment of a live message; ``sent_ns`` counts since ``boot``, both are 0 if it has none."""
 
     qos: QoS

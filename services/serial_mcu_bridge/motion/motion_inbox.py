@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from itertools import chain
 
-from pebble.contract.payloads import Drive, EstopCommand, EstopReset
+from msgspec import Struct
+
+from pebble.contract.payloads import SCRIPT, Drive, EstopCommand, EstopReset
 from pebble.motion.arbiter import PERSON, UNKNOWN_RUN
 
 _STOPS = 8  # as many names as a latch remembers
@@ -14,27 +15,26 @@ _RESETS = 8
 _SENDERS = 8  # the person, and runs of scripts
 
 
-class ReceivedDrive(NamedTuple):
+class ReceivedDrive(Struct, frozen=True):
     """A drive command, and when it was received on the service's clock."""
 
     drive: Drive
     at: float
 
 
-class ReceivedReset(NamedTuple):
+class ReceivedReset(Struct, frozen=True):
     """A reset, and when it was received on the service's clock."""
 
     reset: EstopReset
     at: float
 
 
-@dataclass(slots=True)
-class Batch:
+class Batch(Struct):
     """All that was waiting, to be judged in the order of the fields."""
 
-    stops: list[EstopCommand] = field(default_factory=list)
-    resets: list[ReceivedReset] = field(default_factory=list)
-    drives: list[ReceivedDrive] = field(default_factory=list)
+    stops: list[EstopCommand]
+    resets: list[ReceivedReset]
+    drives: list[ReceivedDrive]
 
 
 class MotionInbox:
@@ -69,7 +69,7 @@ class MotionInbox:
 
     def put_drive(self, drive: Drive, now: float) -> bool:
         with self._lock:
-            was_empty = self._empty
+            was_empty = not (self._drives or self._stops or self._resets)
             sender = run_of(drive)
             waiting = self._drives.pop(sender, None)
             if len(self._drives) >= _SENDERS:
@@ -82,8 +82,7 @@ class MotionInbox:
     def take(self) -> Batch:
         """Return all that waits, and forget it."""
         with self._lock:
-            drives = [received for waiting in self._drives.values() for received in waiting]
-            batch = Batch(self._stops, self._resets, drives)
+            batch = Batch(self._stops, self._resets, list(chain.from_iterable(self._drives.values())))
             self._stops, self._resets, self._drives = [], [], {}
             return batch
 
@@ -98,7 +97,7 @@ class MotionInbox:
 
 def run_of(drive: Drive) -> int:
     """The run of a script's command; PERSON, or UNKNOWN_RUN."""
-    if not drive.signed:
+    if drive.source != SCRIPT:
         return PERSON
     return drive.run if isinstance(drive.run, int) else UNKNOWN_RUN
 

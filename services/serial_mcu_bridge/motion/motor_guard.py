@@ -128,7 +128,9 @@ class MotorGuard:
     @property
     def due(self) -> float | None:
         """When :meth:`tick` has something to do; None: nothing."""
-        return min((at for at in (self._publish_at, self._hold_until) if at is not None), default=None)
+        if self._publish_at is None or self._hold_until is None:
+            return self._hold_until if self._publish_at is None else self._publish_at
+        return min(self._publish_at, self._hold_until)
 
     def tick(self, now: float) -> None:
         """Let a person's hold end, and publish a state that had to wait."""

@@ -8,9 +8,9 @@ A line ends with LF, a CR before it is ignored.
 from __future__ import annotations
 
 import logging
-import math
 import re
 from dataclasses import dataclass
+from math import isfinite
 from typing import TypeAlias
 
 from pebble.errors import PayloadError
@@ -70,26 +70,31 @@ def mix(x: float, z: float) -> tuple[float, float]:
 
     Raises PayloadError for NaN and infinities: with them min() and max() would return full speed.
     """
-    _finite(x, z)
-    return _clamp(z + x, -1.0), _clamp(z - x, -1.0)
+    if not (isfinite(x) and isfinite(z)):
+        raise _not_finite(x, z)
+    return max(-1.0, min(1.0, z + x)), max(-1.0, min(1.0, z - x))
 
 
 def drive_line(left: float, right: float) -> bytes:
     """``M <left> <right>``, each −1..1. Raises PayloadError for NaN and infinities."""
-    _finite(left, right)
-    return _line(b"M %.3f %.3f\n", _clamp(left, -1.0), _clamp(right, -1.0))
+    if not (isfinite(left) and isfinite(right)):
+        raise _not_finite(left, right)
+    # adding 0.0 turns a rounded −0.0 into 0.0: a stop is always the same bytes
+    speeds = round(max(-1.0, min(1.0, left)), 3) + 0.0, round(max(-1.0, min(1.0, right)), 3) + 0.0
+    return b"M %.3f %.3f\n" % speeds
 
 
 def lights_line(blue: float, green: float, red: float) -> bytes:
     """``L <b> <g> <r>``, each 0..1. Raises PayloadError for NaN and infinities."""
-    return _line(b"L %.3f %.3f %.3f\n", *(_clamp(part, 0.0) for part in _finite(blue, green, red)))
+    return b"L %.3f %.3f %.3f\n" % _shares(blue, green, red)
 
 
 def flash_line(blue: float, green: float, red: float, period_s: float) -> bytes:
     """``F <b> <g> <r> <period_s>``: fade from dark to the colour and back once per period, for ever."""
-    colour = [_clamp(part, 0.0) for part in _finite(blue, green, red)]
-    (period,) = _finite(period_s)
-    return _line(b"F %.3f %.3f %.3f %.3f\n", *colour, max(SHORTEST_FLASH_S, min(LONGEST_FLASH_S, period)))
+    if not isfinite(period_s):
+        raise _not_finite(period_s)
+    period = max(SHORTEST_FLASH_S, min(LONGEST_FLASH_S, period_s))
+    return b"F %.3f %.3f %.3f %.3f\n" % (*_shares(blue, green, red), period)
 
 
 def _touch(fields: dict[bytes, bytes]) -> list[Report]:
@@ -113,20 +118,15 @@ def _level(fields: dict[bytes, bytes]) -> list[Report]:
     return [Level(float(raw))] if _DECIMAL.match(raw) else []
 
 
-def _finite(*values: float) -> tuple[float, ...]:
-    for value in values:
-        if not math.isfinite(value):
-            raise PayloadError(f"not a finite number among {values}")
-    return values
+def _shares(*parts: float) -> tuple[float, ...]:
+    """Each within 0..1. Raises PayloadError."""
+    if not all(map(isfinite, parts)):
+        raise _not_finite(*parts)
+    return tuple([max(0.0, min(1.0, part)) for part in parts])
 
 
-def _clamp(value: float, lowest: float) -> float:
-    return max(lowest, min(1.0, value))
-
-
-def _line(form: bytes, *values: float) -> bytes:
-    # adding 0.0 turns a rounded −0.0 into 0.0: a stop is always the same bytes
-    return form % tuple([round(value, 3) + 0.0 for value in values])
+def _not_finite(*values: float) -> PayloadError:
+    return PayloadError(f"not a finite number among {values}")
 
 
 STOP = drive_line(0.0, 0.0)

@@ -130,13 +130,14 @@ class MotorBridge(SerialService):
             else:
                 self._quiet_log.warning("unlatched", "a stop only halts: it could not be reset")
                 self._guard.judge(_FINAL_ZERO, self.clock())
-        for reset, at in batch.resets:
-            self._guard.reset(reset, self.clock() - at, self.clock())
+        for waiting in batch.resets:
+            self._guard.reset(waiting.reset, self.clock() - waiting.at, self.clock())
         for received in batch.drives:
             if latches or not (batch.stops and received.drive.moves):
                 self._drive(received)
         self._arm_guard()
-        self._count_dropped()
+        if self._waiting.dropped:
+            self._count_dropped()
 
     def _count_dropped(self) -> None:
         dropped = self._waiting.dropped - self.counters["motion_dropped"]
