@@ -162,7 +162,7 @@ class Subscription:
             self._call(message)
 
     def _call(self, message: Message) -> None:
-        self._transport.counters.add("delivered")
+        self._transport.count_delivered()
         try:
             self._handler(message)
         except Exception:  # a handler must not take the receiving thread down (T13)
@@ -204,6 +204,9 @@ class Transport(ABC):
             check_topic(will.topic)
         self.client_id, self.will = client_id, will
         self.counters = Counters()
+        self._count_sent, self.count_received, self.count_delivered = map(
+            self.counters.adder, ("sent", "received", "delivered")
+        )
         #: One line that explains why there is no connection; empty while there is one.
         self.problem = ""
         self._state = State.CLOSED
@@ -300,8 +303,10 @@ class Transport(ABC):
             accepted = self._send(message, urgent)
             sent = accepted and self._state is State.CONNECTED
             stored = retain and remember and self._remember(message, sent=sent, shared=shared)
-            # "parked" is the published name of the counter of pending messages.
-            self.counters.add("sent" if accepted else "parked" if stored else "refused")
+            if accepted:
+                self._count_sent()
+            else:  # "parked" is the published name of the counter of pending messages
+                self.counters.add("parked" if stored else "refused")
             return accepted or stored
 
     def subscribe(

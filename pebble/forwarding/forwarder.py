@@ -74,7 +74,6 @@ _RETURN_S = 2.0
 _PROBED = (DRIVE, REBOOT, SERVICE_RESTART, GIT_PULL)
 
 _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES)
-_FORWARDED = {side: f"{side.value}: forwarded" for side in Side}  # names of counters
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
@@ -111,6 +110,7 @@ class Forwarder:
     ) -> None:
         self.gate = Gate.WAITING
         self.counters = Counters()
+        self._count_forwarded = {side: self.counters.adder(f"{side.value}: forwarded") for side in Side}
         self._subjects, self._rules, self._transports = subjects, rules, transports
         self._winner, self._on_value, self._clock = winner, on_value, clock
         self._both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
@@ -276,7 +276,10 @@ class Forwarder:
         """Forward ``message`` by the table."""
         subject = self._subjects[message.topic]
         outcome = self._receive(side, subject, message)
-        self.counters.add(f"{side.value}: {outcome.value}" if isinstance(outcome, Drop) else _FORWARDED[side])
+        if isinstance(outcome, Drop):
+            self.counters.add(f"{side.value}: {outcome.value}")
+        else:
+            self._count_forwarded[side]()
         return Routed(subject, outcome)
 
     def _receive(self, side: Side, subject: Subject | None, message: Message) -> Forward | Drop:

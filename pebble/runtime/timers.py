@@ -7,13 +7,16 @@ from collections.abc import Callable
 from itertools import count
 from math import inf
 
+from msgspec import Struct
 
-class Timer:
+
+class Timer(Struct, eq=False):
     """A call that is due once, or again and again."""
 
-    def __init__(self, due: float, job: Callable[[], None], period: float | None) -> None:
-        self.due, self.job, self.period = due, job, period
-        self.cancelled = False
+    due: float
+    job: Callable[[], None]
+    period: float | None
+    cancelled: bool = False
 
     def cancel(self) -> None:
         self.cancelled = True
@@ -28,14 +31,16 @@ class Timers:
 
     def add(self, due: float, job: Callable[[], None], *, period: float | None = None) -> Timer:
         timer = Timer(due, job, period)
-        self._push(timer)
+        heapq.heappush(self._heap, (due, next(self._order), timer))
         return timer
 
     @property
     def next_due(self) -> float:
         """When the next timer is due; infinite without timers."""
-        self._discard_cancelled()
-        return self._heap[0][0] if self._heap else inf
+        heap = self._heap
+        if heap and heap[0][2].cancelled:
+            self._discard_cancelled()
+        return heap[0][0] if heap else inf
 
     def wait(self, now: float) -> float | None:
         """Seconds until the next timer is due; None without timers."""
@@ -49,12 +54,9 @@ class Timers:
             timer = heapq.heappop(self._heap)[2]
             if timer.period is not None:
                 timer.due = timer.due + timer.period if timer.due + timer.period > now else now + timer.period
-                self._push(timer)
+                heapq.heappush(self._heap, (timer.due, next(self._order), timer))
             timer.job()
             self._discard_cancelled()
-
-    def _push(self, timer: Timer) -> None:
-        heapq.heappush(self._heap, (timer.due, next(self._order), timer))
 
     def _discard_cancelled(self) -> None:
         while self._heap and self._heap[0][2].cancelled:

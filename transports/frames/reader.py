@@ -24,6 +24,7 @@ from pebble.transports.frames.session import METADATA, SharingError, StreamNames
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.wakeup import Wakeup
 from pebble.transports.zenoh.session import check_process, close_at_exit
+from pebble.transports.zenoh.thread_state import direct
 
 log = logging.getLogger(__name__)
 
@@ -90,12 +91,9 @@ class FrameReader:
             # sound skip it: that is sent as bytes.
             views.why_unavailable()
         liveliness = session.liveliness()
-        # Called on Zenoh's receiving thread: these must be quick.
-        on_writer = zenoh.handlers.Callback(self._on_writer, indirect=False)
-        on_frame = zenoh.handlers.Callback(self._on_frame, indirect=False)
-        self._declared = [
-            liveliness.declare_subscriber(self._names.writers, on_writer, history=True),
-            session.declare_subscriber(self._names.data, on_frame),
+        self._declared = [  # called on Zenoh's receiving thread: these must be quick
+            liveliness.declare_subscriber(self._names.writers, direct(self._on_writer), history=True),
+            session.declare_subscriber(self._names.data, direct(self._on_frame)),
             liveliness.declare_token(self._names.reader(os.urandom(6).hex())),
         ]
 

@@ -196,7 +196,7 @@ class MemoryTransport(Transport):
             self._connect()
 
     def _deliver(self, delivery: _Delivery) -> None:
-        self.counters.add("received")
+        self.count_received()
         message = delivery.message
         targets = self._matching(message.topic) if delivery.only is None else [delivery.only]
         for subscription in targets:

@@ -302,9 +302,8 @@ class MqttTransport(Transport):
             connection.pump(left, receive)
 
     def _deliver_all(self, messages: list[Message]) -> None:
-        if messages:
-            self.counters.add("received", len(messages))
         for message in messages:
+            self.count_received()
             repeat = False
             if message.retain and self.as_published:
                 if self._own_message_filter.is_echo(message):

@@ -12,6 +12,10 @@ from __future__ import annotations
 import ctypes
 import itertools
 import threading
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
 
 MOST = 32  # threads of a process that keep their state
 
@@ -26,3 +30,13 @@ def keep_thread_state() -> None:
         _remembered.it = True
         if next(_numbers) < MOST:
             _ensure()
+
+
+def direct(function: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
+    """Run on Zenoh's receiving thread. Zenoh's default would queue, and then block that thread for all."""
+
+    def run(received: Any) -> None:
+        keep_thread_state()
+        function(received)
+
+    return zenoh.handlers.Callback(run, indirect=False)

@@ -11,8 +11,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import zenoh
 
@@ -28,7 +27,7 @@ from pebble.transports.zenoh.ages import MessageAges
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic, topic_to_key
 from pebble.transports.zenoh.presence import Barrier, HubView, HubWatch
 from pebble.transports.zenoh.session import HUB_SOCKET, check_process, close_at_exit, open_session, session_config
-from pebble.transports.zenoh.thread_state import keep_thread_state
+from pebble.transports.zenoh.thread_state import direct
 
 log = logging.getLogger(__name__)
 
@@ -352,7 +351,7 @@ class ZenohTransport(Transport):
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
 
         def take(sample: zenoh.Sample) -> None:
-            self.counters.add("received")
+            self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
             # A sender of the same boot shares the clock, so that also the time in the socket counts.
@@ -368,7 +367,7 @@ class ZenohTransport(Transport):
                 subscription.offer(message)
 
         self._subscribers[subscription] = session.declare_subscriber(
-            filter_to_key(subscription.filter), _direct(take), allowed_origin=origin
+            filter_to_key(subscription.filter), direct(take), allowed_origin=origin
         )
 
     def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp, now: float) -> bool:
@@ -405,7 +404,7 @@ class ZenohTransport(Transport):
             stamp = wire.Stamp.unpack(sample.attachment.to_bytes())
             if stamp.origin == self._name and not subscription.echo:
                 return
-            self.counters.add("received")
+            self.count_received()
             message = _retained_message(sample, stamp, subscription.qos)
             with self._connection_lock:
                 if connection == self._connection:
@@ -488,16 +487,6 @@ class LoopbackQueue:
                     return
                 subscription, message = self._queue.popleft()
             subscription.offer(message)
-
-
-def _direct(function: Callable[[Any], None]) -> zenoh.handlers.Callback[Any]:
-    """Run on Zenoh's receiving thread. Zenoh's default would queue, and then block that thread for all."""
-
-    def run(received: Any) -> None:
-        keep_thread_state()
-        function(received)
-
-    return zenoh.handlers.Callback(run, indirect=False)
 
 
 def _retained_message(sample: zenoh.Sample, stamp: wire.Stamp, qos: QoS) -> Message:

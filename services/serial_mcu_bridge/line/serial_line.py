@@ -154,7 +154,7 @@ class SerialLine:
 
     def _pump(self, now: float) -> None:
         """Write lines until the kernel accepts no more. Lock held."""
-        while self._port is not None and (self._sending or self._next_line(self._port, now)):
+        while self._port is not None and (self._sending or (self.outbox.waiting and self._next_line(self._port, now))):
             sent = self._port.write(self._sending)
             if not sent:
                 return
@@ -164,7 +164,7 @@ class SerialLine:
 
     def _next_line(self, port: Port, now: float) -> bool:
         """Take a line from the outbox if it can be sent at once: a line in the kernel cannot be replaced."""
-        if not self.outbox.waiting or not self._is_free(port, now):
+        if not self._is_free(port, now):
             return False
         self._sending = self.outbox.take(now) or b""
         return bool(self._sending)

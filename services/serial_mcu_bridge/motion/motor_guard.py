@@ -114,7 +114,8 @@ class MotorGuard:
         valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
         run = run_of(drive)
         limit: int = self._arbiter.judge(drive.moves, run, valid_ms, _ms(now))
-        self._note_barred(now)
+        if self._arbiter.barred != self._barred:
+            self._note_barred(now)
         if limit == REFUSED:
             reason = "latched" if self.latched else "overruled"
             self._counters.add(reason)
@@ -137,7 +138,8 @@ class MotorGuard:
         if self._hold_until is not None and now >= self._hold_until:
             self._hold_until = None
             self._arbiter.tick(_ms(now))
-            self._note_barred(now)
+            if self._arbiter.barred != self._barred:
+                self._note_barred(now)
         if self._publish_at is not None and now >= self._publish_at:
             self._publish_state(now)
 
@@ -184,10 +186,9 @@ class MotorGuard:
         return f"run {run} has to wait: a person drives, or this process has just started"
 
     def _note_barred(self, now: float) -> None:
-        if self._arbiter.barred != self._barred:
-            self._barred = self._arbiter.barred
-            self._barred_file.save(self._barred)
-            self._changed(now)
+        self._barred = self._arbiter.barred
+        self._barred_file.save(self._barred)
+        self._changed(now)
 
     def _save(self) -> None:
         if self._can_save:
