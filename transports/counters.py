@@ -34,7 +34,8 @@ class Counters:
 
     def snapshot(self) -> dict[str, int]:
         with self._lock:
-            return {name: count for name in self._counts.keys() | self._ones if (count := self._count(name))}
+            names = dict.fromkeys([*self._counts, *self._ones])
+            return {name: count for name in names if (count := self._count(name))}
 
     def _count(self, name: str) -> int:
         ones = self._ones.get(name)
