@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -86,14 +85,9 @@ def certainty(figures: int) -> float:
 
 def differences(a: Results, b: Results) -> list[str]:
     """Other differences between two runs, one line each: the program may then not be the only cause."""
-    about = [{"pebble": one.pebble, "quick": one.quick} for one in (a, b)]
-    groups: dict[str, Any] = {"machine ": (a.machine, b.machine), "option ": (a.options, b.options), "": about}
-    return [
-        f"{what}{name}: {one.get(name)} in A, {other.get(name)} in B"
-        for what, (one, other) in groups.items()
-        for name in {**one, **other}
-        if one.get(name) != other.get(name)
-    ]
+    one, other = ({**run.machine, **run.options, "pebble": run.pebble, "quick": run.quick} for run in (a, b))
+    changed = [name for name in {**one, **other} if one.get(name) != other.get(name)]
+    return [f"{name}: {one.get(name)} in A, {other.get(name)} in B" for name in changed]
 
 
 def _percents(one: Cell, other: Cell) -> tuple[int, ...]:

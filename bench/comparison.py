@@ -85,7 +85,7 @@ class Option:
         if unknown := [one for one in values if self.known and one not in self.known]:
             raise PebbleError(f"--{self.name}: unknown {', '.join(unknown)}: there are {', '.join(self.known)}")
         if not values or len(set(values)) < len(values):
-            raise PebbleError(f"--{self.name}: name {'each one once' if values else 'at least one'}")
+            raise PebbleError(f"--{self.name}: name at least one, and each one once")
         for one in values if self.kind in (int, float) else ():
             if not self.least <= one <= self.most:
                 raise PebbleError(f"--{self.name} {one}: must be at least {self.least:g} and at most {self.most:g}")

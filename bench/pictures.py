@@ -28,18 +28,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Declared = Callable[[Results], list[Picture]]
+Make = Callable[[Sequence[Cell], str], "Figure"]  # of cells, under a title
 
 LEAST = 20  # samples for a distribution
 _DARK = "#222"
 _SUM, _WHOLE = "all", "all the way"  # the process that stands for the sum, the hop for all: drawn last
 _ITSELF = "itself"
 _GOLDEN = 0.618
-#: Tick labels of a ratio axis, by the largest ratio of its ends.
-_RATIOS = {
-    2.2: (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.5),
-    12.0: (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0),
-    math.inf: (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0),
-}
 
 
 def draw(results: Results, folder: Path) -> dict[Path, Picture]:
@@ -71,25 +66,21 @@ class Drawn:
 def ecdf(title: str, *, measures: Sequence[str] = ()) -> Declared:
     """For each measure the share of messages within a time; one panel for each condition."""
 
-    def made(results: Results, measure: str, cells: Sequence[Cell]) -> Picture:
+    def caption(measure: str, cells: Sequence[Cell]) -> str:
         about = title if measure in title.lower() else f"{title}: {measure}"
-        lost = "; lost messages are missing from 100 %" if any(map(_lost, cells)) else ""
-        caption = f"{about}. Share of all messages within the time on the x-axis{lost}"
-        return Picture(_file_name(results, measure), caption, partial(_curves, cells, about))
+        lost = "; lost messages are missing from 100 %" if any((cell.lost or 0) > 0 for cell in cells) else ""
+        return f"{about}. Share of all messages within the time on the x-axis{lost}"
 
-    return lambda results: [made(results, *one) for one in _by_measure(results, measures, LEAST).items()]
+    return _of_each(measures, caption, _curves, LEAST)
 
 
 def ratios(title: str, baseline: str, *, measures: Sequence[str] = ()) -> Declared:
     """The medians as ratios to the baseline's, with their intervals. No picture without a baseline."""
 
     def found(results: Results) -> list[Picture]:
-        based = ((cell, base_of(cell, results.cells, baseline)) for cell in results.cells)
-        judged = [
-            (cell, paired(cell.rounds, base.rounds))
-            for cell, base in based
-            if base is not None and (not measures or cell.measure in measures)
-        ]
+        cells = [cell for cell in results.cells if cell.measure in (measures or (cell.measure,))]
+        based = [(cell, base) for cell in cells if (base := base_of(cell, cells, baseline)) is not None]
+        judged = [(cell, paired(cell.rounds, base.rounds)) for cell, base in based]
         return _ratios(results, judged, f"{title}: median latency as a ratio to {baseline}'s", baseline)
 
     return found
@@ -109,13 +100,8 @@ def dots(title: str) -> Declared:
 
 def bars(title: str, *, measures: Sequence[str] = (), panel: str = "", group: str = "") -> Declared:
     """A bar for each median: one picture for each measure, with a panel or a group for each value of a parameter."""
-
-    def made(results: Results, measure: str, cells: Sequence[Cell]) -> Picture:
-        caption = f"{title}: {measure}, medians"
-        make = partial(_amounts, cells, caption, panel=panel, group=group)
-        return Picture(_file_name(results, measure), caption, make)
-
-    return lambda results: [made(results, *one) for one in _by_measure(results, measures).items()]
+    make = partial(_amounts, panel=panel, group=group)
+    return _of_each(measures, lambda measure, _cells: f"{title}: {measure}, medians", make)
 
 
 def tails(title: str) -> Declared:
@@ -129,20 +115,27 @@ def _measured(results: Results, least: int = 1) -> list[Cell]:
     return [cell for cell in results.cells if len(finite(cell.samples)) >= least]
 
 
-def _by_measure(results: Results, measures: Sequence[str], least: int = 1) -> dict[str, list[Cell]]:
-    """The measured cells of these measures, or of all."""
-    found = grouped(_measured(results, least), lambda cell: cell.measure)
-    return {measure: found[measure] for measure in measures or found if measure in found}
+def _of_each(
+    measures: Sequence[str], caption: Callable[[str, Sequence[Cell]], str], make: Make, least: int = 1
+) -> Declared:
+    """A picture for each of these measures, or for all."""
+
+    def found(results: Results) -> list[Picture]:
+        made = list[Picture]()
+        for measure, cells in grouped(_measured(results, least), lambda cell: cell.measure).items():
+            if not measures or measure in measures:
+                made += _picture(_file_name(results.bench, measure), caption(measure, cells), cells, make)
+        return made
+
+    return found
 
 
-def _file_name(results: Results, measure: str) -> str:
+def _file_name(bench: str, measure: str) -> str:
     """Of text such as ``one-way there, ± 0.4 ms``."""
-    return f"{results.bench}-{re.sub(r'[^a-z0-9]+', '-', measure.lower()).strip('-')}"
+    return f"{bench}-{re.sub(r'[^a-z0-9]+', '-', measure.lower()).strip('-')}"
 
 
-def _picture(
-    name: str, caption: str, cells: Sequence[Cell], make: Callable[[Sequence[Cell], str], Figure]
-) -> list[Picture]:
+def _picture(name: str, caption: str, cells: Sequence[Cell], make: Make) -> list[Picture]:
     """No picture without cells."""
     return [Picture(name, caption, partial(make, cells, caption))] if cells else []
 
@@ -168,7 +161,7 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
     for axes, place in zip(every, sorted(by_place, key=lambda name: name == _WHOLE), strict=True):
         for cell in by_place[place]:
             times, style, arrived = sorted(finite(cell.samples)), style_of[cell.variant], sum(cell.sizes)
-            step = 100 * arrived / (arrived + _lost(cell)) / len(times)
+            step = 100 * arrived / (arrived + max(0, cell.lost or 0)) / len(times)
             shares = [step * count for count in range(1, len(times) + 1)]
             axes.plot(times, shares, color=style.colour, linestyle=style.dash)
         plots.log_axis(axes, "x", f"latency, {_unit(cells)}", *ends)
@@ -178,11 +171,6 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
             plots.guide(axes, percent, f"p{percent}")
     plots.legend(figure, {name: replace(style, marker="") for name, style in style_of.items()})
     return figure
-
-
-def _lost(cell: Cell) -> int:
-    """The number of lost messages, as far as they were counted."""
-    return max(0, cell.lost or 0)
 
 
 def _dots(cells: Sequence[Cell], title: str) -> Figure:
@@ -250,11 +238,9 @@ def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: s
     ]  # fmt: skip
     low = max(0.02, 0.93 * min(0.95, *(bar.line[0] for bar in bars)))
     high = min(50.0, 1.07 * max(1.25, *(bar.line[1] for bar in bars)))
-    ticks = next(ratios for span, ratios in _RATIOS.items() if high / low < span)
 
     def axis(axes: Axes) -> None:
         plots.log_axis(axes, "x", f"median as a ratio to {baseline} (log); left of 1 is faster", low, high)
-        axes.set_xticks([ratio for ratio in ticks if low <= ratio <= high])
         axes.axvline(1.0, color=_DARK, linewidth=0.9)
         if baseline == _ITSELF:
             axes.axvline(1 + null.SLOWDOWN, color=_DARK, linewidth=0.9, linestyle="--")

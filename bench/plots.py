@@ -18,22 +18,18 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _DPI = 150
-_FEW_DECADES = {"x": 2.5, "y": 3.2}  # a logarithmic axis with fewer decades has ticks between the powers of ten
 _WIDEST = 13.0  # inches
 _SETTINGS: dict[Any, Any] = {
     "font.size": 9,
-    "font.family": "DejaVu Sans",
     "axes.titlesize": 9,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
-    "legend.fontsize": 8.5,
     "figure.titlesize": 11,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
 }
 
 Dash = Literal["-", "--", "-.", ":", ""]
@@ -154,18 +150,15 @@ def save(picture: Picture, path: Path, results: Results) -> None:
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
     """Sets a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
-    from matplotlib.ticker import LogLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
     limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high), f"{which}label": label}
     axes.set(**limits)
     axis, decades = axes.xaxis if which == "x" else axes.yaxis, math.log10(high / low)
-    few = decades <= _FEW_DECADES[which]
-    steps = (1.0,) if not few else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
-    axis.set_major_locator(LogLocator(subs=steps, numticks=20))
+    steps = LogLocator(subs=(1.0,) if decades > 2.5 else (1.0, 2.0, 5.0), numticks=20)
+    axis.set_major_locator(steps if decades > 0.5 else MaxNLocator(6))
     axis.set_major_formatter("{x:,.12g}")
-    axis.set_minor_formatter("")
-    if few:
-        axis.set_ticks([], minor=True)
+    axis.set_minor_locator(NullLocator())
 
 
 def around(values: Sequence[float | None]) -> tuple[float, float]:

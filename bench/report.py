@@ -154,8 +154,7 @@ def text(sections: Sequence[Section]) -> str:
     quick = any(results.quick for results in measured)
     parts = [*_head(measured, quick), *_summary(sections), *_aims(sections), *_machine(measured)]
     parts += [part for section in sections for part in _section(section, quick)]
-    parts += ["## What these numbers do not show", _listed(limits(measured))]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join([*parts, *_limits(measured)]) + "\n"
 
 
 def _listed(lines: Iterable[object]) -> str:
@@ -167,7 +166,7 @@ def _head(measured: Sequence[Results], quick: bool) -> Iterator[str]:
     if quick:
         yield (
             "**Quick: fewer cases, fewer and shorter rounds than a full report.** It shows that everything works, and "
-            "large differences only."
+            "large differences only: “equal within noise” mostly means that there was not enough time to measure one."
         )
     days = sorted({results.began[:10] for results in measured})
     took = _span(sum(results.took_s for results in measured))
@@ -210,13 +209,11 @@ def _aims(sections: Sequence[Section]) -> Iterator[str]:
 
 
 def _machine(measured: Sequence[Results]) -> Iterator[str]:
-    rows: dict[str, dict[str, None]] = {}
-    for results in measured:
-        for name, value in {**results.machine, "pebble": results.pebble}.items():
-            rows.setdefault(name, {})["not installed" if value is None else str(value)] = None
-    if rows:
+    """That of the first comparison: a result file has its own."""
+    for results in measured[:1]:
         yield "## The machine"
-        yield _table(("", ""), [(name, " / ".join(shown)) for name, shown in rows.items()])
+        rows = {**results.machine, "pebble": results.pebble}
+        yield _table(("", ""), [(name, str(value or "not installed")) for name, value in rows.items()])
 
 
 def _section(section: Section, quick: bool) -> Iterator[str]:
@@ -273,17 +270,13 @@ _NO_REAL = (
     "No long run: leaks, and brokers that have run for a month, are not covered.",
     "A null test shows that a comparison finds no difference where there is none, not the cause of those it finds.",
 )
-_OF_QUICK = (
-    "A quick run has too few rounds for a narrow 99 % interval, and leaves out most sizes, rates, loads and trials. "
-    "“Equal within noise” here mostly means that there was not enough time to measure a difference."
-)
 
 
-def limits(measured: Sequence[Results]) -> list[str]:
-    """What the numbers do not show, the most important first."""
+def _limits(measured: Sequence[Results]) -> Iterator[str]:
     machine = measured[0].machine if measured else {}
+    yield "## What these numbers do not show"
     this_machine = (
         f"One machine, {machine.get('cores')} cores of {machine.get('cpu')}. Intervals are over the rounds of one run; "
         "another run, another kernel or another load on the same host changes medians by more than they show."
     )
-    return [*([_OF_QUICK] if any(one.quick for one in measured) else []), this_machine, *_NO_REAL]
+    yield _listed((this_machine, *_NO_REAL))

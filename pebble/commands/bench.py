@@ -38,11 +38,6 @@ def compare(
 
     Both files must come from the same comparison, if possible on the same machine with the same options. The ratios of
     the medians and of the p99 of each cell are tested with confidence intervals over rounds.
-
-    \b
-        pebble bench frames --output before
-        pebble bench frames --output after
-        pebble bench compare before/frames.json after/frames.json
     """
     from pebble.bench.compare import run
 
@@ -81,9 +76,7 @@ def report(
 
     \b
         pebble bench report docs/results
-        pebble bench report build/report-quick --quick
         pebble bench report bench-results --only control,control-null
-        pebble bench report docs/results --render
     """
     from pebble.bench.report import run, write
 
