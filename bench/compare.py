@@ -71,10 +71,10 @@ def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Findin
     asked = [(one, other, percent) for one, other in both for percent in _percents(one, other)]
     findings = [_judged(*one, certainty(len(asked)), threshold) for one in asked]
     for key, cell in {**before, **after}.items():
-        medians = [_figure(cells.get(key), 50) for cells in (before, after)]
-        if sum(map(math.isnan, medians)) == 1:
-            kind = Kind.ONLY_B if math.isnan(medians[0]) else Kind.NO_SAMPLES if key in after else Kind.ONLY_A
-            findings.append(Finding(cell, 50, kind, *medians, Interval()))
+        old, new = (_figure(cells.get(key), 50) for cells in (before, after))
+        if math.isnan(old) != math.isnan(new):
+            kind = Kind.ONLY_B if math.isnan(old) else Kind.NO_SAMPLES if key in after else Kind.ONLY_A
+            findings.append(Finding(cell, 50, kind, old, new, Interval()))
     return sorted(findings, key=lambda one: (list(Kind).index(one.kind), -one.ratio.ratio if one.ratio.known else 0.0))
 
 

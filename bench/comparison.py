@@ -172,12 +172,8 @@ class Comparison:
 
     def arguments(self, quick: bool) -> list[str]:
         """The command line in a report, without ``pebble``."""
-        more = self.reported_full if not quick else ["--quick"] if self.has_quick else []
+        more = ["--quick"] if quick else self.reported_full
         return [*(self.words or ("bench", self.name)), *(self.reported or ()), *more]
-
-    @property
-    def has_quick(self) -> bool:
-        return self.quick is not self.full
 
     def shown(self, cells: Sequence[Cell]) -> list[Table]:
         return [table for tables in self.tables for table in tables(cells)]
@@ -230,7 +226,7 @@ class Run:
         words = ["pebble", *(about.words or ("bench", about.name))]
         for option in about.options:
             words += option.words(self.options.get(option.key), defaults.get(option.key, ()))
-        return [*words, *(["--quick"] if self.quick and about.has_quick else [])]
+        return [*words, "--quick"] if self.quick else words
 
     def records(self) -> dict[str, Value | list[Value]]:
         """All options that affect the results."""

@@ -35,7 +35,7 @@ def run(run: Run) -> int:
     about.prepare(run)
     _leave_out_missing(run)
     results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
-    collected, rounds = Collected(about, roles_of(run), about.conditions(run)), Rounds(run.rounds, console)
+    collected, rounds = Collected(about, roles_of(run)), Rounds(run.rounds, console)
     with interrupted_by_signals():
         try:
             _measure(run, collected, rounds)
@@ -132,18 +132,15 @@ def _round(round_: Round) -> Iterator[Cell]:
 class Collected:
     """Joins the cells of the rounds by variant, conditions and measure."""
 
-    def __init__(
-        self, comparison: Comparison, roles: Sequence[str], conditions: Sequence[Mapping[str, Value]] = ()
-    ) -> None:
-        self._about, self.roles, self._conditions = comparison, roles, conditions
+    def __init__(self, comparison: Comparison, roles: Sequence[str]) -> None:
+        self._about, self.roles = comparison, roles
         self._cells: dict[Hashable, Cell] = {}
         self._figures: defaultdict[tuple[Hashable, str], list[Value]] = defaultdict(list)
         self.pilot: list[Cell] = []  # of a null test, before the first round
 
     def add(self, cells: Iterable[Cell]) -> None:
         """Adds a round: all of it, or nothing if an error is raised meanwhile. Passes of a round are one."""
-        by_key = grouped(cells, lambda cell: (cell.variant, cell.case))
-        for key, parts in sorted(by_key.items(), key=lambda one: self._place(one[1][0])):
+        for key, parts in grouped(cells, lambda cell: (cell.variant, cell.case)).items():
             cell = self._cells.setdefault(key, msgspec.structs.replace(parts[0], rounds=[], figures={}))
             cell.unit = cell.unit or parts[0].unit  # a case that failed has none
             joined = [[sample for part in parts for sample in part.samples]]
@@ -152,11 +149,6 @@ class Collected:
                 self._figures[key, name].append(value)
                 combine = {**_JOINED, **self._about.figures}.get(name, lambda values: values[-1])
                 cell.figures[name] = combine(self._figures[key, name])
-
-    def _place(self, cell: Cell) -> tuple[int, int]:
-        """The order of the cases, of which every other round has the reverse."""
-        of = (at for at, one in enumerate(self._conditions) if one.items() <= cell.params.items())
-        return next(of, -1), self.roles.index(cell.variant) if cell.variant in self.roles else -1
 
     def cells(self) -> list[Cell]:
         """In the order of the declared measures, if there is one."""

@@ -205,7 +205,7 @@ class _Bar:
     text: str = ""
 
 
-def _bars(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes], None], *more: str) -> Figure:
+def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes], None], *more: str) -> Figure:
     """Panels of bars, those of a row below each other; the row of the sum comes last. ``more`` have a style, too."""
     rows = sorted(unique([bar.row for bar in bars]), key=lambda row: row == _SUM)
     by_panel, variants = grouped(bars, lambda bar: bar.panel), unique([bar.variant for bar in bars])
@@ -217,9 +217,9 @@ def _bars(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes],
         for at, row in enumerate(rows):
             here = [bar for bar in some if bar.row == row]
             for number, bar in enumerate(here):
-                y, height = at + 0.8 * ((number + 0.5) / len(here) - 0.5), min(0.5, 0.72 / len(here))
-                colour = style_of[bar.variant].colour
-                axes.barh(y, bar.end - bar.begin, left=bar.begin, height=height, color=colour, alpha=0.8)
+                y, colour = at + 0.8 * ((number + 0.5) / len(here) - 0.5), style_of[bar.variant].colour
+                thick = min(0.5, 0.72 / len(here))
+                axes.barh(y, bar.end - bar.begin, left=bar.begin, height=thick, color=colour, alpha=0.8)
                 axes.plot(bar.line, [y] * len(bar.line), color=_DARK, linewidth=1.1, marker="|", markersize=6)
                 axes.annotate(bar.text, (max((bar.end, *bar.line)), y), fontsize=8, va="center")
         axes.set_yticks(range(len(rows)), [short(row or "all", 34) for row in rows])
@@ -246,7 +246,7 @@ def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: s
             axes.axvline(1 + null.SLOWDOWN, color=_DARK, linewidth=0.9, linestyle="--")
 
     # a role has the same colour with and without the plain one
-    return _bars(title, bars, 5.6, axis, *(null.variant_of(cell.variant) for cell, _ in judged))
+    return _bar_panels(title, bars, 5.6, axis, *(null.variant_of(cell.variant) for cell, _ in judged))
 
 
 def _amounts(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Figure:
@@ -262,17 +262,18 @@ def _amounts(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Fi
         axes.set_xlim(0, 1.14 * max(bar.end for bar in bars) or 1.0)
         axes.set_xlabel(f"{cells[0].measure}, {_unit(cells)}")
 
-    return _bars(title, bars, 5.2 if panel else 8.5, axis)
+    return _bar_panels(title, bars, 5.2 if panel else 8.5, axis)
 
 
 def _tails(cells: Sequence[Cell], title: str) -> Figure:
     ends = [(cell, _p(50, cell), _p(99, cell)) for cell in cells]
-    left, right = 0.5 * min((p50 for _, p50, _ in ends if p50 > 0), default=1.0), 9 * max(p99 for _, _, p99 in ends)
+    left, right = 0.5 * min((p50 for _, p50, _ in ends if p50 > 0), default=1.0), 9 * max(p99 for *_, p99 in ends)
     bars = [
         _Bar(cell.conditions(), cell.variant, cell.variant, left, p50, (p50, p99), f"  {digits(p50)} / {digits(p99)}")
         for cell, p50, p99 in ends
     ]
-    return _bars(title, bars, 5.0, lambda axes: plots.log_axis(axes, "x", f"latency, {_unit(cells)}", left, right))
+    label = f"latency, {_unit(cells)}"
+    return _bar_panels(title, bars, 5.0, lambda axes: plots.log_axis(axes, "x", label, left, right))
 
 
 def _p(percent: float, cell: Cell) -> float:

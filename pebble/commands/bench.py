@@ -112,9 +112,7 @@ def command_of(about: Comparison) -> Callable[..., int]:
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
     declared: dict[str, tuple[Any, Any]] = {name: (_annotation(about, one), None) for name, one in options.items()}
-    if about.has_quick:
-        declared["quick"] = Quick, False
-    declared["output"] = Output, about.folder
+    declared |= {"quick": (Quick, False), "output": (Output, about.folder)}
     run.__doc__ = about.help
     run.__annotations__ = {name: annotation for name, (annotation, _) in declared.items()}
     run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]

@@ -160,10 +160,10 @@ def test_other_differences_are_listed(tmp_path: Path) -> None:
     b.machine, b.quick, b.pebble = {"cpu": "another", "cores": 2, "kernel": "6"}, True, "9.9"
     assert differences(a, b) == [
         "cpu: one in A, another in B",
-        "kernel: None in A, 6 in B",
         "rounds: 10 in A, 9 in B",
         f"pebble: {a.pebble} in A, 9.9 in B",
         "quick: False in A, True in B",
+        "kernel: None in A, 6 in B",
     ]
     assert "not the same: cpu" in report(tmp_path, a, b)[1]
 
