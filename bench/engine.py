@@ -201,7 +201,7 @@ class Rounds:
     @property
     def enough(self) -> bool:
         """Whether enough rounds to judge are left, if so many were requested."""
-        return self._done >= min(LEAST_ROUNDS, self._asked)
+        return self._done >= LEAST_ROUNDS or self._asked < LEAST_ROUNDS
 
 
 def check_folder(folder: Path) -> None:

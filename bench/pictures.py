@@ -213,7 +213,6 @@ def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[
     style_of = plots.styles(unique([*more, *variants]))
     figure, every = plots.panels(len(by_panel), 2, (width, height), title)
     for axes, (panel, some) in zip(every, by_panel.items(), strict=True):
-        axis(axes)
         for at, row in enumerate(rows):
             here = [bar for bar in some if bar.row == row]
             for number, bar in enumerate(here):
@@ -226,6 +225,7 @@ def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.grid(visible=False, axis="y")
         axes.set_title(short(panel, 50), loc="left")
+        axis(axes)
     plots.legend(figure, {name: Style(style_of[name].colour, "", "s") for name in variants})
     return figure
 

@@ -11,6 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from statistics import median_low
 
+from pebble.errors import PebbleError
+
 _PROC = Path("/proc")
 _PINGS = 60
 _PERIOD_S = 0.005  # as messages at 200 Hz: cores go idle in between
@@ -42,7 +44,7 @@ def _sum(file: Path, *fields: str) -> int:
 
 
 def pss_mb(pid: int) -> float:
-    """Proportional set size: shared pages are divided among their users. 0 for a process that has ended."""
+    """Proportional set size: shared pages are divided among their users."""
     return _memory_mb(pid, "Pss:")
 
 
@@ -50,15 +52,20 @@ def own_mb(pid: int) -> float:
     """What a process has allocated, without the pages of programs and libraries: only it can make this grow.
 
     The proportional set size grows too when another process ends with which pages were shared. Shared memory is divided
-    among its users. 0 for a process that has ended.
+    among its users.
     """
     return _memory_mb(pid, "Anonymous:", "Pss_Shmem:")
 
 
 def _memory_mb(pid: int, *fields: str) -> float:
-    with suppress(FileNotFoundError, ProcessLookupError):
-        return _sum(_PROC / str(pid) / "smaps_rollup", *fields) / 1024
-    return 0.0
+    """0 for a process that has ended. Raises PebbleError if the kernel does not provide it."""
+    file = _PROC / str(pid) / "smaps_rollup"
+    try:
+        return _sum(file, *fields) / 1024
+    except OSError as error:
+        if file.parent.exists() and not isinstance(error, ProcessLookupError):
+            raise PebbleError(f"{file}: {error.strerror}: memory cannot be measured without it") from None
+        return 0.0
 
 
 # -- the time of a wake-up, which every message needs several times
