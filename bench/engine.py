@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
+from operator import itemgetter
 from pathlib import Path
 from typing import Final
 
@@ -147,7 +148,7 @@ class Collected:
             cell.rounds += parts[0].rounds if cell.measure.endswith(OVER_TIME) else joined  # times, then values
             for name, value in (one for part in parts for one in part.figures.items()):
                 self._figures[key, name].append(value)
-                combine = {**_JOINED, **self._about.figures}.get(name, lambda values: values[-1])
+                combine = {**_JOINED, **self._about.figures}.get(name, itemgetter(-1))
                 cell.figures[name] = combine(self._figures[key, name])
 
     def cells(self) -> list[Cell]:

@@ -82,8 +82,8 @@ def caveat(cells: Sequence[Cell]) -> list[str]:
     """A note below sentences without intervals."""
     if enough(cells):
         return []
-    few = min(len(medians(cell)) for cell in cells)
-    return [f"Rounds: {few}. A {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}: these are medians (and their range)."]
+    few, needs = min(len(medians(cell)) for cell in cells), f"a {100 * LEVEL:.0f} % interval needs {LEAST_ROUNDS}"
+    return [f"{few} round{'s' if few != 1 else ''}, and {needs}: these are medians, with minimum and maximum."]
 
 
 # -- tables and sentences as data

@@ -39,12 +39,12 @@ def test_few_rounds_give_no_interval_and_a_note() -> None:
     pair = cells([1.0, 2.0], [2.0, 4.0])
     assert against(pair) == "2.00"
     (line,) = caveat(pair)
-    assert line.startswith("Rounds: 2. A 99 % interval needs 8")
+    assert line.startswith("2 rounds, and a 99 % interval needs 8")
 
 
 def test_one_round_claims_nothing() -> None:
     assert printed([1.0], [2.0]) == "M: mqtt 1.00 ms, zenoh 2.00 ms"
-    assert caveat(cells([1.0], [2.0]))[0].startswith("Rounds: 1. ")
+    assert caveat(cells([1.0], [2.0]))[0].startswith("1 round, and ")
 
 
 def test_a_single_robot_is_not_compared() -> None:
