@@ -101,7 +101,7 @@ def roles_of(run: Run) -> Sequence[str]:
 def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
     """Rounds share an environment: a new one every ``fresh_every`` rounds, and after a round that failed."""
     about, env = run.comparison, None
-    with run.console.status("") as status, ExitStack() as shared:
+    with run.console.status("", refresh_per_second=4) as status, ExitStack() as shared:
         for number in range(run.rounds):
             before = f"round {number + 1} of {run.rounds}: "
             run.show = lambda what, before=before: status.update(escape(before + what))  # type: ignore[misc]

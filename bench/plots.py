@@ -156,7 +156,7 @@ def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> Non
     axes.set(**limits)
     axis, decades = axes.xaxis if which == "x" else axes.yaxis, math.log10(high / low)
     steps = LogLocator(subs=(1.0,) if decades > 2.5 else (1.0, 2.0, 5.0), numticks=20)
-    axis.set_major_locator(steps if decades > 0.5 else MaxNLocator(6))
+    axis.set_major_locator(steps if decades > 0.5 else MaxNLocator(6, steps=(1, 2, 5, 10)))
     axis.set_major_formatter("{x:,.12g}")
     axis.set_minor_locator(NullLocator())
 

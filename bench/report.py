@@ -100,6 +100,8 @@ def _run(comparison: Comparison, folder: Path, quick: bool) -> str:
     finally:
         end_all([program], _END_S)
     if code is None:
+        with output.open("a") as file:
+            file.write(f"{comparison.name} hung and was ended\n")
         return "hung and was ended"
     return f"ended with code {code}" if code else "" if results.exists() else "measured nothing"
 

@@ -81,10 +81,9 @@ class Cell(msgspec.Struct, kw_only=True):
         return percentile(self.samples, percent) if known is None else known
 
     def thinned(self) -> Cell:
-        """At most 2,000 samples, or 100 of each round, evenly taken: percentiles of each round stay as they are.
+        """At most 2,000 samples, or 100 of each round: the last of 100, 200, … equal parts, so that percentiles stay.
 
-        Taken are the last samples of equal parts: of 100, 200, … parts whole percentiles are the same. The samples of a
-        round are sorted, except in a curve.
+        Those of a round are sorted, except in a curve.
         """
         most, rounds = max(100, _MOST // max(1, len(self.rounds)) // 100 * 100), []
         for one in self.rounds:
