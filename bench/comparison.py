@@ -6,6 +6,7 @@ large (numpy is not needed: see :mod:`pebble.bench.ratios`) is imported where it
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,6 +44,7 @@ MODULES: Final = {
     "impair": "impair.trials",
 }
 
+Params = Mapping[str, Value]
 Combine = Callable[[Sequence[Any]], Value]  # the values of all rounds into one
 Tables = Callable[[Sequence[Cell]], Iterable[Table]]
 Assess = Callable[[Sequence[Cell]], Iterable[str | Judged]]
@@ -143,7 +145,7 @@ class Comparison:
 
     variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
     references: Sequence[str] = ()  # more of them, which are always measured
-    conditions: Callable[[Run], Sequence[Mapping[str, Value]]] = lambda _run: ({},)
+    conditions: Callable[[Run], Sequence[Params]] = lambda _run: ({},)
     prepare: Callable[[Run], None] = lambda _run: None  # checks what is needed, and notes; raises PebbleError
     missing: Callable[[str], str | None] = lambda _variant: None  # why a variant is left out
     environment: Callable[[Run], AbstractContextManager[Any]] = lambda _run: nullcontext()
@@ -243,7 +245,7 @@ class Case:
     number: int  # of the round, from 0
     variant: str
     role: str  # the variant of its cells: another one in a null test
-    condition: Mapping[str, Value]
+    condition: Params
     planted_us: float = 0.0  # of work for each message in a null test: before its time stamp,
     slowed: bool = False  # or after it
     env: Any = None
@@ -252,12 +254,7 @@ class Case:
         return ", ".join(filter(None, (self.role, *map(str, self.condition.values()))))
 
     def cell(
-        self,
-        measure: str,
-        unit: str,
-        samples: Iterable[float],
-        params: Mapping[str, Value] | None = None,
-        **figures: Value,
+        self, measure: str, unit: str, samples: Iterable[float], params: Params | None = None, **figures: Value
     ) -> Cell:
         of, rounds_ = {**self.condition, **(params or {})}, [list(samples)]
         return Cell(variant=self.role, params=of, measure=measure, unit=unit, rounds=rounds_, figures=figures)
@@ -271,11 +268,9 @@ class Round:
     number: int  # from 0
     env: Any
     roles: Sequence[str]
-    planted_us: Callable[[Mapping[str, Value]], float]
+    planted_us: Callable[[Params], float]
 
-    def cases(
-        self, conditions: Sequence[Mapping[str, Value]] | None = None, passes: int | None = None
-    ) -> Iterator[Case]:
+    def cases(self, conditions: Sequence[Params] | None = None, passes: int | None = None) -> Iterator[Case]:
         """Of all conditions, or only of these; ``passes`` replaces that of the options.
 
         Roles of each condition run one after another, so that a temporary disturbance affects all of them.
@@ -284,14 +279,13 @@ class Round:
         conditions = run.comparison.conditions(run) if conditions is None else conditions
         for pass_ in range(run.options.get("passes", 1) if passes is None else passes):
             step = -1 if (number + pass_) % 2 else 1
-            for condition in conditions[::step]:
-                for role in self.roles[::step]:
-                    case = Case(
-                        run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
-                        slowed=null.is_slowed(role), planted_us=self.planted_us(condition), env=self.env,
-                    )  # fmt: skip
-                    run.show(str(case))
-                    yield case
+            for condition, role in itertools.product(conditions[::step], self.roles[::step]):
+                case = Case(
+                    run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
+                    slowed=null.is_slowed(role), planted_us=self.planted_us(condition), env=self.env,
+                )  # fmt: skip
+                run.show(str(case))
+                yield case
 
 
 # -- all comparisons

@@ -21,6 +21,8 @@ _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
 _SEED = 1  # the same samples give the same interval
 
+Rounds = Sequence[Sequence[float]]  # the samples of each
+
 
 @dataclass(frozen=True, slots=True)
 class Interval:
@@ -67,7 +69,7 @@ class Interval:
         return f"{ours} takes {_digits(self.ratio)}× the {quantity} of {theirs} ({interval})"
 
 
-def paired(ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], percent: float = 50) -> Interval:
+def paired(ours: Rounds, theirs: Rounds, percent: float = 50) -> Interval:
     """The median, over rounds run in turn, of the ratio of their percentiles.
 
     A sample may be infinite: a message that never arrived. Rounds without samples, or both infinite, do not count.
@@ -78,9 +80,7 @@ def paired(ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], p
     return _interval(logs, [0.0] * len(logs), LEVEL)
 
 
-def unpaired(
-    ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], percent: float = 50, level: float = LEVEL
-) -> Interval:
+def unpaired(ours: Rounds, theirs: Rounds, percent: float = 50, level: float = LEVEL) -> Interval:
     """The same for two runs at different times: the ratio of the medians of their rounds' percentiles."""
     figures = ([percentile(one, percent) for one in rounds if one] for rounds in (ours, theirs))
     a, b = ([math.log(one) for one in some if one > 0] for some in figures)
