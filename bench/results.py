@@ -126,6 +126,10 @@ class Results(msgspec.Struct, kw_only=True):
     assessment: list[str] = msgspec.field(name="verdict", default_factory=list)  # sentences
     aims: list[Judged] = []
 
+    def find(self, variant: str, measure: str | None = None, **params: Value) -> Cell | None:
+        same = (one for one in self.cells if one.variant == variant and params.items() <= one.params.items())
+        return next((one for one in same if measure in (None, one.measure)), None)
+
     def save(self, path: Path) -> None:
         """Raises PebbleError if the file cannot be written."""
         for cell in self.cells:
