@@ -49,25 +49,19 @@ class Aim:
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Judged]:
         found = [cell for cell in cells if self.of(cell)]
-        yield from map(self._judged, [max(found, key=self._beyond)] if self.worst and found else found)
+        for cell in [max(found, key=self._beyond)] if self.worst and found else found:
+            value = self.value(cell)
+            words = self.never if math.isinf(value) else f"{self.shown(value)} {self.unit}".strip()
+            enough = len(cell.samples) + (cell.lost or 0) >= self.least and len(cell.rounds) >= self.least_rounds
+            yield Judged(
+                what=_what(self.what, cell, self.at_most if self.at_least is None else self.at_least),
+                outcome=outcome(self._beyond(cell) <= 0, judged=enough),
+                measured=f"{'nothing arrived' if math.isnan(value) else words}{self.beside(cell)}",
+            )
 
     def _beyond(self, cell: Cell) -> float:
         value = self.value(cell)
         return self.at_least - value if self.at_least is not None else value - (self.at_most or 0.0)
-
-    def _judged(self, cell: Cell) -> Judged:
-        value, words = self.value(cell), self.never
-        if math.isnan(value):
-            words = "nothing arrived"
-        elif math.isfinite(value):
-            words = f"{self.shown(value)} {self.unit}".strip()
-        enough = len(cell.samples) + (cell.lost or 0) >= self.least and len(cell.rounds) >= self.least_rounds
-        bound = self.at_most if self.at_least is None else self.at_least
-        return Judged(
-            what=self.what.format(variant=cell.variant, measure=cell.measure, bound=bound, **cell.params),
-            outcome=outcome(self._beyond(cell) <= 0, judged=enough),
-            measured=f"{words}{self.beside(cell)}",
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,24 +81,25 @@ class RatioAim:
 
     def __call__(self, cells: Sequence[Cell]) -> Iterator[Judged]:
         for cell in filter(self.of, cells):
-            base = base_of(cell, cells, self.to)
-            if base is not None:
-                yield self._judged(cell, base)
+            if (base := base_of(cell, cells, self.to)) is None:
+                continue
+            ours, theirs = map(rounds_with_lost, (cell, base))
+            interval, why = paired(ours, theirs, self.percent), ""
+            if interval.few:
+                why = f", {interval.rounds} of {LEAST_ROUNDS} rounds"
+            elif min(map(len, (*ours, *theirs))) < self.least:
+                why = ", too few samples in a round"
+            elif interval.low <= self.at_most < interval.high:
+                why = ", the interval includes the bound"
+            yield Judged(
+                what=_what(self.what, cell, self.at_most),
+                outcome=outcome(interval.high <= self.at_most, judged=not why),
+                measured=f"{interval}{why}",
+            )
 
-    def _judged(self, cell: Cell, base: Cell) -> Judged:
-        ours, theirs = map(rounds_with_lost, (cell, base))
-        interval, why = paired(ours, theirs, self.percent), ""
-        if interval.few:
-            why = f", {interval.rounds} of {LEAST_ROUNDS} rounds"
-        elif min(map(len, (*ours, *theirs))) < self.least:
-            why = ", too few samples in a round"
-        elif interval.low <= self.at_most < interval.high:
-            why = ", the interval includes the bound"
-        return Judged(
-            what=self.what.format(variant=cell.variant, measure=cell.measure, bound=self.at_most, **cell.params),
-            outcome=outcome(interval.high <= self.at_most, judged=not why),
-            measured=f"{interval}{why}",
-        )
+
+def _what(words: str, cell: Cell, bound: float | None) -> str:
+    return words.format(variant=cell.variant, measure=cell.measure, bound=bound, **cell.params)
 
 
 def rounds_with_lost(cell: Cell) -> list[list[float]]:

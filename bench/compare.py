@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Hashable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
-from pebble.bench.ratios import LEAST_ROUNDS, Interval, student, unpaired
+from pebble.bench.ratios import LEAST_ROUNDS, LEVEL, Interval, unpaired
 from pebble.bench.results import OVER_TIME, Cell, Results, load, percentile
 from pebble.bench.tables import figure, plain_table
 from pebble.errors import PebbleError
@@ -29,7 +28,6 @@ THRESHOLD = 1.05
 _SAME_EVERY_TIME = ("kB/s", "kbit/s")  # encoder output is deterministic: one value is exact
 _MORE_IS_BETTER = ("1/s",)
 _LEAST_SAMPLES = 100  # of a round: with fewer, p99 is the maximum
-_LOSS = 0.005  # share of what was sent: smaller changes are ignored
 
 
 class Kind(StrEnum):
@@ -44,24 +42,19 @@ class Kind(StrEnum):
     EQUAL = "no difference"  # beyond noise
 
 
+_COLOURS = dict(zip(Kind, ("red", "red", "yellow", "yellow", "green"), strict=False))
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One percentile of one cell in both runs, as the median over its rounds; or the lost share. NaN: not measured."""
+    """A percentile of one cell in both runs, as the median over its rounds; NaN: not measured."""
 
     cell: Cell
-    percent: int | None  # None: the share that was lost, in %
+    percent: int
+    kind: Kind
     a: float
     b: float
     ratio: Interval  # b / a
-    kind: Kind
-
-    @property
-    def what(self) -> str:
-        return "lost %" if self.percent is None else f"p{self.percent} {self.cell.unit}".strip()
-
-    @property
-    def worse(self) -> bool:
-        return self.kind in (Kind.WORSE, Kind.NO_SAMPLES)
 
     @property
     def changed(self) -> bool:
@@ -70,17 +63,18 @@ class Finding:
 
 def compare(a: Results, b: Results, threshold: float = THRESHOLD) -> list[Finding]:
     """All findings, the worst first. Each metric that both runs have is judged at the level of :func:`certainty`."""
-    (before, _), (after, silent) = (_by_key(one.cells) for one in (a, b))
-    both = [(cell, after[key]) for key, cell in before.items() if key in after]
+    before, after = (
+        {(cell.variant, cell.case): cell for cell in one.cells if not cell.measure.endswith(OVER_TIME)}
+        for one in (a, b)
+    )
+    both = [(one, after[key]) for key, one in before.items() if key in after and one.samples and after[key].samples]
     asked = [(one, other, percent) for one, other in both for percent in _percents(one, other)]
-    level = certainty(len(asked))
-    findings = [_judged(one, other, percent, level, threshold) for one, other, percent in asked]
+    findings = [_judged(*one, certainty(len(asked)), threshold) for one in asked]
     for key, cell in {**before, **after}.items():
-        if key not in after:
-            kind = Kind.NO_SAMPLES if key in silent else Kind.ONLY_A
-            findings.append(Finding(cell, 50, _figure(cell, 50), math.nan, Interval(), kind))
-        elif key not in before:
-            findings.append(Finding(cell, 50, math.nan, _figure(cell, 50), Interval(), Kind.ONLY_B))
+        old, new = (_figure(cells.get(key), 50) for cells in (before, after))
+        if math.isnan(old) != math.isnan(new):
+            kind = Kind.ONLY_B if math.isnan(old) else Kind.NO_SAMPLES if key in after else Kind.ONLY_A
+            findings.append(Finding(cell, 50, kind, old, new, Interval()))
     return sorted(findings, key=lambda one: (list(Kind).index(one.kind), -one.ratio.ratio if one.ratio.known else 0.0))
 
 
@@ -91,40 +85,19 @@ def certainty(figures: int) -> float:
 
 def differences(a: Results, b: Results) -> list[str]:
     """Other differences between two runs, one line each: the program may then not be the only cause."""
-    about = [{"pebble": one.pebble, "quick": one.quick} for one in (a, b)]
-    groups: dict[str, Any] = {"machine ": (a.machine, b.machine), "option ": (a.options, b.options), "": about}
-    return [
-        f"{what}{name}: {one.get(name)} in A, {other.get(name)} in B"
-        for what, (one, other) in groups.items()
-        for name in {**one, **other}
-        if one.get(name) != other.get(name)
-    ]
+    one, other = ({**run.machine, **run.options, "pebble": run.pebble, "quick": run.quick} for run in (a, b))
+    changed = [name for name in {**one, **other} if one.get(name) != other.get(name)]
+    return [f"{name}: {one.get(name)} in A, {other.get(name)} in B" for name in changed]
 
 
-def _by_key(cells: Sequence[Cell]) -> tuple[dict[Hashable, Cell], dict[Hashable, Cell]]:
-    """The cells with samples, and those without."""
-    full: dict[Hashable, Cell] = {}
-    silent: dict[Hashable, Cell] = {}
-    for cell in (cell for cell in cells if not cell.measure.endswith(OVER_TIME)):
-        (full if cell.samples else silent)[cell.variant, cell.case] = cell
-    return full, silent
+def _percents(one: Cell, other: Cell) -> tuple[int, ...]:
+    """Those for which most rounds have enough samples."""
+    sizes = [statistics.median(filter(None, cell.sizes)) for cell in (one, other)]
+    return (50, 99) if min(sizes) >= _LEAST_SAMPLES else (50,)
 
 
-def _percents(one: Cell, other: Cell) -> Iterator[int | None]:
-    """The percentiles for which most rounds have enough samples; None for the lost share, if one is known."""
-    yield 50
-    if all(statistics.median(size for size in cell.sizes if size) >= _LEAST_SAMPLES for cell in (one, other)):
-        yield 99
-    losses = [cell.lost for cell in (one, other) if cell.lost is not None and cell.lost >= 0]
-    if len(losses) == 2 and any(losses):
-        yield None
-
-
-def _judged(one: Cell, other: Cell, percent: int | None, level: float, threshold: float) -> Finding:
-    if percent is None:
-        return _lost(one, other, level)
-    ratio = unpaired(other.rounds, one.rounds, percent, level)
-    exact = other.unit in _SAME_EVERY_TIME
+def _judged(one: Cell, other: Cell, percent: int, level: float, threshold: float) -> Finding:
+    ratio, exact = unpaired(other.rounds, one.rounds, percent, level), other.unit in _SAME_EVERY_TIME
     if exact:
         ratio = replace(ratio, low=ratio.ratio, high=ratio.ratio)
     a, b = _figure(one, percent), _figure(other, percent)
@@ -136,72 +109,31 @@ def _judged(one: Cell, other: Cell, percent: int | None, level: float, threshold
         kind = Kind.EQUAL
     else:
         kind = Kind.WORSE if (ratio.ratio > 1) != (other.unit in _MORE_IS_BETTER) else Kind.BETTER
-    return Finding(other, percent, a, b, ratio, kind)
+    return Finding(other, percent, kind, a, b, ratio)
 
 
-def _lost(one: Cell, other: Cell, level: float) -> Finding:
-    """Compares lost shares by the variance between rounds: losses come in bursts. Each round sends equally many."""
-    shares = []
-    for cell in (one, other):
-        arrived = [size for size in cell.sizes if size]
-        each = int(cell.figures["sent"] or 0) / len(arrived)
-        shares.append([1 - count / each for count in arrived])
-    rounds, (a, b), kind = min(map(len, shares)), map(statistics.fmean, shares), Kind.UNKNOWN
-    if rounds >= LEAST_ROUNDS:
-        error = math.sqrt(sum(statistics.variance(some) / len(some) for some in shares))
-        changed = abs(b - a) > max(_LOSS, student(level, rounds) * error)
-        kind = Kind.EQUAL if not changed else Kind.WORSE if b > a else Kind.BETTER
-    return Finding(other, None, 100 * a, 100 * b, Interval(level=level, rounds=rounds), kind)
-
-
-def _figure(cell: Cell, percent: int) -> float:
-    """The percentile as the median over the rounds, as in the ratio."""
-    return statistics.median(percentile(samples, percent) for samples in cell.rounds if samples)
+def _figure(cell: Cell | None, percent: int) -> float:
+    """The percentile as the median over the rounds, as in the ratio; NaN without samples."""
+    rounds = [] if cell is None else [percentile(samples, percent) for samples in cell.rounds if samples]
+    return statistics.median(rounds) if rounds else math.nan
 
 
 def summary(findings: Sequence[Finding], threshold: float = THRESHOLD) -> list[str]:
-    """Counts of the outcomes and the sensitivity of the comparison, as sentences."""
-    count = {kind: sum(finding.kind is kind for finding in findings) for kind in Kind}
-    judged = [finding for finding in findings if finding.kind in (Kind.WORSE, Kind.BETTER, Kind.EQUAL)]
+    """Counts of the outcomes, and what a change is."""
+    count = Counter(finding.kind for finding in findings)
+    level = max((finding.ratio.level for finding in findings), default=LEVEL)
     lines = [
-        f"{len(judged)} metrics compared: {count[Kind.WORSE]} worse, {count[Kind.BETTER]} better,"
-        f" {count[Kind.EQUAL]} without a difference beyond noise"
+        f"{count[Kind.WORSE] + count[Kind.BETTER] + count[Kind.EQUAL]} metrics compared: {count[Kind.WORSE]} worse,"
+        f" {count[Kind.BETTER]} better, {count[Kind.EQUAL]} without a difference beyond noise",
+        f"A change is a factor beyond {threshold:g} whose {100 * level:.4g} % interval excludes 1.00",
     ]
-    if judged:
-        lines.append(
-            f"A change is a factor beyond {threshold:g} whose {100 * judged[0].ratio.level:.4g} % interval excludes"
-            f" 1.00; random variation within the runs shows any change with a chance of about {100 * CHANCE:g} %, and"
-            " variation between runs adds to that"
-        )
-    if ratios := [one.ratio for one in judged if one.percent == 50]:
-        seen = max(threshold, statistics.median(max(one.high / one.ratio, one.ratio / one.low) for one in ratios))
-        lines.append(f"Half of the medians would have shown a change by a factor of {seen:.2f}")
-    notes = {
-        Kind.NO_SAMPLES: "without samples in B: counted as worse",
-        Kind.UNKNOWN: f"unknown: fewer than {LEAST_ROUNDS} rounds, or zero",
-        Kind.ONLY_A: "only in A: not measured in B",
-        Kind.ONLY_B: "only in B",
-    }
-    return [*lines, *(f"{count[kind]} {note}" for kind, note in notes.items() if count[kind])]
+    unknown = f"{count[Kind.UNKNOWN]} unknown: fewer than {LEAST_ROUNDS} rounds, or zero"
+    return [*lines, unknown] if count[Kind.UNKNOWN] else lines
 
 
-# -- what is printed
-
-_COLOURS = {
-    Kind.NO_SAMPLES: "red", Kind.WORSE: "red", Kind.ONLY_A: "yellow", Kind.ONLY_B: "yellow", Kind.BETTER: "green",
-}  # fmt: skip
-
-
-def run(
-    a: Path, b: Path, *, threshold: float = THRESHOLD, everything: bool = False, console: Console | None = None
-) -> int:
+def run(a: Path, b: Path, *, everything: bool = False, console: Console | None = None) -> int:
     """0 if nothing got worse, 1 if something did. Raises PebbleError for files that cannot be compared."""
-    console = console or Console()
-    if not (math.isfinite(threshold) and threshold >= 1):
-        raise PebbleError(
-            f"--threshold {threshold:g}: a factor of 1 or more is needed (1.05 ignores changes below 5 %)"
-        )
-    before, after = load(a), load(b)
+    console, before, after = console or Console(), load(a), load(b)
     if before.bench != after.bench:
         raise PebbleError(
             f"{a} is of bench {before.bench}, {b} of bench {after.bench}: compare two runs of the same bench"
@@ -209,22 +141,18 @@ def run(
     for line in differences(before, after):
         console.print(f"not the same: {line}", style="yellow", highlight=False, markup=False, soft_wrap=True)
     with console.status("comparing"):  # hundreds of intervals take a few seconds
-        findings = compare(before, after, threshold)
-    shown = [finding for finding in findings if everything or finding.changed]
-    if shown:
-        console.print(_table(shown, before.bench))
-    for line in summary(findings, threshold):
-        console.print(line, highlight=False, soft_wrap=True)
-    return int(any(finding.worse for finding in findings))
-
-
-def _table(findings: Sequence[Finding], bench: str) -> Table:
-    table = plain_table(f"{bench}: B against A", ("what", "metric", "A", "B", "B / A", ""), left=2)
+        findings = compare(before, after)
+    table = plain_table(f"{before.bench}: B against A", ("what", "metric", "A", "B", "B / A", ""), left=2)
     table.columns[0].no_wrap = False  # long names wrap, so that the outcome is never cut off
-    for finding in findings:
-        cell = finding.cell
-        where = ", ".join(filter(None, (cell.variant, cell.measure, cell.conditions())))
-        values = (figure(finding.a), figure(finding.b), str(finding.ratio))
-        table.add_row(where, finding.what, *values, finding.kind, style=_COLOURS.get(finding.kind))
     table.columns[-1].justify = "left"
-    return table
+    for finding in findings:
+        cell, kind = finding.cell, finding.kind
+        if everything or finding.changed:
+            where = ", ".join(filter(None, (cell.variant, cell.measure, cell.conditions())))
+            figures = (figure(finding.a), figure(finding.b), str(finding.ratio))
+            table.add_row(where, f"p{finding.percent} {cell.unit}", *figures, kind, style=_COLOURS.get(kind))
+    if table.row_count:
+        console.print(table)
+    for line in summary(findings):
+        console.print(line, highlight=False, soft_wrap=True)
+    return int(any(finding.kind in (Kind.WORSE, Kind.NO_SAMPLES) for finding in findings))

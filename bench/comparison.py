@@ -6,10 +6,13 @@ large (numpy is not needed: see :mod:`pebble.bench.ratios`) is imported where it
 
 from __future__ import annotations
 
+import itertools
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,7 +27,24 @@ if TYPE_CHECKING:
     from pebble.bench.pictures import Declared
 
 FOLDER: Final = Path("bench-results")
+#: The module of each comparison, which has it as a constant of the same name; in the order of the report. A module has
+#: its modes, too: CONTROL_NULL.
+MODULES: Final = {
+    "control": "control",
+    "bridge": "bridge",
+    "startup": "startup",
+    "cost": "cost",
+    "frames": "frames",
+    "video": "wire",
+    "sound": "wire",
+    "estop": "estop",
+    "fleet": "fleet",
+    "traffic": "traffic",
+    "page": "page",
+    "impair": "impair.trials",
+}
 
+Params = Mapping[str, Value]
 Combine = Callable[[Sequence[Any]], Value]  # the values of all rounds into one
 Tables = Callable[[Sequence[Cell]], Iterable[Table]]
 Assess = Callable[[Sequence[Cell]], Iterable[str | Judged]]
@@ -48,11 +68,10 @@ class Option:
     help: str
     sets: str = ""  # the value that it sets, if that has another name
     kind: type[Any] = str  # of one value; bool: a flag
-    many: bool = False  # several values, separated by commas
-    repeated: bool = False  # or each in an option of its own
+    many: bool = False  # several values, separated by commas, or each in an option of its own
     known: Sequence[str] = ()  # the values that there are
-    least: float | None = None
-    most: float | None = None
+    least: float = -math.inf
+    most: float = math.inf
     metavar: str | None = None
     recorded: bool = True  # among the options of the results
     private: bool = False  # results name no hosts and files: neither recorded nor, with its value, in their command
@@ -68,12 +87,10 @@ class Option:
         if unknown := [one for one in values if self.known and one not in self.known]:
             raise PebbleError(f"--{self.name}: unknown {', '.join(unknown)}: there are {', '.join(self.known)}")
         if not values or len(set(values)) < len(values):
-            raise PebbleError(f"--{self.name}: name {'each one once' if values else 'at least one'}")
-        limits = {name: limit for name, limit in (("least", self.least), ("most", self.most)) if limit is not None}
-        for one in values:
-            if not limits.get("least", one) <= one <= limits.get("most", one):
-                words = " and ".join(f"at {name} {limit:g}" for name, limit in limits.items())
-                raise PebbleError(f"--{self.name} {one}: must be {words}")
+            raise PebbleError(f"--{self.name}: name at least one, and each one once")
+        for one in values if self.kind in (int, float) else ():
+            if not self.least <= one <= self.most:
+                raise PebbleError(f"--{self.name} {one}: must be at least {self.least:g} and at most {self.most:g}")
 
     def words(self, value: Any, default: Any) -> list[str]:
         """As on the command line; names only if they are not the default ones."""
@@ -81,16 +98,12 @@ class Option:
             return [f"--{self.name}"] if value else []
         if value is None or (self.many and list(value) == list(default or ())):
             return []
-        if self.private:
-            return [f"--{self.name}", self.metavar or self.name.upper()]
-        if self.repeated:
-            return [word for one in value for word in (f"--{self.name}", as_word(one))]
-        return [f"--{self.name}", ",".join(map(as_word, value if self.many else [value]))]
+        return [f"--{self.name}", (self.metavar or self.name.upper()) if self.private else self.as_word(value)]
 
-
-def as_word(value: Any) -> str:
-    """A value as on the command line."""
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    def as_word(self, value: Any) -> str:
+        """A value as on the command line."""
+        values = value if self.many else [value]
+        return ",".join(f"{one:g}" if isinstance(one, float) else str(one) for one in values)
 
 
 def rounds(help_: str, *, least: int = 1) -> Option:
@@ -132,7 +145,7 @@ class Comparison:
 
     variants: Sequence[str] = ()  # measured in turn; the option of this name chooses some
     references: Sequence[str] = ()  # more of them, which are always measured
-    conditions: Callable[[Run], Sequence[Mapping[str, Value]]] = lambda _run: ({},)
+    conditions: Callable[[Run], Sequence[Params]] = lambda _run: ({},)
     prepare: Callable[[Run], None] = lambda _run: None  # checks what is needed, and notes; raises PebbleError
     missing: Callable[[str], str | None] = lambda _variant: None  # why a variant is left out
     environment: Callable[[Run], AbstractContextManager[Any]] = lambda _run: nullcontext()
@@ -161,12 +174,8 @@ class Comparison:
 
     def arguments(self, quick: bool) -> list[str]:
         """The command line in a report, without ``pebble``."""
-        more = self.reported_full if not quick else ["--quick"] if self.has_quick else []
+        more = ["--quick"] if quick else self.reported_full
         return [*(self.words or ("bench", self.name)), *(self.reported or ()), *more]
-
-    @property
-    def has_quick(self) -> bool:
-        return self.quick is not self.full
 
     def shown(self, cells: Sequence[Cell]) -> list[Table]:
         return [table for tables in self.tables for table in tables(cells)]
@@ -177,11 +186,6 @@ class Comparison:
     def expected_s(self, quick: bool) -> int:
         return (self.quick if quick else self.full).takes_s
 
-    @property
-    def needs_more_rights(self) -> bool:
-        """Whether this user may not run it."""
-        return self.root and os.geteuid() != 0
-
     def run_of(
         self, *, quick: bool = False, output: Path = FOLDER, console: Console | None = None, **given: Any
     ) -> Run:
@@ -190,11 +194,10 @@ class Comparison:
         if self.variants:
             values.setdefault("variants", list(self.variants))
         values |= {name: value for name, value in given.items() if value is not None}
-        run = Run(self, values, quick, output, console=console or Console())
         for option in self.options:
-            if run.options.get(option.key) is not None:
-                option.check(run.options[option.key])
-        return run
+            if values.get(option.key) is not None:
+                option.check(values[option.key])
+        return Run(self, values, quick, output, console=console or Console())
 
 
 @dataclass
@@ -225,7 +228,7 @@ class Run:
         words = ["pebble", *(about.words or ("bench", about.name))]
         for option in about.options:
             words += option.words(self.options.get(option.key), defaults.get(option.key, ()))
-        return [*words, *(["--quick"] if self.quick and about.has_quick else [])]
+        return [*words, "--quick"] if self.quick else words
 
     def records(self) -> dict[str, Value | list[Value]]:
         """All options that affect the results."""
@@ -242,7 +245,7 @@ class Case:
     number: int  # of the round, from 0
     variant: str
     role: str  # the variant of its cells: another one in a null test
-    condition: Mapping[str, Value]
+    condition: Params
     planted_us: float = 0.0  # of work for each message in a null test: before its time stamp,
     slowed: bool = False  # or after it
     env: Any = None
@@ -251,24 +254,13 @@ class Case:
         return ", ".join(filter(None, (self.role, *map(str, self.condition.values()))))
 
     def cell(
-        self,
-        measure: str,
-        unit: str,
-        samples: Iterable[float],
-        params: Mapping[str, Value] | None = None,
-        **figures: Value,
+        self, measure: str, unit: str, samples: Iterable[float], params: Params | None = None, **figures: Value
     ) -> Cell:
-        return Cell(
-            variant=self.role,
-            params={**self.condition, **(params or {})},
-            measure=measure,
-            unit=unit,
-            rounds=[list(samples)],
-            figures=figures,
-        )
+        of, rounds_ = {**self.condition, **(params or {})}, [list(samples)]
+        return Cell(variant=self.role, params=of, measure=measure, unit=unit, rounds=rounds_, figures=figures)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Round:
     """One round: its cases are in reverse order in every other round and pass."""
 
@@ -276,12 +268,9 @@ class Round:
     number: int  # from 0
     env: Any
     roles: Sequence[str]
-    planted_us: Callable[[Mapping[str, Value]], float]
-    advance: Callable[[], None]  # after each case
+    planted_us: Callable[[Params], float]
 
-    def cases(
-        self, conditions: Sequence[Mapping[str, Value]] | None = None, passes: int | None = None
-    ) -> Iterator[Case]:
+    def cases(self, conditions: Sequence[Params] | None = None, passes: int | None = None) -> Iterator[Case]:
         """Of all conditions, or only of these; ``passes`` replaces that of the options.
 
         Roles of each condition run one after another, so that a temporary disturbance affects all of them.
@@ -290,12 +279,38 @@ class Round:
         conditions = run.comparison.conditions(run) if conditions is None else conditions
         for pass_ in range(run.options.get("passes", 1) if passes is None else passes):
             step = -1 if (number + pass_) % 2 else 1
-            for condition in conditions[::step]:
-                for role in self.roles[::step]:
-                    case = Case(
-                        run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
-                        slowed=null.is_slowed(role), planted_us=self.planted_us(condition), env=self.env,
-                    )  # fmt: skip
-                    run.show(str(case))
-                    yield case
-                    self.advance()
+            for condition, role in itertools.product(conditions[::step], self.roles[::step]):
+                case = Case(
+                    run=run, number=number, variant=null.variant_of(role), role=role, condition=condition,
+                    slowed=null.is_slowed(role), planted_us=self.planted_us(condition), env=self.env,
+                )  # fmt: skip
+                run.show(str(case))
+                yield case
+
+
+# -- all comparisons
+
+
+def find(name: str) -> Comparison:
+    """Imports its module. Raises KeyError for an unknown name."""
+    module = MODULES.get(name) or MODULES[name.rpartition("-")[0]]
+    found: Comparison = getattr(import_module(f"pebble.bench.{module}"), name.upper().replace("-", "_"))
+    return found
+
+
+def reported() -> list[Comparison]:
+    """The comparisons of the report, each followed by its modes."""
+    every = [one for about in map(find, MODULES) for one in (about, *about.modes.values())]
+    return [one for one in every if one.reported is not None]
+
+
+def chosen(names: Sequence[str]) -> list[Comparison]:
+    """The comparisons of these names, in the report's order; without names all that this user may run.
+
+    Raises PebbleError for unknown names.
+    """
+    known = {one.name: one for one in reported()}
+    if unknown := [name for name in names if name not in known]:
+        raise PebbleError(f"there is no {', '.join(unknown)} in the report: there are {', '.join(known)}")
+    may_run = [name for name, one in known.items() if not one.root or os.geteuid() == 0]
+    return [one for name, one in known.items() if name in (names or may_run)]

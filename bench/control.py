@@ -346,6 +346,7 @@ CONTROL_FAR = Comparison(
     complete=lambda cells: all(cell.samples for cell in cells if cell.measure == ROUND_TRIP),
     words=("bench", "control"),
     reported=None,
+    pictures=(ecdf("Control far"),),
 )
 _CONTROL = Comparison(
     name="control",

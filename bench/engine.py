@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from importlib.util import find_spec
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.markup import escape
 
 from pebble.bench import null
 from pebble.bench.comparison import Combine, Comparison, Round, Run
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import OVER_TIME, Cell, Judged, Results, Value, begin, grouped, named, percentile
+from pebble.bench.results import OVER_TIME, Cell, Judged, Value, begin, grouped, named, percentile
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.segments import sweep
@@ -35,28 +36,38 @@ def run(run: Run) -> int:
     about.prepare(run)
     _leave_out_missing(run)
     results, since = begin(about.name, run.command, quick=run.quick), time.monotonic()
-    collected, rounds = Collected(about, roles_of(run), about.conditions(run)), Rounds(run.rounds, console)
+    collected, rounds = Collected(about, roles_of(run)), Rounds(run.rounds, console)
     with interrupted_by_signals():
         try:
             _measure(run, collected, rounds)
         finally:
             sweep()  # Zenoh leaves files behind even after a regular end
     cells = about.derived(collected.cells())
+    results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
+    early = str(run.problem or "").partition("\n")[0]
+    lines = [*([early[0].upper() + early[1:]] if early else []), *rounds.notes(), *about.assessed(cells), *run.notes]
+    results.assessment = [line for line in lines if isinstance(line, str)]
+    results.aims = [line for line in lines if isinstance(line, Judged)]
     for table in about.shown(cells):
-        suffix = about.title_suffix.format(**run.records(), quick=", quick" if run.quick else "")
-        table.title = f"{table.title}{suffix}"
+        table.title = f"{table.title}{about.title_suffix.format(**run.records(), quick=', quick' if run.quick else '')}"
         console.print(table)
     for line in about.legend(cells):
         console.print(line, style="dim", highlight=False, soft_wrap=True)
-    early = [] if run.problem is None else [str(run.problem).splitlines()[0]]
-    lines = [*(f"{why[0].upper()}{why[1:]}" for why in early), *rounds.notes(), *about.assessed(cells), *run.notes]
-    results.assessment = [line for line in lines if isinstance(line, str)]
-    results.aims = [line for line in lines if isinstance(line, Judged)]
-    results.cells, results.options, results.took_s = cells, run.records(), round(time.monotonic() - since, 1)
-    _finish(results, run.output, console)
+    for sentence in (*results.assessment, *results.aims):
+        console.print(str(sentence), highlight=False, soft_wrap=True)
+    results.complete = run.problem is None and rounds.enough and about.complete(cells)
+    written = [run.output / f"{about.name}.json"]
+    results.save(written[0])
+    if find_spec("matplotlib") is None:
+        console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
+    else:
+        from pebble.bench.pictures import draw
+
+        written += draw(results, run.output)
+    console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)
     if run.problem is not None:
         raise run.problem
-    return int(not (rounds.enough and about.complete(cells)))
+    return int(not results.complete)
 
 
 def _leave_out_missing(run: Run) -> None:
@@ -88,21 +99,17 @@ def roles_of(run: Run) -> Sequence[str]:
 
 
 def _measure(run: Run, collected: Collected, rounds: Rounds) -> None:
-    about = run.comparison
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=run.console, transient=True) as progress, _Environment(run) as environment:
-        cases = len(collected.roles) * len(about.conditions(run)) * run.options.get("passes", 1)
-        bar = progress.add_task("", total=run.rounds * cases)
-
+    """Rounds share an environment: a new one every ``fresh_every`` rounds, and after a round that failed."""
+    about, env = run.comparison, None
+    with run.console.status("", refresh_per_second=4) as status, ExitStack() as shared:
         for number in range(run.rounds):
-            progress.update(bar, completed=number * cases)
             before = f"round {number + 1} of {run.rounds}: "
-            run.show = lambda what, before=before: progress.update(bar, description=before + what)  # type: ignore[misc]
-            with rounds.attempt(number), environment.of(number) as env:
-                round_ = Round(
-                    run=run, number=number, env=env, roles=collected.roles, planted_us=collected.planted_us,
-                    advance=partial(progress.advance, bar),
-                )  # fmt: skip
+            run.show = lambda what, before=before: status.update(escape(before + what))  # type: ignore[misc]
+            with rounds.attempt(number):
+                if rounds.last_failed or number % run.options.get("fresh_every", 1) == 0:
+                    shared.close()
+                    env = shared.enter_context(about.environment(run))
+                round_ = Round(run, number, env, roles=collected.roles, planted_us=collected.planted_us)
                 if about.is_null and about.measure is not None and not collected.pilot:
                     collected.pilot = list(about.measure(next(round_.cases())))
                 collected.add(_round(round_))
@@ -123,64 +130,29 @@ def _round(round_: Round) -> Iterator[Cell]:
                 yield from (case.cell(measure, "", []) for measure in about.measures)
 
 
-class _Environment(ExitStack):
-    """What the rounds share: a new one every ``fresh_every`` rounds, and after a round that failed."""
-
-    def __init__(self, run: Run) -> None:
-        super().__init__()
-        self._run = run
-        self._current: list[Any] = []  # at most one
-
-    @contextmanager
-    def of(self, number: int) -> Iterator[Any]:
-        if number % self._run.options.get("fresh_every", 1) == 0:
-            self.close()
-        if not self._current:
-            self.callback(self._current.clear)
-            self._current.append(self.enter_context(self._run.comparison.environment(self._run)))
-        try:
-            yield self._current[0]
-        except BaseException:
-            self.close()
-            raise
-
-
 class Collected:
     """Joins the cells of the rounds by variant, conditions and measure."""
 
-    def __init__(
-        self, comparison: Comparison, roles: Sequence[str], conditions: Sequence[Mapping[str, Value]] = ()
-    ) -> None:
-        self._about, self.roles, self._conditions = comparison, roles, conditions
+    def __init__(self, comparison: Comparison, roles: Sequence[str]) -> None:
+        self._about, self.roles = comparison, roles
         self._cells: dict[Hashable, Cell] = {}
-        self._figures: dict[Hashable, dict[str, list[Value]]] = {}
+        self._figures: defaultdict[tuple[Hashable, str], list[Value]] = defaultdict(list)
         self.pilot: list[Cell] = []  # of a null test, before the first round
 
     def add(self, cells: Iterable[Cell]) -> None:
         """Adds a round: all of it, or nothing if an error is raised meanwhile. Passes of a round are one."""
-        by_key = grouped(cells, lambda cell: (cell.variant, cell.case))
-        for key, parts in sorted(by_key.items(), key=lambda one: self._place(one[1][0])):
+        for key, parts in grouped(cells, lambda cell: (cell.variant, cell.case)).items():
             cell = self._cells.setdefault(key, msgspec.structs.replace(parts[0], rounds=[], figures={}))
             cell.unit = cell.unit or parts[0].unit  # a case that failed has none
-            if cell.measure.endswith(OVER_TIME):
-                cell.rounds += parts[0].rounds  # times, then values
-            else:
-                cell.rounds.append([sample for part in parts for sample in part.samples])
-            for part in parts:
-                for name, value in part.figures.items():
-                    self._figures.setdefault(key, {}).setdefault(name, []).append(value)
-
-    def _place(self, cell: Cell) -> tuple[int, int]:
-        """The order of the cases, of which every other round has the reverse."""
-        of = (at for at, one in enumerate(self._conditions) if one.items() <= cell.params.items())
-        return next(of, -1), self.roles.index(cell.variant) if cell.variant in self.roles else -1
+            joined = [[sample for part in parts for sample in part.samples]]
+            cell.rounds += parts[0].rounds if cell.measure.endswith(OVER_TIME) else joined  # times, then values
+            for name, value in (one for part in parts for one in part.figures.items()):
+                self._figures[key, name].append(value)
+                combine = {**_JOINED, **self._about.figures}.get(name, itemgetter(-1))
+                cell.figures[name] = combine(self._figures[key, name])
 
     def cells(self) -> list[Cell]:
         """In the order of the declared measures, if there is one."""
-        combine = {**_JOINED, **self._about.figures}
-        for key, cell in self._cells.items():
-            known = self._figures.get(key, {})
-            cell.figures = {name: combine.get(name, _last)(values) for name, values in known.items()}
         order = {measure: at for at, measure in enumerate(self._about.measures)}
         return sorted(self._cells.values(), key=lambda cell: order.get(cell.measure, 0))
 
@@ -196,10 +168,6 @@ class Collected:
         return null.SLOWDOWN * percentile(usual, 50) if usual else 0.0
 
 
-def _last(values: Sequence[Value]) -> Value:
-    return values[-1]
-
-
 class Rounds:
     """Counts successful and failed rounds of ``asked``: a failed one is left out and noted, the others still count."""
 
@@ -207,6 +175,7 @@ class Rounds:
         self._asked, self._console = asked, console
         self._done = 0
         self._failed: list[str] = []
+        self.last_failed = False
 
     @contextmanager
     def attempt(self, number: int) -> Iterator[None]:
@@ -218,8 +187,10 @@ class Rounds:
             if not self._done and len(self._failed) == min(_GIVEN_UP, self._asked):
                 raise
             self._console.print(self._failed[-1], style="red", highlight=False, markup=False)
+            self.last_failed = True
         else:
             self._done += 1
+            self.last_failed = False
 
     def notes(self) -> list[str]:
         """A sentence for the assessment: how many rounds failed, and why the first of them did."""
@@ -239,18 +210,3 @@ def check_folder(folder: Path) -> None:
     with named(folder):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
-
-
-def _finish(results: Results, folder: Path, console: Console) -> None:
-    """Prints the assessment, writes ``<bench>.json`` and, if matplotlib is installed, the plots."""
-    for line in (*results.assessment, *results.aims):
-        console.print(str(line), highlight=False, soft_wrap=True)
-    written = [folder / f"{results.bench}.json"]
-    results.save(written[0])
-    if find_spec("matplotlib") is None:
-        console.print("No plots: pip install 'pebble-robot[bench]'", style="dim", highlight=False)
-    else:
-        from pebble.bench.pictures import draw
-
-        written += draw(results, folder)
-    console.print(f"Written: {', '.join(map(str, written))}", style="dim", highlight=False, soft_wrap=True)

@@ -221,9 +221,9 @@ FRAMES = Comparison(
     options=(
         seconds("Duration of each case in a round."),
         rounds("Rounds of all cases.", least=2),  # one shows no variation
-        Option(name="size", many=True, repeated=True, metavar="SIZE", help="640x480; may be given several times."),
+        Option(name="size", many=True, metavar="SIZE", help="640x480; may be given several times."),
         Option(
-            name="readers", kind=int, many=True, repeated=True, least=1, most=16, metavar="COUNT",
+            name="readers", kind=int, many=True, least=1, most=16, metavar="COUNT",
             help="May be given several times.",
         ),
         variants(VARIANTS),

@@ -6,19 +6,21 @@ A declared picture is a function of results. matplotlib is imported only when on
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from statistics import median
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from pebble.bench import catalogue, null, plots
-from pebble.bench.plots import Picture, Style, finite, place, short, unique
+from pebble.bench import null, plots
+from pebble.bench.comparison import find
+from pebble.bench.plots import Picture, Style, finite, short, unique
 from pebble.bench.ratios import LEAST_ROUNDS, Interval, paired
 from pebble.bench.results import Cell, Results, grouped, percentile
-from pebble.bench.tables import base_of
+from pebble.bench.tables import base_of, medians
 from pebble.bench.tables import figure as digits
 
 if TYPE_CHECKING:
@@ -26,35 +28,25 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Declared = Callable[[Results], list[Picture]]
+Make = Callable[[Sequence[Cell], str], "Figure"]  # of cells, under a title
 
 LEAST = 20  # samples for a distribution
 _DARK = "#222"
-_BAR = 0.8  # of the distance between rows
-_LONGEST = 34  # characters of a label at an axis
 _SUM, _WHOLE = "all", "all the way"  # the process that stands for the sum, the hop for all: drawn last
 _ITSELF = "itself"
 _GOLDEN = 0.618
-_WORDS = {"wire": "on the wire", "PSS": "memory (PSS)"}
-#: Tick labels of a ratio axis, by the largest ratio of its ends.
-_RATIOS = {
-    2.2: (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.5),
-    12.0: (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0),
-    math.inf: (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0),
-}
 
 
-def draw(results: Results, folder: Path) -> list[Path]:
-    """Draws the pictures of a comparison; returns the files. Raises PebbleError if they cannot be written."""
+def draw(results: Results, folder: Path) -> dict[Path, Picture]:
+    """Draws the pictures of a comparison, by file. Raises PebbleError if they cannot be written."""
     found = {folder / f"{picture.name}.png": picture for picture in pictures(results)}
     for path, picture in found.items():
         plots.save(picture, path, results)
-    return list(found)
+    return found
 
 
 def pictures(results: Results) -> list[Picture]:
-    known = results.bench in catalogue.MODULES
-    declared = catalogue.find(results.bench).pictures if known else [ecdf(results.bench.replace("-", " ").capitalize())]
-    return [picture for one in declared for picture in one(results)]
+    return [picture for one in find(results.bench).pictures for picture in one(results)]
 
 
 # -- what may be declared
@@ -74,29 +66,21 @@ class Drawn:
 def ecdf(title: str, *, measures: Sequence[str] = ()) -> Declared:
     """For each measure the share of messages within a time; one panel for each condition."""
 
-    def found(results: Results) -> list[Picture]:
-        made = []
-        for measure, cells in _by_measure(results, measures, LEAST).items():
-            about = title if measure in title.lower() else f"{title}: {measure}"
-            caption = f"{about}. Share of all messages within the time on the x-axis"
-            if any(map(_lost, cells)):
-                caption += "; lost messages are missing from 100 %"
-            made.append(Picture(plots.file_name(results.bench, measure), caption, partial(_curves, cells, about)))
-        return made
+    def caption(measure: str, cells: Sequence[Cell]) -> str:
+        about = title if measure in title.lower() else f"{title}: {measure}"
+        lost = "; lost messages are missing from 100 %" if any((cell.lost or 0) > 0 for cell in cells) else ""
+        return f"{about}. Share of all messages within the time on the x-axis{lost}"
 
-    return found
+    return _of_each(measures, caption, _curves, LEAST)
 
 
 def ratios(title: str, baseline: str, *, measures: Sequence[str] = ()) -> Declared:
     """The medians as ratios to the baseline's, with their intervals. No picture without a baseline."""
 
     def found(results: Results) -> list[Picture]:
-        based = ((cell, base_of(cell, results.cells, baseline)) for cell in results.cells)
-        judged = [
-            (cell, paired(cell.rounds, base.rounds))
-            for cell, base in based
-            if base is not None and (not measures or cell.measure in measures)
-        ]
+        cells = [cell for cell in results.cells if cell.measure in (measures or (cell.measure,))]
+        based = [(cell, base) for cell in cells if (base := base_of(cell, cells, baseline)) is not None]
+        judged = [(cell, paired(cell.rounds, base.rounds)) for cell, base in based]
         return _ratios(results, judged, f"{title}: median latency as a ratio to {baseline}'s", baseline)
 
     return found
@@ -116,16 +100,8 @@ def dots(title: str) -> Declared:
 
 def bars(title: str, *, measures: Sequence[str] = (), panel: str = "", group: str = "") -> Declared:
     """A bar for each median: one picture for each measure, with a panel or a group for each value of a parameter."""
-
-    def found(results: Results) -> list[Picture]:
-        make = partial(_amounts, panel=panel, group=group)
-        made = []
-        for measure, cells in _by_measure(results, measures).items():
-            what = f"{measure}, medians" if panel else _WORDS.get(measure, measure)
-            made += _picture(plots.file_name(results.bench, measure), f"{title}: {what}", cells, make)
-        return made
-
-    return found
+    make = partial(_amounts, panel=panel, group=group)
+    return _of_each(measures, lambda measure, _cells: f"{title}: {measure}, medians", make)
 
 
 def tails(title: str) -> Declared:
@@ -139,15 +115,27 @@ def _measured(results: Results, least: int = 1) -> list[Cell]:
     return [cell for cell in results.cells if len(finite(cell.samples)) >= least]
 
 
-def _by_measure(results: Results, measures: Sequence[str], least: int = 1) -> dict[str, list[Cell]]:
-    """The measured cells of these measures, or of all."""
-    found = grouped(_measured(results, least), lambda cell: cell.measure)
-    return {measure: found[measure] for measure in measures or found if measure in found}
+def _of_each(
+    measures: Sequence[str], caption: Callable[[str, Sequence[Cell]], str], make: Make, least: int = 1
+) -> Declared:
+    """A picture for each of these measures, or for all."""
+
+    def found(results: Results) -> list[Picture]:
+        made = list[Picture]()
+        for measure, cells in grouped(_measured(results, least), lambda cell: cell.measure).items():
+            if not measures or measure in measures:
+                made += _picture(_file_name(results.bench, measure), caption(measure, cells), cells, make)
+        return made
+
+    return found
 
 
-def _picture(
-    name: str, caption: str, cells: Sequence[Cell], make: Callable[[Sequence[Cell], str], Figure]
-) -> list[Picture]:
+def _file_name(bench: str, measure: str) -> str:
+    """Of text such as ``one-way there, ± 0.4 ms``."""
+    return f"{bench}-{re.sub(r'[^a-z0-9]+', '-', measure.lower()).strip('-')}"
+
+
+def _picture(name: str, caption: str, cells: Sequence[Cell], make: Make) -> list[Picture]:
     """No picture without cells."""
     return [Picture(name, caption, partial(make, cells, caption))] if cells else []
 
@@ -156,11 +144,8 @@ def _ratios(results: Results, judged: Sequence[tuple[Cell, Interval]], caption: 
     judged = [(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]
     if not judged:
         return []
-    few = [interval.few for _, interval in judged]
-    if all(few):
-        caption += f"; no intervals: these need {LEAST_ROUNDS} rounds"
-    else:
-        caption += "; lines: intervals of 99 %" + (f", none for fewer than {LEAST_ROUNDS} rounds" if any(few) else "")
+    few = all(interval.few for _, interval in judged)
+    caption += f"; no intervals: these need {LEAST_ROUNDS} rounds" if few else "; lines: intervals of 99 %"
     return [Picture(f"{results.bench}-ratios", caption, partial(_ratio_bars, judged, caption, baseline))]
 
 
@@ -169,161 +154,135 @@ def _ratios(results: Results, judged: Sequence[tuple[Cell, Interval]], caption: 
 
 def _curves(cells: Sequence[Cell], title: str) -> Figure:
     """The curves end below 100 % by the lost share; the slowest few are cut off."""
-    by_place, style_of = grouped(cells, place), _styles(cells)
-    conditions = sorted(by_place, key=lambda name: name == _WHOLE)
-    figure, every = plots.panels(len(conditions), 3, (3.9, 2.7), title)
+    by_place, style_of = grouped(cells, Cell.conditions), _styles(cells)
+    figure, every = plots.panels(len(by_place), 3, (3.9, 2.7), title)
     positive = [[sample for sample in finite(cell.samples) if sample > 0] for cell in cells]
     ends = plots.around([percentile(some, percent) for some in positive for percent in (0.1, 99.8)])
-    for number, (axes, condition) in enumerate(zip(every, conditions, strict=True)):
-        for cell in by_place[condition]:
+    for axes, place in zip(every, sorted(by_place, key=lambda name: name == _WHOLE), strict=True):
+        for cell in by_place[place]:
             times, style, arrived = sorted(finite(cell.samples)), style_of[cell.variant], sum(cell.sizes)
-            step = 100 * arrived / (arrived + _lost(cell)) / len(times)
+            step = 100 * arrived / (arrived + max(0, cell.lost or 0)) / len(times)
             shares = [step * count for count in range(1, len(times) + 1)]
             axes.plot(times, shares, color=style.colour, linestyle=style.dash)
-        plots.log_axis(axes, "x", f"latency, {plots.unit_of(cells[0].unit)}", *ends)
+        plots.log_axis(axes, "x", f"latency, {_unit(cells)}", *ends)
         axes.set_ylim(0, 101)
-        axes.set_title(short(condition, 44), loc="left")
+        axes.set_title(short(place, 44), loc="left")
         for percent in (50, 99):
             plots.guide(axes, percent, f"p{percent}")
-        if number % 3 == 0:
-            axes.set_ylabel("share of messages, %")
-    plots.legend(figure, {name: Style(style.colour, style.dash, "") for name, style in style_of.items()})
+    plots.legend(figure, {name: replace(style, marker="") for name, style in style_of.items()})
     return figure
 
 
-def _lost(cell: Cell) -> int:
-    """The number of lost messages, as far as they were counted."""
-    return max(0, cell.lost or 0)
-
-
 def _dots(cells: Sequence[Cell], title: str) -> Figure:
-    kinds, style_of = grouped(cells, lambda cell: f"{cell.measure}\n{place(cell)}".strip()), _styles(cells)
+    kinds, style_of = grouped(cells, lambda cell: f"{cell.measure}\n{cell.conditions()}".strip()), _styles(cells)
     figure, every = plots.panels(len(kinds), 3, (3.6, 2.9), title)
     for axes, (kind, shown) in zip(every, kinds.items(), strict=True):
         for at, cell in enumerate(shown):
-            samples, style = finite(cell.samples), style_of[cell.variant]
+            samples, style, middle = finite(cell.samples), style_of[cell.variant], median(medians(cell))
             beside = [at - 0.16 + 0.32 * (_GOLDEN * number % 1) for number in range(len(samples))]  # evenly spread
             axes.scatter(beside, samples, s=18, color=style.colour, marker=style.marker, alpha=0.65, linewidths=0)
-            middle = median(percentile(known, 50) for one in cell.rounds if (known := finite(one)))
             axes.plot([at - 0.3, at + 0.3], [middle, middle], color=_DARK, linewidth=1.5)
             axes.annotate(digits(middle), (at + 0.32, middle), fontsize=8, va="center", annotation_clip=False)
         axes.set_xticks(range(len(shown)), [short(cell.variant, 14) for cell in shown])
         axes.set_xlim(-0.6, len(shown) - 0.2)
         axes.set_ylim(0, 1.08 * max(sample for cell in shown for sample in finite(cell.samples)) or 1.0)
         axes.grid(visible=False, axis="x")
-        axes.set_title("\n".join(short(line, 40) for line in kind.split("\n")), loc="left")
-        axes.set_ylabel(f"time, {plots.unit_of(shown[0].unit)}")
+        axes.set_title(short(kind, 40), loc="left")
+        axes.set_ylabel(f"time, {_unit(shown)}")
     return figure
 
 
-class _Bar(NamedTuple):
-    """A bar from ``begin`` to ``value`` in a variant's colour, a line over it, and a text at the end."""
+@dataclass(frozen=True, slots=True)
+class _Bar:
+    """A bar in a panel and in a row, in a variant's colour; a line over it, and a text at the end of both."""
 
+    panel: str
+    row: str
     variant: str
     begin: float
-    value: float
-    line: tuple[float, float] | None = None
+    end: float
+    line: tuple[float, ...] = ()
     text: str = ""
 
 
-def _bars(
-    axes: Axes, rows: Sequence[str], bars: Sequence[tuple[str, _Bar]], style_of: dict[str, Style], none: str = ""
-) -> None:
-    """Draws bars in the rows of these names, without gaps in a row, and a text in a row that has ``none``."""
-    for at, name in enumerate(rows):
-        row = [bar for one, bar in bars if one == name]
-        if not row:
-            axes.annotate(none, (0, at), fontsize=8, va="center", color="#777")
-        for number, bar in enumerate(row):
-            y, height = at + _BAR * ((number + 0.5) / len(row) - 0.5), min(0.5, 0.9 * _BAR / len(row))
-            colour = style_of[bar.variant].colour
-            axes.barh(y, bar.value - bar.begin, left=bar.begin, height=height, color=colour, alpha=0.8)
-            if bar.line is not None:
-                axes.plot(bar.line, (y, y), color=_DARK, linewidth=1.1, marker="|", markersize=6)
-            axes.annotate(bar.text, (bar.line[1] if bar.line else bar.value, y), fontsize=8, va="center")
-    axes.set_yticks(range(len(rows)), [short(name or "all", _LONGEST) for name in rows])
-    axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.grid(visible=False, axis="y")
+def _bar_panels(title: str, bars: Sequence[_Bar], width: float, axis: Callable[[Axes], None], *more: str) -> Figure:
+    """Panels of bars, those of a row below each other; the row of the sum comes last. ``more`` have a style, too."""
+    rows = sorted(unique([bar.row for bar in bars]), key=lambda row: row == _SUM)
+    by_panel, variants = grouped(bars, lambda bar: bar.panel), unique([bar.variant for bar in bars])
+    height = 0.9 + 0.17 * max(map(len, by_panel.values())) + 0.15 * len(rows)
+    style_of = plots.styles(unique([*more, *variants]))
+    figure, every = plots.panels(len(by_panel), 2, (width, height), title)
+    for axes, (panel, some) in zip(every, by_panel.items(), strict=True):
+        for at, row in enumerate(rows):
+            here = [bar for bar in some if bar.row == row]
+            for number, bar in enumerate(here):
+                y, colour = at + 0.8 * ((number + 0.5) / len(here) - 0.5), style_of[bar.variant].colour
+                thick = min(0.5, 0.72 / len(here))
+                axes.barh(y, bar.end - bar.begin, left=bar.begin, height=thick, color=colour, alpha=0.8)
+                axes.plot(bar.line, [y] * len(bar.line), color=_DARK, linewidth=1.1, marker="|", markersize=6)
+                axes.annotate(bar.text, (max((bar.end, *bar.line)), y), fontsize=8, va="center")
+        axes.set_yticks(range(len(rows)), [short(row or "all", 34) for row in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.grid(visible=False, axis="y")
+        axes.set_title(short(panel, 50), loc="left")
+        axis(axes)
+    plots.legend(figure, {name: Style(style_of[name].colour, "", "s") for name in variants})
+    return figure
 
 
 def _ratio_bars(judged: Sequence[tuple[Cell, Interval]], title: str, baseline: str) -> Figure:
-    by_measure = grouped(judged, lambda one: one[0].measure)
-    variants, places = (unique([of(cell) for cell, _ in judged]) for of in (lambda cell: cell.variant, place))
-    height = 0.9 + len(places) * (0.22 + 0.2 * len(variants))
-    figure, every = plots.panels(len(by_measure), 2, (5.6, max(1.9, height)), title)
-    # a role has the same colour with and without the plain one
-    style_of = plots.styles(unique([*map(null.variant_of, variants), *variants]))
-    lows, highs = zip(*(_line(interval) for _, interval in judged), strict=True)
-    low, high = max(0.02, 0.93 * min(0.95, *lows)), min(50.0, 1.07 * max(1.25, *highs))
-    ticks = next(ratios for span, ratios in _RATIOS.items() if high / low < span)
-    for number, (axes, (measure, some)) in enumerate(zip(every, by_measure.items(), strict=True)):
-        drawn = [(place(cell), _Bar(cell.variant, 1.0, one.ratio, _line(one))) for cell, one in some]
-        _bars(axes, places, drawn, style_of)
+    bars = [
+        _Bar(cell.measure, cell.conditions(), cell.variant, 1.0, one.ratio,
+             (one.ratio, one.ratio) if one.few else (one.low, one.high))
+        for cell, one in judged
+    ]  # fmt: skip
+    low = max(0.02, 0.93 * min(0.95, *(bar.line[0] for bar in bars)))
+    high = min(50.0, 1.07 * max(1.25, *(bar.line[1] for bar in bars)))
+
+    def axis(axes: Axes) -> None:
         plots.log_axis(axes, "x", f"median as a ratio to {baseline} (log); left of 1 is faster", low, high)
-        axes.set_xticks([ratio for ratio in ticks if low <= ratio <= high])
         axes.axvline(1.0, color=_DARK, linewidth=0.9)
         if baseline == _ITSELF:
             axes.axvline(1 + null.SLOWDOWN, color=_DARK, linewidth=0.9, linestyle="--")
-        axes.tick_params(labelleft=number % 2 == 0)
-        axes.set_title(measure, loc="left")
-    _squares(figure, {name: style_of[name] for name in variants})
-    return figure
 
-
-def _line(interval: Interval) -> tuple[float, float]:
-    """The ends of its line; without an interval it has no length."""
-    return (interval.ratio, interval.ratio) if interval.few else (interval.low, interval.high)
+    # a role has the same colour with and without the plain one
+    return _bar_panels(title, bars, 5.6, axis, *(null.variant_of(cell.variant) for cell, _ in judged))
 
 
 def _amounts(cells: Sequence[Cell], title: str, *, panel: str, group: str) -> Figure:
-    """A panel for each value of the parameter ``panel``, in which ``group`` names the rows; the sum comes last."""
-    style_of, by_panel = _styles(cells), grouped(cells, lambda cell: str(cell.params.get(panel, "")))
-    row_of: Callable[[Cell], str] = (lambda cell: str(cell.params.get(group, ""))) if group else place
-    # if most variants have conditions of their own, each bar has its full name as label
-    if named := not panel and len(grouped(cells, row_of)) not in (1, len(cells) / len(style_of)):
-        row_of = _name
-    names = sorted(grouped(cells, row_of), key=lambda name: name == _SUM)
-    size = (5.2 if panel else 8.5, 0.9 + 0.17 * max(map(len, by_panel.values())) + 0.15 * len(names))
-    figure, every = plots.panels(len(by_panel), 2, size, title)
-    unit = "% of one core" if (cells[0].measure, cells[0].unit) == ("CPU", "%") else plots.unit_of(cells[0].unit)
-    for axes, (panel_name, some) in zip(every, by_panel.items(), strict=True):
-        drawn = [(row_of(one), _Bar(one.variant, 0.0, _p(50, one), text=f" {digits(_p(50, one))}")) for one in some]
-        _bars(axes, names, drawn, style_of, " not running")
-        axes.set_xlim(0, 1.14 * max(_p(50, cell) for cell in cells) or 1.0)
-        axes.set_title(short(panel_name, 50), loc="left")
-        axes.set_xlabel(", ".join(filter(None, (_WORDS.get(cells[0].measure, cells[0].measure), unit))))
-    if not named:
-        _squares(figure, style_of)
-    return figure
+    """A panel for each value of the parameter ``panel``, in which ``group`` names the rows."""
+    bars = [
+        _Bar(str(cell.params.get(panel, "")), str(cell.params[group]) if group else cell.conditions() or cell.variant,
+             cell.variant, 0.0, p50, text=f" {digits(p50)}")
+        for cell in cells
+        for p50 in [_p(50, cell)]
+    ]  # fmt: skip
 
+    def axis(axes: Axes) -> None:
+        axes.set_xlim(0, 1.14 * max(bar.end for bar in bars) or 1.0)
+        axes.set_xlabel(f"{cells[0].measure}, {_unit(cells)}")
 
-def _name(cell: Cell) -> str:
-    return f"{cell.variant}, {place(cell)}".removesuffix(", ")
+    return _bar_panels(title, bars, 5.2 if panel else 8.5, axis)
 
 
 def _tails(cells: Sequence[Cell], title: str) -> Figure:
-    by_place, style_of = grouped(cells, place), _styles(cells)
-    figure, every = plots.panels(len(by_place), 2, (5.0, 0.9 + 0.32 * len(style_of)), title)
-    left = 0.5 * min((middle for cell in cells if (middle := _p(50, cell)) > 0), default=1.0)
-    for axes, (condition, some) in zip(every, by_place.items(), strict=True):
-        plots.log_axis(
-            axes, "x", f"latency, {plots.unit_of(cells[0].unit)}", left, 9 * max(_p(99, cell) for cell in cells)
-        )
-        ends = [(cell.variant, _p(50, cell), _p(99, cell)) for cell in some]
-        drawn = [(one, _Bar(one, left, p50, (p50, p99), f"  {digits(p50)} / {digits(p99)}")) for one, p50, p99 in ends]
-        _bars(axes, list(style_of), drawn, style_of)
-        axes.set_title(short(condition, 50), loc="left")
-    return figure
+    ends = [(cell, _p(50, cell), _p(99, cell)) for cell in cells]
+    left, right = 0.5 * min((p50 for _, p50, _ in ends if p50 > 0), default=1.0), 9 * max(p99 for *_, p99 in ends)
+    bars = [
+        _Bar(cell.conditions(), cell.variant, cell.variant, left, p50, (p50, p99), f"  {digits(p50)} / {digits(p99)}")
+        for cell, p50, p99 in ends
+    ]
+    label = f"latency, {_unit(cells)}"
+    return _bar_panels(title, bars, 5.0, lambda axes: plots.log_axis(axes, "x", label, left, right))
 
 
 def _p(percent: float, cell: Cell) -> float:
     return percentile(finite(cell.samples), percent)
 
 
+def _unit(cells: Sequence[Cell]) -> str:
+    return "µs" if cells[0].unit == "us" else cells[0].unit
+
+
 def _styles(cells: Sequence[Cell]) -> dict[str, Style]:
     return plots.styles(unique([cell.variant for cell in cells]))
-
-
-def _squares(figure: Figure, style_of: dict[str, Style]) -> None:
-    """A legend of colours only."""
-    plots.legend(figure, {name: Style(style.colour, "", "s") for name, style in style_of.items()})

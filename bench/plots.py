@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import io
 import math
-import re
 import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pebble.bench.results import Cell, Results, named
+from pebble.bench.results import Results, named
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,29 +18,18 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _DPI = 150
-_COLOURS = 255  # of the palette, which reduces files to a third
-_FEW_DECADES = {"x": 2.5, "y": 3.2}  # a logarithmic axis with fewer decades has ticks between the powers of ten
-_GREY = "#8a8a8a"
-_BACKGROUND = "white"
 _WIDEST = 13.0  # inches
-
 _SETTINGS: dict[Any, Any] = {
     "font.size": 9,
-    "font.family": "DejaVu Sans",
     "axes.titlesize": 9,
-    "axes.labelsize": 9,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
-    "legend.fontsize": 8.5,
     "figure.titlesize": 11,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.5,
-    "figure.facecolor": _BACKGROUND,
 }
 
 Dash = Literal["-", "--", "-.", ":", ""]
@@ -66,44 +54,38 @@ class Picture:
     make: Callable[[], Figure]
 
 
-_BLUES = ("#0072B2", "#2AA198", "#56B4E9", "#1B3A6B")
-_REDS = ("#D55E00", "#E69F00", "#A4133C", "#8C510A")
-_GREYS = ("#4d4d4d", "#8a8a8a", "#1a1a1a", "#b3b3b3")
-_GREENS = ("#117733", "#6DBE8B")
-_DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
-_MARKERS = ("o", "s", "^", "D", "v", "P")
-_SHARED = {
-    Style(_BLUES[0]): ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
-    Style(_BLUES[1], "--", "s"): ("zenoh-hub", "zenoh-copy"),
-    Style(_BLUES[2], "-.", "^"): ("zenoh-net",),
-    Style(_BLUES[2], "--", "s", hollow=True): ("zenoh original",),
-    Style(_REDS[0], marker="D"): ("mqtt", "mqtt h264 opus"),
-    Style(_REDS[1], "--", "v"): ("mqtt-nodelay",),
-    Style(_REDS[1], "--", "v", hollow=True): ("mqtt original",),
-    Style(_REDS[2], "-.", "P"): ("mqtt5",),
-    Style(_REDS[3], ":", "X"): ("paho",),
-    Style(_GREYS[0], ":", "X"): ("one hop", "memcpy"),
-    Style(_GREYS[1], "--", "v"): ("gstreamer-shm",),
-    Style(_GREYS[1]): ("json", "pcm"),
-    Style(_GREYS[3]): ("reference",),
-    Style("#CC79A7", "--", "s"): ("pbvd",),
-    Style("#7B4F9E", "-.", "^"): ("pbvz",),
-    Style(_GREENS[0], marker="D"): ("h264", "opus"),
-    Style(_GREENS[1], ":", "v"): ("h264, key/5",),
+#: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the next of all.
+_VARIANTS = {
+    "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
+    "#2AA198": ("zenoh-hub", "zenoh-copy"),
+    "#56B4E9": ("zenoh-net", "zenoh original"),
+    "#1B3A6B": (),
+    "#D55E00": ("mqtt", "mqtt h264 opus"),
+    "#E69F00": ("mqtt-nodelay", "mqtt original"),
+    "#A4133C": ("mqtt5",),
+    "#8C510A": ("paho",),
+    "#4D4D4D": ("one hop", "memcpy"),
+    "#8A8A8A": ("gstreamer-shm", "json", "pcm"),
+    "#1A1A1A": (),
+    "#B3B3B3": ("reference",),
+    "#CC79A7": ("pbvd",),
+    "#7B4F9E": ("pbvz",),
+    "#117733": ("h264", "opus"),
+    "#6DBE8B": ("h264, key/5",),
 }
-_KNOWN = {name: style for style, names in _SHARED.items() for name in names}
+_COLOUR_OF = {name: colour for colour, names in _VARIANTS.items() for name in names}
+_DASHES: tuple[Dash, ...] = ("-", "--", "-.", ":")
+_STYLES = {colour: Style(colour, _DASHES[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)}
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
     """The fixed style of each known variant, and one from its family's colours for every other."""
-    found = {name: _KNOWN[name] for name in variants if name in _KNOWN}
+    found = {name: _COLOUR_OF[name] for name in variants if name in _COLOUR_OF}
     for name in variants:
-        if name not in found:
-            family = _BLUES if name.startswith("zenoh") else _REDS if name.startswith(("mqtt", "paho")) else _GREYS
-            used, turn = {style.colour for style in found.values()}, len(found)
-            colour = next((one for one in family if one not in used), family[turn % len(family)])
-            found[name] = Style(colour, _DASHES[turn % len(_DASHES)], _MARKERS[turn % len(_MARKERS)])
-    return {name: found[name] for name in variants}
+        begin = 0 if name.startswith("zenoh") else 4 if name.startswith(("mqtt", "paho")) else 8
+        family = list(_VARIANTS)[begin : begin + 4]
+        found.setdefault(name, next((colour for colour in family if colour not in found.values()), family[0]))
+    return {name: replace(_STYLES[found[name]], hollow="original" in name) for name in variants}
 
 
 def unique(values: Sequence[str]) -> list[str]:
@@ -111,27 +93,9 @@ def unique(values: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(values))
 
 
-def file_name(*words: str) -> str:
-    """Converts text such as ``one-way there, ± 0.4 ms`` to a file name."""
-    return "-".join(re.sub(r"[^a-z0-9]+", "-", word.lower()).strip("-") for word in words)
-
-
 def finite(samples: Sequence[float | None]) -> list[float]:
     """The finite samples, without NaN and None."""
     return [sample for sample in samples if sample is not None and math.isfinite(sample)]
-
-
-def place(cell: Cell) -> str:
-    """The conditions of a cell as text: ``40 B, 200 Hz, with media``."""
-    words = []
-    for name, value in cell.params.items():
-        if name == "load":
-            words.append("" if value in (None, "none") else f"with {value}")
-        elif value is None or isinstance(value, str):
-            words.append(value or "")
-        else:
-            words.append(f"{value} {name.removesuffix('s') if value == 1 else name}")
-    return ", ".join(filter(None, words)) or ("unloaded" if "load" in cell.params else "")
 
 
 def short(text: str, width: int = 30) -> str:
@@ -159,17 +123,16 @@ def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] 
     handles = [
         Line2D(
             [], [], color=style.colour, label=short(name, 40), linestyle=style.dash,
-            marker=style.marker, markersize=5, markerfacecolor=_BACKGROUND if style.hollow else style.colour,
+            marker=style.marker, markersize=5, markerfacecolor="white" if style.hollow else style.colour,
         )
         for name, style in entries.items()
     ]  # fmt: skip
-    handles += more
-    columns = max(1, min(len(handles), int(figure.get_figwidth() // 1.8)))
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
+    columns = max(1, min(len([*handles, *more]), int(figure.get_figwidth() // 1.8)))
+    figure.legend(handles=[*handles, *more], loc="outside lower center", ncols=columns, frameon=False)
 
 
 def save(picture: Picture, path: Path, results: Results) -> None:
-    """Draws a PNG with a palette; a quick run is marked in the corner. Raises PebbleError if it cannot be written."""
+    """Draws a PNG; a quick run is marked in the corner. Raises PebbleError if it cannot be written."""
     import matplotlib as mpl
     from PIL import Image
 
@@ -179,27 +142,23 @@ def save(picture: Picture, path: Path, results: Results) -> None:
         if results.quick:
             figure.text(0.995, 0.993, "quick run", ha="right", va="top", color="#A4133C", weight="bold")
         figure.savefig(buffer, format="png", dpi="figure")
-    drawn = Image.open(buffer).convert("RGB")
-    image = drawn.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    drawn = Image.open(buffer).convert("RGB")  # with a palette, a file is a third as large
+    image = drawn.quantize(255, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     with named(path):
         image.save(path, optimize=True, dpi=(_DPI, _DPI))
 
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
     """Sets a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
-    from matplotlib.ticker import LogLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-    limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high)}
+    limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high), f"{which}label": label}
     axes.set(**limits)
     axis, decades = axes.xaxis if which == "x" else axes.yaxis, math.log10(high / low)
-    few = decades <= _FEW_DECADES[which]
-    steps = (1.0,) if not few else (1.0, 2.0, 5.0) if decades > 0.5 else tuple(range(1, 10))
-    axis.set_major_locator(LogLocator(subs=steps, numticks=20))
+    steps = LogLocator(subs=(1.0,) if decades > 2.5 else (1.0, 2.0, 5.0), numticks=20)
+    axis.set_major_locator(steps if decades > 0.5 else MaxNLocator(6, steps=(1, 2, 5, 10)))
     axis.set_major_formatter("{x:,.12g}")
-    axis.set_minor_formatter("")
-    if few:
-        axis.set_ticks([], minor=True)
-    axis.set_label_text(label)
+    axis.set_minor_locator(NullLocator())
 
 
 def around(values: Sequence[float | None]) -> tuple[float, float]:
@@ -208,13 +167,9 @@ def around(values: Sequence[float | None]) -> tuple[float, float]:
     return 0.75 * min(positive), 1.4 * max(positive)
 
 
-def unit_of(unit: str) -> str:
-    return "µs" if unit == "us" else unit
-
-
 def guide(axes: Axes, value: float, text: str) -> None:
     """Draws a thin line at a reference value, with its name at the end."""
-    axes.axhline(value, color=_GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+    axes.axhline(value, color="#8a8a8a", linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
     axes.annotate(
         text, (1.0, value), xycoords=axes.get_yaxis_transform(), xytext=(4, 0), textcoords="offset points", fontsize=8,
         color="#555", ha="left", va="center", annotation_clip=False,

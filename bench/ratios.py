@@ -21,6 +21,8 @@ _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
 _SEED = 1  # the same samples give the same interval
 
+Rounds = Sequence[Sequence[float]]  # the samples of each
+
 
 @dataclass(frozen=True, slots=True)
 class Interval:
@@ -38,9 +40,8 @@ class Interval:
     def __str__(self) -> str:
         if not self.known:
             return "–"
-        if self.few:
-            return _digits(self.ratio)
-        return f"{_digits(self.ratio)} ({_digits(self.low)} to {_digits(self.high)})"
+        interval = "" if self.few else f" ({_digits(self.low)} to {_digits(self.high)})"
+        return f"{_digits(self.ratio)}{interval}"
 
     @property
     def known(self) -> bool:
@@ -68,7 +69,7 @@ class Interval:
         return f"{ours} takes {_digits(self.ratio)}× the {quantity} of {theirs} ({interval})"
 
 
-def paired(ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], percent: float = 50) -> Interval:
+def paired(ours: Rounds, theirs: Rounds, percent: float = 50) -> Interval:
     """The median, over rounds run in turn, of the ratio of their percentiles.
 
     A sample may be infinite: a message that never arrived. Rounds without samples, or both infinite, do not count.
@@ -79,14 +80,10 @@ def paired(ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], p
     return _interval(logs, [0.0] * len(logs), LEVEL)
 
 
-def unpaired(
-    ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]], percent: float = 50, level: float = LEVEL
-) -> Interval:
+def unpaired(ours: Rounds, theirs: Rounds, percent: float = 50, level: float = LEVEL) -> Interval:
     """The same for two runs at different times: the ratio of the medians of their rounds' percentiles."""
-    a, b = (
-        [math.log(value) for one in rounds if one and (value := percentile(one, percent)) > 0]
-        for rounds in (ours, theirs)
-    )
+    figures = ([percentile(one, percent) for one in rounds if one] for rounds in (ours, theirs))
+    a, b = ([math.log(one) for one in some if one > 0] for some in figures)
     return _interval(a, b, level)
 
 
@@ -101,20 +98,12 @@ def _interval(ours: Sequence[float], theirs: Sequence[float], level: float) -> I
     if rounds < 2:
         return Interval(math.exp(ratio), 0.0, math.inf, level, rounds)
     random = np.random.default_rng(_SEED)
-    a, b = (
-        np.median(logs[random.integers(0, len(logs), (_RESAMPLES, len(logs)))], axis=1)
-        for logs in map(np.asarray, (ours, theirs))
-    )
-    tail = (1 - level) / 2
-    wider = student(level, rounds) / NormalDist().inv_cdf(1 - tail)
+    a, b = (np.median(random.choice(logs, (_RESAMPLES, len(logs))), axis=1) for logs in (ours, theirs))
+    tail, freedom = (1 - level) / 2, rounds - 1
+    z = NormalDist().inv_cdf(1 - tail)  # half of the width in standard errors; few rounds: Student's t, approximated
+    wider = 1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2)
     low, high = (ratio + wider * (end - ratio) for end in np.quantile(a - b, [tail, 1 - tail]))
     return Interval(math.exp(ratio), math.exp(low), math.exp(high), level, rounds)
-
-
-def student(level: float, rounds: int) -> float:
-    """Half of an interval's width in standard errors (Student's t, approximated), for at least two rounds."""
-    z, freedom = NormalDist().inv_cdf((1 + level) / 2), rounds - 1
-    return z * (1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2))
 
 
 def _digits(ratio: float) -> str:

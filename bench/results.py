@@ -23,10 +23,10 @@ from pebble.version import __version__
 
 FORMAT = 1
 SAMPLES = "samples.json.xz"  # of the results in the same folder, after a report
-MOST = 2000  # samples of a thinned cell
-_PERCENTS = (50, 95, 99, 100)  # kept of a thinned cell
 LONGEST_S = 3600.0  # of one phase of a comparison
 OVER_TIME = " over time"  # suffix of the measure of a cell that holds a curve: times, then values
+_MOST = 2000  # samples of a thinned cell
+_PERCENTS = (50, 95, 99, 100)  # kept of a thinned cell
 _PACKAGES = ("eclipse-zenoh", "paho-mqtt", "numpy", "opencv-python-headless", "av", "msgspec")
 _DIGITS = 3  # decimal places of a sample
 
@@ -63,7 +63,7 @@ class Cell(msgspec.Struct, kw_only=True):
     def lost(self) -> int | None:
         """Messages that were sent and never arrived; None if not counted."""
         sent = self.figures.get("sent")
-        return int(sent) - sum(self.sizes) if isinstance(sent, int) else None
+        return sent - sum(self.sizes) if isinstance(sent, int) else None
 
     @property
     def sizes(self) -> list[int]:
@@ -81,18 +81,21 @@ class Cell(msgspec.Struct, kw_only=True):
         return percentile(self.samples, percent) if known is None else known
 
     def thinned(self) -> Cell:
-        """At most :data:`MOST` samples, or 100 of each round, evenly taken: percentiles of each round stay as they are.
+        """At most 2,000 samples, or 100 of each round: the last of 100, 200, … equal parts, so that percentiles stay.
 
         Those of a round are sorted, except in a curve.
         """
-        curve, most = self.measure.endswith(OVER_TIME), max(100, MOST // max(1, len(self.rounds)) // 100 * 100)
-        rounds = [_thinned(one if curve else sorted(one), most) for one in self.rounds]
+        most, rounds = max(100, _MOST // max(1, len(self.rounds)) // 100 * 100), []
+        for one in self.rounds:
+            ordered, parts = one if self.measure.endswith(OVER_TIME) else sorted(one), min(most, len(one))
+            rounds.append([ordered[math.ceil(len(one) * part / parts) - 1] for part in range(1, parts + 1)])
         found = {f"{percent}": self.percentile(percent) for percent in _PERCENTS if self.samples}
         return msgspec.structs.replace(self, rounds=rounds, counts=self.sizes, percentiles=found)
 
     def conditions(self) -> str:
-        """The conditions as text: ``40 B, 200 Hz``."""
-        return ", ".join(str(value) for value in self.params.values())
+        """The conditions as text: ``40 B, 200 Hz`` or ``640x480, readers: 3``."""
+        known = [(name, value) for name, value in self.params.items() if value is not None]
+        return ", ".join(value if isinstance(value, str) else f"{name}: {value}" for name, value in known)
 
 
 class Judged(msgspec.Struct, kw_only=True):
@@ -118,6 +121,7 @@ class Results(msgspec.Struct, kw_only=True):
     began: str = ""  # UTC, ISO 8601
     took_s: float = 0.0
     quick: bool = False
+    complete: bool = True  # else something could not be measured
     cells: list[Cell] = []
     assessment: list[str] = msgspec.field(name="verdict", default_factory=list)  # sentences
     aims: list[Judged] = []
@@ -143,32 +147,23 @@ def named(path: Path) -> Iterator[None]:
         raise PebbleError(f"{path}: {error.strerror}") from None
 
 
-def _thinned(samples: Sequence[float], most: int) -> list[float]:
-    """The last sample of each of ``most`` equal parts: if there are 100, 200, …, whole percentiles are the same."""
-    if len(samples) <= most:
-        return list(samples)
-    return [samples[math.ceil(len(samples) * part / most) - 1] for part in range(1, most + 1)]
-
-
 def pack(folder: Path) -> None:
     """Moves the samples of all results in a folder into one small file, thinned. Raises PebbleError.
 
     It holds the differences of neighbours, which compress well.
     """
-    packed: dict[str, list[list[list[float]]]] = {}
+    packed: dict[str, list[list[list[int]]]] = {}
     for path in sorted(folder.glob("*.json")):
-        try:
+        with suppress(PebbleError):  # of another version, or not of a comparison
             results = load(path)
-        except PebbleError:  # of another version, or not of a comparison
-            continue
-        results.cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
-        packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in results.cells]
-        results.cells = [msgspec.structs.replace(cell, rounds=[]) for cell in results.cells]
-        results.save(path)
+            cells = [cell if cell.counts else cell.thinned() for cell in results.cells]
+            packed[results.bench] = [[_steps(one) for one in cell.rounds] for cell in cells]
+            results.cells = [msgspec.structs.replace(cell, rounds=[]) for cell in cells]
+            results.save(path)
     (folder / SAMPLES).write_bytes(lzma.compress(msgspec.json.encode(packed), preset=9))
 
 
-def _steps(samples: Sequence[float]) -> list[float]:
+def _steps(samples: Sequence[float]) -> list[int]:
     whole = [round(sample * 10**_DIGITS) for sample in samples]
     return [one - before for before, one in itertools.pairwise([0, *whole])]
 
@@ -203,22 +198,21 @@ def begin(bench: str, command: Sequence[str], *, quick: bool = False) -> Results
 
 
 def machine() -> dict[str, Value]:
-    """The machine and the versions the results depend on; no names of hosts or users."""
-    cpuinfo, system = "", platform.system()
-    with suppress(OSError):
-        cpuinfo = Path("/proc/cpuinfo").read_text()
-    with suppress(OSError):
-        system = platform.freedesktop_os_release().get("PRETTY_NAME", "")
-    model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", cpuinfo, re.MULTILINE)
-    return {
+    """The machine and the versions the results depend on; no names of hosts or users. None: not installed."""
+    model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    found: dict[str, Value] = {
         "cpu": model[1] if model else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),
-        "system": system,
+        "system": platform.freedesktop_os_release()["PRETTY_NAME"],
         "python": platform.python_version(),
         "mosquitto": _mosquitto(),
-        **{name: _version(name) for name in _PACKAGES},
+        **dict.fromkeys(_PACKAGES),
     }
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def _mosquitto() -> str | None:
@@ -228,12 +222,6 @@ def _mosquitto() -> str | None:
         command = [mosquitto_path() or "", "-h"]
         answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5).stdout
         return answer.partition("\n")[0].removeprefix("mosquitto version ").strip() or None
-    return None
-
-
-def _version(package: str) -> str | None:
-    with suppress(PackageNotFoundError):
-        return version(package)
     return None
 
 
@@ -249,8 +237,7 @@ def percentile(figures: Sequence[float], percent: float) -> float:
     """The smallest value that at least ``percent`` per cent of the values do not exceed; NaN without values."""
     if not figures:
         return math.nan
-    ordered = sorted(figures)
-    return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
+    return sorted(figures)[max(0, math.ceil(len(figures) * percent / 100) - 1)]
 
 
 def rounded(figure: float | int | None, digits: int) -> float | int | None:

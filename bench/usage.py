@@ -44,10 +44,7 @@ def _sum(file: Path, *fields: str) -> int:
 
 
 def pss_mb(pid: int) -> float:
-    """Proportional set size: shared pages are divided among their users. 0 for a process that has ended.
-
-    Raises PebbleError if the kernel does not provide it.
-    """
+    """Proportional set size: shared pages are divided among their users."""
     return _memory_mb(pid, "Pss:")
 
 
@@ -55,20 +52,20 @@ def own_mb(pid: int) -> float:
     """What a process has allocated, without the pages of programs and libraries: only it can make this grow.
 
     The proportional set size grows too when another process ends with which pages were shared. Shared memory is divided
-    among its users. 0 for a process that has ended. Raises PebbleError if the kernel does not provide it.
+    among its users.
     """
     return _memory_mb(pid, "Anonymous:", "Pss_Shmem:")
 
 
 def _memory_mb(pid: int, *fields: str) -> float:
+    """0 for a process that has ended. Raises PebbleError if the kernel does not provide it."""
+    file = _PROC / str(pid) / "smaps_rollup"
     try:
-        return _sum(_PROC / str(pid) / "smaps_rollup", *fields) / 1024
-    except (FileNotFoundError, PermissionError) as error:
-        if (_PROC / str(pid)).exists():
-            raise PebbleError(f"{error.filename}: {error.strerror}: memory cannot be measured without it") from None
-    except ProcessLookupError:
-        pass
-    return 0.0
+        return _sum(file, *fields) / 1024
+    except OSError as error:
+        if file.parent.exists() and not isinstance(error, ProcessLookupError):
+            raise PebbleError(f"{file}: {error.strerror}: memory cannot be measured without it") from None
+        return 0.0
 
 
 # -- the time of a wake-up, which every message needs several times
@@ -78,7 +75,7 @@ def wake_up_us() -> tuple[float, float]:
     """The time to wake up a waiting process on the same core and on another one, us; alike if there is only one core.
 
     It is half of the median round trip of a byte through a socket to ``cat``: a round trip is two wake-ups and little
-    else. Raises PebbleError without ``cat``.
+    else.
     """
     cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, cores[:1])  # only this thread, and processes that it starts meanwhile
@@ -90,19 +87,14 @@ def wake_up_us() -> tuple[float, float]:
 
 def _wake_up_us(core: int) -> float:
     near, far = socket.socketpair()
-    with near, far:
-        try:
-            cat = subprocess.Popen(["cat"], stdin=far.fileno(), stdout=far.fileno())
-        except OSError as error:
-            raise PebbleError(f"cat: {error.strerror}") from None
-        with cat:
-            os.sched_setaffinity(cat.pid, {core})
-            ways = []
-            for _ in range(_PINGS):
-                time.sleep(_PERIOD_S)
-                sent = time.monotonic_ns()
-                near.send(b".")
-                near.recv(1)
-                ways.append(time.monotonic_ns() - sent)
-            near.shutdown(socket.SHUT_WR)  # it ends when its input closes
+    with near, far, subprocess.Popen(["cat"], stdin=far.fileno(), stdout=far.fileno()) as cat:
+        os.sched_setaffinity(cat.pid, {core})
+        ways = []
+        for _ in range(_PINGS):
+            time.sleep(_PERIOD_S)
+            sent = time.monotonic_ns()
+            near.send(b".")
+            near.recv(1)
+            ways.append(time.monotonic_ns() - sent)
+        near.shutdown(socket.SHUT_WR)  # it ends when its input closes
     return median_low(ways) / 2000

@@ -6,20 +6,21 @@ The command of a comparison follows from its declaration.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from pebble.bench.comparison import FOLDER, Comparison, Option, as_word
+from pebble.bench.comparison import FOLDER, MODULES, Comparison, Option, chosen, find
 from pebble.commands.options import CaCert, Output, PasswordFile, Quick, split_names
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
 
+_NAMES = [name for name in MODULES if name != "impair"]  # that is a command of its own
 _GROUP_HELP = """Comparisons, side by side in one run on this machine.
 
 \b
@@ -31,22 +32,16 @@ _GROUP_HELP = """Comparisons, side by side in one run on this machine.
 def compare(
     a: Annotated[Path, typer.Argument(help="Results of the older run.", metavar="A.json", show_default=False)],
     b: Annotated[Path, typer.Argument(help="Results of the newer run.", metavar="B.json", show_default=False)],
-    threshold: Annotated[float, typer.Option(help="Smaller factors never count as a change.")] = 1.05,
     everything: Annotated[bool, typer.Option("--all", help="Also list what did not change.")] = False,
 ) -> int:
     """Did anything get worse from A to B, beyond noise? Exit code 1 if so.
 
     Both files must come from the same comparison, if possible on the same machine with the same options. The ratios of
     the medians and of the p99 of each cell are tested with confidence intervals over rounds.
-
-    \b
-        pebble bench frames --output before
-        pebble bench frames --output after
-        pebble bench compare before/frames.json after/frames.json
     """
     from pebble.bench.compare import run
 
-    return run(a, b, threshold=threshold, everything=everything)
+    return run(a, b, everything=everything)
 
 
 def echo(
@@ -81,37 +76,27 @@ def report(
 
     \b
         pebble bench report docs/results
-        pebble bench report build/report-quick --quick
         pebble bench report bench-results --only control,control-null
-        pebble bench report docs/results --render
     """
-    from pebble.bench.catalogue import chosen, reported
     from pebble.bench.report import run, write
 
     if render:
         typer.echo(f"Written: {write(folder)}")
         return 0
-    names = [] if only is None else split_names(only)
-    left_out = [] if names else [one for one in reported() if one.needs_more_rights]
-    return run(chosen(names), folder, quick=quick, left_out=left_out)
+    return run(chosen([] if only is None else split_names(only)), folder, quick=quick)
 
 
 class Comparisons(TyperGroup):
     """Imports the declaration of a comparison when its command is wanted."""
 
     def list_commands(self, ctx: Context) -> list[str]:
-        from pebble.bench import catalogue
-
-        return [*catalogue.commands(), *super().list_commands(ctx)]
+        return [*_NAMES, *super().list_commands(ctx)]
 
     def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
-        from pebble.bench import catalogue
-
-        if cmd_name not in catalogue.commands():
+        if cmd_name not in _NAMES:
             return super().get_command(ctx, cmd_name)
-        about = catalogue.find(cmd_name)
         app = typer.Typer(rich_markup_mode=None, add_completion=False)
-        app.command(cmd_name)(command_of(about))
+        app.command(cmd_name)(command_of(find(cmd_name)))
         return typer.main.get_command(app)
 
 
@@ -127,58 +112,41 @@ def command_of(about: Comparison) -> Callable[..., int]:
         return run_(mode.run_of(quick=quick, output=output, **wanted))
 
     declared: dict[str, tuple[Any, Any]] = {name: (_annotation(about, one), None) for name, one in options.items()}
-    if about.has_quick:
-        declared["quick"] = Quick, False
-    declared["output"] = Output, about.folder
+    declared |= {"quick": (Quick, False), "output": (Output, about.folder)}
     run.__doc__ = about.help
-    return with_parameters(
-        run,
+    run.__annotations__ = {name: annotation for name, (annotation, _) in declared.items()}
+    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
             for name, (annotation, default) in declared.items()
-        ],
+        ]
     )
-
-
-def with_parameters(run: Callable[..., int], parameters: Sequence[inspect.Parameter]) -> Callable[..., int]:
-    """The function with the parameters that typer is to see."""
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return run
 
 
 def _annotation(about: Comparison, option: Option) -> Any:
-    """The option for typer: None if it is not given."""
-    kind: Any = list[option.kind] if option.repeated else str if option.many else option.kind  # type: ignore[name-defined]
-    low, high = (None, None) if option.many else (option.least, option.most)
-    name, help_ = f"--{option.name}", f"{option.help}{_default(about, option)}"
-    return Annotated[
-        kind | None, typer.Option(name, help=help_, metavar=option.metavar, show_default=False, min=low, max=high)
-    ]
-
-
-def _default(about: Comparison, option: Option) -> str:
+    """The option for typer, with its defaults as text: None if it is not given."""
+    kind: Any = list[str] if option.many else option.kind
     full, quick = (budget.get(option.key) for budget in (about.full, about.quick))
+    default = "" if full is None or option.kind is bool else option.as_word(full)
     if option.key == "variants" or (option.many and full == list(option.known)):
-        return " [default: all]"
-    if full is None or option.kind is bool:
-        return ""
-    shown = [
-        ", ".join(map(as_word, value if option.many else [value]))
-        for value in ([full] if quick in (None, full) else [full, quick])
+        default = "all"
+    elif default and quick not in (None, full):
+        default += f"; quick {option.as_word(quick)}"
+    help_ = f"{option.help} [default: {default}]" if default else option.help
+    return Annotated[
+        kind | None, typer.Option(f"--{option.name}", help=help_, metavar=option.metavar, show_default=False)
     ]
-    return f" [default: {'; quick '.join(shown) if option.many else ', quick '.join(shown)}]"
 
 
 def _parsed(option: Option, value: Any) -> Any:
-    if option.repeated:
-        return value or None
-    if value is None or not option.many:
+    """Of several values, each may be separated by commas. Raises PebbleError for text in place of numbers."""
+    if not option.many:
         return value
     try:
-        return [option.kind(one) for one in split_names(value)]
+        return [option.kind(one) for words in value or () for one in split_names(words)] or None
     except ValueError:
-        raise PebbleError(f"--{option.name}: {value} is not a list of numbers") from None
+        raise PebbleError(f"--{option.name}: {','.join(value)} is not a list of numbers") from None
 
 
 def register(app: typer.Typer) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperCommand
 
-from pebble.bench import catalogue
+from pebble.bench.comparison import find
 from pebble.client.connection import Target
 from pebble.commands.bench import command_of
 from pebble.commands.options import CaCert, PasswordFile
@@ -81,7 +81,7 @@ class _Command(TyperCommand):
     @cached_property
     def _simulated(self) -> Command:
         app = typer.Typer(rich_markup_mode=None, add_completion=False)
-        app.command()(command_of(catalogue.find("impair")))
+        app.command()(command_of(find("impair")))
         return typer.main.get_command(app)
 
     def get_params(self, ctx: Context) -> list[Parameter]:

@@ -189,7 +189,7 @@ def far_cells(exchanges: Sequence[Exchange], monkeypatch: pytest.MonkeyPatch, of
     if offset is not None:
         monkeypatch.setattr(control_far, "estimate", lambda _exchanges: offset)
     run, condition = CONTROL_FAR.run_of(), {"size": "40 B", "rate": "20 Hz"}
-    collected = engine.Collected(CONTROL_FAR, ["mqtt"], [condition])
+    collected = engine.Collected(CONTROL_FAR, ["mqtt"])
     case = Case(run=run, number=0, variant="mqtt", role="mqtt", condition=condition, env=Answered())
     collected.add(control_far.measure(case))
     return control_far.derived(collected.cells())

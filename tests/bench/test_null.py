@@ -69,7 +69,7 @@ def test_nothing_measured_is_not_passed() -> None:
 
 def test_a_fifth_of_what_was_usual_is_planted() -> None:
     about, condition = FRAMES_NULL, {"size": "64x48", "readers": 1}
-    so_far = engine.Collected(about, null.roles("mqtt"), [condition])
+    so_far = engine.Collected(about, null.roles("mqtt"))
     assert so_far.planted_us(condition) == 0
     times = {"mqtt": [[100.0], []], "mqtt again": [[300.0], []], "mqtt +20 %": [[9000.0]]}
     so_far.add(

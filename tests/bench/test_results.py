@@ -120,7 +120,8 @@ def test_percentiles_are_of_all_rounds() -> None:
 
 
 def test_conditions_are_words() -> None:
-    assert a_cell().conditions() == "40 B, 3"
+    assert a_cell().conditions() == "40 B, readers: 3"
+    assert a_cell(params={"load": None, "rate": 10.0}).conditions() == "rate: 10.0"
     assert a_cell(params={}).conditions() == ""
 
 

@@ -35,23 +35,16 @@ def test_what_differs_by_chance_is_equal() -> None:
 
 def test_few_rounds_give_no_interval_and_a_note() -> None:
     low, high = [1.0, 2.0, 3.0, 4.0, 5.0], [6.0, 7.0, 8.0, 9.0, 10.0]
-    assert printed(low, high).endswith(": mqtt takes less time in every round")
-    assert printed(high, low).endswith(": zenoh takes less time in every round")
-    assert printed(low, [5.0, *high[1:]]).endswith(": no clear difference")
+    assert printed(low, high) == "M: mqtt 3.00 (1.00 to 5.00) ms, zenoh 8.00 (6.00 to 10.0) ms"
     pair = cells([1.0, 2.0], [2.0, 4.0])
     assert against(pair) == "2.00"
     (line,) = caveat(pair)
     assert line.startswith("2 rounds, and a 99 % interval needs 8")
 
 
-def test_what_happens_by_chance_is_not_claimed() -> None:
-    """Of two equal robots, all four values of one lie beyond those of the other in one run of 35."""
-    assert printed([1.0, 2.0, 3.0, 4.0], [6.0, 7.0, 8.0, 9.0]).endswith("(6.00 to 9.00) ms")
-
-
 def test_one_round_claims_nothing() -> None:
     assert printed([1.0], [2.0]) == "M: mqtt 1.00 ms, zenoh 2.00 ms"
-    assert caveat(cells([1.0], [2.0])) == ["One round is not enough to compare; a 99 % interval needs 8."]
+    assert caveat(cells([1.0], [2.0]))[0].startswith("1 round, and ")
 
 
 def test_a_single_robot_is_not_compared() -> None:

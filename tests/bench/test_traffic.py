@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from pebble.bench import traffic as comparison
-from pebble.bench.catalogue import chosen
+from pebble.bench.comparison import chosen
 from pebble.bench.engine import run
 from pebble.bench.paper import TABLE_4_1
 from pebble.bench.pictures import pictures
