@@ -31,6 +31,10 @@ def send(encoder: VideoEncoder, count: int, first: int = 0, **asked: bool) -> li
     return [encoder.encode(picture(n), T0 + n * 66, **asked) for n in range(first, first + count)]
 
 
+def _squared_error(one: Pixels, other: Pixels) -> float:
+    return cv2.norm(one, other, cv2.NORM_L2SQR) / one.size
+
+
 def test_this_installation_makes_all_of_them() -> None:
     assert VIDEO_ENCODINGS == FORMS
 
