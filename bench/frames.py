@@ -164,14 +164,7 @@ FRAMES = Comparison(
     "written until the reader has a whole numpy array.",
     help="""Camera frames from one process to others: latency, CPU and memory.
 
-    BGR pictures at 30 Hz through Zenoh shared memory (without copies, and with), Zenoh without shared memory, MQTT
-    through mosquitto, and GStreamer's shared memory, compared with a bare copy. Each round measures every variant.
-
-    With --null: one variant, one size (640x480), one reader, 30 rounds of 0.4 s. The run fails if it finds a
-    difference where there is none, or misses the planted one.
-
     \b
-        pebble bench frames
         pebble bench frames --size 640x480 --readers 1 --variants zenoh-shm,gstreamer-shm
         pebble bench frames --null zenoh-shm
     """,

@@ -6,8 +6,8 @@ file in the system's Python, where gi and Gst are installed; without arguments i
 file imports only the standard library, numpy, and the other end of a worker.
 
 A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
-time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns), and answers an
-empty line with what it measured in that window.
+time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns), and answers
+an empty line with what it measured in that window.
 """
 
 from __future__ import annotations
@@ -42,12 +42,9 @@ Gst: Any = None  # loaded by main(): other Pythons have no gi
 
 
 class Writer(Protocol):
-    """One way of sending frames."""
+    """One way of sending frames; ``fallbacks`` did not go through shared memory."""
 
-    @property
-    def fallbacks(self) -> int:
-        """The number of frames that did not go through shared memory."""
-        return 0
+    fallbacks = 0
 
     def begin(self) -> np.ndarray | None:
         """The buffer for the next frame's pixels (uint8, 1-D); None if no frame can be sent now."""
@@ -154,18 +151,14 @@ def read(reader: Reader, *, bare_copy: int = 0) -> None:
 
 
 class ZenohWriter(Writer):
-    """``in_segment``: frames are created in the shared segment, else copied there."""
+    """Frames are created in the shared segment, or copied there, or sent as bytes."""
 
-    def __init__(self, folder: Path, size: int, *, in_segment: bool, shared: bool) -> None:
-        self._size, self._in_segment, self._info = size, in_segment, FrameInfo(format="bgr24")
+    def __init__(self, variant: str, folder: Path, size: int) -> None:
+        self._size, self._in_segment, self._info = size, variant in _WITHOUT_COPIES, FrameInfo(format="bgr24")
         self._writer = FrameWriter(folder, _STREAM, capacity=size).open()
-        _refuse(self._writer.problem if shared else "")
+        _refuse(self._writer.problem, variant)
         self._frame = np.zeros(size, np.uint8)
         self._slot: Slot | None = None
-
-    @property
-    def fallbacks(self) -> int:
-        return self._writer.counters["fallbacks"]
 
     def begin(self) -> np.ndarray | None:
         if not self._writer.wanted:
@@ -178,6 +171,7 @@ class ZenohWriter(Writer):
             self._slot.send(self._info)
         else:
             self._writer.write(self._frame, self._info)
+        self.fallbacks = self._writer.counters["fallbacks"]
 
     def close(self) -> None:
         self._slot = None
@@ -187,22 +181,22 @@ class ZenohWriter(Writer):
 class ZenohReader(Reader):
     """Frames are views into the segment, or copies."""
 
-    def __init__(self, folder: Path, *, views: bool, shared: bool) -> None:
-        self._shared = shared
-        self._reader = FrameReader(folder, _STREAM, views=views).open()
+    def __init__(self, variant: str, folder: Path) -> None:
+        self._variant = variant
+        self._reader = FrameReader(folder, _STREAM, views=variant in _WITHOUT_COPIES).open()
 
     def read(self, timeout: float) -> np.ndarray | None:
         frame = self._reader.read(timeout)
-        _refuse(self._reader.problem if self._shared else "")
+        _refuse(self._reader.problem, self._variant)
         return None if frame is None else frame.data
 
     def close(self) -> None:
         self._reader.close()
 
 
-def _refuse(problem: str) -> None:
+def _refuse(problem: str, variant: str) -> None:
     """Raises TransportError: results of frames that took another way would be labelled wrongly."""
-    if problem:
+    if problem and variant != "zenoh-net":
         raise TransportError(problem)
 
 
@@ -340,7 +334,7 @@ def writer(variant: str, where: str, size: int, caps: str = "") -> Writer:
         return GstWriter(f"{where}/gst.sock", caps, size)
     if variant == "mqtt":
         return MqttWriter(int(where), size)
-    return ZenohWriter(Path(where), size, in_segment=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
+    return ZenohWriter(variant, Path(where), size)
 
 
 def reader(variant: str, where: str, caps: str = "") -> Reader:
@@ -348,7 +342,7 @@ def reader(variant: str, where: str, caps: str = "") -> Reader:
         return GstReader(f"{where}/gst.sock", caps)
     if variant == "mqtt":
         return MqttReader(int(where))
-    return ZenohReader(Path(where), views=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
+    return ZenohReader(variant, Path(where))
 
 
 def main(arguments: list[str]) -> None:

@@ -235,18 +235,12 @@ def pictures(rig: Rig, scale: float) -> Samples:
         page.evaluate("([ref, one]) => pebble.commands.setEncoding(ref, one)", [rig.ref(_ROBOT), encoding])
         rig.until(page, f"bench.drawn.at(-1)?.[0] === '{encoding}'", f"no {encoding}")
         rig.pause(page, 1.5)
-        drawn = [one for one in _drawn(rig, page, 20 * scale) if one[0] == encoding]
+        page.evaluate("bench.drawn.length = 0")
+        rig.pause(page, 20 * scale)
+        drawn = [one for one in page.evaluate("bench.drawn") if one[0] == encoding]
         found[f"scene, {encoding} to drawn"] = [at - captured for _, _, captured, at in drawn]
         found[f"scene, {encoding} lost"] = [lost_percent([one[1] for one in drawn])]
     return found
-
-
-def _drawn(rig: Rig, page: Page, seconds: float) -> list[tuple[str, int, float, float]]:
-    """The pictures drawn in this time, as the page notes them: encoding, number, captured and drawn (ms)."""
-    page.evaluate("bench.drawn.length = 0")
-    rig.pause(page, seconds)
-    drawn: list[tuple[str, int, float, float]] = page.evaluate("bench.drawn")
-    return drawn
 
 
 def lost_percent(numbers: list[int]) -> float:
@@ -430,12 +424,8 @@ PAGE = Comparison(
     help="""The operator page in a browser: what a driver feels, and what its server costs.
 
     From a key to the motors of a simulated robot, from whatever interrupts a driver to their stop, from the camera to
-    the screen; many viewers, many robots, slow links. Needs mosquitto and its clients, chromium, the extra dev, and
-    root for the links.
-
-    \b
-        pebble bench page
-        pebble bench page --quick --only keys,stops
+    the screen; many viewers, many robots, a slow link. Needs mosquitto and its clients, chromium, the extra dev, and
+    root for the link.
     """,
     options=(
         Option(name="only", sets="cases", many=True, known=list(CASES), metavar="NAMES",

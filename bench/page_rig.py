@@ -52,11 +52,9 @@ _WITHOUT = (
     "HttpsFirstBalancedModeAutoEnable,MediaRouter,PaintHolding,ThirdPartyStoragePartitioning,"
     "AvoidCorsURLLoaderRestartOnRedirect,OptimizationHints,NetworkTimeServiceQuerying,AimEnabled,PreconnectToSearch"
 )
-FLAGS = (
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--autoplay-policy=no-user-gesture-required"),
-    f"--disable-features={_WITHOUT}",
-)
+_AUTOPLAY = "--autoplay-policy=no-user-gesture-required"
+#: Beside those of Playwright.
+_FLAGS = ("--disable-gpu", "--disable-quic", _AUTOPLAY, f"--disable-features={_WITHOUT}")
 
 #: Stamps inputs, first contents, drawn pictures and sent commands; runs before the page's own scripts.
 _HOOKS = """
@@ -75,7 +73,7 @@ bench.film = () => {
   const draw = pebble.video.draw;
   pebble.video.draw = function (bitmap, info) {
     draw.call(this, bitmap, info);
-    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]);
+    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]); // in ms
   };
 };
 bench.confirmed = (refs) => {
@@ -257,7 +255,7 @@ def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
 
     with sync_playwright() as playwright:
         path = program or shutil.which("chromium")
-        with closing(playwright.chromium.launch(executable_path=path, args=[*FLAGS, *flags])) as browser:
+        with closing(playwright.chromium.launch(executable_path=path, args=[*_FLAGS, *flags])) as browser:
             yield browser
 
 

@@ -14,7 +14,6 @@ from typing import Final, cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from pebble.bench.aims import Aim, single
 from pebble.bench.comparison import Budget, Case, Comparison, seconds
@@ -273,7 +272,7 @@ def measure_sound(case: Case) -> Iterator[Cell]:
             yield _cell(replace(case, role="opus"), "kbit/s", opus, pcm, params)
 
 
-def speak(speech: npt.NDArray[np.int16], name: str, bitrate: int = 24_000, bundle: int = 1) -> Coded:
+def speak(speech: np.ndarray, name: str, bitrate: int = 24_000, bundle: int = 1) -> Coded:
     """Encodes and decodes the speech."""
     encoder = make_sound_encoder(name, rate=RATE, channels=1, chunk_ms=_CHUNK_MS, bitrate=bitrate, bundle=bundle)
     size = RATE * _CHUNK_MS // 1000
