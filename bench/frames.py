@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 import statistics
 import subprocess
 import time
@@ -15,7 +14,7 @@ from pebble.bench import null
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Run, of_known, rounds, seconds, variants
 from pebble.bench.pictures import ecdf, null_ratios, tails
 from pebble.bench.ratios import LEAST_ROUNDS, paired
-from pebble.bench.results import Cell, Value
+from pebble.bench.results import Cell
 from pebble.bench.tables import COUNT, LOST, Column, Grid, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
@@ -35,15 +34,6 @@ _READY_S = 20.0
 _STARTUP_S = 0.1  # from the last process ready to the first counted frame
 _LATE_S = 0.15  # how long to wait for the last frames after the window
 _ANSWER_S = 10.0
-_SIZE = re.compile(r"[1-9]\d{1,3}x[1-9]\d{1,3}")
-
-
-def conditions(run: Run) -> list[dict[str, Value]]:
-    """Raises PebbleError for an invalid size."""
-    for size in run["size"]:
-        if not _SIZE.fullmatch(size) or int(size.partition("x")[0]) % 4:  # else GStreamer pads the rows
-            raise PebbleError(f"not a size: {size} (example: 640x480; the width must be a multiple of 4)")
-    return [{"size": size, "readers": count} for size in run["size"] for count in run["readers"]]
 
 
 def prepare(run: Run) -> None:
@@ -162,20 +152,10 @@ FRAMES = Comparison(
     title="Camera frames inside the robot",
     what="BGR pictures at 30 Hz from one process to others on the same machine. The latency is from the last byte "
     "written until the reader has a whole numpy array.",
-    help="""Camera frames from one process to others: latency, CPU and memory.
-
-    \b
-        pebble bench frames --size 640x480 --readers 1 --variants zenoh-shm,gstreamer-shm
-        pebble bench frames --null zenoh-shm
-    """,
+    help="Camera frames from one process to others: latency, CPU and memory.",
     options=(
         seconds("Duration of each case in a round."),
         rounds("Rounds of all cases.", least=2),  # one shows no variation
-        Option(name="size", many=True, repeated=True, metavar="SIZE", help="640x480; may be given several times."),
-        Option(
-            name="readers", kind=int, many=True, repeated=True, least=1, most=16, metavar="COUNT",
-            help="May be given several times.",
-        ),
         variants(VARIANTS),
         Option(
             name="null", known=VARIANTS, metavar="VARIANT", recorded=False,
@@ -185,7 +165,7 @@ FRAMES = Comparison(
     full=Budget(330, seconds=0.5, rounds=LEAST_ROUNDS, size=("640x480", "1920x1080"), readers=(1, 3), null=None),
     quick=Budget(20, rounds=2, size=("640x480",), readers=(1,)),
     variants=VARIANTS,
-    conditions=conditions,
+    conditions=lambda run: [{"size": size, "readers": count} for size in run["size"] for count in run["readers"]],
     prepare=prepare,
     missing=missing,
     measure=measure,

@@ -203,7 +203,8 @@ def stops(rig: Rig, scale: float) -> Samples:
             page.locator(f"[data-test={button}]").wait_for()
             for _ in range(max(1, round(10 * scale))):
                 driver.choose(refs)
-                rig.until(page, lambda names=names: all(map(rig.stage.wheels_turning, names)), "the robots do not move")
+                for name in names:
+                    rig.until(page, partial(rig.stage.wheels_turning, name), f"{name} does not move")
                 rig.pause(page, _HELD_S)
                 page.evaluate("refs => bench.confirmed(refs)", refs)
                 page.locator(f"[data-test={button}]").click()
@@ -306,8 +307,8 @@ def viewers(rig: Rig, scale: float) -> Samples:
         received = 0
         with suppress(TimeoutError, WebSocketException), connect(address, **options) as socket:
             while not ending.is_set():
-                picture = socket.recv(_PICTURE_S)
-                socket.send(picture[:4] + b"\0")
+                picture = socket.recv(_PICTURE_S, decode=False)
+                socket.send(picture[:4] + b"\0")  # type: ignore[operator]
                 received += 1
         return received
 
