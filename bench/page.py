@@ -26,7 +26,7 @@ from pebble.bench.drivers import driving as others_drive
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.page_rig import Rig, linked, monotonic, rig
 from pebble.bench.results import Cell, Judged, percentile
-from pebble.bench.tables import Column, Grid, figure
+from pebble.bench.tables import figure
 from pebble.bench.usage import cpu_s
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.errors import PebbleError
@@ -57,7 +57,7 @@ _HIDE = """() => {
 
 
 class Row(NamedTuple):
-    """One line of the table, and its goal: bounds of the median and of the 95th percentile."""
+    """What is measured, and its goal: bounds of the median and of the 95th percentile."""
 
     key: str
     p50: float = math.inf
@@ -307,7 +307,7 @@ def viewers(rig: Rig, scale: float) -> Samples:
         received = 0
         with suppress(TimeoutError, WebSocketException), connect(address, **options) as socket:
             while not ending.is_set():
-                picture = socket.recv(_PICTURE_S, decode=False)
+                picture = socket.recv(_PICTURE_S)
                 socket.send(picture[:4] + b"\0")  # type: ignore[operator]
                 received += 1
         return received
@@ -396,26 +396,17 @@ def measure(case: Case) -> Iterator[Cell]:
         yield case.cell(row.key, row.unit, samples.get(row.key, []))
 
 
-def _column(head: str, value: Callable[[Row, list[float]], str]) -> Column:
-    """Of the best try."""
-    return Column(head, lambda cell: value(ROWS[cell.measure], ROWS[cell.measure].best(cell.rounds)))
-
-
-def _shown(_row: Row, samples: Sequence[float]) -> str:
-    return f"{figure(percentile(samples, 50))} / {figure(percentile(samples, 95))}"
-
-
-def goals(cells: Sequence[Cell]) -> Iterator[Judged]:
+def goals(cells: Sequence[Cell]) -> Iterator[str | Judged]:
     """The goals as aims, each judged by the best try."""
     for cell in cells:
         row = ROWS[cell.measure]
         best = row.best(cell.rounds)
+        measured = f"{figure(percentile(best, 50))} / {figure(percentile(best, 95))} {row.unit}"
         if row.goal:
-            yield Judged(
-                what=f"{row.key}, p50 / p95 {row.goal} {row.unit}",
-                outcome=outcome(row.met(best), judged=bool(best)),
-                measured=f"{_shown(row, best)} {row.unit}",
-            )
+            what = f"{row.key}, p50 / p95 {row.goal} {row.unit}"
+            yield Judged(what=what, outcome=outcome(row.met(best), judged=bool(best)), measured=measured)
+        else:
+            yield f"{row.key}: {measured}"
 
 
 PAGE = Comparison(
@@ -439,15 +430,6 @@ PAGE = Comparison(
     variants=("page",),
     conditions=lambda run: [{"case": name} for name in CASES if name in run["cases"]],
     measure=measure,
-    tables=(
-        Grid(
-            title="p50 / p95 of the best try", rows=("case", "measure", "unit"), heads=("case", "", "unit"),
-            columns=(
-                _column("measured", _shown), _column("n", lambda _row, samples: str(len(samples))),
-                _column("goal", lambda row, _samples: row.goal),
-            ),
-        ),
-    ),
     assessment=(goals,),
     reported=None,
 )  # fmt: skip

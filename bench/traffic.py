@@ -22,7 +22,7 @@ from pebble.bench.aims import outcome
 from pebble.bench.comparison import Budget, Case, Comparison, Run
 from pebble.bench.paper import MONO_PCM_KBPS, TABLE_4_1
 from pebble.bench.pictures import Drawn
-from pebble.bench.results import Cell, Judged, Results
+from pebble.bench.results import Cell, Judged, Results, Value
 from pebble.bench.tables import plain_table
 from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
@@ -145,7 +145,7 @@ def cells_of(traffic: Traffic) -> list[Cell]:
         analysis = msgspec.json.encode(robot).decode()
         cells.append(Cell(variant=name, measure="outage", unit="ms", rounds=[lengths], figures={_ANALYSIS: analysis}))
         for one in robot.bandwidth:
-            about = {"messages": one.family, "time": one.time}
+            about: dict[str, Value] = {"messages": one.family, "time": one.time}
             median = [one.median_kbps]
             cells.append(Cell(variant=name, params=about, measure="bandwidth", unit="kbit/s", rounds=[median]))
     return cells

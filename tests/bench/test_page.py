@@ -52,20 +52,18 @@ def test_goals_as_text() -> None:
     ]
 
 
-def test_the_table_shows_the_best_try_and_its_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_best_try_is_judged_by_its_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tries = iter([{"key to MQTT": [3.0, 6.0]}, {"key to MQTT": [1.0, 2.0]}])
     case = PageCase(lambda _rig, _scale: next(tries), (KEY, MEMORY), lambda: nullcontext(cast(Rig, None)))
     monkeypatch.setattr(module, "CASES", {"keys": case})
     console = Console(file=io.StringIO(), width=200)
     assert engine.run(PAGE.run_of(rounds=2, output=tmp_path, console=console)) == 1, "something was not measured"
     assert isinstance(console.file, io.StringIO)
-    lines = [" ".join(line.split()) for line in console.file.getvalue().splitlines()]
-    assert "keys key to MQTT ms 1.00 / 2.00 2 ≤ 2 / 5" in lines
-    assert "1 viewer, driving: RSS MB – / – 0 ≤ 60 / –" in lines
     results = load(tmp_path / "page.json")
     assert [cell.rounds for cell in results.cells] == [[[3.0, 6.0], [1.0, 2.0]], [[], []]]
     assert str(results.aims[0]) == "aim: key to MQTT, p50 / p95 ≤ 2 / 5 ms: met (1.00 / 2.00 ms)"
     assert [aim.outcome for aim in results.aims] == ["met", "not judged"]
+    assert all(str(aim) in console.file.getvalue() for aim in results.aims)
     assert results.assessment[1].startswith("keys, try 2: load ")
 
 
