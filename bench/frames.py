@@ -18,8 +18,9 @@ from pebble.bench.results import Cell
 from pebble.bench.tables import COUNT, LOST, Column, Grid, percentile_column
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
-from pebble.rig.broker import mosquitto_path
+from pebble.rig.broker import Broker, mosquitto_path
 from pebble.rig.processes import Processes, python
+from pebble.rig.programs import Worker
 
 VARIANTS = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
 OURS = "zenoh-shm"
@@ -58,45 +59,46 @@ def _gstreamer() -> str | None:
 
 
 def measure(case: Case) -> Iterator[Cell]:
-    """Runs one writer and its readers, each as a process. Raises PebbleError if one of them fails.
-
-    CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean.
-    """
-    seconds, readers = case.run["seconds"], int(case.condition["readers"] or 0)
-    is_gstreamer, bare = case.variant == "gstreamer-shm", case.variant == "memcpy"
+    """Runs one writer and its readers, each as a process. Raises PebbleError if one of them fails."""
+    is_gstreamer = case.variant == "gstreamer-shm"
     program = [_SYSTEM_PYTHON, _PLAIN_WORKER] if is_gstreamer else python("pebble.bench.frames_worker")
     with Processes() as processes:
         broker = processes.broker() if case.variant == "mqtt" else None
         if broker is not None:
             broker.wait()
         where = processes.folder if broker is None else broker.port
-        for name in ("writer", *(f"reader {number + 1}" for number in range(readers))):
-            options = (case.variant, name.split()[0], where, case.condition["size"], case.planted_us * case.slowed)
-            worker = processes.command(f"{case}: {name}", [*program, *map(str, options)])
-            if is_gstreamer and name == "writer":  # its readers fail without a writer; the others wait
+        for number, role in enumerate(("writer", *["reader"] * int(case.condition["readers"] or 0))):
+            options = (case.variant, role, where, case.condition["size"], case.planted_us * case.slowed)
+            worker = processes.command(f"{case}: {role} {number}", [*program, *map(str, options)])
+            if is_gstreamer and role == "writer":  # its readers fail without a writer; the others wait
                 worker.answer(_READY_S)
         for worker in processes.workers[is_gstreamer:]:
             worker.answer(_READY_S)
+        yield _observed(case, processes.workers, broker)
 
-        begin = time.monotonic_ns() + int(_STARTUP_S * 1e9)
-        for worker in processes.workers:
-            worker.send(f"{begin} {begin + int(seconds * 1e9)}")
-        pids = [program.pid for program in (*processes.workers, *([broker] if broker else []))]
-        time.sleep(_STARTUP_S)
-        before = [cpu_s([pid]) for pid in pids]
-        time.sleep(seconds)
-        cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
-        time.sleep(_LATE_S)
-        writer, *answers = (worker.ask("", _ANSWER_S) for worker in processes.workers)
-        latencies_us = [latency for answer in answers for latency in answer["latencies_us"]]
-        memory_mb = [pss_mb(worker.pid) for worker in processes.workers]
-    copying = sum(latencies_us) / 1e4 / seconds / readers
-    yield case.cell(
+
+def _observed(case: Case, workers: Sequence[Worker], broker: Broker | None) -> Cell:
+    """CPU is in % of one core, memory (PSS) in MB; those of the readers are their mean."""
+    seconds, readers = case.run["seconds"], len(workers) - 1
+    begin = time.monotonic_ns() + int(_STARTUP_S * 1e9)
+    for worker in workers:
+        worker.send(f"{begin} {begin + int(seconds * 1e9)}")
+    pids = [process.pid for process in (*workers, *([broker] if broker else []))]
+    time.sleep(_STARTUP_S)
+    before = [cpu_s([pid]) for pid in pids]
+    time.sleep(seconds)
+    cpu = [100 * (cpu_s([pid]) - so_far) / seconds for pid, so_far in zip(pids, before, strict=True)]
+    time.sleep(_LATE_S)
+    writer, *answers = (worker.ask("", _ANSWER_S) for worker in workers)
+    latencies_us = [latency for answer in answers for latency in answer["latencies_us"]]
+    memory_mb = [pss_mb(worker.pid) for worker in workers]
+    bare = case.variant == "memcpy"  # has no writer; it times copies, so there is no number of sent ones
+    return case.cell(
         "frame",
         "us",
         latencies_us,
         cpu_writer=None if bare else cpu[0],
-        cpu_reader=copying if bare else statistics.fmean(cpu[1 : 1 + readers]),
+        cpu_reader=sum(latencies_us) / 1e4 / seconds / readers if bare else statistics.fmean(cpu[1 : 1 + readers]),
         cpu_broker=None if broker is None else cpu[-1],
         memory_writer_mb=None if bare else memory_mb[0],
         memory_reader_mb=None if bare else statistics.fmean(memory_mb[1:]),
