@@ -44,7 +44,7 @@ Gst: Any = None  # loaded by main(): other Pythons have no gi
 class Writer(Protocol):
     """One way of sending frames; ``fallbacks`` did not go through shared memory."""
 
-    fallbacks = 0
+    fallbacks: int = 0
 
     def begin(self) -> np.ndarray | None:
         """The buffer for the next frame's pixels (uint8, 1-D); None if no frame can be sent now."""
