@@ -53,9 +53,9 @@ _DIFFERENCES: Final = (
     "bytes a second; here Goob has one channel",
     "Video differs from the paper's: a simulated camera shows other things, and Table 4.1 names neither encoding, size "
     "nor rate",
-    "Heartbeats go over loopback here. The paper's are of archived operation, over the internet: most outages are shorter "
-    "than 300 ms; latencies of Goob are mostly 20 to 40 ms, those of BenJr and MiniLAMP about 100 to 1100 ms, a range "
-    "as of stamps of whole seconds",
+    "Heartbeats go over loopback here. The paper's are of archived operation, over the internet: most outages are "
+    "shorter than 300 ms; latencies of Goob are mostly 20 to 40 ms, those of BenJr and MiniLAMP about 100 to 1100 ms, "
+    "a range as of stamps of whole seconds",
 )
 _OUTAGES, _LATENCY, _BANDWIDTH = "outages of heartbeats", "latency of heartbeats", "bandwidth"
 #: Of the paper: number, robot and content.
