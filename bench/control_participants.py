@@ -240,7 +240,6 @@ def read(reader: Reader, switch: Switch) -> None:
         if frame is not None:
             switch.pictures += bool(frame[::_EVERY].any())
             del frame
-            reader.done()
     reader.close()
 
 

@@ -6,16 +6,16 @@ file in the system's Python, where gi and Gst are installed; without arguments i
 file imports only the standard library, numpy, and the other end of a worker.
 
 A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
-time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns) and answers
-after that window.
+time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns), and answers
+an empty line with what it measured in that window.
 """
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,7 +25,7 @@ import numpy as np
 if __package__:
     from pebble.errors import TransportError
     from pebble.rig import worker_end
-    from pebble.transports.frames import Frame, FrameInfo, FrameReader, FrameWriter, Slot, shared_memory
+    from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, Slot, shared_memory
 else:  # the system's Python runs plain files
     sys.path.append(str(Path(__file__).parents[1] / "rig"))
     import worker_end  # type: ignore[import-not-found, no-redef]
@@ -33,12 +33,9 @@ else:  # the system's Python runs plain files
 RATE_HZ = 30.0
 _WARM_UP = 8  # frames: the first ones create pools and fill caches
 _READ_S = 0.2
-_LATE_NS = 150_000_000  # how long to wait for the last frames after the window
 _GAP_S = 0.010  # between a frame and the bare copy after it
 _FRAMES_IN_SEGMENT = 8
-_START_NS = 5_000_000_000
 _STREAM, _TOPIC = "bench", "pebble/bench/frames"
-_CONNECT_S = 10.0
 _WITHOUT_COPIES = ("zenoh-shm", "memcpy")
 
 Gst: Any = None  # loaded by main(): other Pythons have no gi
@@ -47,50 +44,39 @@ Gst: Any = None  # loaded by main(): other Pythons have no gi
 class Writer(Protocol):
     """One way of sending frames; ``fallbacks`` did not go through shared memory."""
 
-    @property
-    def fallbacks(self) -> int: ...
+    fallbacks: int = 0
 
     def begin(self) -> np.ndarray | None:
         """The buffer for the next frame's pixels (uint8, 1-D); None if no frame can be sent now."""
 
     def send(self) -> None: ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        return
 
 
 class Reader(Protocol):
     """One way of receiving frames."""
 
     def read(self, timeout: float) -> np.ndarray | None:
-        """The next frame, or None after ``timeout`` seconds."""
+        """The next frame, or None after ``timeout`` seconds. A view is released as soon as it is deleted."""
 
-    def done(self) -> None:
-        """Releases the array; nothing to do if it is a copy."""
+    def close(self) -> None:
         return
-
-    def close(self) -> None: ...
 
 
 class Window:
-    """The time in which is measured, as standard input names it; CLOCK_MONOTONIC, ns."""
+    """The time in which is measured (``ns``), and the end of standard input, which names it."""
 
-    def __init__(self) -> None:
-        self._begin = self._end = math.inf
-        self._answered = False
-        self.ended = worker_end.serve_on_thread(self._take)  # standard input
+    def __init__(self, results: Callable[[], dict[str, Any]]) -> None:
+        self.ns, self._results = range(0), results
+        self.ended = worker_end.serve_on_thread(self._handle)
 
-    def _take(self, line: str) -> None:
-        self._begin, self._end = map(int, line.split())
-
-    def __contains__(self, ns: int) -> bool:
-        return self._begin <= ns < self._end
-
-    def is_over(self) -> bool:
-        """True once: when the last frames of the window have had time to arrive."""
-        if self._answered or time.monotonic_ns() < self._end + _LATE_NS:
-            return False
-        self._answered = True
-        return True
+    def _handle(self, line: str) -> dict[str, Any] | None:
+        if not line:
+            return self._results()
+        self.ns = range(*map(int, line.split()))
+        return None
 
 
 def write(writer: Writer, size: int, *, slower_us: float) -> None:
@@ -99,28 +85,25 @@ def write(writer: Writer, size: int, *, slower_us: float) -> None:
     Each frame is delayed by ``slower_us`` of busy work between its time stamp and its sending.
     """
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
-    window, number, sent, due = Window(), 0, 0, time.monotonic()
+    stamps: list[int] = []
+    window = Window(lambda: {"sent": sum(one in window.ns for one in stamps), "fallbacks": writer.fallbacks})
     worker_end.answer({"ready": True})
+    due = time.monotonic()
     while not window.ended.is_set():
         due += 1 / RATE_HZ
         window.ended.wait(max(0.0, due - time.monotonic()))
         frame = writer.begin()
         if frame is not None:
-            number += 1
-            stamp = _fill(frame, picture, number)
+            stamps.append(_fill(frame, picture, len(stamps) + 1))
             _spin(slower_us)
             writer.send()
-            sent += stamp in window
-        if window.is_over():
-            worker_end.answer({"sent": sent, "fallbacks": writer.fallbacks})
     writer.close()
 
 
 def _fill(frame: np.ndarray, picture: np.ndarray, number: int) -> int:
     """Fills the frame as a camera does: pixels, then the time, which is returned."""
     np.copyto(frame, picture)
-    ends = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
-    frame[8:16] = frame[-8:] = ends
+    frame[8:16] = frame[-8:] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
     stamp = time.monotonic_ns()
     frame[:8] = np.frombuffer(stamp.to_bytes(8, "little"), np.uint8)
     return stamp
@@ -141,39 +124,39 @@ def read(reader: Reader, *, bare_copy: int = 0) -> None:
     """
     source = np.random.default_rng(2).integers(0, 256, bare_copy, dtype=np.uint8)
     target = np.zeros(bare_copy, np.uint8)
-    window, took_ns, torn, frames = Window(), [], 0, 0
+    latencies_us: list[float] = []
+    frames = torn = 0
+    window = Window(lambda: {"latencies_us": latencies_us, "torn": torn})
     while not window.ended.is_set():
         frame = reader.read(_READ_S)
-        if frame is not None:
-            now, frames = time.monotonic_ns(), frames + 1
-            stamp, number = (int.from_bytes(frame[at : at + 8].tobytes(), "little") for at in (0, 8))
-            torn += number != int.from_bytes(frame[-8:].tobytes(), "little")
-            reader.done()
-            del frame
-            if stamp in window:
-                if bare_copy:
-                    window.ended.wait(_GAP_S)
-                    stamp = time.monotonic_ns()
-                    np.copyto(target, source)
-                    now = time.monotonic_ns()
-                took_ns.append(now - stamp)
-            if frames == _WARM_UP:
-                worker_end.answer({"ready": True})
-        if window.is_over():
-            worker_end.answer({"latencies_us": [took / 1000 for took in took_ns], "torn": torn})
+        if frame is None:
+            continue
+        now, frames = time.monotonic_ns(), frames + 1
+        stamp, number, last = (int.from_bytes(frame[at:][:8].tobytes(), "little") for at in (0, 8, -8))
+        torn += number != last
+        del frame
+        if stamp in window.ns:
+            if bare_copy:
+                window.ended.wait(_GAP_S)
+                stamp = time.monotonic_ns()
+                np.copyto(target, source)
+                now = time.monotonic_ns()
+            latencies_us.append((now - stamp) / 1000)
+        if frames == _WARM_UP:
+            worker_end.answer({"ready": True})
     reader.close()
 
 
 # -- Pebble's frame transport
 
 
-class ZenohWriter:
-    """``in_segment``: frames are created in the shared segment, else copied there."""
+class ZenohWriter(Writer):
+    """Frames are created in the shared segment, or copied there, or sent as bytes."""
 
-    def __init__(self, folder: Path, size: int, *, in_segment: bool, shared: bool) -> None:
-        self._size, self._in_segment, self._info = size, in_segment, FrameInfo(format="bgr24")
+    def __init__(self, variant: str, folder: Path, size: int) -> None:
+        self._size, self._in_segment, self._info = size, variant in _WITHOUT_COPIES, FrameInfo(format="bgr24")
         self._writer = FrameWriter(folder, _STREAM, capacity=size).open()
-        _refuse(self._writer.problem if shared else "")
+        _refuse(self._writer.problem, variant)
         self._frame = np.zeros(size, np.uint8)
         self._slot: Slot | None = None
 
@@ -188,10 +171,7 @@ class ZenohWriter:
             self._slot.send(self._info)
         else:
             self._writer.write(self._frame, self._info)
-
-    @property
-    def fallbacks(self) -> int:
-        return self._writer.counters["fallbacks"]
+        self.fallbacks = self._writer.counters["fallbacks"]
 
     def close(self) -> None:
         self._slot = None
@@ -201,42 +181,34 @@ class ZenohWriter:
 class ZenohReader(Reader):
     """Frames are views into the segment, or copies."""
 
-    def __init__(self, folder: Path, *, views: bool, shared: bool) -> None:
-        self._shared = shared
-        self._reader = FrameReader(folder, _STREAM, views=views).open()
-        self._frame: Frame | None = None
+    def __init__(self, variant: str, folder: Path) -> None:
+        self._variant = variant
+        self._reader = FrameReader(folder, _STREAM, views=variant in _WITHOUT_COPIES).open()
 
     def read(self, timeout: float) -> np.ndarray | None:
-        self._frame = self._reader.read(timeout)
-        _refuse(self._reader.problem if self._shared else "")
-        return None if self._frame is None else self._frame.data
-
-    def done(self) -> None:
-        self._frame = None
+        frame = self._reader.read(timeout)
+        _refuse(self._reader.problem, self._variant)
+        return None if frame is None else frame.data
 
     def close(self) -> None:
         self._reader.close()
 
 
-def _refuse(problem: str) -> None:
+def _refuse(problem: str, variant: str) -> None:
     """Raises TransportError: results of frames that took another way would be labelled wrongly."""
-    if problem:
+    if problem and variant != "zenoh-net":
         raise TransportError(problem)
 
 
 # -- MQTT, QoS 0
 
 
-class MqttWriter:
+class MqttWriter(Writer):
     """The next frame is not begun before the last one is sent."""
 
-    fallbacks = 0
-
     def __init__(self, port: int, size: int) -> None:
-        self._client = _mqtt(port, None)
+        self._client, self._frame, self._leaving = _mqtt(port), bytearray(size), None
         self._client.loop_start()
-        self._frame = bytearray(size)
-        self._leaving: Any = None
 
     def begin(self) -> np.ndarray | None:
         if self._leaving is not None and not self._leaving.is_published():
@@ -246,17 +218,14 @@ class MqttWriter:
     def send(self) -> None:
         self._leaving = self._client.publish(_TOPIC, self._frame, qos=0)
 
-    def close(self) -> None:
-        self._client.disconnect()
-        self._client.loop_stop()
-
 
 class MqttReader(Reader):
     """Runs paho's network loop in the reading thread, which avoids a handover between threads."""
 
     def __init__(self, port: int) -> None:
         self._arrived: deque[bytes] = deque(maxlen=1)
-        self._client = _mqtt(port, lambda _client, _data, message: self._arrived.append(message.payload))
+        self._client = _mqtt(port)
+        self._client.on_message = lambda _client, _data, message: self._arrived.append(message.payload)
         self._client.subscribe(_TOPIC, qos=0)
 
     def read(self, timeout: float) -> np.ndarray | None:
@@ -268,19 +237,14 @@ class MqttReader(Reader):
             self._client.loop(left)
         return np.frombuffer(self._arrived.popleft(), np.uint8)
 
-    def close(self) -> None:
-        self._client.disconnect()
 
-
-def _mqtt(port: int, on_message: Any) -> Any:
+def _mqtt(port: int) -> Any:
     from paho.mqtt.client import Client
     from paho.mqtt.enums import CallbackAPIVersion
 
     client = Client(CallbackAPIVersion.VERSION2)
-    client.on_message = on_message
     client.connect("127.0.0.1", port)
-    end = time.monotonic() + _CONNECT_S
-    while not client.is_connected() and time.monotonic() < end:
+    while not client.is_connected():
         client.loop(0.05)
     return client
 
@@ -288,10 +252,8 @@ def _mqtt(port: int, on_message: Any) -> Any:
 # -- GStreamer's shmsink and shmsrc, in the system's Python
 
 
-class GstWriter:
+class GstWriter(Writer):
     """appsrc into shmsink. As in the original Pebble, pictures are created in the shared segment: no copy is made."""
-
-    fallbacks = 0
 
     def __init__(self, socket: str, caps: str, size: int) -> None:
         self._size = size
@@ -337,8 +299,6 @@ class GstReader(Reader):
         )
         self._sink = self._pipeline.get_by_name("sink")
         self._pipeline.set_state(Gst.State.PLAYING)
-        if self._pipeline.get_state(_START_NS)[0] == Gst.StateChangeReturn.FAILURE:
-            raise RuntimeError(f"shmsrc cannot read {socket}")
 
     def read(self, timeout: float) -> np.ndarray | None:
         sample = self._sink.try_pull_sample(int(timeout * 1e9))
@@ -374,7 +334,7 @@ def writer(variant: str, where: str, size: int, caps: str = "") -> Writer:
         return GstWriter(f"{where}/gst.sock", caps, size)
     if variant == "mqtt":
         return MqttWriter(int(where), size)
-    return ZenohWriter(Path(where), size, in_segment=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
+    return ZenohWriter(variant, Path(where), size)
 
 
 def reader(variant: str, where: str, caps: str = "") -> Reader:
@@ -382,7 +342,7 @@ def reader(variant: str, where: str, caps: str = "") -> Reader:
         return GstReader(f"{where}/gst.sock", caps)
     if variant == "mqtt":
         return MqttReader(int(where))
-    return ZenohReader(Path(where), views=variant in _WITHOUT_COPIES, shared=variant != "zenoh-net")
+    return ZenohReader(variant, Path(where))
 
 
 def main(arguments: list[str]) -> None:

@@ -1,6 +1,6 @@
-"""A stage, a browser and subscribers at the broker: what all measurements of the operator page need.
+"""A stage, a browser and a subscriber at the broker: what all measurements of the operator page need.
 
-Times are seconds of time.monotonic(), also those that the page stamps. The subscribers are mosquitto's own: one in this
+Times are seconds of time.monotonic(), also those that the page stamps. The subscriber is mosquitto's own: one in this
 process would wait for its other threads at the very moment that counts. The browser is Chromium, driven by Playwright,
 which comes with the extra ``dev``; it may be behind an impaired network, by the namespaces of pebble impair.
 """
@@ -15,7 +15,8 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,8 +24,7 @@ from typing import TYPE_CHECKING, Any
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.network import ROBOT_HOST as SERVER
 from pebble.bench.impair.network import NamespaceNetwork, why_no_namespaces
-from pebble.contract import CAMERA, DRIVE
-from pebble.contract.channels import Channel
+from pebble.contract import DRIVE
 from pebble.errors import PebbleError
 from pebble.rig.processes import OPERATORS
 from pebble.rig.programs import Program
@@ -33,7 +33,7 @@ from pebble.rig.testbed import ROBOTS, Stage
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-Received = list[tuple[float, str, Any]]  # time, base topic, and what was received
+Drives = list[tuple[float, str, dict[str, float]]]  # time, base topic, and axes
 Test = str | Callable[[], object]  # an expression of the page, or a function
 
 _AT_REST_S = 0.2  # motors that are off for so long have stopped
@@ -52,11 +52,9 @@ _WITHOUT = (
     "HttpsFirstBalancedModeAutoEnable,MediaRouter,PaintHolding,ThirdPartyStoragePartitioning,"
     "AvoidCorsURLLoaderRestartOnRedirect,OptimizationHints,NetworkTimeServiceQuerying,AimEnabled,PreconnectToSearch"
 )
-FLAGS = (
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--autoplay-policy=no-user-gesture-required"),
-    f"--disable-features={_WITHOUT}",
-)
+_AUTOPLAY = "--autoplay-policy=no-user-gesture-required"
+#: Beside those of Playwright.
+_FLAGS = ("--disable-gpu", "--disable-quic", _AUTOPLAY, f"--disable-features={_WITHOUT}")
 
 #: Stamps inputs, first contents, drawn pictures and sent commands; runs before the page's own scripts.
 _HOOKS = """
@@ -75,7 +73,7 @@ bench.film = () => {
   const draw = pebble.video.draw;
   pebble.video.draw = function (bitmap, info) {
     draw.call(this, bitmap, info);
-    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]);
+    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]); // in ms
   };
 };
 bench.confirmed = (refs) => {
@@ -111,11 +109,10 @@ _READY = """() => {
 
 
 class Rig:
-    """One stage and one browser. ``drives`` (commands) and ``frames`` (bytes) are what the broker delivered so far."""
+    """One stage and one browser. ``drives`` are the commands that the broker has delivered so far."""
 
-    def __init__(self, stage: Stage, browser: Browser, drives: Received, frames: Received) -> None:
-        self.stage, self.ref, self.drives, self.frames = stage, stage.ref, drives, frames
-        self._browser = browser
+    def __init__(self, stage: Stage, browser: Browser, drives: Drives) -> None:
+        self.stage, self.ref, self.drives, self._browser = stage, stage.ref, drives, browser
 
     def page(self, name: str = "") -> Page:
         """A robot's page; without a name the fleet's."""
@@ -125,10 +122,10 @@ class Rig:
         page.goto(self.stage.robot_url(name) if name else self.stage.url, wait_until="domcontentloaded")
         return page
 
-    def watched(self, name: str, wait_s: float = _WAIT_S) -> Page:
+    def watched(self, name: str) -> Page:
         """Its page, once it shows pictures."""
         page = self.page(name)
-        self.until(page, "bench.picture", "no picture", wait_s)
+        self.until(page, "bench.picture", "no picture")
         return page
 
     def drivable(self, name: str) -> Page:
@@ -164,25 +161,19 @@ class Rig:
 
     def hold(self, page: Page, name: str, key: str) -> None:
         """Hold a key until the robot moves; press it again if the page or the server interrupts the gesture."""
-        for attempt in range(_PRESSES):
+        for _ in range(_PRESSES):
             page.keyboard.down(key)
-            try:
+            with suppress(PebbleError):
                 self.moved_after(page, name, self.stamp(page, "down"))
-            except PebbleError:
-                page.keyboard.up(key)
-                self.ready(page)
-                if attempt == _PRESSES - 1:
-                    raise
-            else:
                 return
+            page.keyboard.up(key)
+            self.ready(page)
+        raise PebbleError(f"{name} did not move")
 
     def moved_after(self, page: Page, name: str, since: float) -> float:
         """When its motors first ran after ``since``."""
-
-        def why() -> str:
-            return f"{name} did not move: {page.evaluate('pebble.driver.reason()?.text') or 'no reason'}"
-
-        self.until(page, lambda: self.stage.wheels_turning(name, int(1e9 * since)), why, _MOVED_S)
+        turned = partial(self.stage.wheels_turning, name, int(1e9 * since))
+        self.until(page, turned, f"{name} did not move", _MOVED_S)
         return next(ns / 1e9 for ns, speeds in self.stage.motors(name) if ns / 1e9 > since and any(speeds))
 
     def stopped(self, page: Page | None, name: str) -> float:
@@ -219,27 +210,26 @@ def rig(*names: str, program: str | None = None, flags: tuple[str, ...] = (), **
     with (
         Stage(*(names or ROBOTS), **settings) as stage,
         chromium(*flags, program=program) as browser,
-        _subscribed(stage, DRIVE, "%p", json.loads) as drives,
-        _subscribed(stage, CAMERA, "%l", int) as frames,
+        _drives(stage) as drives,
     ):
-        yield Rig(stage, browser, drives, frames)
+        yield Rig(stage, browser, drives)
 
 
 @contextmanager
-def _subscribed(stage: Stage, channel: Channel, what: str, read: Callable[[bytes], Any]) -> Iterator[Received]:
-    """``what`` of each message, in mosquitto_sub's format, as ``read`` reads it; on a thread."""
+def _drives(stage: Stage) -> Iterator[Drives]:
+    """The commands that the broker delivers; received on a thread."""
     program = shutil.which("mosquitto_sub")
     if program is None:
         raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
-    options = ["-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", channel.filter("+/+/+"), "-F", f"%U %t {what}"]
-    log = stage.folder / "subscriber.log"
-    received: Received = []
+    options = ["-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", DRIVE.filter("+/+/+"), "-F", "%U %t %p"]
+    received: Drives = []
 
     def receive(line: bytes) -> None:
-        at, topic, rest = line.split(b" ", 2)
-        base = topic.decode().removesuffix(f"/{channel.suffix}")
-        received.append((monotonic(1000 * float(at)), base, read(rest)))
+        at, topic, axes = line.split(b" ", 2)
+        base = topic.decode().removesuffix(f"/{DRIVE.suffix}")
+        received.append((monotonic(1000 * float(at)), base, json.loads(axes)))
 
+    log = stage.folder / "subscriber.log"
     subscriber = stage.add(Program("mosquitto_sub", [program, *options], log, each=receive), OPERATORS)
     yield received
     if subscriber.ended or not subscriber.is_read:
@@ -265,7 +255,7 @@ def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
 
     with sync_playwright() as playwright:
         path = program or shutil.which("chromium")
-        with closing(playwright.chromium.launch(executable_path=path, args=[*FLAGS, *flags])) as browser:
+        with closing(playwright.chromium.launch(executable_path=path, args=[*_FLAGS, *flags])) as browser:
             yield browser
 
 

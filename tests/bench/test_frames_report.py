@@ -7,7 +7,7 @@ import pytest
 
 from pebble.bench.comparison import Case
 from pebble.bench.engine import Collected
-from pebble.bench.frames import FRAMES, VARIANTS, complete, legend
+from pebble.bench.frames import FRAMES, VARIANTS, complete
 from pebble.bench.results import Cell
 
 HD, SMALL = "1920x1080", "64x48"
@@ -78,22 +78,21 @@ def test_a_cell_has_the_name_of_its_role() -> None:
 
 def test_words_compare_like_with_like() -> None:
     cells = [
-        eight_rounds("zenoh-shm", 500, cpu_reader=0.5),
+        eight_rounds("zenoh-shm", 500),
         eight_rounds("gstreamer-shm", 1000),
         eight_rounds("memcpy", 500),
         cell_of("gstreamer-shm", [a_round(1)] * 8, readers=3),
     ]
     against, memcpy = assessment(cells)
     assert against.startswith("1920x1080, one reader: zenoh-shm takes 0.50× the time of gstreamer-shm (")
-    assert against.endswith("; CPU of a reader 0.50 % against 1.00 %")
     assert memcpy.startswith("1920x1080, one reader: zenoh-shm and memcpy are equal within noise: 1.00× the time (")
 
 
-@pytest.mark.parametrize(("rounds", "lines"), [(7, 2), (8, 1)])
-def test_few_rounds_are_shown_and_not_judged(rounds: int, lines: int) -> None:
+@pytest.mark.parametrize(("rounds", "expected"), [(7, "too few to judge"), (8, "equal within noise")])
+def test_few_rounds_are_shown_and_not_judged(rounds: int, expected: str) -> None:
     cells = [cell_of(name, [a_round(5.0)] * rounds) for name in ("zenoh-shm", "mqtt")]
-    assert len(assessment(cells)) == lines
-    assert ("equal within noise" in assessment(cells)[0]) == (lines == 1)
+    [line] = assessment(cells)
+    assert expected in line
 
 
 @pytest.mark.parametrize(
@@ -126,7 +125,3 @@ def test_one_table_for_each_size_and_number_of_readers() -> None:
         f"{size} BGR at 30 Hz, readers: {count}" for size in (SMALL, HD) for count in (1, 3)
     ]
     assert [table.row_count for table in tables] == [len(VARIANTS)] * 4
-
-
-def test_every_variant_is_explained() -> None:
-    assert len(list(legend([eight_rounds(name, 1.0) for name in VARIANTS]))) > len(VARIANTS)

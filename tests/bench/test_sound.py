@@ -28,9 +28,8 @@ def test_opus_stays_within_the_aim(tmp_path: Path) -> None:
     assert run(SOUND.run_of(output=tmp_path, seconds=3.0, bitrates=[24_000], console=console)) == 0
     results = load(tmp_path / "sound.json")
     pcm, *opus = results.cells
-    assert (pcm.variant, pcm.figures["ratio"], pcm.figures["likeness"]) == ("pcm", 1.0, pytest.approx(1.0))
+    assert (pcm.variant, pcm.figures["ratio"]) == ("pcm", 1.0)
     assert [cell.params["packet"] for cell in opus] == ["1 part", "2 parts", "3 parts"]
     assert opus[1].percentile(50) <= AIM * pcm.percentile(50)
-    assert min(cell.figures["likeness"] for cell in opus) > 0.9
     assert re.search(r"opus +24 kbit/s +1 part ", shown.getvalue())
     assert str(results.aims[0]) in shown.getvalue().replace("\n", " ")

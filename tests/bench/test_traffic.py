@@ -15,7 +15,7 @@ from pebble.bench.engine import run
 from pebble.bench.paper import TABLE_4_1
 from pebble.bench.pictures import pictures
 from pebble.bench.results import load
-from pebble.bench.traffic import TRAFFIC, cells_of, robots_of, sentences, tables
+from pebble.bench.traffic import TRAFFIC, assessment, cells_of, robots_of, tables
 from pebble.errors import PebbleError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.analysis import analyse
@@ -57,10 +57,18 @@ def test_table_4_1_stands_beside_the_paper_s(recorded: Traffic) -> None:
     assert float(here[3]) == pytest.approx(median, abs=0.006)
 
 
+def test_heartbeats_have_a_line_for_each_robot(recorded: Traffic) -> None:
+    lines = [line.split() for line in printed(recorded).splitlines()]
+    robots = [(robot.robot.rpartition("/")[2], robot.latency) for robot in recorded.robots]
+    shown = [(name, str(one.count), f"{one.median_ms:.1f}") for name, one in robots if one is not None]
+    assert shown
+    assert set(shown) <= {(line[0], line[1], line[-2]) for line in lines if len(line) > 8}
+
+
 def test_sentences_name_what_differs(recorded: Traffic) -> None:
-    found = [str(one) for one in sentences(cells_of(recorded))]
-    assert any("goob's heartbeats take" in one and "20 to 40 ms" in one for one in found)
-    assert any(one.startswith("fred's video as JSON takes") for one in found)
+    found = [str(one) for one in assessment(cells_of(recorded))]
+    assert any("heartbeats" in one.lower() and "20 to 40 ms" in one for one in found)
+    assert any(one.startswith("Video differs") for one in found)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +78,7 @@ def test_the_bandwidth_of_sound_is_judged_over_many_seconds(seconds: int, kbps: 
     traffic = synthetic.analysed()
     for robot in traffic.robots:
         robot.bandwidth = [Bandwidth(AUDIO, ALL, seconds, kbps, kbps, 50 * seconds, 664 * 50 * seconds)]
-    assert f"within 1 %: {expected} (goob {kbps:.1f} kbit/s" in str(next(iter(sentences(cells_of(traffic)))))
+    assert f"within 1 %: {expected} (goob {kbps:.1f} kbit/s" in str(next(iter(assessment(cells_of(traffic)))))
 
 
 def test_the_whole_analysis_is_in_the_results(recorded: Traffic, tmp_path: Path) -> None:
