@@ -88,13 +88,10 @@ def _lines(port: serial.Serial) -> Iterator[bytes]:
         yield from lines
 
 
-def main(part: str, local: str, remote: str, base: str, device: str, reports: str = "") -> None:
-    """Ports of the two brokers, the base of the robot's topics, its serial line; ``--reports`` publishes reports."""
-    if part == "bridge":
-        bridge(int(remote), int(local), base)
-    else:
-        serial_bridge(int(local), base, device, reports=bool(reports))
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    # ports of the two brokers, the base of the robot's topics, its serial line, and whether reports are published
+    part, local_port, remote_port, topics, device, *options = sys.argv[1:]
+    if part == "bridge":
+        bridge(int(remote_port), int(local_port), topics)
+    else:
+        serial_bridge(int(local_port), topics, device, reports="--reports" in options)
