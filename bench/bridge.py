@@ -21,7 +21,7 @@ from rich.table import Table
 
 from pebble.bench import null
 from pebble.bench.aims import Aim, RatioAim, with_lost
-from pebble.bench.bridge_operator import FLOWS, HOP, STAND_IN, DrivenRobot, Turn, Wheels, arrivals, wheels_of
+from pebble.bench.bridge_operator import ALL, FLOWS, HOP, STAND_IN, DrivenRobot, Turn, Wheels, arrivals, wheels_of
 from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run, of_known, rounds, seconds, variants
 from pebble.bench.drivers import RATE_HZ
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
@@ -124,15 +124,16 @@ def _with_media(case: Case, robot: DrivenRobot) -> Iterator[Cell]:
 def cells_of(case: Case, turn: Turn, flowed: Mapping[str, int] | None = None) -> Iterator[Cell]:
     """Of one turn; ``flowed`` counts the media received meanwhile."""
     load, took_s = case.condition["load"], (turn.ended - turn.began) / 1e9
-    figures: dict[str, Any] = {"cpu_percent": 100 * turn.cpu_s / took_s} if turn.cpu_s else {}
-    figures |= {f"{name}_per_s": count / took_s for name, count in (flowed or {}).items()}
+    figures: dict[str, Any] = {f"{name}_per_s": count / took_s for name, count in (flowed or {}).items()}
+    if ALL in turn.cpu_s:
+        figures["cpu_percent"] = 100 * turn.cpu_s[ALL] / took_s
     yield case.cell(DOWN, "ms", turn.down, sent=len(turn.sent), **figures)
     if case.run.comparison.is_null:
         return
     if load != COMMANDS and case.variant != HOP:
         yield case.cell(UP, "ms", turn.up, sent=turn.reports, **figures)
-    if load != LOADED:
-        for part, cpu_s in turn.parts_cpu_s.items():
+    for part, cpu_s in turn.cpu_s.items():
+        if part != ALL and load != LOADED:
             each = [1e6 * cpu_s / turn.forwarded] if turn.forwarded else []
             yield case.cell(CPU, "us", each, {"process": part})
 

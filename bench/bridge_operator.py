@@ -36,7 +36,7 @@ from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 from pebble.simulation.trace import Entry, Trace
 
 STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
-FORWARDER, SERIAL = "bridge", "serial bridge"
+ALL, FORWARDER, SERIAL = "all", "bridge", "serial bridge"  # processes of a robot
 FLOWS = ("frames", "video", "audio")
 _SERVICES = {FORWARDER: "mqtt_bridge", SERIAL: "serial_mcu_bridge"}
 _MODULE = "pebble.bench.bridge_operator"
@@ -50,10 +50,8 @@ _ARRIVE_S = 1.0  # commands and reports that take longer count as lost
 _POLL_S = 0.05
 
 Wheels = tuple[float, float]
-Reports = Sequence[tuple[int, int | None]]
-"""When each report was sent, and when it was received; None: it was not."""
-Received = Sequence[tuple[int, Touch]]
-"""All reports that were received, with their times."""
+Reports = Sequence[tuple[int, int | None]]  # when each was sent, and when it was received; None: it was not
+Received = Sequence[tuple[int, Touch]]  # all reports that were received, with their times
 
 
 @dataclass(slots=True, kw_only=True)
@@ -63,8 +61,7 @@ class Turn:
     began: int = 0
     ended: int = 0
     sent: dict[Wheels, int] = field(default_factory=dict)
-    cpu_s: float = 0.0  # of all the robot's processes
-    parts_cpu_s: Mapping[str, float] = field(default_factory=dict)  # of some of them
+    cpu_s: Mapping[str, float] = field(default_factory=dict)  # of the robot's processes: of all, and of its bridges
     down: Sequence[float] = ()  # latencies of commands, ms
     up: Sequence[float] = ()  # and of reports
     reports: int = 0  # that were sent
@@ -82,61 +79,6 @@ class Turn:
         self.reports = len(own)
         self.forwarded = len(arrived) + sum(self.began <= ns <= self.ended for ns, _ in received)
         return all(last in commands for last in [*self.sent][-1:]) and (not own or own[-1][1] is not None)
-
-
-class Operator(StockClient):
-    """One MQTT connection to the remote broker. Each command is identified by the wheel speeds it causes.
-
-    It uses the same TCP options as our own clients. TCP_NODELAY: see :class:`StockClient`. TCP_QUICKACK: otherwise a
-    stock broker delays a report by up to 40 ms while its answer to a command is not acknowledged. Without them the
-    comparison would measure that.
-    """
-
-    def __init__(self, port: int, base: str) -> None:
-        self._base, self._number = base, 0
-        self._received: list[tuple[int, bytes]] = []
-        self._reports = TOUCH_SENSORS.topic(base)
-        super().__init__(self._on_message, [(one.topic(base), 1) for one in (STATUS, ONLINE, TOUCH_SENSORS)])
-        self.paho.on_publish = self._acknowledge
-        self.open(port)
-
-    def media(self, wanted: bool) -> None:
-        """Allows and requests video and audio, or stops both."""
-        for flag in (contract.MQTT_VIDEO, contract.MQTT_AUDIO):
-            self.send(flag, self._base, wanted)
-        for request in (contract.VIDEO_CONTROL, contract.AUDIO_CONTROL):
-            self.send(request, self._base, {"enabled": wanted})
-
-    def drive(self, seconds: float, rate_hz: float, *, work_us: float = 0.0, slowed: bool = False) -> Turn:
-        """Drives; it works for ``work_us`` before each command: before it reads the clock, or, if ``slowed``, after."""
-        turn = Turn(began=time.monotonic_ns())
-        due = time.monotonic()
-        for _ in range(round(seconds * rate_hz)):
-            self._number += 1
-            left, right = wheels(self._number)
-            spin(0.0 if slowed else work_us)
-            turn.sent[left, right] = time.monotonic_ns()
-            spin(work_us if slowed else 0.0)
-            self.send(DRIVE, self._base, {"x": (left - right) / 2, "z": (left + right) / 2})
-            due += 1 / rate_hz
-            time.sleep(max(0.0, due - time.monotonic()))
-        turn.ended = time.monotonic_ns()
-        return turn
-
-    def received(self, since_ns: int) -> list[tuple[int, Touch]]:
-        """The MCU's reports after ``since_ns``, each with its time of arrival."""
-        return [(ns, Touch(**json.loads(raw)["value"])) for ns, raw in self._received.copy() if ns >= since_ns]
-
-    def _on_message(self, message: MQTTMessage) -> None:
-        if message.topic == self._reports:
-            self._received.append((time.monotonic_ns(), bytes(message.payload)))
-        self._acknowledge()
-
-    def _acknowledge(self, *_: object) -> None:
-        """Sets TCP_QUICKACK. The kernel resets it whenever we send, so this is called after every message."""
-        sock: Any = self.paho.socket()
-        if sock is not None:
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
 
 def wheels(number: int) -> Wheels:
@@ -176,12 +118,19 @@ def matched(entries: Sequence[Entry], received: Received) -> list[tuple[int, int
 
 
 class DrivenRobot(Processes):
-    """A robot and its operator: starts both in ``with``. With ``reports`` it forwards those of its MCU."""
+    """A robot and its operator: starts both in ``with``. With ``reports`` it forwards those of its MCU.
+
+    The operator has one MQTT connection to the remote broker, with the TCP options of our own clients. TCP_NODELAY: see
+    :class:`StockClient`. TCP_QUICKACK: otherwise a stock broker delays a report by up to 40 ms while its answer to a
+    command is not acknowledged. Without them the comparison would measure that.
+    """
 
     def __init__(self, kind: str, *, media: bool = False, reports: bool = True) -> None:
         super().__init__()
         self.kind, self._media, self._reports = kind, media, reports
-        self._parts: dict[str, int] = {}  # the processes that forward
+        self._number = 0  # of the last command
+        self._received: list[tuple[int, bytes]] = []  # reports
+        self._parts: dict[str, list[int]] = {}  # the processes that forward
 
     def start(self) -> None:
         """Raises PebbleError if something does not start."""
@@ -191,7 +140,10 @@ class DrivenRobot(Processes):
         broker.wait()
         self.subject.prepare()
         self.subject.launch()
-        self.operator = self.closing.enter_context(closing(Operator(broker.port, BASE)))
+        channels = (STATUS, ONLINE, TOUCH_SENSORS)
+        self._client = StockClient(self._on_message, [(channel.topic(BASE), 1) for channel in channels])
+        self._client.paho.on_publish = self._acknowledge
+        self.closing.enter_context(closing(self._client.open(broker.port)))
 
     def wait(self) -> None:
         """Until it is ready. Raises PebbleError if it does not become so."""
@@ -201,19 +153,31 @@ class DrivenRobot(Processes):
                 f"{self.kind}: the robot is not ready", _UP_S,
             )  # fmt: skip
         running = self.subject.processes()
-        self._parts = {part: running[name] for part, name in _SERVICES.items() if name in running}
+        self._parts = {part: [running[name]] for part, name in _SERVICES.items() if name in running}
         if running and len(self._parts) < len(_SERVICES):
             raise self.problem("a bridge is not running")
 
     def drive(self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False) -> Turn:
-        """See :meth:`Operator.drive`. Raises PebbleError if one of the two bridges has ended."""
-        pids = self.subject.pids()
-        used, before = cpu_s(pids), self._parts_cpu_s()
-        turn = self.operator.drive(seconds, rate_hz, work_us=work_us, slowed=slowed)
-        turn.parts_cpu_s = {part: after - before[part] for part, after in self._parts_cpu_s().items()}
-        turn.cpu_s = cpu_s(pids) - used
-        if gone := [part for part, used_s in turn.parts_cpu_s.items() if used_s <= 0]:
-            raise self.problem(f"the {' and the '.join(gone)} ended while it was driven")
+        """The operator works for ``work_us`` before each command: before it reads the clock, or, if ``slowed``, after.
+
+        Raises PebbleError if one of the two bridges has ended.
+        """
+        groups = {ALL: self.subject.pids(), **self._parts}
+        before = {name: cpu_s(pids) for name, pids in groups.items()}
+        turn, due = Turn(began=time.monotonic_ns()), time.monotonic()
+        for _ in range(round(seconds * rate_hz)):
+            self._number += 1
+            left, right = wheels(self._number)
+            spin(0.0 if slowed else work_us)
+            turn.sent[left, right] = time.monotonic_ns()
+            spin(work_us if slowed else 0.0)
+            self._client.send(DRIVE, BASE, {"x": (left - right) / 2, "z": (left + right) / 2})
+            due += 1 / rate_hz
+            time.sleep(max(0.0, due - time.monotonic()))
+        turn.ended = time.monotonic_ns()
+        turn.cpu_s = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
+        if min(turn.cpu_s.values(), default=1.0) <= 0:
+            raise self.problem("a process has ended while it was driven")
         return turn
 
     def match_arrivals(self, turns: Sequence[Turn]) -> None:
@@ -222,7 +186,8 @@ class DrivenRobot(Processes):
         late = False
         while not late:
             late = time.monotonic() > end
-            entries, received = self.subject.lines(since), self.operator.received(since)
+            entries = self.subject.lines(since)
+            received = [(ns, Touch(**json.loads(raw)["value"])) for ns, raw in self._received.copy() if ns >= since]
             commands, reports = arrivals(entries), matched(entries, received)
             if [turn.match(commands, reports, received) for turn in turns][-1]:
                 return
@@ -250,16 +215,31 @@ class DrivenRobot(Processes):
                 worker.send("")
             return {name: count for worker in workers for name, count in worker.answer(_ANSWER_S).items()}
 
-        self.operator.media(True)
+        self._allow_media(True)
         robot.expect(lambda: all(counts().values()), "its media do not flow", _UP_S)
         yield counts
-        self.operator.media(False)
+        self._allow_media(False)
         for worker in workers:
             self.end(worker)
         robot.expect(lambda: len(robot.pids()) <= before, "its media do not end", _UP_S)
 
-    def _parts_cpu_s(self) -> dict[str, float]:
-        return {part: cpu_s([pid]) for part, pid in self._parts.items()}
+    def _allow_media(self, wanted: bool) -> None:
+        """Allows and requests video and audio, or stops both."""
+        for flag in (contract.MQTT_VIDEO, contract.MQTT_AUDIO):
+            self._client.send(flag, BASE, wanted)
+        for request in (contract.VIDEO_CONTROL, contract.AUDIO_CONTROL):
+            self._client.send(request, BASE, {"enabled": wanted})
+
+    def _on_message(self, message: MQTTMessage) -> None:
+        if message.topic.endswith(TOUCH_SENSORS.suffix):
+            self._received.append((time.monotonic_ns(), bytes(message.payload)))
+        self._acknowledge()
+
+    def _acknowledge(self, *_: object) -> None:
+        """Sets TCP_QUICKACK. The kernel resets it whenever we send, so this is called after every message."""
+        sock: Any = self._client.paho.socket()
+        if sock is not None:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
 
 class StandIn(Robot):

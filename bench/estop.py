@@ -77,21 +77,23 @@ def stop(
     bases: Collection[str],
     timeout: float,
     *,
-    every: bool = False,
-    hold: bool = False,
-    start: Callable[[], object] = lambda: None,
+    every: bool,
+    start: Callable[[], object] | None = None,
 ) -> tuple[int, dict[str, list[int]]]:
-    """Stops these robots, or ``every`` one as ``--all`` does, and calls ``start``; waits until these have confirmed it.
+    """Stops these robots, or ``every`` one as ``--all`` does, and waits until these have confirmed it.
 
-    The result is when it began, and for each robot when its first message, the first state that says it is stopped, and
-    its confirmation arrived (CLOCK_MONOTONIC, ns). Raises PebbleError after ``timeout`` seconds.
+    It is held for those that ``start`` starts. Returns when it began, and for each robot when its first message, the
+    first state that says it is stopped, and its confirmation arrived (CLOCK_MONOTONIC, ns). Raises PebbleError after
+    ``timeout`` seconds.
     """
     began, end, times = time.monotonic_ns(), time.monotonic() + timeout, defaultdict[str, list[int]](list)
-    sender = StopSender(new_name(), by=_BY, why="", now=began / 1e9, robots=None if every else bases, hold=hold)
+    named, hold = None if every else bases, start is not None
+    sender = StopSender(new_name(), by=_BY, why="", now=began / 1e9, robots=named, hold=hold)
     send(transport, sender.tick(time.monotonic()))
     filters = [ALL_OUTGOING] if every else [one.filter(base) for one in (ESTOP_STATE, CAPABILITIES) for base in bases]
     listener = Listener(transport, filters)
-    start()
+    if start is not None:
+        start()
     while any(len(times[base]) < _REACHED for base in bases):
         if time.monotonic() > end:
             missing = [f"{base}: {robot.why}" for base, robot in sender.robots.items() if robot.why]
@@ -116,7 +118,7 @@ class Robots(Processes):
     def __init__(self, boards: int) -> None:
         super().__init__()
         self.linux: dict[str, Robot] = {}
-        self.boards = {identity.id: identity.base for _, identity in members(boards)}
+        self.boards = [identity.base for _, identity in members(boards)]
         self.started: list[str] = []  # the bases of those that run
         self._trace = self.folder / "trace.jsonl"
 
@@ -141,7 +143,7 @@ class Robots(Processes):
         """Start these robots while a stop of all robots is held."""
         self.started += bases
         with connected(self._target) as (transport, _):
-            _, times = stop(transport, self.started, _STARTED_S, every=True, hold=True, start=start)
+            _, times = stop(transport, self.started, _STARTED_S, every=True, start=start)
         for base in bases:
             received, latched, _ = times[base]
             yield sample(HOLD, robot, STOP, received, latched)
@@ -222,13 +224,11 @@ class Robots(Processes):
 
     def _moves(self, bases: Collection[str]) -> list[list[Moved]]:
         """Every change of their motors so far, by robot."""
-        linux = [robot for robot in self.linux.values() if robot.base in bases]
-        boards = [name for name, base in self.boards.items() if base in bases]
-        changes = read_moves(self._trace) if boards else {}
-        return [
-            *([Moved(e.ns, robot.base, e.motors) for e in robot.lines(0) if e.motors is not None] for robot in linux),
-            *(changes.get(name, []) for name in boards),
-        ]
+        changes = read_moves(self._trace) if self._trace.exists() else {}
+        for robot in self.linux.values():
+            own = [(one.ns, one.motors) for one in robot.lines(0) if one.motors is not None]
+            changes[robot.name] = [Moved(ns, robot.name, motors) for ns, motors in own]
+        return [changes.get(base.rpartition("/")[2], []) for base in bases]
 
 
 def _wait(condition: Callable[[], bool], problem: str, seconds: float = _ANSWER_S) -> None:
@@ -253,7 +253,7 @@ def measure(round_: Round) -> Iterator[Cell]:
     for kind in KINDS:
         yield from env.stop_by_command(kind)
     run.show(f"{run['boards']} boards start while a stop is held")
-    yield from env.hold(BOARD, env.start_boards, [*env.boards.values()])
+    yield from env.hold(BOARD, env.start_boards, env.boards)
     for number in range(run["all_stops"]):
         run.show(f"stop {number + 1} of {run['all_stops']} of all robots")
         yield from env.stop(ALL, env.started)
@@ -294,8 +294,7 @@ ESTOP = Comparison(
         Claims(
             what="{measure}, {robot}",
             of=lambda cell: cell.measure == REST and cell.params["robot"] in KINDS and cell.variant != COMMAND,
-            order=(ZERO, STOP),
-            judged=lambda cell: cell.measure == REST and cell.variant == STOP,
+            order=(ZERO, STOP), judged=lambda cell: cell.measure == REST and cell.variant == STOP,
         ),
         _aim(REST, 50.0, *KINDS),
         _aim(REST, 250.0, ALL),

@@ -66,7 +66,9 @@ def cell_of(
     case: Case, online: int, found: dict[str, Any], moves: dict[str, list[Moved]], cpu: dict[str, float], mb: float
 ) -> Cell:
     """Latencies in ms, rates in Hz, CPU in % of one core; ``found`` is the operator's answer."""
-    robots, heartbeats, sent = case.run["robots"], found["heartbeats"], found["sent"]
+    robots, sent = case.run["robots"], found["sent"]
+    began, ended = min(map(min, sent.values())), max(map(max, sent.values()))
+    heartbeats = [[ns for ns in own if began <= ns <= ended] for own in found["heartbeats"]]
     rates = [(len(own) - 1) / (own[-1] - own[0]) * 1e9 for own in heartbeats if len(own) > 1]
     return case.cell(
         "command to pins", "ms", latencies_ms(sent, moves), {"robots": robots, "rate": f"{case.run['rate']:g} Hz"},
@@ -76,7 +78,7 @@ def cell_of(
         beats_min_hz=rounded(percentile(rates, 0), 3),
         beats_median_hz=rounded(percentile(rates, 50), 3),
         beats_max_hz=rounded(percentile(rates, 100), 3),
-        longest_gap_s=rounded(longest_gap_s(heartbeats, found["began"], found["ended"]), 3),
+        longest_gap_s=rounded(longest_gap_s(heartbeats, began, ended), 3),
         **{f"cpu_{name}": rounded(share, 1) for name, share in cpu.items()},
         fleet_mb=rounded(mb, 1),
         mb_per_robot=rounded(mb / robots, 3),
@@ -142,9 +144,7 @@ def drive_fleet(port: int, seconds: float, rate_hz: float, ids: Sequence[str]) -
         late += left < -1 / rate_hz
         sent[ids[robot]].append(time.monotonic_ns())
         client.paho.publish(topics[robot], bodies[step % len(STEPS)], qos=DRIVE.default_qos)
-    span = int(1e9 * began), time.monotonic_ns()
-    received = [[ns for ns in own if span[0] <= ns <= span[1]] for own in heartbeats.values()]
-    answer({"began": span[0], "ended": span[1], "late": late, "sent": sent, "heartbeats": received})
+    answer({"late": late, "sent": sent, "heartbeats": list(heartbeats.values())})
     client.close()
 
 

@@ -29,6 +29,7 @@ from pebble.bench.bridge import (
     hops,
 )
 from pebble.bench.bridge_operator import (
+    ALL,
     FORWARDER,
     HOP,
     SERIAL,
@@ -141,7 +142,7 @@ def turn_of(down: Sequence[float] = (), up: Sequence[float] = (), sent: int = 1,
 
 
 def test_cells_have_a_list_of_samples_for_each_round() -> None:
-    case, took = case_of("zenoh", LOADED), {"ended": 500 * MS, "cpu_s": 0.1}
+    case, took = case_of("zenoh", LOADED), {"ended": 500 * MS, "cpu_s": {ALL: 0.1}}
     first = [
         *cells_of(case, turn_of([1.0], [2.0], **took), {"frames": 15, "video": 8}),
         *cells_of(case, turn_of([1.5], **took), {"frames": 15, "video": 7}),
@@ -163,7 +164,7 @@ def test_without_reports_there_is_one_cell() -> None:
 
 def test_cpu_is_divided_by_what_was_forwarded_in_each_turn() -> None:
     case, parts = case_of("mqtt", UNLOADED), {FORWARDER: 0.007, SERIAL: 0.014}
-    all_, half, none = ([*cells_of(case, turn_of(parts_cpu_s=parts, forwarded=count))] for count in (70, 35, 0))
+    all_, half, none = ([*cells_of(case, turn_of(cpu_s=parts, forwarded=count))] for count in (70, 35, 0))
     *_, bridge_, serial = collected([all_ + half, none])
     assert (bridge_.measure, bridge_.unit, bridge_.params) == (CPU, "us", {"load": "none", "process": "bridge"})
     assert [*bridge_.rounds, *serial.rounds] == [pytest.approx([100, 200]), [], pytest.approx([200, 400]), []]
@@ -201,7 +202,7 @@ class FakeRobot:
     def drive(self, seconds: float, rate_hz: float = 20, **work: Any) -> Turn:
         self.driven.append(f"{self.kind} {seconds:g}")
         self.work += [work] if work else []
-        return turn_of([1.0], [1.0], parts_cpu_s={} if self.kind == HOP else {FORWARDER: 0.1, SERIAL: 0.1}, forwarded=2)
+        return turn_of([1.0], [1.0], cpu_s={} if self.kind == HOP else {FORWARDER: 0.1, SERIAL: 0.1}, forwarded=2)
 
     def match_arrivals(self, turns: Sequence[Turn]) -> None:
         pass

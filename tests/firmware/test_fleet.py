@@ -123,7 +123,7 @@ def test_figures_are_shown_and_written(tmp_path: Path) -> None:
     second = 1_000_000_000
     heartbeats = [[number * second // 4 for number in range(5)], [number * second // 4 for number in range(9)]]
     sent = {"minilamp-001": [0, second], "benjr-001": [0]}
-    answer = {"sent": sent, "late": 0, "heartbeats": heartbeats, "began": 0, "ended": 2 * second}
+    answer = {"sent": sent, "late": 0, "heartbeats": heartbeats}
     moves = {name: [Moved(ms * 1_000_000, name, (1.0, 1.0))] for name, ms in (("minilamp-001", 1), ("benjr-001", 9))}
     measured = replace(FLEET, measure=lambda case: [cell_of(case, 2, answer, moves, {"fleet": 1.0}, 8.0)])
     out = StringIO()
