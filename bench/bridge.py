@@ -26,7 +26,7 @@ from pebble.bench.comparison import Budget, Case, Comparison, Option, Round, Run
 from pebble.bench.drivers import RATE_HZ
 from pebble.bench.pictures import bars, ecdf, null_ratios, ratios
 from pebble.bench.ratios import LEAST_ROUNDS
-from pebble.bench.results import Cell
+from pebble.bench.results import Cell, grouped
 from pebble.bench.tables import COUNT, SPREAD, Claims, Grid, latency_table, percentile_column, single_column
 from pebble.errors import PebbleError
 from pebble.rig.robot import KINDS
@@ -103,9 +103,8 @@ def _in_turns(round_: Round, load: str, driven: Mapping[str, DrivenRobot], rate_
     for case in round_.cases([{"load": load}]):
         if (robot := driven.get(case.variant)) is not None:
             turns.append((case, robot.drive(turn_s, rate_hz, work_us=case.planted_us, slowed=case.slowed)))
-    for name, one in driven.items():
-        own = [(case, turn) for case, turn in turns if case.variant == name]
-        one.match_arrivals([turn for _, turn in own])
+    for name, own in grouped(turns, lambda one: one[0].variant).items():
+        driven[name].match_arrivals([turn for _, turn in own])
         for case, turn in own:
             yield from cells_of(case, turn)
 

@@ -35,9 +35,8 @@ from pebble.simulation.wireless import KINDS
 
 #: Wheel speeds, left and right, in sequence: no robot gets the same command twice within eight commands.
 STEPS: Final = ((1, 1), (-1, -1), (1, 0), (-1, 0), (1, -1), (0, 1), (-1, 1), (0, -1))
-_ONLINE_S, _UP_S = 60.0, 90.0
-_ARRIVE_S = 1.0
-_POLL_S = 0.05
+_SPREAD = {"min": 0, "median": 50, "max": 100}
+_ONLINE_S, _UP_S, _ARRIVE_S, _POLL_S = 60.0, 90.0, 1.0, 0.05
 
 
 def measure(case: Case) -> Iterator[Cell]:
@@ -52,7 +51,7 @@ def measure(case: Case) -> Iterator[Cell]:
         operator = processes.worker("operator", "pebble.bench.fleet", broker.port, run["seconds"], run["rate"], *ids)
         run.show(f"{count} robots are connecting")
         online = operator.answer(_UP_S)["online"]
-        run.show(f"{online} robots are online and being driven for {run['seconds']:.0f} s")
+        run.show(f"{online} robots are online and driven")
         pids = {"broker": broker.pid, "fleet": fleet.pid, "operator": operator.pid}
         began, before = time.monotonic(), {name: cpu_s([pid]) for name, pid in pids.items()}
         found = operator.answer(run["seconds"] + _UP_S)
@@ -75,9 +74,7 @@ def cell_of(
         sent=sum(map(len, sent.values())),
         online=online,
         late=found["late"],
-        beats_min_hz=rounded(percentile(rates, 0), 3),
-        beats_median_hz=rounded(percentile(rates, 50), 3),
-        beats_max_hz=rounded(percentile(rates, 100), 3),
+        **{f"beats_{name}_hz": rounded(percentile(rates, at), 3) for name, at in _SPREAD.items()},
         longest_gap_s=rounded(longest_gap_s(heartbeats, began, ended), 3),
         **{f"cpu_{name}": rounded(share, 1) for name, share in cpu.items()},
         fleet_mb=rounded(mb, 1),

@@ -20,7 +20,6 @@ from pebble.bench.estop import (
     HOLD,
     REST,
     STOP,
-    WIRE,
     ZERO,
     is_moving,
     rest,
@@ -71,7 +70,6 @@ def one_round(stop_ms: float, *, again: bool = False, lost: bool = False) -> Ite
     yield sample(REST, ALL, STOP, 0, None if lost else round(100 * MS))
     yield sample(CONFIRMED, "mqtt", STOP, 0, 600 * MS)
     yield sample(HOLD, "mqtt", STOP, 0, 3 * MS)
-    yield sample(WIRE, "mqtt", "pebble estop", 0, 180 * MS)
 
 
 def cells(*rounds: Iterator[Cell]) -> list[Cell]:
@@ -117,7 +115,7 @@ def test_a_stop_that_did_not_happen_misses_its_aim() -> None:
 def test_the_table_names_every_measure_within_130_columns() -> None:
     out = io.StringIO()
     Console(file=out, width=130).print(*ESTOP.shown(cells(one_round(2.0))))
-    assert all(measure in out.getvalue() for measure in (REST, CONFIRMED, HOLD, WIRE))
+    assert all(measure in out.getvalue() for measure in (REST, CONFIRMED, HOLD))
     assert "…" not in out.getvalue()
 
 
